@@ -1,0 +1,57 @@
+"""The ``gpvo`` command: one file per group of commands, each thin over the library.
+
+Exit code 0, or 2 with one line that says what is wrong with which file and what would mend it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from rich.console import Console
+
+from gpvo import __version__
+from gpvo.cli import evaluate, fuse, learn, run, simulate
+from gpvo.errors import GpvoError
+
+app = typer.Typer(
+    name="gpvo",
+    help="Tells your filter how wrong stereo visual odometry is, right now.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(show: bool) -> None:
+    if show:
+        print(f"gpvo {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    """Options that stand before the command."""
+
+
+for group in (simulate, run, learn, evaluate, fuse):
+    group.register(app)
+
+
+def main() -> None:
+    """Entry point of the ``gpvo`` script."""
+    try:
+        app()
+    except GpvoError as error:
+        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"gpvo: {error}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("gpvo: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,5 @@
+"""``python -m gpvo.cli``."""
+
+from gpvo.cli import main
+
+main()

@@ -1,0 +1,1 @@
+"""SE(3), fixed frames and the transport of covariances. NumPy only."""

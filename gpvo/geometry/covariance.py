@@ -1,0 +1,73 @@
+"""Transport and compounding of pose covariances under right perturbations (translation, rotation)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+
+
+def symmetrise(C: Array) -> Array:
+    """Average of a matrix and its transpose. (..., n, n)."""
+    return 0.5 * (C + np.swapaxes(C, -1, -2))
+
+
+def is_positive_definite(C: Array) -> bool:
+    """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
+    C = np.asarray(C)
+    if not np.isfinite(C).all() or not np.allclose(C, C.T, rtol=1e-8, atol=1e-12 * np.abs(C).max()):
+        return False
+    try:
+        np.linalg.cholesky(C)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def of_inverse(T_a_b: Array, cov_a_b: Array) -> Array:
+    """Covariance of ``T_b_a`` from ``T_a_b`` and its covariance: ``(T Exp(xi))^-1 = T^-1 Exp(-Ad(T) xi)``."""
+    A = se3.adjoint(T_a_b)
+    return A @ cov_a_b @ np.swapaxes(A, -1, -2)
+
+
+def compound(T_b_c: Array, cov_a_b: Array, cov_b_c: Array) -> Array:
+    """Covariance of ``T_a_b T_b_c`` for independent errors: ``Ad(T_b_c)^-1 S_ab Ad(T_b_c)^-T + S_bc``."""
+    A = se3.adjoint(se3.inverse(T_b_c))
+    return A @ cov_a_b @ np.swapaxes(A, -1, -2) + cov_b_c
+
+
+def change_body(T_new_old: Array, covariance: Array) -> Array:
+    """Covariance of a motion or twist of the same rigid body, seen at another of its frames: ``Ad C Ad^T``."""
+    A = se3.adjoint(T_new_old)
+    return A @ covariance @ np.swapaxes(A, -1, -2)
+
+
+def position_in_world(T_world_cur: Array, covariance: Array) -> Array:
+    """(..., 3, 3) covariance of the position in world axes, from the right-perturbation (..., 6, 6)."""
+    R = T_world_cur[..., :3, :3]
+    return R @ covariance[..., :3, :3] @ np.swapaxes(R, -1, -2)
+
+
+def accumulate(T_prev_cur: Array, covariances: Array, parent: NDArray[np.int64] | None = None) -> Array:
+    """Pose covariances along a chain of independent motions.
+
+    Parameters
+    ----------
+    T_prev_cur : (N, 4, 4) motions.
+    covariances : (N, 6, 6) of the motions, right perturbation.
+    parent : (N,) index of the pose each motion starts from, -1 for the origin; default ``arange(N) - 1``.
+
+    Returns
+    -------
+    (N, 6, 6) covariance of each pose after its motion, in the axes of that pose.
+    """
+    n = len(T_prev_cur)
+    start = np.arange(n) - 1 if parent is None else parent
+    A = se3.adjoint(se3.inverse(T_prev_cur))
+    out = np.empty((n, 6, 6))
+    for k in range(n):
+        before = out[start[k]] if start[k] >= 0 else np.zeros((6, 6))
+        out[k] = A[k] @ before @ A[k].T + covariances[k]
+    return symmetrise(out)

@@ -1,0 +1,206 @@
+"""SE(3) as 4x4 matrices, with batches in the leading axes.
+
+House rules: a tangent vector is ``(translation xyz [m], rotation xyz [rad])`` and perturbs on the right,
+``T Exp(xi)``. ``T_a_b`` maps coordinates in ``b`` to coordinates in ``a``.
+
+Formulas: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics" (2018),
+appendices B (SO(3)) and D (SE(3)); T. Barfoot, "State Estimation for Robotics" (2017), section 7.1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Below this angle the closed forms lose more digits to cancellation than the series drop.
+_SMALL_ANGLE_RAD = 1e-4
+
+
+def skew(v: Array) -> Array:
+    """Matrix of the cross product: ``skew(v) @ w == cross(v, w)``. (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:
+    """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 from t^2, by series near zero."""
+    theta = np.sqrt(theta2)
+    small = theta < _SMALL_ANGLE_RAD
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
+    # 2 sin^2(t/2) keeps the digits that 1 - cos(t) loses.
+    b = np.where(small, 0.5 - theta2 / 24.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe**2)
+    c_small = 1.0 / 6.0 - theta2 / 120.0
+    c = np.where(theta < 1e-2, c_small + theta2**2 / 5040.0, (safe - np.sin(safe)) / safe**3)
+    return a, b, c
+
+
+def so3_exp(phi: Array) -> Array:
+    """Rotation vector [rad] to rotation matrix (Rodrigues). (..., 3) -> (..., 3, 3)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    a, b, _ = _coefficients((phi**2).sum(-1))
+    W = skew(phi)
+    return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
+
+
+def so3_log(R: Array) -> Array:
+    """Rotation matrix to rotation vector [rad] of angle at most pi. (..., 3, 3) -> (..., 3).
+
+    Goes through the quaternion, which stays accurate at both zero and pi.
+    """
+    q_xyzw = rotation_to_quaternion_xyzw(R)
+    xyz, w = q_xyzw[..., :3], q_xyzw[..., 3]
+    sine = np.linalg.norm(xyz, axis=-1)
+    angle = 2.0 * np.arctan2(sine, w)
+    small = sine < 1e-9
+    scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+    return xyz * scale[..., None]
+
+
+def so3_left_jacobian(phi: Array) -> Array:
+    """Left Jacobian of SO(3), ``V`` in the SE(3) exponential. (..., 3) -> (..., 3, 3)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    _, b, c = _coefficients((phi**2).sum(-1))
+    W = skew(phi)
+    return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
+
+
+def so3_left_jacobian_inverse(phi: Array) -> Array:
+    """Inverse of :func:`so3_left_jacobian`. (..., 3) -> (..., 3, 3)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    theta2 = (phi**2).sum(-1)
+    a, b, _ = _coefficients(theta2)
+    small = theta2 < 1e-4
+    safe = np.where(small, 1.0, theta2)
+    # (1 - a / (2 b)) / t^2, and its series 1/12 + t^2/720 + t^4/30240.
+    d = np.where(
+        small,
+        1.0 / 12.0 + theta2 / 720.0 + theta2**2 / 30240.0,
+        (1.0 - a / (2.0 * np.where(b == 0, 1.0, b))) / safe,
+    )
+    W = skew(phi)
+    return np.eye(3) - 0.5 * W + d[..., None, None] * (W @ W)
+
+
+def so3_right_jacobian(phi: Array) -> Array:
+    """Right Jacobian of SO(3): ``Exp(phi + d) ~ Exp(phi) Exp(Jr d)``. (..., 3) -> (..., 3, 3)."""
+    return so3_left_jacobian(-np.asarray(phi, dtype=np.float64))
+
+
+def exp(xi: Array) -> Array:
+    """Tangent (..., 6) to pose (..., 4, 4)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = so3_exp(xi[..., 3:])
+    T[..., :3, 3] = (so3_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def log(T: Array) -> Array:
+    """Pose (..., 4, 4) to tangent (..., 6)."""
+    T = np.asarray(T, dtype=np.float64)
+    phi = so3_log(T[..., :3, :3])
+    rho = (so3_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def inverse(T: Array) -> Array:
+    """Inverse pose, by transposing the rotation. (..., 4, 4) -> (..., 4, 4)."""
+    T = np.asarray(T, dtype=np.float64)
+    out = np.zeros_like(T)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def adjoint(T: Array) -> Array:
+    """``Ad(T)``, with ``T Exp(xi) T^-1 == Exp(Ad(T) xi)``. (..., 4, 4) -> (..., 6, 6)."""
+    T = np.asarray(T, dtype=np.float64)
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = R
+    out[..., 3:, 3:] = R
+    out[..., :3, 3:] = skew(T[..., :3, 3]) @ R
+    return out
+
+
+def transform(T: Array, points: Array) -> Array:
+    """Apply one pose (4, 4) to points (..., 3)."""
+    return np.asarray(points) @ T[:3, :3].T + T[:3, 3]
+
+
+def from_rt(R: Array, t: Array) -> Array:
+    """Pose (..., 4, 4) from rotation (..., 3, 3) and translation (..., 3)."""
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def from_quaternion(t: Array, q_xyzw: Array) -> Array:
+    """Pose (..., 4, 4) from translation (..., 3) and quaternion (..., 4) in x, y, z, w order.
+
+    The quaternion is normalised first: published ground truth is unit only to about 1e-4.
+    """
+    q = np.asarray(q_xyzw, dtype=np.float64)
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    R = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+    return from_rt(R, t)
+
+
+def rotation_to_quaternion_xyzw(R: Array) -> Array:
+    """Unit quaternion (..., 4), x y z w with w >= 0, of a rotation matrix (..., 3, 3).
+
+    Picks the largest of the four components to divide by (S. W. Shepperd, 1978).
+    """
+    R = np.asarray(R, dtype=np.float64)
+    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    choice = np.argmax(np.stack([d0, d1, d2, d0 + d1 + d2], -1), axis=-1)
+    yz, zx, xy = (R[..., i, j] + R[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1)))
+    wx, wy, wz = (R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    candidates = np.stack(
+        [
+            np.stack([1 + d0 - d1 - d2, xy, zx, wx], -1),
+            np.stack([xy, 1 - d0 + d1 - d2, yz, wy], -1),
+            np.stack([zx, yz, 1 - d0 - d1 + d2, wz], -1),
+            np.stack([wx, wy, wz, 1 + d0 + d1 + d2], -1),
+        ],
+        -2,
+    )
+    q = np.take_along_axis(candidates, choice[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def interpolate(T_a: Array, T_b: Array, fraction: Array) -> Array:
+    """Geodesic between poses (..., 4, 4), at ``fraction`` (...) of the way: translation straight, rotation slerp."""
+    fraction = np.asarray(fraction, dtype=np.float64)
+    R_a = T_a[..., :3, :3]
+    phi = so3_log(np.swapaxes(R_a, -1, -2) @ T_b[..., :3, :3])
+    R = R_a @ so3_exp(fraction[..., None] * phi)
+    t = T_a[..., :3, 3] + fraction[..., None] * (T_b[..., :3, 3] - T_a[..., :3, 3])
+    return from_rt(R, t)
+
+
+def orthonormalise(T: Array) -> Array:
+    """Pose whose rotation block is the nearest rotation matrix (SVD). (..., 4, 4) -> (..., 4, 4)."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    sign = np.linalg.det(U @ Vt)
+    U = U * np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)[..., None, :]
+    return from_rt(U @ Vt, T[..., :3, 3])

@@ -1,0 +1,1 @@
+"""gpvo.online."""

@@ -1,0 +1,1 @@
+"""Consistency statistics and their uncertainty. NumPy only."""

@@ -1,0 +1,292 @@
+"""The nouns that travel between the stages: frozen, NumPy only, SI units.
+
+Frame of every motion, covariance, error and feature: the rectified left optical frame ``cam``
+(x right, y down, z forward). Tangent order: translation xyz [m], rotation xyz [rad], right perturbation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Status(str, Enum):
+    """How far a motion can be trusted. ``start`` marks the first frame, which has no motion yet."""
+
+    START = "start"
+    OK = "ok"
+    DEGRADED = "degraded"
+    LOST = "lost"
+
+    @property
+    def severity(self) -> int:
+        """0 for ``start`` and ``ok``, 1 for ``degraded``, 2 for ``lost``: the worse of two is the larger."""
+        return {"start": 0, "ok": 0, "degraded": 1, "lost": 2}[self.value]
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """A rectified stereo pair: two identical pinhole cameras, rows aligned, the right one at +x.
+
+    ``fx_px, fy_px, cx_px, cy_px``: intrinsics [px], pixel (0, 0) is the centre of the first pixel.
+    ``baseline_m``: distance of the optical centres [m], positive. ``width, height``: image size [px].
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    width: int
+    height: int
+
+    @property
+    def K(self) -> Array:
+        """(3, 3) camera matrix."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    def project(self, points_cam: Array) -> Array:
+        """(N, 3) points in ``cam`` [m] to (N, 3) measurements (u, v, disparity) [px]."""
+        X, Y, Z = np.asarray(points_cam, dtype=np.float64).T
+        return np.stack(
+            [
+                self.fx_px * X / Z + self.cx_px,
+                self.fy_px * Y / Z + self.cy_px,
+                self.fx_px * self.baseline_m / Z,
+            ],
+            axis=1,
+        )
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """One stereo pair: ``left`` and ``right`` are (H, W) uint8, raw or rectified as the source says."""
+
+    t_ns: int
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class TrackFrame:
+    """One frame of stereo tracks: ``track`` (N,) identities, ``uv_left``/``uv_right`` (N, 2) rectified pixels."""
+
+    t_ns: int
+    track: NDArray[np.int64]
+    uv_left: Array
+    uv_right: Array
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """White noise densities and random walks of an IMU, in Kalibr's units."""
+
+    gyro_density_radps_sqrthz: float
+    acc_density_mps2_sqrthz: float
+    gyro_walk_radps2_sqrthz: float
+    acc_walk_mps3_sqrthz: float
+
+
+@dataclass(frozen=True)
+class ImuLog:
+    """IMU samples in the IMU's own frame, already shifted to the camera's clock.
+
+    ``t_ns`` (N,) int64; ``gyro_radps`` (N, 3); ``acc_mps2`` (N, 3) specific force (+9.81 up at rest).
+    """
+
+    t_ns: NDArray[np.int64]
+    gyro_radps: Array
+    acc_mps2: Array
+    noise: ImuNoise | None = None
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Where the rectified left camera sits: ``T_body_cam`` and ``T_imu_cam`` (4, 4), None where unknown.
+
+    ``body`` is FLU ``base_link``.
+    """
+
+    T_body_cam: Array | None = None
+    T_imu_cam: Array | None = None
+
+
+@dataclass(frozen=True)
+class TruthLog:
+    """Ground truth poses of the rectified left camera: ``t_ns`` (N,), ``T_world_cam`` (N, 4, 4).
+
+    ``sigma_translation_m`` and ``sigma_rotation_rad``: standard deviation of the truth's own white noise per
+    pose and axis; 0 for simulation.
+    """
+
+    t_ns: NDArray[np.int64]
+    T_world_cam: Array
+    sigma_translation_m: float = 0.0
+    sigma_rotation_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class VoRecord:
+    """What stereo VO knows about one motion, from the frame at ``t_prev_ns`` to the frame at ``t_ns``.
+
+    ``T_prev_cur`` maps points of the current camera to the reference camera. The reference is normally the
+    frame before; after a lost frame, or while the vehicle stands still, it may be an older one, so poses
+    compound as ``T_world_cam(t_ns) = T_world_cam(t_prev_ns) T_prev_cur``. ``is_reference`` says whether this
+    frame is the reference of the next motion.
+
+    Counts are -1 and floats NaN where the producer does not know them. ``covariances`` (6, 6) and ``v_t``
+    (3, 3, the thesis' translation-only ``V_T`` [m^2]) are keyed by method, empty where unknown. Covariances are
+    of ``T_prev_cur`` as it stands. ``imu_*`` are means and standard deviations over the interval in IMU axes,
+    None without an IMU.
+    """
+
+    t_ns: int
+    t_prev_ns: int
+    status: Status
+    T_prev_cur: Array
+    is_reference: bool = True
+    reason: str = ""
+    n_detected: int = -1
+    n_stereo: int = -1
+    n_tracked: int = -1
+    n_inliers: int = -1
+    reproj_rms_px: float = np.nan
+    disparity_p10_px: float = np.nan
+    disparity_p50_px: float = np.nan
+    disparity_p90_px: float = np.nan
+    spread_u: float = np.nan  # standard deviation of the inliers' normalised image coordinate (u - cx) / fx
+    spread_v: float = np.nan
+    log10_condition: float = np.nan  # of the information matrix, lengths scaled by the median depth
+    brightness: float = np.nan  # mean grey value, 0..1
+    contrast: float = np.nan  # standard deviation of the grey value, 0..1
+    sharpness: float = np.nan  # log10 of the variance of the Laplacian, grey values 0..255
+    noise_level: float = np.nan  # estimated standard deviation of the image noise, 0..1
+    imu_gyro_mean_radps: Array | None = None
+    imu_gyro_std_radps: Array | None = None
+    imu_acc_mean_mps2: Array | None = None
+    imu_acc_std_mps2: Array | None = None
+    covariances: Mapping[str, Array] = field(default_factory=dict)
+    v_t: Mapping[str, Array] = field(default_factory=dict)
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def dt_s(self) -> float:
+        """Duration of the motion [s]; 0 for the first frame."""
+        return (self.t_ns - self.t_prev_ns) * 1e-9
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Inliers over tracked points; NaN where either is unknown or nothing was tracked."""
+        return self.n_inliers / self.n_tracked if self.n_tracked > 0 and self.n_inliers >= 0 else np.nan
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is a measured motion: status ``ok`` or ``degraded``."""
+        return self.status in (Status.OK, Status.DEGRADED)
+
+    def with_status(self, status: Status, reason: str) -> VoRecord:
+        """The same record with the worse of its own and the given status, and the reason appended."""
+        if status.severity <= self.status.severity:
+            return self
+        return replace(self, status=status, reason="; ".join(filter(None, (self.reason, reason))))
+
+
+@dataclass(frozen=True)
+class VoLog:
+    """All records of a run, in time order, with the camera that made them (None for imported poses)."""
+
+    records: Sequence[VoRecord]
+    camera: StereoCamera | None = None
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def __iter__(self) -> Iterator[VoRecord]:
+        return iter(self.records)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """One scalar attribute of every record (``"t_ns"``, ``"dt_s"``, ``"n_inliers"``, ...) as an array (N,)."""
+        return np.array([getattr(r, name) for r in self.records])
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        """(N,) stamps of the frames."""
+        return np.array([r.t_ns for r in self.records], dtype=np.int64)
+
+    @property
+    def T_prev_cur(self) -> Array:
+        """(N, 4, 4) motions; identity for the first frame."""
+        return np.array([r.T_prev_cur for r in self.records], dtype=np.float64).reshape(-1, 4, 4)
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(N,) whether each record holds a measured motion."""
+        return np.array([r.usable for r in self.records], dtype=bool)
+
+    @property
+    def parent(self) -> NDArray[np.int64]:
+        """(N,) index of the frame each motion starts from; -1 for the first."""
+        index = {int(t): k for k, t in enumerate(self.t_ns)}
+        return np.array([-1 if r.t_prev_ns == r.t_ns else index[r.t_prev_ns] for r in self.records], dtype=np.int64)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the geometric covariance methods present, in first-seen order."""
+        seen: dict[str, None] = {}
+        for record in self.records:
+            seen.update(dict.fromkeys(record.covariances))
+        return tuple(seen)
+
+    def covariance(self, method: str) -> Array:
+        """(N, 6, 6) of one method; NaN where a record has none."""
+        missing = np.full((6, 6), np.nan)
+        return np.array([r.covariances.get(method, missing) for r in self.records]).reshape(-1, 6, 6)
+
+    def trajectory(self) -> Array:
+        """(N, 4, 4) ``T_first_cam``: the motions compounded, never corrected by a model."""
+        T, parent = self.T_prev_cur, self.parent
+        out = np.empty_like(T)
+        for k in range(len(T)):
+            out[k] = T[k] if parent[k] < 0 else out[parent[k]] @ T[k]
+        return out
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The predicted error of one motion: ``xi ~ N(mean, covariance)`` with ``T_true = T_est Exp(-xi)``.
+
+    ``mean`` (6,) and ``covariance`` (6, 6) in ``cam``, translation first [m, rad], per motion (not per second).
+    ``parts`` splits the covariance by how it accumulates and sums to it: ``jitter`` (pixel noise of a frame that
+    two motions share with opposite sign, half of it per end), ``white`` (independent from motion to motion) and
+    ``bias`` (first-order Gauss-Markov with time constants ``bias_tau_s`` (6,)). ``epistemic`` (6,) is the share of
+    each variance that comes from being away from the training data, already inside ``covariance``.
+    ``confidence`` and ``in_domain`` are in [0, 1].
+    """
+
+    t_ns: int
+    dt_s: float
+    mean: Array
+    covariance: Array
+    parts: Mapping[str, Array]
+    bias_tau_s: Array
+    epistemic: Array
+    confidence: float
+    in_domain: float
+    status: Status
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation per axis [m, m, m, rad, rad, rad]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def field_names(cls: type) -> tuple[str, ...]:
+    """Names of a dataclass' fields, in order."""
+    return tuple(f.name for f in fields(cls))
