@@ -1,0 +1,279 @@
+"""A Gaussian process with several outputs, reduced to one projection of its kernel: what flies on board.
+
+All outputs share the squared-exponential kernel and its points, ``k_i(x) = exp(-|u(x) - u_i|^2 / 2)``. The posterior is
+
+    z(x)   = P k(x)
+    mean_j = offset_j + sum_r A_jr z_r
+    var_j  = s_j^2 - sum_r W_jr z_r^2
+
+P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs squares of z alone. One P serves
+all outputs, exactly, while the rows' noise weights are one common profile times a scale per output; otherwise P has one slice
+per output. Mean and variance: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), equations
+2.25 and 2.26; with inducing points M. Titsias (2009), equation 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpvo.errors import ModelError
+
+Array = NDArray[np.float64]
+
+_CHUNK_ROWS = 4096
+_GP_FIELDS = ("centre", "lengthscale", "points", "projection", "weights", "reduction", "signal_var", "offset")
+_SHARED_FIELDS = ("weights", "reduction", "signal_var", "offset")
+
+
+@dataclass(frozen=True)
+class ProjectedGP:
+    """Posterior of a GP with d inputs and D outputs on m points and r directions, all arrays float64.
+
+    ``centre``, ``lengthscale`` (d,): inputs are taken as ``u = (x - centre) / lengthscale``, in the inputs' units.
+    ``points`` (m, d): training or inducing points, as u. ``projection`` (r, m), or (D, r, m) with one slice per output.
+    ``weights`` (D, r): A. ``reduction`` (D, r): W. ``signal_var``, ``offset`` (D,): prior variance and mean.
+    """
+
+    centre: Array
+    lengthscale: Array
+    points: Array
+    projection: Array
+    weights: Array
+    reduction: Array
+    signal_var: Array
+    offset: Array
+
+    def __post_init__(self) -> None:
+        m, d = self.points.shape
+        D, r = self.weights.shape
+        wanted = {
+            "centre": {(d,)},
+            "lengthscale": {(d,)},
+            "projection": {(r, m), (D, r, m)},
+            "reduction": {(D, r)},
+            "signal_var": {(D,)},
+            "offset": {(D,)},
+        }
+        for name, shapes in wanted.items():
+            if getattr(self, name).shape not in shapes:
+                raise ModelError(f"GP array '{name}' has shape {getattr(self, name).shape}, expected {sorted(shapes)}")
+
+    @property
+    def n_inputs(self) -> int:
+        """d."""
+        return int(self.points.shape[1])
+
+    @property
+    def n_outputs(self) -> int:
+        """D."""
+        return int(self.weights.shape[0])
+
+    @property
+    def flat_projection(self) -> Array:
+        """(r, m), or (D r, m) with the outputs' slices below one another."""
+        return self.projection.reshape(-1, self.points.shape[0])
+
+    def kernel(self, X: ArrayLike) -> Array:
+        """(n, m) unit kernel between the rows of X (n, d) and the points."""
+        u = (np.asarray(X, dtype=np.float64) - self.centre) / self.lengthscale
+        e = u @ self.points.T
+        e -= 0.5 * (self.points**2).sum(1)
+        e -= 0.5 * (u**2).sum(1)[:, None]
+        return np.exp(np.minimum(e, 0.0))
+
+    def evaluate(self, X: ArrayLike) -> tuple[Array, Array]:
+        """Mean and latent variance (no noise) of rows X (n, d): (n, D) and (n, D)."""
+        X = np.asarray(X, dtype=np.float64)
+        mean, var = np.empty((len(X), self.n_outputs)), np.empty((len(X), self.n_outputs))
+        for i in range(0, len(X), _CHUNK_ROWS):
+            rows = slice(i, i + _CHUNK_ROWS)
+            z = self.kernel(X[rows]) @ self.flat_projection.T
+            if self.projection.ndim == 2:
+                mean[rows], var[rows] = z @ self.weights.T, (z * z) @ self.reduction.T
+            else:
+                z = z.reshape(len(z), *self.weights.shape)
+                mean[rows], var[rows] = (z * self.weights).sum(2), (z * z * self.reduction).sum(2)
+        return mean + self.offset, np.maximum(self.signal_var - var, 0.0)
+
+
+class BasisPrediction(NamedTuple):
+    """What the GPs say, each (n, D) for many rows or (D,) for one.
+
+    ``mean``: of the error. ``epistemic_var``: variance of that mean, grows away from the training data. ``log_noise_var``: log
+    of the expected squared noise; with a base log-variance the model was trained as a ratio to it, so add the base.
+    ``log_noise_spread``: variance of the log noise variance, whose half is already inside ``log_noise_var``:
+    ``exp(log_noise_var) (1 - exp(-log_noise_spread / 2))`` is the part of the noise variance owed to ignorance.
+    """
+
+    mean: Array
+    epistemic_var: Array
+    log_noise_var: Array
+    log_noise_spread: Array
+
+
+class SharedBasis:
+    """Mean, epistemic variance and input-dependent noise of D outputs, from features alone; NumPy only.
+
+    ``mean``: GP of the error. ``noise``: GP of the log of the noise variance (or of its ratio to a base), None for constant
+    noise; where it is built on the very arrays ``points`` and ``projection`` of ``mean``, kernel and projection are computed
+    once. ``log_noise_offset`` (D,): added to the log-variance (tail and calibration constants; all of it if ``noise`` is None).
+
+    ``predict_one`` reuses its buffers: one instance per thread.
+    """
+
+    def __init__(self, mean: ProjectedGP, noise: ProjectedGP | None, log_noise_offset: Array) -> None:
+        self.mean = mean
+        self.noise = noise
+        self.log_noise_offset = np.asarray(log_noise_offset, dtype=np.float64)
+        if self.log_noise_offset.shape != (mean.n_outputs,):
+            raise ModelError(f"log_noise_offset has shape {self.log_noise_offset.shape}, expected ({mean.n_outputs},)")
+        if noise is not None and (noise.n_inputs, noise.n_outputs) != (mean.n_inputs, mean.n_outputs):
+            raise ModelError("the GPs of mean and noise differ in their number of inputs or outputs")
+        self._row: _RowPlan | None = None
+
+    @property
+    def n_inputs(self) -> int:
+        """d."""
+        return self.mean.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """D."""
+        return self.mean.n_outputs
+
+    @property
+    def shares_kernel(self) -> bool:
+        """Whether the noise model uses the points and the projection of the mean."""
+        return self.noise is not None and self.noise.points is self.mean.points
+
+    def predict(self, X: ArrayLike) -> BasisPrediction:
+        """Rows X (n, d), in the units of training, in float64."""
+        X = np.asarray(X, dtype=np.float64)
+        if X.ndim != 2 or X.shape[1] != self.n_inputs:
+            raise ValueError(f"expected rows of {self.n_inputs} features, got an array of shape {X.shape}")
+        mean, var = self.mean.evaluate(X)
+        if self.noise is None:
+            log_noise, spread = np.zeros_like(mean), np.zeros_like(mean)
+        else:
+            log_noise, spread = self.noise.evaluate(X)
+        return BasisPrediction(mean, var, log_noise + 0.5 * spread + self.log_noise_offset, spread)
+
+    def predict_one(self, x: Array) -> BasisPrediction:
+        """One row x (d,), float64: the same numbers from a float32 projection, in buffers made once; fresh arrays out."""
+        if self._row is None:
+            self._row = _RowPlan(self)
+        return BasisPrediction(*self._row(x))
+
+    def to_arrays(self, prefix: str = "") -> dict[str, Array]:
+        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
+        out = {f"{prefix}mean.{name}": getattr(self.mean, name) for name in _GP_FIELDS}
+        out[f"{prefix}log_noise_offset"] = self.log_noise_offset
+        if self.noise is not None:
+            names = _SHARED_FIELDS if self.shares_kernel else _GP_FIELDS
+            out |= {f"{prefix}noise.{name}": getattr(self.noise, name) for name in names}
+        return out
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> SharedBasis:
+        """The basis from named arrays. Raises ModelError where one is missing or of the wrong shape."""
+        try:
+            mean = ProjectedGP(**{n: np.asarray(arrays[f"{prefix}mean.{n}"], np.float64) for n in _GP_FIELDS})
+            noise = None
+            if f"{prefix}noise.weights" in arrays:
+                own = f"{prefix}noise.points" in arrays
+                found = {n: np.asarray(arrays[f"{prefix}noise.{n}"], np.float64) for n in _GP_FIELDS if own or n in _SHARED_FIELDS}
+                noise = ProjectedGP(**{n: found[n] if n in found else getattr(mean, n) for n in _GP_FIELDS})
+            return cls(mean, noise, np.asarray(arrays[f"{prefix}log_noise_offset"], np.float64))
+        except KeyError as missing:
+            raise ModelError(f"the model file lacks the array {missing}") from None
+        except (ValueError, IndexError) as wrong:
+            raise ModelError(f"the model file's GP arrays do not fit together: {wrong}") from None
+
+
+class _RowPlan:
+    """Everything :meth:`SharedBasis.predict_one` can prepare: stacked matrices and buffers.
+
+    With v = [u, 1, -|u|^2/2 of each kernel] all exponents are one product ``G v``; with f = [z, z^2] all outputs are one
+    product ``H f``. Exponents are float64 (they cancel), projections float32.
+    """
+
+    def __init__(self, basis: SharedBasis) -> None:
+        mean, noise = basis.mean, basis.noise
+        own = noise if noise is not None and not basis.shares_kernel else None
+        kernels = [mean] if own is None else [mean, own]
+        d, sizes = mean.n_inputs, [len(gp.points) for gp in kernels]
+        self._d = d
+        self._centre, self._inverse = mean.centre.copy(), 1.0 / mean.lengthscale
+        self._exponents(mean, kernels)
+        k = np.empty(sum(sizes), np.float32)
+        flats = [np.ascontiguousarray(gp.flat_projection, dtype=np.float32) for gp in kernels]
+        R = sum(len(P) for P in flats)
+        self._k, self._f = k, np.empty(2 * R, np.float32)
+        self._z, self._z2 = self._f[:R], self._f[R:]
+        starts_k, starts_z = np.cumsum([0, *sizes]), np.cumsum([0, *(len(P) for P in flats)])
+        self._products = [
+            (P, k[starts_k[i] : starts_k[i + 1]], self._z[starts_z[i] : starts_z[i + 1]]) for i, P in enumerate(flats)
+        ]
+        self._outputs(basis, R, int(starts_z[1]) if own is not None else 0)
+
+    def _exponents(self, mean: ProjectedGP, kernels: list[ProjectedGP]) -> None:
+        """G and the rows that give ``-|u|^2/2`` of each kernel from u*u, in the scaling of ``mean``."""
+        d, rows, squares = mean.n_inputs, [], []
+        for i, gp in enumerate(kernels):
+            ratio = mean.lengthscale / gp.lengthscale
+            points = gp.points + (gp.centre - mean.centre) / gp.lengthscale
+            one = np.zeros((len(points), len(kernels)))
+            one[:, i] = 1.0
+            rows.append(np.hstack([points * ratio, -0.5 * (points**2).sum(1)[:, None], one]))
+            squares.append(-0.5 * ratio**2)
+        self._G, self._Q = np.ascontiguousarray(np.vstack(rows)), np.array(squares)
+        self._v = np.zeros(d + 1 + len(kernels))
+        self._v[d] = 1.0
+        self._u, self._norms = self._v[:d], self._v[d + 1 :]
+        self._uu, self._e = np.empty(d), np.empty(len(self._G))
+
+    def _outputs(self, basis: SharedBasis, R: int, noise_start: int) -> None:
+        """H (4 D, 2 R) and its offset: mean, variance, log noise variance (with half its spread), spread."""
+        mean, noise, D = basis.mean, basis.noise, basis.n_outputs
+        H, offset = np.zeros((4, D, 2, R)), np.zeros((4, D))
+        _place(H[0, :, 0], mean, mean.weights, 0)
+        _place(H[1, :, 1], mean, -mean.reduction, 0)
+        offset[0], offset[1], offset[2] = mean.offset, mean.signal_var, basis.log_noise_offset
+        if noise is not None:
+            _place(H[2, :, 0], noise, noise.weights, noise_start)
+            _place(H[2, :, 1], noise, -0.5 * noise.reduction, noise_start)
+            _place(H[3, :, 1], noise, -noise.reduction, noise_start)
+            offset[2] += noise.offset + 0.5 * noise.signal_var
+            offset[3] = noise.signal_var
+        self._H = np.ascontiguousarray(H.reshape(4 * D, 2 * R), dtype=np.float32)
+        self._offset, self._out32 = offset, np.empty(4 * D, np.float32)
+        self._out_rows = self._out32.reshape(4, D)
+
+    def __call__(self, x: Array) -> Array:
+        u, e = self._u, self._e
+        np.subtract(x, self._centre, out=u)
+        np.multiply(u, self._inverse, out=u)
+        np.multiply(u, u, out=self._uu)
+        np.dot(self._Q, self._uu, out=self._norms)
+        np.dot(self._G, self._v, out=e)
+        np.exp(e, out=self._k, casting="same_kind")
+        for P, k, z in self._products:
+            np.dot(P, k, out=z)
+        np.multiply(self._z, self._z, out=self._z2)
+        np.dot(self._H, self._f, out=self._out32)
+        out = self._offset + self._out_rows
+        np.maximum(out[1::2], 0.0, out=out[1::2])
+        return out
+
+
+def _place(block: Array, gp: ProjectedGP, values: Array, start: int) -> None:
+    """Write per-output coefficients (D, r) into ``block`` (D, R) at the columns of the directions they multiply."""
+    D, r = values.shape
+    for j in range(D):
+        first = start + (j * r if gp.projection.ndim == 3 else 0)
+        block[j, first : first + r] = values[j]
