@@ -158,6 +158,8 @@ class VoRecord:
     n_tracked: int = -1
     n_inliers: int = -1
     reproj_rms_px: float = np.nan
+    residual_sigma_p_px: float = np.nan  # pointing and matching noise that this motion's residuals show
+    residual_sigma_m_px: float = np.nan
     disparity_p10_px: float = np.nan
     disparity_p50_px: float = np.nan
     disparity_p90_px: float = np.nan

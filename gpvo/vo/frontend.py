@@ -1,0 +1,95 @@
+"""What a front end gives the odometry, and the front end for pixel tracks made by somebody else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
+from gpvo.vo.config import VoConfig
+from gpvo.vo.image import ImageStats
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What is known of a frame before any motion: its statistics, and whether it repeats the frame before bit by
+    bit."""
+
+    stats: ImageStats | None
+    repeated: bool
+
+
+@dataclass(frozen=True)
+class Matches:
+    """The same points in the reference and the current frame: (u, v, d) [px], each (N, 3).
+
+    ``n_tracked``: points found again in the left image, with or without a right one.
+    """
+
+    uvd_prev: Array
+    uvd_cur: Array
+    n_tracked: int
+
+
+EMPTY = Matches(np.empty((0, 3)), np.empty((0, 3)), 0)
+
+
+class Frontend(Protocol):
+    """Turns frames into matches. The odometry calls ``observe``, then ``match``, then perhaps ``promote``."""
+
+    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
+        """Take in a new frame."""
+
+    def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
+        """Points of the reference found in the observed frame, near where the guess puts them.
+
+        ``from_scratch``: the guess is not to be trusted.
+        """
+
+    def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
+        """Make the observed frame the reference; counts of detected and of stereo-matched points.
+
+        ``inliers`` marks which of the last matches may be carried on, None for none. With fewer stereo points than
+        ``at_least`` the old reference stays.
+        """
+
+
+class TrackFrontend:
+    """For stereo tracks: points are matched by their identity."""
+
+    def __init__(self, camera: StereoCamera, config: VoConfig) -> None:
+        self._min_disparity_px = config.min_disparity_px
+        self._max_row_error_px = config.max_row_error_px
+        self._previous: tuple[NDArray[np.int64], Array] | None = None
+        self._current: tuple[NDArray[np.int64], Array] | None = None
+        self._detected = 0
+
+    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
+        """Take in a :class:`TrackFrame`; a non-finite pixel or an impossible disparity drops its point."""
+        assert isinstance(frame, TrackFrame)
+        left, right = np.asarray(frame.uv_left, np.float64), np.asarray(frame.uv_right, np.float64)
+        d, row_error = left[:, 0] - right[:, 0], np.abs(left[:, 1] - right[:, 1])
+        with np.errstate(invalid="ignore"):
+            good = (d >= self._min_disparity_px) & (row_error <= max(self._max_row_error_px, 3.0))
+        uvd = np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), d], 1)
+        self._detected = len(left)
+        track, first = np.unique(frame.track[good], return_index=True)
+        self._current = (track, uvd[good][first])
+        return Observation(None, repeated=False)
+
+    def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
+        """Pair the points of equal identity."""
+        if self._previous is None or self._current is None:
+            return EMPTY
+        _, i, j = np.intersect1d(self._previous[0], self._current[0], assume_unique=True, return_indices=True)
+        return Matches(self._previous[1][i], self._current[1][j], len(i))
+
+    def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
+        """See :class:`Frontend`."""
+        assert self._current is not None
+        if len(self._current[0]) >= at_least:
+            self._previous = self._current
+        return self._detected, len(self._current[0])

@@ -1,0 +1,224 @@
+"""The motion between two stereo frames: how a measurement moves, and the weighted least-squares estimate.
+
+Everything is written in (u, v, d), where pixel noise is Gaussian even for far points, and never divides by the
+disparity: with ``m = ((u - cx)/fx, (v - cy)/fy, 1)`` and the inverse depth ``r = d / (fx b)``, a point moves as
+``m' ~ R m + t r``. To first order this equals weighting 3-D points with ``W = (R U R^T + V)^-1`` (L. Matthies, S.
+Shafer, "Error modeling in stereo navigation", 1987, eq. 16).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.geometry import se3
+from gpvo.types import Array, StereoCamera
+from gpvo.vo.points import triangulation_pixel_covariance
+
+# Quantiles of chi-square with 3 degrees of freedom.
+_CHI2_3_MEDIAN = 2.366
+_CHI2_3_999 = 16.266
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Measurements of the reference frame moved into the current one, with derivatives. Axes last for speed.
+
+    ``uvd`` (3, N) prediction; ``H`` (3, 6, N) by a right perturbation of ``T_prev_cur``; ``G`` (3, 3, N) by the
+    reference measurement; ``in_front`` (N,) whether the point lies before the camera.
+    """
+
+    uvd: Array
+    H: Array
+    G: Array
+    in_front: NDArray[np.bool_]
+
+
+def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transfer:
+    """Predict (u, v, d) in the current frame from (N, 3) in the reference frame. See :class:`Transfer`."""
+    fx, fy, b = camera.fx_px, camera.fy_px, camera.baseline_m
+    R = T_prev_cur[:3, :3].T
+    t = -R @ T_prev_cur[:3, 3]
+    n = len(uvd_prev)
+    rho = uvd_prev[:, 2] / (fx * b)
+    m_prev = np.empty((3, n))
+    m_prev[0] = (uvd_prev[:, 0] - camera.cx_px) / fx
+    m_prev[1] = (uvd_prev[:, 1] - camera.cy_px) / fy
+    m_prev[2] = 1.0
+    m = R @ m_prev + t[:, None] * rho
+    in_front = m[2] > 1e-6
+    w = 1.0 / np.where(in_front, m[2], 1.0)
+    x, y = m[0] * w, m[1] * w
+    d = fx * b * rho * w
+    uvd = np.stack([fx * x + camera.cx_px, fy * y + camera.cy_px, d])
+
+    # Rows of d(u, v, d)/dm: (fx w, 0, -fx x w), (0, fy w, -fy y w), (0, 0, -d w).
+    def rows(dm: Array) -> tuple[Array, Array, Array]:
+        back = dm[2] * w
+        return fx * (dm[0] * w - x * back), fy * (dm[1] * w - y * back), -d * back
+
+    # A right perturbation (tau, phi) of T_prev_cur moves the point by -tau + p x phi.
+    zero = np.zeros(n)
+    columns = [
+        (-rho, zero, zero),
+        (zero, -rho, zero),
+        (zero, zero, -rho),
+        (zero, m[2], -m[1]),
+        (-m[2], zero, m[0]),
+        (m[1], -m[0], zero),
+    ]
+    H = np.empty((3, 6, n))
+    for j, column in enumerate(columns):
+        H[0, j], H[1, j], H[2, j] = rows(np.stack(column))
+    G = np.empty((3, 3, n))
+    for j, direction in enumerate((R[:, 0] / fx, R[:, 1] / fy, t / (fx * b))):
+        G[0, j], G[1, j], G[2, j] = rows(np.broadcast_to(direction[:, None], (3, n)))
+    G[2, 2] += w
+    return Transfer(uvd, H, G, in_front)
+
+
+def residual_covariance(G: Array, S_prev: Array, S_cur: Array) -> Array:
+    """Covariance (3, 3, N) of (measured - predicted): ``G S_prev G^T + S_cur``."""
+    GS = np.einsum("ikn,kl->iln", G, S_prev)
+    C = np.empty_like(G)
+    for i in range(3):
+        for j in range(i, 3):
+            C[i, j] = C[j, i] = GS[i, 0] * G[j, 0] + GS[i, 1] * G[j, 1] + GS[i, 2] * G[j, 2] + S_cur[i, j]
+    return C
+
+
+def whitener(C: Array) -> Array:
+    """Inverse Cholesky factors (3, 3, N): ``L^-1`` with ``L L^T = C``, in closed form."""
+    a = 1.0 / np.sqrt(C[0, 0])
+    l10, l20 = C[1, 0] * a, C[2, 0] * a
+    b = 1.0 / np.sqrt(C[1, 1] - l10**2)
+    l21 = (C[2, 1] - l20 * l10) * b
+    c = 1.0 / np.sqrt(C[2, 2] - l20**2 - l21**2)
+    W = np.zeros_like(C)
+    W[0, 0], W[1, 1], W[2, 2] = a, b, c
+    W[1, 0] = -l10 * a * b
+    W[2, 1] = -l21 * b * c
+    W[2, 0] = -(l20 * a + l21 * W[1, 0]) * c
+    return W
+
+
+def apply_whitener(W: Array, M: Array) -> Array:
+    """Lower-triangular (3, 3, N) times (3, k, N) or (3, N)."""
+    w = W if M.ndim == 2 else W[:, :, None]
+    return np.stack([w[0, 0] * M[0], w[1, 0] * M[0] + w[1, 1] * M[1], w[2, 0] * M[0] + w[2, 1] * M[1] + w[2, 2] * M[2]])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A solved motion.
+
+    ``T_prev_cur`` (4, 4); ``inliers`` (N,); ``scale_px``: robust standard deviation of one image coordinate;
+    ``residuals`` (M, 3) of (u, v, d) [px] of the inliers; ``uvd_prev`` (M, 3) their measurements in the reference
+    frame, smoothed by those in the current one; ``information`` (6, 6) at unit pixel noise; ``converged``,
+    ``iterations``.
+    """
+
+    T_prev_cur: Array
+    inliers: NDArray[np.bool_]
+    scale_px: float
+    residuals: Array
+    uvd_prev: Array
+    information: Array
+    converged: bool
+    iterations: int
+
+    def __str__(self) -> str:
+        t = np.linalg.norm(self.T_prev_cur[:3, 3])
+        return f"motion of {t:.4f} m, {self.inliers.sum()} of {len(self.inliers)} inliers, noise {self.scale_px:.3f} px"
+
+
+# Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
+_CHOOSING = 4
+_S_UNIT = triangulation_pixel_covariance(1.0)
+
+
+def refine(
+    T_start: Array,
+    uvd_prev: Array,
+    uvd_cur: Array,
+    camera: StereoCamera,
+    *,
+    max_iterations: int = 12,
+    robust: bool = True,
+    S_uvd: Array | None = None,
+) -> Motion | None:
+    """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
+
+    Each point's stacked residual is weighted with the full inverse of ``G S G^T + S`` at unit pixel noise, or with
+    ``S_uvd``. The derivatives are taken at the points as smoothed by both frames, not as measured in the first: else
+    the noise of far points, entering the derivative, biases the motion (errors in variables; B. Triggs et al., "Bundle
+    adjustment, a modern synthesis", 2000, section 6.1: this is the two-frame problem with the points eliminated).
+
+    If ``robust``, the noise scale is taken from the median residual, points beyond its 99.9 % ellipsoid are left out,
+    and the rest are weighted by Huber's rule.
+
+    Returns None where the geometry leaves the motion undetermined.
+    """
+    S = _S_UNIT if S_uvd is None else S_uvd
+    T, smoothed, converged = T_start, uvd_prev, False
+    for iteration in range(1, max_iterations + 1):
+        moved = transfer(T, smoothed, camera)
+        back = (uvd_prev - smoothed).T
+        r = uvd_cur.T - moved.uvd - np.einsum("ikn,kn->in", moved.G, back)
+        W = whitener(residual_covariance(moved.G, S, S))
+        z = apply_whitener(W, r)
+        if not robust:
+            keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
+        elif iteration <= _CHOOSING:
+            keep, scale, weight = _robust_weights((z**2).sum(0), moved.in_front)
+        if keep.sum() < 3:
+            return None
+        A = apply_whitener(W, moved.H)
+        information, step = _solve_step(A[..., keep], z[:, keep], weight[keep])
+        if step is None:
+            return None
+        T = T @ se3.exp(step)
+        # What is left of the residual is shared between the two frames: S G^T C^-1 (r - H step).
+        left = z - np.einsum("ijn,j->in", A, step)
+        smoothed = uvd_prev + _smoothing(S, moved.G, W, left)
+        if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
+            converged = True
+            break
+    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, iteration)
+
+
+def _solve_step(A: Array, z: Array, weight: Array) -> tuple[Array, Array | None]:
+    """Information (6, 6) and Gauss-Newton step (6,), None if undetermined, from whitened rows (3, 6, M) and (3, M)."""
+    root = np.sqrt(weight)
+    rows = (A * root).transpose(0, 2, 1).reshape(-1, 6)
+    information = rows.T @ rows
+    try:
+        step = np.linalg.solve(information, rows.T @ (z * root).reshape(-1))
+    except np.linalg.LinAlgError:
+        return information, None
+    # A turn beyond 2 rad in one step means that the problem, not the motion, is large.
+    return information, step if np.isfinite(step).all() and np.abs(step[3:]).max() < 2.0 else None
+
+
+def _smoothing(S: Array, G: Array, W: Array, left: Array) -> Array:
+    """Correction (N, 3) of the reference measurements, ``S G^T W^T z`` for whitened residuals z (3, N)."""
+    lifted = np.stack(
+        [
+            W[0, 0] * left[0] + W[1, 0] * left[1] + W[2, 0] * left[2],
+            W[1, 1] * left[1] + W[2, 1] * left[2],
+            W[2, 2] * left[2],
+        ]
+    )
+    return np.einsum("ikn,in->nk", G, lifted) @ S
+
+
+def _robust_weights(m2: Array, in_front: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float, Array]:
+    """Inliers, noise scale [px] and Huber weights from squared Mahalanobis distances at unit noise."""
+    # Floor: below a fiftieth of a pixel the residual is rounding, and everything would look like an outlier.
+    scale2 = max(float(np.median(m2[in_front])) / _CHI2_3_MEDIAN if in_front.any() else 1.0, 0.02**2)
+    ratio = m2 / scale2
+    keep = in_front & (ratio < _CHI2_3_999)
+    distance = np.sqrt(np.maximum(ratio, 1e-12))
+    return keep, float(np.sqrt(scale2)), np.minimum(1.0, 3.2 / distance)

@@ -1,0 +1,222 @@
+"""Stereo visual odometry, one frame at a time: ``StereoOdometry(camera).step(frame) -> VoRecord``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.geometry import se3
+from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
+from gpvo.vo import opencv
+from gpvo.vo.config import VoConfig
+from gpvo.vo.covariance import covariances_by_method
+from gpvo.vo.frontend import Frontend, Matches
+from gpvo.vo.motion import Motion, refine
+from gpvo.vo.parts import Stopwatch, check_frame, imu_fields, make_frontend, motion_fields, stats_fields
+from gpvo.vo.points import triangulate
+from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
+from gpvo.vo.sigmas import SigmaEstimator
+
+
+class StereoOdometry:
+    """Motion from frame to frame, with its covariance by each geometric method.
+
+    Parameters
+    ----------
+    camera : the rectified pair.
+    config : settings; default the preset ``fast``.
+    mask : (H, W) bool, where the left image may be used.
+
+    Frames must be rectified and of the camera's size, in time order.
+    """
+
+    def __init__(
+        self, camera: StereoCamera, config: VoConfig | None = None, mask: NDArray[np.bool_] | None = None
+    ) -> None:
+        self.camera = camera
+        self.config = config or VoConfig()
+        self._mask = mask
+        self._frontend: Frontend | None = None
+        self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
+        self._state: _State | None = None
+
+    def step(self, frame: StereoFrame | TrackFrame, imu: ImuLog | None = None) -> VoRecord:
+        """Take in one frame and say how the camera moved since the reference frame.
+
+        ``imu`` holds the samples since the last frame, if any; their mean and spread go into the record.
+
+        Raises
+        ------
+        SourceError
+            If the frame is not later than the last one, or not of the camera's size.
+        """
+        clock = Stopwatch()
+        check_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
+        frontend = self._frontend = self._frontend or make_frontend(frame, self.camera, self.config, self._mask)
+        seen = frontend.observe(frame)
+        clock.lap("observe")
+        if self._state is None:
+            counts = frontend.promote(None)
+            self._state = _State(frame.t_ns, frame.t_ns, frame.t_ns, np.eye(4), np.zeros(6), 0.0, counts[1])
+            record = VoRecord(frame.t_ns, frame.t_ns, Status.START, np.eye(4), n_detected=counts[0], n_stereo=counts[1])
+            return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **imu_fields(imu))
+        guess = self._state.guess(frame.t_ns)
+        matches, motion = self._solve(guess, clock)
+        verdict = judge(matches, motion, seen.repeated and self._state.parallax_px > 0.3, self.camera, self.config)
+        record = self._record(frame.t_ns, guess, matches, motion, verdict)
+        clock.lap("covariance")
+        is_reference, counts = self._advance(record, matches, motion)
+        clock.lap("reference")
+        return replace(
+            record,
+            is_reference=is_reference,
+            n_detected=counts[0],
+            n_stereo=counts[1],
+            stage_ms=clock.stages,
+            **stats_fields(seen.stats),
+            **imu_fields(imu),
+        )
+
+    def _solve(self, guess: Array, clock: Stopwatch) -> tuple[Matches, Motion | None]:
+        """Match near the guess; if too little agrees, match without it and keep the better."""
+        assert self._frontend is not None
+        config = self.config
+        matches = self._frontend.match(guess)
+        clock.lap("match")
+        motion = self._estimate(matches)
+        clock.lap("motion")
+        agreeing = 0 if motion is None else int(motion.inliers.sum())
+        if config.preset != "fast" or agreeing >= max(config.weak_inliers, 0.5 * matches.n_tracked):
+            return matches, motion
+        again = self._frontend.match(guess, from_scratch=True)
+        second = self._estimate(again)
+        if second is not None and second.inliers.sum() > agreeing:
+            matches, motion = again, second
+        elif motion is not None:
+            matches = self._frontend.match(guess)  # the first result stands: the front end must hold its points again
+        clock.lap("rematch")
+        return matches, motion
+
+    def _estimate(self, matches: Matches) -> Motion | None:
+        """P3P in RANSAC on the left image, then the weighted refinement over both."""
+        camera, config = self.camera, self.config
+        near = matches.uvd_prev[:, 2] > 2 * config.min_disparity_px
+        if near.sum() < config.min_inliers:
+            return None
+        found = opencv.pose_from_points(
+            triangulate(matches.uvd_prev[near], camera),
+            matches.uvd_cur[near, :2],
+            camera.K,
+            config.ransac_threshold_px,
+            config.ransac_iterations,
+            config.seed,
+        )
+        if found is None:
+            return None
+        T_prev_cur = se3.inverse(found[0])
+        close = agrees(T_prev_cur, matches, camera, 2 * config.ransac_threshold_px)
+        if close.sum() < config.min_inliers:
+            return None
+        motion = refine(T_prev_cur, matches.uvd_prev[close], matches.uvd_cur[close], camera)
+        if motion is None:
+            return None
+        inliers = np.zeros(len(close), bool)
+        inliers[np.flatnonzero(close)[motion.inliers]] = True
+        return replace(motion, inliers=inliers)
+
+    def _record(self, t_ns: int, guess: Array, matches: Matches, motion: Motion | None, verdict: Verdict) -> VoRecord:
+        """The record of this motion, still without counts and image statistics of the new reference."""
+        assert self._state is not None
+        state, config = self._state, self.config
+        record = VoRecord(t_ns, state.t_ref_ns, verdict.status, guess, reason=verdict.reason)
+        if motion is not None:
+            record = replace(record, **motion_fields(matches, motion, self.camera))
+        if motion is None or verdict.status is Status.LOST:
+            C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, state.twist)
+            return replace(
+                record,
+                n_tracked=matches.n_tracked,
+                covariances=dict.fromkeys(config.methods, C),
+                v_t=dict.fromkeys(config.methods, C[:3, :3]),
+            )
+        self._sigmas.update(record.residual_sigma_p_px, record.residual_sigma_m_px)
+        sigma_p_px, sigma_m_px = self._sigmas.values
+        by_method = covariances_by_method(
+            config.methods,
+            motion.T_prev_cur,
+            motion.uvd_prev,
+            matches.uvd_cur[motion.inliers],
+            self.camera,
+            sigma_px=config.sigma_px,
+            sigma_p_px=sigma_p_px,
+            sigma_m_px=sigma_m_px,
+        )
+        return replace(
+            record,
+            T_prev_cur=motion.T_prev_cur,
+            covariances={m: c.full for m, c in by_method.items()},
+            v_t={m: c.v_t for m, c in by_method.items()},
+        )
+
+    def _advance(self, record: VoRecord, matches: Matches, motion: Motion | None) -> tuple[bool, tuple[int, int]]:
+        """Choose the reference of the next motion; whether it is this frame, and the counts of points."""
+        assert self._frontend is not None
+        assert self._state is not None
+        state, config = self._state, self.config
+        if motion is None or not record.usable:
+            state.t_last_ns = record.t_ns
+            if "frozen" in record.reason:
+                return False, (matches.n_tracked, matches.n_tracked)
+            # A good picture that fits nothing known is a new beginning; a bad one leaves the old reference standing.
+            counts = self._frontend.promote(None, at_least=config.weak_inliers)
+            if counts[1] < config.weak_inliers:
+                return False, counts
+            state.restart(record.t_ns, counts[1])
+            return True, counts
+        inliers = motion.inliers
+        state.believe(record.t_ns, record.T_prev_cur, median_parallax_px(matches, inliers))
+        at_rest = state.parallax_from_reference_px < config.keyframe_parallax_px
+        if at_rest and inliers.sum() > 0.6 * state.reference_points:
+            return False, (state.reference_points, state.reference_points)
+        counts = self._frontend.promote(inliers, at_least=config.min_inliers)
+        if counts[1] < config.min_inliers:
+            return False, counts
+        state.restart(record.t_ns, counts[1])
+        return True, counts
+
+
+@dataclass
+class _State:
+    """Where the odometry stands between two frames."""
+
+    t_ref_ns: int
+    t_last_ns: int
+    t_believed_ns: int  # end of the last believed motion
+    T_ref_believed: Array
+    twist: Array  # (6,) per second, of the last believed motion
+    parallax_px: float  # median image motion between the last two believed frames
+    reference_points: int
+    parallax_from_reference_px: float = 0.0
+
+    def guess(self, t_ns: int) -> Array:
+        """Motion from the reference to time ``t_ns`` at constant velocity, for at most half a second."""
+        dt_s = min((t_ns - self.t_believed_ns) * 1e-9, 0.5)
+        return self.T_ref_believed @ se3.exp(self.twist * dt_s)
+
+    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float) -> None:
+        """Take over a measured motion from the reference."""
+        step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
+        self.twist = step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
+        self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
+        self.parallax_from_reference_px = parallax_px
+        self.T_ref_believed = T_ref_cur
+        self.t_believed_ns = self.t_last_ns = t_ns
+
+    def restart(self, t_ns: int, points: int) -> None:
+        """The frame at ``t_ns`` is the new reference."""
+        self.t_ref_ns = self.t_believed_ns = self.t_last_ns = t_ns
+        self.T_ref_believed = np.eye(4)
+        self.parallax_from_reference_px = 0.0
+        self.reference_points = points

@@ -1,0 +1,134 @@
+"""The one place that calls OpenCV's feature code, so that a move to another major version is one edit.
+
+OpenCV 5 moved AKAZE out of the main wheel; gpvo stays on 4.x. Arrays are (N, 1, 2) float32 at this border because
+both major versions accept nothing else everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Points = NDArray[np.floating[Any]]
+
+
+def halve(image: Image) -> Image:
+    """Image of half the width and height, each pixel the mean of four: pixel i covers 2 i and 2 i + 1."""
+    h, w = image.shape
+    return cv2.resize(image[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+
+
+def corners(image: Image, count: int, quality: float, min_distance_px: float, mask: Image | None) -> Points:
+    """Shi-Tomasi corners (N, 2), strongest first."""
+    found = cv2.goodFeaturesToTrack(image, count, quality, max(min_distance_px, 1.0), mask=mask)
+    return np.empty((0, 2), np.float32) if found is None else found[:, 0]
+
+
+def track(
+    image_from: Image, image_to: Image, points: Points, guess: Points, window_px: int, levels: int
+) -> tuple[Points, NDArray[np.bool_]]:
+    """Pyramidal Lucas-Kanade from ``points`` (N, 2), starting at ``guess`` (N, 2): positions and success."""
+    if len(points) == 0:
+        return np.empty((0, 2), np.float32), np.empty(0, bool)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        image_from,
+        image_to,
+        np.ascontiguousarray(points, np.float32)[:, None],
+        np.ascontiguousarray(guess, np.float32)[:, None].copy(),
+        winSize=(window_px, window_px),
+        maxLevel=levels - 1,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
+        minEigThreshold=1e-4,
+    )
+    moved = moved[:, 0]
+    h, w = image_to.shape
+    inside = (moved[:, 0] >= 0) & (moved[:, 1] >= 0) & (moved[:, 0] <= w - 1) & (moved[:, 1] <= h - 1)
+    return moved, (found[:, 0] > 0) & inside
+
+
+def coarse_disparity(left: Image, right: Image, max_disparity_px: int) -> NDArray[np.float32]:
+    """Block-matched disparity (H, W) of a small rectified pair [px]; negative where none was found."""
+    count = int(np.ceil(max(max_disparity_px, 16) / 16)) * 16
+    matcher = cv2.StereoBM.create(numDisparities=count, blockSize=15)
+    matcher.setUniquenessRatio(5)
+    matcher.setTextureThreshold(4)
+    # The matcher leaves a strip of the width of its search on the left; extending the rows keeps those corners.
+    wide = [cv2.copyMakeBorder(i, 0, 0, count, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
+    return matcher.compute(*wide)[:, count:].astype(np.float32) / 16.0
+
+
+def describe(image: Image, points: Points, *, quick: bool) -> tuple[Points, NDArray[np.uint8]]:
+    """AKAZE descriptors at given corners: the corners that got one (N, 2), and the descriptors (N, 61).
+
+    ``quick`` builds one octave and one layer only: the same bits at corners of that scale, at a quarter of the cost.
+    The key point size must not be 1, which silently gives all-zero descriptors.
+    """
+    akaze = cv2.AKAZE.create(nOctaves=1, nOctaveLayers=1) if quick else cv2.AKAZE_create()
+    keypoints = [cv2.KeyPoint(float(x), float(y), 8.0, -1, 0, 0, 0) for x, y in points]
+    kept, descriptors = akaze.compute(image, keypoints)
+    if descriptors is None:
+        return np.empty((0, 2), np.float32), np.empty((0, 61), np.uint8)
+    return np.array([k.pt for k in kept], np.float32).reshape(-1, 2), descriptors
+
+
+def match_mutual(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float = 0.85) -> NDArray[np.int64]:
+    """Brute-force Hamming matches (M, 2) that are each other's best and pass the ratio test."""
+    if len(a) < 2 or len(b) < 2:
+        return np.empty((0, 2), np.int64)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    forward = matcher.knnMatch(a, b, k=2)
+    backward = {m.queryIdx: m.trainIdx for m in matcher.match(b, a)}
+    good = [
+        (m.queryIdx, m.trainIdx)
+        for m, second in (pair for pair in forward if len(pair) == 2)
+        if m.distance < ratio * second.distance and backward.get(m.trainIdx) == m.queryIdx
+    ]
+    return np.array(good, np.int64).reshape(-1, 2)
+
+
+def pose_from_points(
+    points: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    K: NDArray[np.float64],
+    threshold_px: float,
+    iterations: int,
+    seed: int,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    """P3P inside RANSAC: ``T_cam_points`` (4, 4) and the inlier mask (N,), or None."""
+    if len(points) < 4:
+        return None
+    cv2.setRNGSeed(seed)
+    try:
+        found, rvec, tvec, inliers = cv2.solvePnPRansac(
+            np.ascontiguousarray(points, np.float64)[:, None],
+            np.ascontiguousarray(uv, np.float64)[:, None],
+            K,
+            None,
+            iterationsCount=iterations,
+            reprojectionError=threshold_px,
+            confidence=0.999,
+            flags=cv2.SOLVEPNP_P3P,
+        )
+    except cv2.error:
+        return None
+    if not found or inliers is None or not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
+        return None
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(rvec)[0]
+    T[:3, 3] = tvec.ravel()
+    mask = np.zeros(len(points), bool)
+    mask[inliers.ravel()] = True
+    return T, mask
+
+
+def triangulate_dlt(
+    P_left: NDArray[np.float64], P_right: NDArray[np.float64], uv_left: Points, uv_right: Points
+) -> NDArray[np.float64]:
+    """Linear triangulation by OpenCV (N, 3): slower than the closed form, kept for the naive pipeline."""
+    X = cv2.triangulatePoints(P_left, P_right, uv_left.T.astype(np.float64), uv_right.T.astype(np.float64))
+    return (X[:3] / X[3]).T

@@ -1,0 +1,111 @@
+"""Small pieces around the odometry's one screen: the clock, the checks of a frame, the fields of a record."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import SourceError
+from gpvo.types import ImuLog, StereoCamera, StereoFrame, TrackFrame
+from gpvo.vo.config import VoConfig
+from gpvo.vo.frontend import Frontend, Matches, TrackFrontend
+from gpvo.vo.image import ImageStats
+from gpvo.vo.motion import Motion, transfer
+from gpvo.vo.quality import log10_condition
+from gpvo.vo.sigmas import residual_sigmas
+
+
+class Stopwatch:
+    """Milliseconds of each stage of one frame."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, float] = {}
+        self._since = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Book the time since the last lap to ``stage``."""
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + (now - self._since) * 1e3
+        self._since = now
+
+
+def check_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns: int | None) -> None:
+    """Refuse a frame out of order or of another size than the camera's."""
+    if t_last_ns is not None and frame.t_ns <= t_last_ns:
+        raise SourceError(
+            f"frame at t_ns={frame.t_ns} is not later than the one before ({t_last_ns})",
+            cure="feed frames in time order",
+        )
+    if isinstance(frame, StereoFrame):
+        for side, image in (("left", frame.left), ("right", frame.right)):
+            if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
+                raise SourceError(
+                    f"{side} image is {image.dtype} {image.shape[1]}x{image.shape[0]}, the camera is"
+                    f" uint8 {camera.width}x{camera.height}",
+                    cure="use the calibration of this resolution",
+                )
+
+
+def make_frontend(
+    frame: StereoFrame | TrackFrame, camera: StereoCamera, config: VoConfig, mask: NDArray[np.bool_] | None
+) -> Frontend:
+    """The front end for this kind of frame and preset."""
+    # Imported here: tracks need no image code.
+    if isinstance(frame, TrackFrame):
+        return TrackFrontend(camera, config)
+    if config.preset == "thesis":
+        from gpvo.vo.descriptors import DescriptorFrontend
+
+        return DescriptorFrontend(camera, config, mask)
+    from gpvo.vo.klt import KltFrontend
+
+    return KltFrontend(camera, config, mask)
+
+
+def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera) -> dict[str, Any]:
+    """Fields of a :class:`gpvo.types.VoRecord` that describe the match and the solution."""
+    uvd = matches.uvd_cur[motion.inliers]
+    p10, p50, p90 = (float(p) for p in np.percentile(uvd[:, 2], [10, 50, 90]))
+    depth_m = camera.fx_px * camera.baseline_m / max(float(p50), 1e-3)
+    G = transfer(motion.T_prev_cur, motion.uvd_prev, camera).G
+    sigma_p, sigma_m = residual_sigmas(motion.residuals, G)
+    return {
+        "n_tracked": matches.n_tracked,
+        "n_inliers": len(uvd),
+        "reproj_rms_px": float(np.sqrt((motion.residuals[:, :2] ** 2).sum(1).mean())),
+        "residual_sigma_p_px": sigma_p,
+        "residual_sigma_m_px": sigma_m,
+        "disparity_p10_px": float(p10),
+        "disparity_p50_px": float(p50),
+        "disparity_p90_px": float(p90),
+        "spread_u": float(np.std(uvd[:, 0]) / camera.fx_px),
+        "spread_v": float(np.std(uvd[:, 1]) / camera.fy_px),
+        "log10_condition": log10_condition(motion.information, depth_m),
+    }
+
+
+def stats_fields(stats: ImageStats | None) -> dict[str, Any]:
+    """Fields of a record that describe the image; empty for tracks."""
+    if stats is None:
+        return {}
+    return {
+        "brightness": stats.brightness,
+        "contrast": stats.contrast,
+        "sharpness": stats.sharpness,
+        "noise_level": stats.noise_level,
+    }
+
+
+def imu_fields(imu: ImuLog | None) -> dict[str, Any]:
+    """Fields of a record that describe the IMU over the interval; empty without samples."""
+    if imu is None or len(imu.t_ns) == 0:
+        return {}
+    return {
+        "imu_gyro_mean_radps": imu.gyro_radps.mean(0),
+        "imu_gyro_std_radps": imu.gyro_radps.std(0),
+        "imu_acc_mean_mps2": imu.acc_mps2.mean(0),
+        "imu_acc_std_mps2": imu.acc_mps2.std(0),
+    }
