@@ -7,7 +7,7 @@ when the motion cannot be guessed.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,7 @@ class _View:
     right: Image
     half_left: Image
     half_right: Image
+    survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) and disparity, of the half images
     uvd: Array  # (N, 3) points usable as reference
     left_uv: Points  # (N, 2) their positions in the left image, the templates' centres
 
@@ -40,7 +41,8 @@ class KltFrontend:
     def __init__(self, camera: StereoCamera, config: VoConfig, mask: NDArray[np.bool_] | None = None) -> None:
         self._camera = camera
         self._config = config
-        self._mask = None if mask is None else np.ascontiguousarray(mask.astype(np.uint8) * 255)
+        half = None if mask is None else mask[: camera.height // 2 * 2 : 2, : camera.width // 2 * 2 : 2]
+        self._half_mask = None if half is None else np.ascontiguousarray(half.astype(np.uint8) * 255)
         self._reference: _View | None = None
         self._current: _View | None = None
         self._matched_left: Points = np.empty((0, 2), np.float32)
@@ -52,8 +54,11 @@ class KltFrontend:
         assert isinstance(frame, StereoFrame)
         before = self._current
         half_left, half_right = opencv.halve(frame.left), opencv.halve(frame.right)
-        none = np.empty((0, 3))
-        self._current = _View(frame.left, frame.right, half_left, half_right, none, np.empty((0, 2), np.float32))
+        # New corners and rough depth are wanted only after the motion; they are found beside it.
+        survey = self._pool.submit(self._survey, half_left, half_right)
+        self._current = _View(
+            frame.left, frame.right, half_left, half_right, survey, np.empty((0, 3)), np.empty((0, 2), np.float32)
+        )
         # Comparing the small images first leaves the costly comparison to true repetitions.
         repeated = (
             before is not None
@@ -84,11 +89,11 @@ class KltFrontend:
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """Carry on the inliers, and add new corners where there are none."""
-        current, config = self._current, self._config
+        current = self._current
         assert current is not None
         carried = np.zeros(len(self._matched_uvd), bool) if inliers is None else inliers
         uv, uvd = self._matched_left[carried], self._matched_uvd[carried]
-        new_uv = self._detect(current, uv, config.max_features - len(uv))
+        new_uv = self._new_corners(current, uv)
         new_uvd, good = self._new_stereo(current, new_uv)
         current.left_uv = np.concatenate([uv, new_uv[good]])
         current.uvd = np.concatenate([uvd, new_uvd[good]])
@@ -107,26 +112,29 @@ class KltFrontend:
         visible = moved.in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
         return np.where(visible[:, None], moved.uvd.T, uvd)
 
-    def _detect(self, view: _View, taken_uv: Points, count: int) -> Points:
-        """Up to ``count`` new corners (N, 2) away from those taken, on even pixels of the full image."""
-        if count <= 0:
-            return np.empty((0, 2), np.float32)
-        h, w = view.half_left.shape
-        free = np.full((h, w), 255, np.uint8) if self._mask is None else self._mask[: 2 * h : 2, : 2 * w : 2].copy()
-        radius = max(int(self._config.min_distance_px / 2), 1)
-        for x, y in (taken_uv / 2).astype(int):
-            free[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1] = 0
+    def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:
+        """Corners of the half-size left image, strongest first, and its block-matched disparity."""
+        config = self._config
+        limit = int(config.max_disparity_share * self._camera.width / 2)
         found = opencv.corners(
-            view.half_left, count, self._config.corner_quality, self._config.min_distance_px / 2, free
+            half_left, config.max_features, config.corner_quality, config.min_distance_px / 2, self._half_mask
         )
-        return found * 2.0
+        return found, opencv.coarse_disparity(half_left, half_right, limit)
+
+    def _new_corners(self, view: _View, taken_uv: Points) -> Points:
+        """Corners (N, 2) away from those taken, on even pixels of the full image."""
+        room = self._config.max_features - len(taken_uv)
+        found = view.survey.result()[0] * 2.0
+        if len(taken_uv) == 0 or len(found) == 0:
+            return found[:room]
+        distance2 = ((found[:, None] - taken_uv[None]) ** 2).sum(-1).min(1)
+        return found[distance2 > self._config.min_distance_px**2][:room]
 
     def _new_stereo(self, view: _View, uv: Points) -> tuple[Array, NDArray[np.bool_]]:
-        """Stereo measurement of new corners: block matching at half resolution starts Lucas-Kanade at full."""
+        """Stereo measurement of new corners: the rough disparity starts Lucas-Kanade at full resolution."""
         if len(uv) == 0:
             return np.empty((0, 3)), np.empty(0, bool)
-        limit = int(self._config.max_disparity_share * self._camera.width / 2)
-        coarse = opencv.coarse_disparity(view.half_left, view.half_right, limit)
+        coarse = view.survey.result()[1]
         x, y = (uv / 2).astype(int).T
         near = coarse[np.clip(y, 0, coarse.shape[0] - 1), np.clip(x, 0, coarse.shape[1] - 1)]
         known = near >= 0
@@ -147,9 +155,8 @@ class KltFrontend:
 
     def _match_descriptors(self, reference: _View, current: _View) -> tuple[NDArray[np.int64], Points]:
         """Reference points (indices) and their places in the current left image, without any guess."""
-        corners = self._detect(current, np.empty((0, 2), np.float32), 2 * self._config.max_features)
         described = self._pool.submit(opencv.describe, reference.half_left, reference.left_uv / 2, quick=True)
-        cur_uv, cur_bits = opencv.describe(current.half_left, corners / 2, quick=True)
+        cur_uv, cur_bits = opencv.describe(current.half_left, current.survey.result()[0], quick=True)
         ref_uv, ref_bits = described.result()
         pairs = opencv.match_mutual(ref_bits, cur_bits)
         # AKAZE drops corners at the border, so the kept ones are found again by their place.

@@ -54,28 +54,21 @@ def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transf
     d = fx * b * rho * w
     uvd = np.stack([fx * x + camera.cx_px, fy * y + camera.cy_px, d])
 
-    # Rows of d(u, v, d)/dm: (fx w, 0, -fx x w), (0, fy w, -fy y w), (0, 0, -d w).
-    def rows(dm: Array) -> tuple[Array, Array, Array]:
-        back = dm[2] * w
-        return fx * (dm[0] * w - x * back), fy * (dm[1] * w - y * back), -d * back
-
+    # d(u, v, d)/dm, applied to nine directions of m at once: six of the motion, three of the measurement.
+    dm = np.zeros((9, 3, n))
     # A right perturbation (tau, phi) of T_prev_cur moves the point by -tau + p x phi.
-    zero = np.zeros(n)
-    columns = [
-        (-rho, zero, zero),
-        (zero, -rho, zero),
-        (zero, zero, -rho),
-        (zero, m[2], -m[1]),
-        (-m[2], zero, m[0]),
-        (m[1], -m[0], zero),
-    ]
-    H = np.empty((3, 6, n))
-    for j, column in enumerate(columns):
-        H[0, j], H[1, j], H[2, j] = rows(np.stack(column))
-    G = np.empty((3, 3, n))
-    for j, direction in enumerate((R[:, 0] / fx, R[:, 1] / fy, t / (fx * b))):
-        G[0, j], G[1, j], G[2, j] = rows(np.broadcast_to(direction[:, None], (3, n)))
-    G[2, 2] += w
+    dm[0, 0] = dm[1, 1] = dm[2, 2] = -rho
+    dm[3, 1], dm[3, 2] = m[2], -m[1]
+    dm[4, 0], dm[4, 2] = -m[2], m[0]
+    dm[5, 0], dm[5, 1] = m[1], -m[0]
+    dm[6], dm[7], dm[8] = (c[:, None] for c in (R[:, 0] / fx, R[:, 1] / fy, t / (fx * b)))
+    back = dm[:, 2] * w
+    D = np.empty((3, 9, n))
+    D[0] = fx * (dm[:, 0] * w - x * back)
+    D[1] = fy * (dm[:, 1] * w - y * back)
+    D[2] = -d * back
+    D[2, 8] += w
+    H, G = D[:, :6], D[:, 6:]
     return Transfer(uvd, H, G, in_front)
 
 
@@ -193,9 +186,9 @@ def _solve_step(A: Array, z: Array, weight: Array) -> tuple[Array, Array | None]
     """Information (6, 6) and Gauss-Newton step (6,), None if undetermined, from whitened rows (3, 6, M) and (3, M)."""
     root = np.sqrt(weight)
     rows = (A * root).transpose(0, 2, 1).reshape(-1, 6)
-    information = rows.T @ rows
+    information: Array = rows.T @ rows
     try:
-        step = np.linalg.solve(information, rows.T @ (z * root).reshape(-1))
+        step = np.asarray(np.linalg.solve(information, rows.T @ (z * root).reshape(-1)), np.float64)
     except np.linalg.LinAlgError:
         return information, None
     # A turn beyond 2 rad in one step means that the problem, not the motion, is large.

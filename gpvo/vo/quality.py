@@ -78,8 +78,7 @@ def lost_covariance(dt_s: float, twist: Array) -> Array:
 
     A vehicle may have stopped, or doubled its speed, or started from rest at one m/s and half a radian per second.
     """
-    speed = np.linalg.norm(twist[:3])
-    rate = np.linalg.norm(twist[3:])
+    speed, rate = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
     sigma_m, sigma_rad = dt_s * max(speed, 1.0), dt_s * max(rate, 0.5)
     return np.diag([max(sigma_m, 1e-3) ** 2] * 3 + [max(sigma_rad, 1e-3) ** 2] * 3)
 
