@@ -1,9 +1,75 @@
-"""Commands of this group."""
+"""``gpvo run``: stereo odometry over a sequence."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
+
+from gpvo.errors import GpvoError
+
+
+def run(
+    source: Annotated[
+        Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, ROS bag, image folder, or tracks (.npz).")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
+    model: Annotated[Path | None, typer.Option(help="Error model: predict as it goes.")] = None,
+    preset: Annotated[str, typer.Option(help="fast, or thesis.")] = "fast",
+    methods: Annotated[
+        str, typer.Option(help="Covariances: triangulation, pointing_matching, spherical.")
+    ] = "triangulation,pointing_matching",
+    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto: from the residuals so far.")] = "0.1",
+    sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
+    sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
+    kind: Annotated[str | None, typer.Option("--source", help="Override the guessed format of the sequence.")] = None,
+    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Run stereo VO over a sequence: log, trajectory and covariances.
+
+    Example: gpvo run MH_01_easy/ -o runs/mh01
+    """
+    from gpvo import runner
+    from gpvo.cli.output import print_json, progress
+    from gpvo.io import open_source
+    from gpvo.vo.config import make_config
+
+    config = make_config(
+        preset,
+        methods=tuple(m.strip() for m in methods.split(",") if m.strip()),
+        sigma_px=sigma,
+        sigma_p_px=_pixels("--sigma-p", sigma_p),
+        sigma_m_px=_pixels("--sigma-m", sigma_m),
+    )
+    options = {} if hfov_deg is None else {"hfov_deg": hfov_deg}
+    sequence = open_source(source, kind=kind, **options)
+    predictor = None
+    if model is not None:
+        from gpvo.online.predictor import Predictor
+
+        predictor = Predictor.load(model)
+    with progress("frames", len(sequence)) as advance:
+        summary = runner.run(sequence, out, config, predictor, on_frame=lambda record, prediction: advance())
+    if json_:
+        print_json({"schema": 1, "run": str(out), **summary.__dict__})
+    else:
+        print(f"{out}: {summary}")
+        if summary.source_report != f"{summary.frames} frames":
+            print(f"source: {summary.source_report}")
+
+
+def _pixels(option: str, text: str) -> float | None:
+    """A number of pixels, or None for ``auto``."""
+    if text == "auto":
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise GpvoError(f"{option} is '{text}'", cure="give pixels, such as 0.1, or auto") from None
 
 
 def register(app: typer.Typer) -> None:
     """Add this file's commands to the application."""
+    app.command()(run)

@@ -1,0 +1,46 @@
+# make demo   set up and show the main job, in a few minutes
+# make test   set up and run lint, import contracts, types and tests
+# make check  the longer tests: every README command, notebooks, docs, other people's readers
+# make bench  speed and memory, as ratios within one run
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: demo test check bench docs clean
+
+.venv/pip-ready:
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
+	@touch $@
+
+.venv/demo-ready: .venv/pip-ready pyproject.toml constraints.txt
+	@echo "setting up .venv (a few minutes, once)"
+	$(PIP) torch
+	$(PIP) --editable '.[sim]'
+	@touch $@
+
+.venv/test-ready: .venv/demo-ready
+	$(PIP) --editable '.[sim,mavlink,onnx,dask]' --group dev
+	@touch $@
+
+demo: .venv/demo-ready
+	$(BIN)/python examples/demo.py
+
+test: .venv/test-ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+check: .venv/test-ready
+	$(BIN)/python -m pytest -n 2 -m slow
+
+bench: .venv/test-ready
+	$(BIN)/python -m bench
+
+docs: .venv/test-ready
+	$(BIN)/sphinx-build -W --keep-going -q docs docs/_build
+
+clean:
+	rm -rf .venv out docs/_build .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,135 @@
+"""From a source to a run folder: odometry, and predictions where there is a model."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpvo.errors import SourceError
+from gpvo.io.run import RunWriter
+from gpvo.types import ImuLog, Prediction, Status, VoRecord
+from gpvo.vo.config import VoConfig
+from gpvo.vo.odometry import StereoOdometry
+
+if TYPE_CHECKING:
+    from gpvo.io.source import Source
+    from gpvo.online.predictor import Predictor
+
+# With fewer pairs of one kind the first frames say nothing about the order of the cameras.
+_FRAMES_BEFORE_DOUBT = 5
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run came to: counts by status, the length of the path [m], and frames per second of odometry alone."""
+
+    frames: int
+    status: dict[str, int]
+    path_length_m: float
+    frames_per_s: float
+    source_report: str
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{n} {s}" for s, n in self.status.items() if s != Status.START.value)
+        return f"{self.frames} frames ({parts}), {self.path_length_m:.1f} m, {self.frames_per_s:.0f} frames/s"
+
+
+def run(
+    source: Source,
+    out: Path,
+    config: VoConfig | None = None,
+    predictor: Predictor | None = None,
+    on_frame: Callable[[VoRecord, Prediction | None], None] | None = None,
+) -> RunSummary:
+    """Run stereo VO over a source and write the run folder ``out``.
+
+    ``on_frame`` is called after every frame, for progress bars and live views. An interrupted run leaves a folder that can be
+    read up to its last complete chunk.
+
+    Raises
+    ------
+    SourceError
+        If the source holds no frames, or its left and right images look swapped.
+    """
+    config = config or VoConfig()
+    meta = {"source": str(source.name), "format": source.format, "kind": source.kind}
+    if predictor is not None:
+        meta["model_digest"] = predictor.digest
+    status: Counter[str] = Counter()
+    length_m = busy_s = 0.0
+    with RunWriter(
+        out,
+        camera=source.camera,
+        mounting=source.mounting,
+        truth=source.truth,
+        imu=source.imu,
+        config=asdict(config),
+        meta=meta,
+        calibration=source.calibration,
+    ) as writer:
+        for record, seconds in records(source, config):
+            prediction = None
+            if predictor is not None:
+                prediction = predictor.step(record)
+                record = record.with_status(prediction.status, "prediction") if prediction else record
+            writer.append(record, prediction)
+            status[record.status.value] += 1
+            length_m += float(np.linalg.norm(record.T_prev_cur[:3, 3])) if record.is_reference else 0.0
+            busy_s += seconds
+            if on_frame is not None:
+                on_frame(record, prediction)
+        frames = sum(status.values())
+        if frames == 0:
+            raise SourceError("no readable stereo pair", where=source.path, cure="look at the images of both cameras")
+        summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report))
+        writer.finish(source_report=source.report.as_dict(), summary=asdict(summary))
+    return summary
+
+
+def records(source: Source, config: VoConfig) -> Iterator[tuple[VoRecord, float]]:
+    """The records of a source, one by one, with the seconds that each took."""
+    odometry = StereoOdometry(source.camera, config, source.mask)
+    t_last_ns: int | None = None
+    few = 0
+    for k, frame in enumerate(source):
+        samples = None if t_last_ns is None else imu_between(source.imu, t_last_ns, frame.t_ns)
+        start = time.perf_counter()
+        record = odometry.step(frame, samples)
+        seconds = time.perf_counter() - start
+        t_last_ns = frame.t_ns
+        few += record.n_stereo < config.min_inliers
+        if k + 1 == _FRAMES_BEFORE_DOUBT and few == _FRAMES_BEFORE_DOUBT:
+            _refuse_swapped(source, config)
+        yield record, seconds
+
+
+def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | None:
+    """IMU samples in ``(t_from_ns, t_to_ns]``."""
+    if imu is None:
+        return None
+    i, j = np.searchsorted(imu.t_ns, [t_from_ns, t_to_ns], side="right")
+    return replace(imu, t_ns=imu.t_ns[i:j], gyro_radps=imu.gyro_radps[i:j], acc_mps2=imu.acc_mps2[i:j])
+
+
+def _refuse_swapped(source: Source, config: VoConfig) -> None:
+    """Say so if the first pair matches only with its images exchanged; a dark or blank start passes."""
+    from gpvo.types import StereoFrame, TrackFrame
+
+    frame: Any = next(iter(source))
+    if isinstance(frame, StereoFrame):
+        frame = replace(frame, left=frame.right, right=frame.left)
+    elif isinstance(frame, TrackFrame):
+        frame = replace(frame, uv_left=frame.uv_right, uv_right=frame.uv_left)
+    swapped = StereoOdometry(source.camera, config).step(frame)
+    if swapped.n_stereo >= config.weak_inliers:
+        raise SourceError(
+            f"left and right look swapped: the first pair has {swapped.n_stereo} matches only with its images exchanged",
+            where=source.path,
+            cure="exchange the two cameras, or the sign of the baseline",
+        )
