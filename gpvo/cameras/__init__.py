@@ -1,1 +1,1 @@
-"""gpvo.cameras."""
+"""Lens models, stereo rigs, rectification and the calibration files of the field."""

@@ -1,0 +1,68 @@
+"""ROS ``sensor_msgs/CameraInfo`` of a stereo pair, for raw or rectified images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpvo.cameras.kalibr import make_lens
+from gpvo.cameras.models import PinholeRadtan
+from gpvo.cameras.rig import StereoRig
+from gpvo.errors import CalibrationError
+from gpvo.geometry.se3 import Array
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The fields of the message: ``K`` (3, 3), ``D`` (n,), ``R`` (3, 3), ``P`` (3, 4), size [px]."""
+
+    width: int
+    height: int
+    distortion_model: str
+    D: Array
+    K: Array
+    R: Array
+    P: Array
+
+
+def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool, where: object = None) -> StereoRig:
+    """The rig of two CameraInfo messages; ``rectified`` says that the images already are.
+
+    The right camera's ``P[0, 3]`` is ``-fx' B``. For raw images the rectifying rotations ``R`` of both give their
+    relative orientation: ``R_right_left = R_right^T R_left``.
+
+    Raises
+    ------
+    CalibrationError
+        Where the cameras are uncalibrated (``K[0] == 0``), the baseline is absent or the rig impossible.
+    """
+    for name, info in (("left", left), ("right", right)):
+        if info.K[0, 0] == 0 or info.P[0, 0] == 0:
+            raise CalibrationError(
+                f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)",
+                where=where,
+                cure="put a Kalibr camchain.yaml beside the bag",
+            )
+    baseline = left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0]
+    T_rect = np.eye(4)
+    T_rect[0, 3] = -baseline
+    text = None if where is None else str(where)
+    if rectified:
+        lenses = [PinholeRadtan(c.P[0, 0], c.P[1, 1], c.P[0, 2], c.P[1, 2], c.width, c.height) for c in (left, right)]
+        return StereoRig(left=lenses[0], right=lenses[1], T_right_left=T_rect, where=text)
+    raw = [
+        make_lens(
+            "pinhole",
+            c.distortion_model,
+            [c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]],
+            [float(d) for d in c.D],
+            (c.width, c.height),
+            where,
+        )
+        for c in (left, right)
+    ]
+    T_right_left = np.eye(4)
+    T_right_left[:3, :3] = right.R.T @ left.R
+    T_right_left[:3, 3] = right.R.T @ T_rect[:3, 3]
+    return StereoRig(left=raw[0], right=raw[1], T_right_left=T_right_left, where=text)

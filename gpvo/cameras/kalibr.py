@@ -1,0 +1,188 @@
+"""Kalibr: ``camchain.yaml`` (also ``camchain-imucam.yaml`` and OpenVINS' variant) and ``imu.yaml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
+from gpvo.cameras.rig import StereoRig, check_pose
+from gpvo.cameras.yamlfile import get_numbers, read_yaml
+from gpvo.errors import CalibrationError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.types import ImuNoise
+
+# Chained and direct transforms of one calibration agree to the digits printed; a mistaken meaning does not.
+_CHAIN_TOLERANCE_M = 5e-3
+_CHAIN_TOLERANCE_RAD = np.deg2rad(0.5)
+
+
+def read_camchain(path: Path, *, left: str = "cam0", right: str = "cam1") -> StereoRig:
+    """The stereo pair ``left``, ``right`` of a camera chain.
+
+    ``T_cn_cnm1`` (previous camera to this one) and ``T_cam_imu`` (or its inverse ``T_imu_cam``, never both) are read;
+    where both give the baseline they must agree, since published files have put other things under ``T_cn_cnm1``.
+
+    Raises
+    ------
+    CalibrationError
+        Where a key is missing, a model unknown, or the rig impossible.
+    """
+    document = read_yaml(path)
+    blocks = {}
+    for name in (left, right):
+        if not isinstance(document.get(name), dict):
+            found = ", ".join(k for k in document if str(k).startswith("cam")) or "none"
+            raise CalibrationError(
+                f"has no block '{name}' (cameras found: {found})", where=path, cure="a stereo pair needs two cameras"
+            )
+        blocks[name] = document[name]
+    T_left_imu, T_right_imu = (_cam_imu(blocks[n], f"{path}: {n}") for n in (left, right))
+    shift = blocks[left].get("timeshift_cam_imu", 0.0)
+    if not isinstance(shift, (int, float)) or not np.isfinite(shift):
+        raise CalibrationError("timeshift_cam_imu is not a number", where=path)
+    return StereoRig(
+        left=_lens(blocks[left], f"{path}: {left}"),
+        right=_lens(blocks[right], f"{path}: {right}"),
+        T_right_left=_right_left(document, left, right, T_left_imu, T_right_imu, path),
+        T_imu_left=None if T_left_imu is None else se3.inverse(T_left_imu),
+        timeshift_cam_imu_s=float(shift),
+        where=str(path),
+    )
+
+
+def camchain_topics(path: Path, *, left: str = "cam0", right: str = "cam1") -> tuple[str | None, str | None]:
+    """The ``rostopic`` of both cameras, None where not given."""
+    document = read_yaml(path)
+    topics = (document[n].get("rostopic") if isinstance(document.get(n), dict) else None for n in (left, right))
+    first, second = (t if isinstance(t, str) else None for t in topics)
+    return first, second
+
+
+def read_imu_noise(path: Path) -> ImuNoise:
+    """Noise densities of Kalibr's ``imu.yaml``, flat or under ``imu0``; the keys are also those of EuRoC."""
+    document = read_yaml(path)
+    block = document["imu0"] if isinstance(document.get("imu0"), dict) else document
+
+    def number(*keys: str) -> float:
+        key = next((k for k in keys if k in block), keys[0])
+        value = get_numbers(block, key, 1, path)[0]
+        if value < 0:
+            raise CalibrationError(f"'{key}' is negative", where=path)
+        return value
+
+    return ImuNoise(
+        gyro_density_radps_sqrthz=number("gyroscope_noise_density"),
+        acc_density_mps2_sqrthz=number("accelerometer_noise_density"),
+        gyro_walk_radps2_sqrthz=number("gyroscope_random_walk"),
+        acc_walk_mps3_sqrthz=number("accelerometer_random_walk"),
+    )
+
+
+def make_lens(
+    camera_model: str,
+    distortion_model: str,
+    intrinsics: list[float],
+    distortion: list[float],
+    resolution: tuple[int, int],
+    where: object,
+) -> CameraModel:
+    """A lens from the names that Kalibr, EuRoC and ROS use for the two models.
+
+    Raises
+    ------
+    CalibrationError
+        For a model other than pinhole with radial-tangential or equidistant distortion.
+    """
+    fx, fy, cx, cy = intrinsics
+    width, height = resolution
+    name = distortion_model.lower().replace("_", "-")
+    if camera_model != "pinhole":
+        raise CalibrationError(
+            f"camera model '{camera_model}' is not supported",
+            where=where,
+            cure="calibrate as pinhole with radtan, or with equidistant distortion for a fisheye",
+        )
+    if name in ("radtan", "radial-tangential", "plumb-bob", "none", ""):
+        if len(distortion) > 5 and any(distortion[5:]):
+            raise CalibrationError("more than five distortion coefficients are not supported", where=where)
+        k = (*distortion[:5], *([0.0] * (5 - len(distortion[:5]))))
+        return PinholeRadtan(fx, fy, cx, cy, width, height, k)
+    if name in ("equidistant", "fisheye", "kannala-brandt", "kannala-brandt4"):
+        if len(distortion) < 4 or any(distortion[4:]):
+            raise CalibrationError(f"a fisheye needs 4 distortion coefficients, not {len(distortion)}", where=where)
+        k1, k2, k3, k4 = distortion[:4]
+        return KannalaBrandt(fx, fy, cx, cy, width, height, (k1, k2, k3, k4))
+    raise CalibrationError(
+        f"distortion model '{distortion_model}' is not supported", where=where, cure="use radtan or equidistant"
+    )
+
+
+def _lens(block: dict[str, Any], where: str) -> CameraModel:
+    width, height = get_numbers(block, "resolution", 2, where)
+    model = str(block.get("camera_model", "pinhole"))
+    if model != "pinhole":
+        return make_lens(model, "", [0.0] * 4, [], (0, 0), where)
+    distortion = []
+    distortion_model = str(block.get("distortion_model", "none"))
+    if distortion_model != "none":
+        distortion = get_numbers(block, "distortion_coeffs", (4, 5), where)
+    intrinsics = get_numbers(block, "intrinsics", 4, where)
+    return make_lens(model, distortion_model, intrinsics, distortion, (int(width), int(height)), where)
+
+
+def _cam_imu(block: dict[str, Any], where: str) -> Array | None:
+    if "T_cam_imu" in block and "T_imu_cam" in block:
+        raise CalibrationError("holds both T_cam_imu and T_imu_cam", where=where, cure="keep the one that is right")
+    if "T_cam_imu" in block:
+        return check_pose(block["T_cam_imu"], "T_cam_imu", where)
+    if "T_imu_cam" in block:
+        return se3.inverse(check_pose(block["T_imu_cam"], "T_imu_cam", where))
+    return None
+
+
+def _right_left(
+    document: dict[str, Any], left: str, right: str, T_left_imu: Array | None, T_right_imu: Array | None, path: Path
+) -> Array:
+    """Left to right camera by the chain, by the IMU, or by both where they agree."""
+    chained = _chain(document, left, right, path)
+    by_imu = None
+    if T_left_imu is not None and T_right_imu is not None:
+        by_imu = T_right_imu @ se3.inverse(T_left_imu)
+    if chained is None and by_imu is None:
+        raise CalibrationError(
+            f"does not say how '{right}' sits to '{left}'",
+            where=path,
+            cure="add T_cn_cnm1 to the second camera, or T_cam_imu to both",
+        )
+    if chained is not None and by_imu is not None:
+        difference = se3.log(se3.inverse(by_imu) @ chained)
+        shift_m, turn_rad = np.linalg.norm(difference[:3]), np.linalg.norm(difference[3:])
+        if shift_m > _CHAIN_TOLERANCE_M or turn_rad > _CHAIN_TOLERANCE_RAD:
+            raise CalibrationError(
+                f"T_cn_cnm1 and the transforms to the IMU disagree by {shift_m * 1e3:.1f} mm and"
+                f" {np.rad2deg(turn_rad):.2f} degrees",
+                where=path,
+                cure="T_cn_cnm1 maps points of the previous camera to this one; T_cam_imu those of the IMU",
+            )
+    result = chained if chained is not None else by_imu
+    assert result is not None
+    return result
+
+
+def _chain(document: dict[str, Any], left: str, right: str, path: Path) -> Array | None:
+    """Product of ``T_cn_cnm1`` from one camera to the other, None where a link is missing."""
+    try:
+        first, last = int(left.removeprefix("cam")), int(right.removeprefix("cam"))
+    except ValueError:
+        raise CalibrationError("cameras are named cam0, cam1, ...", where=path) from None
+    T = np.eye(4)
+    for n in range(min(first, last) + 1, max(first, last) + 1):
+        block = document.get(f"cam{n}")
+        if not isinstance(block, dict) or "T_cn_cnm1" not in block:
+            return None
+        T = check_pose(block["T_cn_cnm1"], "T_cn_cnm1", f"{path}: cam{n}") @ T
+    return T if first < last else se3.inverse(T)

@@ -1,0 +1,53 @@
+"""One call for a calibration file of any known kind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gpvo.cameras.kalibr import read_camchain
+from gpvo.cameras.opencv_yaml import read_opencv_stereo
+from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.yamlfile import read_yaml
+from gpvo.errors import CalibrationError
+
+# Names under which a calibration lies beside images or a bag, the most telling first.
+CALIBRATION_NAMES = (
+    "camchain-imucam.yaml",
+    "camchain.yaml",
+    "kalibr_imucam_chain.yaml",
+    "dso/camchain.yaml",
+    "*camchain*.yaml",
+    "*camchain*.yml",
+    "*imucam*.yaml",
+    "stereo*.yaml",
+    "stereo*.yml",
+    "calib*.yaml",
+    "calib*.yml",
+)
+
+
+def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> StereoRig:
+    """A Kalibr camera chain or an OpenCV stereo file, told apart by their keys.
+
+    Raises
+    ------
+    CalibrationError
+        Where it is neither.
+    """
+    document = read_yaml(path)
+    if "cam0" in document or "cam1" in document:
+        return read_camchain(path)
+    if "K1" in document:
+        return read_opencv_stereo(path, size=size)
+    raise CalibrationError(
+        "is neither a Kalibr camera chain (cam0, cam1) nor an OpenCV stereo file (K1, D1, K2, D2, R, T)", where=path
+    )
+
+
+def find_calibration(folder: Path) -> Path | None:
+    """The calibration file in a folder, None where there is none."""
+    for pattern in CALIBRATION_NAMES:
+        for path in sorted(folder.glob(pattern)):
+            if path.is_file():
+                return path
+    return None

@@ -1,0 +1,199 @@
+"""A stereo rig as calibrated: two lenses, how they sit to one another and on the vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.cameras.models import CameraModel, PinholeRadtan
+from gpvo.errors import CalibrationError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+
+# What no stereo head for odometry exceeds; beyond them the file is wrong, not the rig unusual.
+MAX_BASELINE_M = 10.0
+MIN_BASELINE_M = 1e-3
+MAX_ROTATION_RAD = np.deg2rad(30.0)
+MAX_FOCAL_RATIO = 1.5
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """Two cameras and their places.
+
+    ``T_right_left`` (4, 4) maps points of the left camera to the right one, so that its x translation is minus the
+    baseline. ``T_imu_left`` and ``T_body_left`` (4, 4) are None where unknown; ``body`` is FLU ``base_link``.
+    ``timeshift_cam_imu_s``: ``t_imu = t_cam + shift``. ``mask_left``, ``mask_right``: (H, W) bool, True where the raw
+    image is usable, None for everywhere. ``where``: the file the rig comes from, for messages.
+    """
+
+    left: CameraModel
+    right: CameraModel
+    T_right_left: Array
+    T_imu_left: Array | None = None
+    T_body_left: Array | None = None
+    timeshift_cam_imu_s: float = 0.0
+    mask_left: NDArray[np.bool_] | None = None
+    mask_right: NDArray[np.bool_] | None = None
+    where: str | None = None
+
+    def __post_init__(self) -> None:
+        check_rig(self)
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance of the optical centres [m]."""
+        return float(np.linalg.norm(self.T_right_left[:3, 3]))
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the images are already a rectified pair: no distortion, no rotation, equal intrinsics."""
+        a, b = self.left, self.right
+        return (
+            isinstance(a, PinholeRadtan)
+            and isinstance(b, PinholeRadtan)
+            and not any(a.distortion)
+            and not any(b.distortion)
+            and bool(np.allclose(_intrinsics(a), _intrinsics(b), atol=1e-6))
+            and bool(np.allclose(self.T_right_left[:3, :3], np.eye(3), atol=1e-9))
+            and bool(np.allclose(self.T_right_left[1:3, 3], 0.0, atol=1e-9))
+        )
+
+    def with_masks(self, left: NDArray[np.bool_] | None, right: NDArray[np.bool_] | None) -> StereoRig:
+        """The same rig with masks of the raw images."""
+        return replace(self, mask_left=left, mask_right=right)
+
+    def describe(self) -> dict[str, object]:
+        """Plain numbers for ``rig.json``."""
+
+        def lens(model: CameraModel) -> dict[str, object]:
+            return {
+                "model": model.kind,
+                "intrinsics_px": _intrinsics(model),
+                "distortion": [float(k) for k in model.distortion],
+                "resolution_px": [model.width, model.height],
+            }
+
+        return {
+            "left": lens(self.left),
+            "right": lens(self.right),
+            "T_right_left": self.T_right_left.tolist(),
+            "T_imu_left": None if self.T_imu_left is None else self.T_imu_left.tolist(),
+            "T_body_left": None if self.T_body_left is None else self.T_body_left.tolist(),
+            "timeshift_cam_imu_s": self.timeshift_cam_imu_s,
+        }
+
+
+def _intrinsics(model: CameraModel) -> list[float]:
+    return [float(v) for v in (model.fx_px, model.fy_px, model.cx_px, model.cy_px)]
+
+
+def check_pose(T: object, name: str, where: object = None) -> Array:
+    """``T`` as a (4, 4) pose whose rotation is a rotation, cleaned of rounding.
+
+    Raises
+    ------
+    CalibrationError
+        Where it is not 4x4, not finite, or its upper left block is not a rotation to 1e-3.
+    """
+    try:
+        M = np.asarray(T, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise CalibrationError(f"{name} is not a matrix of numbers", where=where) from None
+    if M.shape != (4, 4):
+        raise CalibrationError(f"{name} has shape {M.shape}, expected (4, 4)", where=where)
+    if not np.isfinite(M).all():
+        raise CalibrationError(f"{name} holds a number that is not finite", where=where)
+    R = M[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(M[3], [0, 0, 0, 1]):
+        raise CalibrationError(f"{name} is not a rigid transform: its rotation block is no rotation", where=where)
+    return M if np.abs(R @ R.T - np.eye(3)).max() < 1e-15 else se3.orthonormalise(M)
+
+
+def check_rig(rig: StereoRig) -> None:
+    """Refuse a rig that cannot exist.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the reason: baseline absent, too long, pointing the wrong way or not sideways; cameras turned apart;
+        lenses that do not belong together; intrinsics outside the image.
+    """
+    for name, lens in (("left", rig.left), ("right", rig.right)):
+        _check_lens(lens, name, rig.where)
+    check_pose(rig.T_right_left, "T_right_left", rig.where)
+    _check_baseline(rig)
+    ratio = max(rig.left.fx_px, rig.right.fx_px) / min(rig.left.fx_px, rig.right.fx_px)
+    if ratio > MAX_FOCAL_RATIO:
+        raise CalibrationError(
+            f"focal lengths of {rig.left.fx_px:.1f} px and {rig.right.fx_px:.1f} px do not make a stereo pair",
+            where=rig.where,
+            cure="are these two cameras of one rig, calibrated at one resolution?",
+        )
+    for name, mask, lens in (("left", rig.mask_left, rig.left), ("right", rig.mask_right, rig.right)):
+        if mask is not None and mask.shape != (lens.height, lens.width):
+            raise CalibrationError(
+                f"the {name} mask is {mask.shape[1]}x{mask.shape[0]}, the camera {lens.width}x{lens.height}",
+                where=rig.where,
+            )
+
+
+def _check_lens(lens: CameraModel, name: str, where: str | None) -> None:
+    numbers = np.array([*_intrinsics(lens), *lens.distortion], dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        raise CalibrationError(f"the {name} camera has an intrinsic that is not a finite number", where=where)
+    if not (0 < lens.width <= 16384 and 0 < lens.height <= 16384):
+        raise CalibrationError(f"the {name} camera has resolution {lens.width}x{lens.height}", where=where)
+    if lens.fx_px <= 1 or lens.fy_px <= 1 or not 0.5 < lens.fx_px / lens.fy_px < 2:
+        raise CalibrationError(f"the {name} camera has focal lengths {lens.fx_px:g}, {lens.fy_px:g} px", where=where)
+    inside_x = -0.25 * lens.width < lens.cx_px < 1.25 * lens.width
+    inside_y = -0.25 * lens.height < lens.cy_px < 1.25 * lens.height
+    if not (inside_x and inside_y):
+        raise CalibrationError(
+            f"the {name} camera's principal point ({lens.cx_px:.1f}, {lens.cy_px:.1f}) lies far outside its"
+            f" {lens.width}x{lens.height} image",
+            where=where,
+            cure="was it calibrated at another resolution?",
+        )
+
+
+def _check_baseline(rig: StereoRig) -> None:
+    T, where = rig.T_right_left, rig.where
+    length = rig.baseline_m
+    if length < MIN_BASELINE_M:
+        raise CalibrationError(
+            f"the baseline is {length * 1e3:.3g} mm: both cameras at one place",
+            where=where,
+            cure="give the transform between left and right camera in metres",
+        )
+    if length > MAX_BASELINE_M:
+        raise CalibrationError(
+            f"the baseline is {length:.3g} m, more than {MAX_BASELINE_M:g} m",
+            where=where,
+            cure="are the translations in metres?",
+        )
+    angle = float(np.linalg.norm(se3.so3_log(T[:3, :3])))
+    if angle > MAX_ROTATION_RAD:
+        raise CalibrationError(
+            f"the cameras are turned apart by {np.rad2deg(angle):.0f} degrees, too far for stereo",
+            where=where,
+            cure="check the order and the direction of the chained transforms",
+        )
+    # Position of the right camera along the mean orientation of the two.
+    half = se3.so3_exp(0.5 * se3.so3_log(T[:3, :3]))
+    x, y, z = half @ (-T[:3, :3].T @ T[:3, 3]) / length
+    if x < -0.7:
+        raise CalibrationError(
+            f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped",
+            where=where,
+            cure="swap the two cameras, or invert the transform between them",
+        )
+    if x < 0.7:
+        axis = "above or below" if abs(y) >= abs(z) else "in front of or behind"
+        raise CalibrationError(
+            f"the right camera sits {axis} the left one, direction ({x:.2f}, {y:.2f}, {z:.2f})",
+            where=where,
+            cure="the pair must sit side by side in image axes; check the chained transforms",
+        )

@@ -1,0 +1,177 @@
+"""EuRoC MAV ("ASL") folders, and TUM-VI, which adds a Kalibr camera chain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.cameras.euroc_yaml import read_sensor_pair, read_sensor_pose
+from gpvo.cameras.kalibr import read_imu_noise
+from gpvo.cameras.readers import find_calibration, read_stereo_yaml
+from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.yamlfile import read_yaml
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.io.images import FileSource, PairFiles
+from gpvo.io.imu import read_imu_csv
+from gpvo.io.source import SourceReport
+from gpvo.io.stamps import match_equal
+from gpvo.io.trajectory import read_euroc_csv
+from gpvo.io.truth import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap
+from gpvo.types import ImuLog, ImuNoise, TruthLog
+
+# Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.
+_TRUTH = (
+    ("state_groundtruth_estimate0", BATCH_ESTIMATE),
+    ("mocap0", MOTION_CAPTURE),
+    ("vicon0", MOTION_CAPTURE),
+)
+
+
+class EurocSource(FileSource):
+    """A sequence folder that holds ``mav0/`` (or is it), with ``cam0 cam1`` and, where present, ``imu0`` and truth.
+
+    The calibration is that of ``sensor.yaml`` in both camera folders, else a Kalibr chain in ``dso/`` or the folder
+    itself (TUM-VI). ``body.yaml`` with the line ``axes: FLU`` says that the body is x forward, y left, z up.
+    """
+
+    format = "euroc"
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        calibration: str | Path | None = None,
+        truth_noise: TruthNoise | None = None,
+        **options: Any,
+    ) -> None:
+        mav = _mav_folder(path)
+        rig = _read_rig(path, mav, None if calibration is None else Path(calibration))
+        known = SourceReport()
+        super().__init__(path, path.resolve().name, rig, _list_pairs(mav, known), known, **options)
+        self.imu = _read_imu(path, mav, rig)
+        self.truth = self._read_truth(mav, truth_noise)
+        if self.truth is None and (mav / "leica0").is_dir():
+            known.note("leica0 gives positions only: not used as truth of motions")
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A folder with ``mav0/cam0/data.csv``, or that folder."""
+        return path.is_dir() and any((p / "cam0" / "data.csv").is_file() for p in (path / "mav0", path))
+
+    def _read_truth(self, mav: Path, noise: TruthNoise | None) -> TruthLog | None:
+        if self.mounting.T_imu_cam is None:
+            return None
+        for folder, usual in _TRUTH:
+            file = mav / folder / "data.csv"
+            if not file.is_file():
+                continue
+            stated = _stated_noise(mav / folder / "sensor.yaml")
+            T_marker_imu = _marker_to_imu(mav, folder)
+            truth = carry(read_euroc_csv(file), T_marker_imu @ self.mounting.T_imu_cam, noise or stated or usual)
+            check_overlap(truth, np.array([p.t_ns for p in self._pairs], dtype=np.int64), file)
+            return truth
+        return None
+
+
+def _mav_folder(path: Path) -> Path:
+    mav = path / "mav0" if (path / "mav0").is_dir() else path
+    for camera in ("cam0", "cam1"):
+        if not (mav / camera / "data.csv").is_file():
+            raise SourceError(
+                "no list of images", where=mav / camera / "data.csv", cure="a line 'stamp_ns,file' per image"
+            )
+    return mav
+
+
+def _read_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
+    sensors = [mav / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
+    if given is None and all(s.is_file() for s in sensors):
+        imu = mav / "imu0" / "sensor.yaml"
+        return read_sensor_pair(*sensors, imu=imu if imu.is_file() else None, body_is_flu=_body_is_flu(mav))
+    chain = given or next((c for c in map(find_calibration, (path, mav, path / "dso", mav.parent)) if c), None)
+    if chain is None:
+        raise CalibrationError(
+            "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml",
+            where=mav,
+            cure="put Kalibr's camchain.yaml into the folder or name one with --calibration",
+        )
+    return read_stereo_yaml(chain)
+
+
+def _body_is_flu(mav: Path) -> bool:
+    body = mav / "body.yaml"
+    return body.is_file() and str(read_yaml(body).get("axes", "")).upper() == "FLU"
+
+
+def _list_pairs(mav: Path, known: SourceReport) -> list[PairFiles]:
+    left, right = (_read_image_list(mav / camera / "data.csv", known) for camera in ("cam0", "cam1"))
+    folders = [mav / camera / "data" for camera in ("cam0", "cam1")]
+    return [PairFiles(t, folders[0] / a, folders[1] / b) for t, a, b in match_equal(left, right, known)]
+
+
+def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
+    """(stamp, file name) of each line; a line that is neither is counted and skipped."""
+    out = []
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+    for number, line in enumerate(lines, 1):
+        text = line.strip().removeprefix("\ufeff")
+        if not text or text.startswith("#"):
+            continue
+        stamp, _, name = (part.strip() for part in text.partition(","))
+        name = name or f"{stamp}.png"
+        if not stamp.isdigit() or not _is_plain_name(name):
+            known.unreadable += 1
+            known.note(f"{path.parent.name}/{path.name} line {number} is no 'stamp_ns,file'")
+            continue
+        out.append((int(stamp), name))
+    if not out:
+        raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
+    return out
+
+
+def _is_plain_name(name: str) -> bool:
+    """Whether a name stays inside its folder."""
+    return bool(name) and name not in (".", "..") and not any(c in name for c in ("/", "\\", "\0"))
+
+
+def _read_imu(path: Path, mav: Path, rig: StereoRig) -> ImuLog | None:
+    file = mav / "imu0" / "data.csv"
+    if not file.is_file():
+        return None
+    return read_imu_csv(file, shift_s=rig.timeshift_cam_imu_s, noise=_imu_noise(path, mav))
+
+
+def _imu_noise(path: Path, mav: Path) -> ImuNoise | None:
+    for candidate in (mav / "imu0" / "sensor.yaml", path / "dso" / "imu_config.yaml", path / "imu.yaml"):
+        if candidate.is_file() and "gyroscope_noise_density" in candidate.read_text(errors="replace"):
+            return read_imu_noise(candidate)
+    return None
+
+
+def _marker_to_imu(mav: Path, folder: str) -> Array:
+    """(4, 4) IMU to the frame whose poses the truth folder holds, identity where nothing else is said."""
+    T = []
+    for sensor in (folder, "imu0"):
+        file = mav / sensor / "sensor.yaml"
+        has_pose = file.is_file() and "T_BS" in read_yaml(file)
+        T.append(read_sensor_pose(file) if has_pose else np.eye(4))
+    T_body_marker, T_body_imu = T
+    return se3.inverse(T_body_marker) @ T_body_imu
+
+
+def _stated_noise(sensor: Path) -> TruthNoise | None:
+    """Noise that the truth's own ``sensor.yaml`` states, as gpvo's simulator writes it."""
+    if not sensor.is_file():
+        return None
+    document = read_yaml(sensor)
+    values = [document.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
+    if not all(isinstance(v, (int, float)) and 0 <= v < 10 for v in values):
+        return None
+    return TruthNoise(float(values[0]), float(values[1]))  # type: ignore[arg-type]

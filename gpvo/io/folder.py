@@ -1,0 +1,152 @@
+"""A folder of image pairs with a Kalibr camera chain beside them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.cameras.kalibr import read_imu_noise
+from gpvo.cameras.readers import find_calibration, read_stereo_yaml
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles
+from gpvo.io.imu import read_imu_csv
+from gpvo.io.source import SourceReport
+from gpvo.io.stamps import match_equal, seconds_text_to_ns
+from gpvo.io.trajectory import read_times, read_tum
+from gpvo.io.truth import UNKNOWN, TruthNoise, carry, check_overlap
+
+_FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("left/data", "right/data"))
+_SIDE = re.compile(r"(?P<stem>.*?)[_-]?(?P<side>left|right|cam0|cam1|l|r)$", re.IGNORECASE)
+_DIGITS = re.compile(r"\d+(?:\.\d+)?")
+# Whole numbers of at least this many digits are nanoseconds since an epoch, not indices.
+_STAMP_DIGITS = 13
+
+
+class FolderSource(FileSource):
+    """Pairs in ``left/ right/`` or ``cam0/ cam1/``, or named ``*_left.png *_right.png`` in one folder.
+
+    Stamps are the names in nanoseconds (or decimal seconds), else the lines of ``times.txt`` (seconds) in the order
+    of the names, else ``rate_hz`` makes them from the number in the name. ``imu.csv`` (EuRoC columns) and
+    ``truth.tum`` (poses of the left camera as calibrated) are read where present.
+    """
+
+    format = "folder"
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        calibration: str | Path | None = None,
+        rate_hz: float | None = None,
+        truth_noise: TruthNoise = UNKNOWN,
+        **options: Any,
+    ) -> None:
+        chain = Path(calibration) if calibration is not None else find_calibration(path)
+        if chain is None:
+            raise CalibrationError(
+                "no calibration beside the images",
+                where=path,
+                cure="put Kalibr's camchain.yaml there or name one with --calibration",
+            )
+        rig = read_stereo_yaml(chain)
+        known = SourceReport()
+        super().__init__(path, path.resolve().name, rig, _list_pairs(path, rate_hz, known), known, **options)
+        if (path / "imu.csv").is_file():
+            noise = path / "imu.yaml"
+            self.imu = read_imu_csv(
+                path / "imu.csv",
+                shift_s=rig.timeshift_cam_imu_s,
+                noise=read_imu_noise(noise) if noise.is_file() else None,
+            )
+        if (path / "truth.tum").is_file():
+            truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, truth_noise)
+            check_overlap(truth, np.array([p.t_ns for p in self._pairs], dtype=np.int64), path / "truth.tum")
+            self.truth = truth
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A folder with a pair of image folders or left and right images."""
+        if not path.is_dir():
+            return False
+        if any((path / a).is_dir() and (path / b).is_dir() for a, b in _FOLDERS):
+            return True
+        sides = {m["side"].lower() for f in path.iterdir() if _is_image(f) and (m := _SIDE.match(f.stem))}
+        return any({a, b} <= sides for a, b in (("left", "right"), ("cam0", "cam1"), ("l", "r")))
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES
+
+
+def _list_pairs(path: Path, rate_hz: float | None, known: SourceReport) -> list[PairFiles]:
+    left, right = _find_images(path)
+    if not left or not right:
+        raise SourceError(
+            "holds no image pairs", where=path, cure="left/ and right/ with equal names, or names ending _left, _right"
+        )
+    stamps = _stamps(path, sorted({*left, *right}), rate_hz, known)
+    lists = [
+        [(stamps[key], key) for key in sorted(side, key=stamps.__getitem__) if key in stamps] for side in (left, right)
+    ]
+    return [PairFiles(t, left[a], right[b]) for t, a, b in match_equal(lists[0], lists[1], known)]
+
+
+def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
+    """Images of both cameras, keyed by what their names have in common."""
+    for a, b in _FOLDERS:
+        if (path / a).is_dir() and (path / b).is_dir():
+            sides = [path / s / "data" if (path / s / "data").is_dir() else path / s for s in (a, b)]
+            left, right = ({_key(f): f for f in sorted(s.iterdir()) if _is_image(f)} for s in sides)
+            return left, right
+    named: tuple[dict[str, Path], dict[str, Path]] = ({}, {})
+    for file in sorted(path.iterdir()):
+        match = _SIDE.match(file.stem) if _is_image(file) else None
+        if match is not None:
+            named[match["side"].lower() in ("right", "cam1", "r")][match["stem"]] = file
+    return named
+
+
+def _key(file: Path) -> str:
+    """The name without a side at its end: ``000012_left`` and ``000012`` alike."""
+    match = re.fullmatch(r"(.*?)[_-](left|right|cam0|cam1)", file.stem, re.IGNORECASE)
+    return match[1] if match else file.stem
+
+
+def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceReport) -> dict[str, int]:
+    """Stamp [ns] of each key."""
+    numbers = {k: found[-1] for k in keys if (found := _DIGITS.findall(k))}
+    if len(numbers) == len(keys) and all(_is_stamp(n) for n in numbers.values()):
+        return {k: seconds_text_to_ns(n) if "." in n else int(n) for k, n in numbers.items()}
+    times = path / "times.txt"
+    if times.is_file():
+        return _stamps_by_line(path, keys, numbers, known)
+    if rate_hz is not None and rate_hz > 0 and len(numbers) == len(keys):
+        return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
+    raise SourceError(
+        "the image names are no stamps and there is no times.txt",
+        where=path,
+        cure="name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz",
+    )
+
+
+def _is_stamp(number: str) -> bool:
+    return "." in number or len(number) >= _STAMP_DIGITS
+
+
+def _stamps_by_line(path: Path, keys: list[str], numbers: dict[str, str], known: SourceReport) -> dict[str, int]:
+    """Lines of ``times.txt`` by the number in the name (from 0 or 1), so that a missing image shifts nothing."""
+    lines = read_times(path / "times.txt")
+    if len(numbers) == len(keys):
+        index = {k: int(float(n)) for k, n in numbers.items()}
+        first = 1 if min(index.values()) == 1 and max(index.values()) == len(lines) else 0
+        inside = {k: i - first for k, i in index.items() if 0 <= i - first < len(lines)}
+        if len(inside) < len(keys):
+            known.missing += len(keys) - len(inside)
+            known.note(f"{len(keys) - len(inside)} images have no line in times.txt")
+        return {k: int(lines[i]) for k, i in inside.items()}
+    if len(keys) != len(lines):
+        raise SourceError(f"holds {len(lines)} stamps for {len(keys)} images", where=path / "times.txt")
+    return {k: int(t) for k, t in zip(keys, lines, strict=True)}

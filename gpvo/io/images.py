@@ -1,0 +1,249 @@
+"""Decoding images to 8 bit grey, and sequences of image pairs that lie in files."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.cameras.masks import read_mask
+from gpvo.cameras.rectify import Rectifier
+from gpvo.cameras.rig import StereoRig
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.io.source import SourceReport
+from gpvo.io.stamps import in_order
+from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+_MAX_IMAGE_BYTES = 500_000_000
+
+Image8 = NDArray[np.uint8]
+T = TypeVar("T")
+
+
+def to_grey8(image: NDArray[Any], *, bgr: bool = True) -> Image8:
+    """(H, W) uint8 from a grey or colour image of 8 or 16 bit; 16 bit is scaled by 1/256 [full range]."""
+    if image.ndim == 3:
+        channels = image.shape[2]
+        if channels == 1:
+            image = image[:, :, 0]
+        else:
+            code = {(3, True): cv2.COLOR_BGR2GRAY, (3, False): cv2.COLOR_RGB2GRAY}.get((channels, bgr))
+            code = (cv2.COLOR_BGRA2GRAY if bgr else cv2.COLOR_RGBA2GRAY) if code is None else code
+            image = np.asarray(cv2.cvtColor(image, code))
+    if image.dtype == np.uint16:
+        # Rounded, not cut: cutting would darken by half a step.
+        return np.asarray(np.minimum((image.astype(np.uint32) + 128) >> 8, 255), dtype=np.uint8)
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def read_grey8(path: Path) -> Image8 | None:
+    """An image file as (H, W) uint8; None where it is missing, damaged or no image."""
+    try:
+        if not 0 < path.stat().st_size <= _MAX_IMAGE_BYTES:
+            return None
+        raw = np.fromfile(path, dtype=np.uint8)
+    except OSError:
+        return None
+    return decode_grey8(raw)
+
+
+def decode_grey8(raw: NDArray[np.uint8]) -> Image8 | None:
+    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8, None where they are no image."""
+    try:
+        image = cv2.imdecode(raw, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+    except cv2.error:
+        return None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        return None
+    return to_grey8(image)
+
+
+def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """The same items, made ahead in one background thread; at most ``depth`` wait.
+
+    An exception in the thread is raised here; the thread ends when the consumer stops.
+    """
+    waiting: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=depth)
+    stop = threading.Event()
+
+    def put(entry: tuple[str, Any]) -> None:
+        while not stop.is_set():
+            try:
+                waiting.put(entry, timeout=0.1)
+                return
+            except queue.Full:
+                continue
+
+    def work() -> None:
+        try:
+            for item in items:
+                put(("item", item))
+                if stop.is_set():
+                    return
+            put(("end", None))
+        except BaseException as error:
+            put(("error", error))
+
+    thread = threading.Thread(target=work, name="gpvo-decode", daemon=True)
+    thread.start()
+    try:
+        while True:
+            what, value = waiting.get()
+            if what == "end":
+                return
+            if what == "error":
+                raise value
+            yield value
+    finally:
+        stop.set()
+        thread.join()
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """One stereo pair on disk: its stamp and both files."""
+
+    t_ns: int
+    left: Path
+    right: Path
+
+
+class ImageSource:
+    """Base of all sources of images: guards the stamps, decodes ahead, rectifies and counts what is wrong.
+
+    A subclass passes the rig and what lies beside it, and gives the raw pairs by :meth:`raw_pairs`.
+    """
+
+    kind: Literal["images", "tracks"] = "images"
+    format = "images"
+
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        rig: StereoRig,
+        *,
+        hfov_deg: float | None = None,
+        size: tuple[int, int] | None = None,
+        mask_left: str | Path | None = None,
+        mask_right: str | Path | None = None,
+        prefetch: bool = True,
+    ) -> None:
+        if mask_left is not None or mask_right is not None:
+            left, right = (None if m is None else read_mask(Path(m)) for m in (mask_left, mask_right))
+            rig = rig.with_masks(left, right)
+        self.path, self.name, self.rig = path, name, rig
+        self.rectifier = Rectifier(rig, hfov_deg=hfov_deg, size=size)
+        self.camera: StereoCamera = self.rectifier.camera
+        self.mask: NDArray[np.bool_] | None = self.rectifier.mask
+        self.mounting: Mounting = self.rectifier.mounting
+        self.imu: ImuLog | None = None
+        self.truth: TruthLog | None = None
+        self.report = SourceReport()
+        self._prefetch = prefetch
+
+    @property
+    def calibration(self) -> dict[str, Any] | None:
+        """The raw rig and the rectifying rotation, as plain numbers."""
+        return {**self.rig.describe(), "R_rect_left": self.rectifier.R_rect_left.tolist()}
+
+    def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
+        """Stamps [ns] with decoded raw images, None for an image that is not readable."""
+        raise NotImplementedError
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        self.report = report = self._fresh_report()
+        frames = self._frames(report)
+        return prefetched(frames) if self._prefetch else frames
+
+    def _fresh_report(self) -> SourceReport:
+        """A report with what was already known when the source was opened."""
+        return SourceReport()
+
+    def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
+        for frame in in_order(self._readable(report), report):
+            report.frames += 1
+            yield StereoFrame(frame.t_ns, *self.rectifier.apply(frame.left, frame.right))
+        if report.frames == 0:
+            raise SourceError("not one readable image pair", where=self.path)
+
+    def _readable(self, report: SourceReport) -> Iterator[StereoFrame]:
+        for t_ns, left, right in self.raw_pairs(report):
+            if left is None or right is None:
+                report.unreadable += 1
+                report.note(f"unreadable image at {t_ns} ns")
+            elif not (self._fits(left, self.rig.left) and self._fits(right, self.rig.right)):
+                report.unreadable += 1
+                report.note(f"image of another size at {t_ns} ns")
+            else:
+                yield StereoFrame(t_ns, left, right)
+
+    @staticmethod
+    def _fits(image: Image8, lens: Any) -> bool:
+        return image.shape == (lens.height, lens.width)
+
+
+class FileSource(ImageSource):
+    """Image pairs in files, known beforehand."""
+
+    def __init__(
+        self, path: Path, name: str, rig: StereoRig, pairs: Sequence[PairFiles], known: SourceReport, **options: Any
+    ) -> None:
+        if not pairs:
+            raise SourceError("holds no image pair with equal stamps", where=path)
+        super().__init__(path, name, rig, **options)
+        self._pairs, self._known = pairs, known
+        self.report = self._fresh_report()
+        check_size(pairs, rig)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def _fresh_report(self) -> SourceReport:
+        return replace(self._known, notes=list(self._known.notes))
+
+    def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
+        """Decode pair by pair; a file that is not there counts as missing."""
+        for pair in self._pairs:
+            absent = [p for p in (pair.left, pair.right) if not p.is_file()]
+            if absent:
+                report.missing += 1
+                report.note(f"missing {absent[0].parent.name}/{absent[0].name}")
+                continue
+            yield pair.t_ns, read_grey8(pair.left), read_grey8(pair.right)
+
+
+def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
+    """Refuse a calibration for another resolution, judged by the first readable image of each camera.
+
+    Raises
+    ------
+    CalibrationError
+        Naming both resolutions.
+    """
+    for side, lens in (("left", rig.left), ("right", rig.right)):
+        for pair in pairs[:20]:
+            path: Path = getattr(pair, side)
+            image = read_grey8(path)
+            if image is None:
+                continue
+            height, width = image.shape
+            if (width, height) != (lens.width, lens.height):
+                raise CalibrationError(
+                    f"the image is {width}x{height}, its calibration is for {lens.width}x{lens.height}"
+                    + (f" ({rig.where})" if rig.where else ""),
+                    where=path,
+                    cure="use the calibration of this resolution, or scale its intrinsics",
+                )
+            break

@@ -1,0 +1,54 @@
+"""IMU samples of an ASL folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gpvo.errors import SourceError
+from gpvo.types import ImuLog, ImuNoise
+
+
+def read_imu_csv(path: Path, *, shift_s: float = 0.0, noise: ImuNoise | None = None) -> ImuLog:
+    """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order.
+
+    ``shift_s``: ``t_imu = t_cam + shift``, taken off so that the stamps are of the camera's clock. Lines that repeat
+    or go back in time are dropped.
+
+    Raises
+    ------
+    SourceError
+        Naming file and line.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                text = line.strip().removeprefix("\ufeff")
+                if not text or text.startswith("#"):
+                    continue
+                try:
+                    fields = text.split(",")
+                    stamps.append(int(fields[0]))
+                    rows.append([float(f) for f in fields[1:7]])
+                    if len(rows[-1]) != 6 or not np.isfinite(rows[-1]).all():
+                        raise ValueError
+                except ValueError:
+                    raise SourceError(
+                        f"line {number}: expected t[ns] and six finite numbers, gyro first", where=path
+                    ) from None
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+    if not stamps:
+        raise SourceError("holds no IMU samples", where=path)
+    return make_imu(np.array(stamps, dtype=np.int64), np.array(rows), shift_s=shift_s, noise=noise)
+
+
+def make_imu(t_ns: np.ndarray, gyro_acc: np.ndarray, *, shift_s: float = 0.0, noise: ImuNoise | None = None) -> ImuLog:
+    """An :class:`ImuLog` of samples (N, 6), gyro first; those that repeat or go back in time are dropped."""
+    latest = np.maximum.accumulate(t_ns)
+    keep = np.concatenate([[True], t_ns[1:] > latest[:-1]])
+    t = t_ns[keep] - round(shift_s * 1e9)
+    return ImuLog(t_ns=t, gyro_radps=gyro_acc[keep, :3], acc_mps2=gyro_acc[keep, 3:], noise=noise)

@@ -1,0 +1,83 @@
+"""Small Parquet tables: written under a temporary name with page checksums, read back with sizes checked first."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from gpvo.errors import SourceError
+
+MAX_ROWS = 50_000_000
+MAX_COLUMNS = 4096
+MAX_BYTES = 8_000_000_000
+_INTEGERS = {"t_ns", "t_prev_ns", "n_detected", "n_stereo", "n_tracked", "n_inliers"}
+_TYPES = {"status": pa.string(), "reason": pa.string(), "is_reference": pa.bool_()}
+
+
+def make_table(columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> pa.Table:
+    """Columns as a table: integers, strings and booleans where their name says so, else float64."""
+    fields, arrays = [], []
+    for name, values in columns.items():
+        kind = pa.int64() if name in _INTEGERS else _TYPES.get(name, pa.float64())
+        arrays.append(pa.array(values, type=kind))
+        fields.append(pa.field(name, kind))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(metadata or {})))
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    """Write one table in place of what was there, or not at all."""
+    temporary = path.with_name(path.name + ".part")
+    pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+    os.replace(temporary, path)
+
+
+def concatenate(parts: Sequence[Path], target: Path, metadata: Mapping[str, str] | None = None) -> None:
+    """Join tables of a growing set of columns into one file, a part at a time in memory."""
+    schema = pa.unify_schemas([pq.read_schema(p).remove_metadata() for p in parts])
+    schema = schema.with_metadata(dict(metadata or {}))
+    temporary = target.with_name(target.name + ".part")
+    with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
+        for part in parts:
+            table = pq.read_table(part)
+            n = table.num_rows
+            columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
+            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
+    os.replace(temporary, target)
+
+
+def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Columns as arrays (nulls of numbers as NaN) and the file's metadata.
+
+    Raises
+    ------
+    SourceError
+        Where the file is missing, damaged or implausibly large.
+    """
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            shape = file.metadata
+            if shape.num_rows > MAX_ROWS or shape.num_columns > MAX_COLUMNS:
+                raise SourceError(f"has {shape.num_rows} rows and {shape.num_columns} columns: no run's", where=path)
+            if sum(shape.row_group(i).total_byte_size for i in range(shape.num_row_groups)) > MAX_BYTES:
+                raise SourceError("unpacks to more than 8 GB", where=path)
+            table = file.read()
+    except FileNotFoundError:
+        raise SourceError("is missing", where=path) from None
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SourceError(f"is damaged: {reason}", where=path, cure="run the sequence again") from None
+    metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
+    return {name: _to_numpy(table[name]) for name in table.column_names}, metadata
+
+
+def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type) or pa.types.is_dictionary(column.type):
+        return np.array(column.to_pylist(), dtype=object)
+    return np.asarray(column.to_numpy())

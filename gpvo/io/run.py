@@ -1,0 +1,254 @@
+"""The run folder: everything later stages need, so that nothing reopens the source.
+
+``vo_log.parquet`` (columns in :mod:`gpvo.io.run_table`), ``trajectory.tum`` (raw VO, never corrected), ``rig.json``,
+``truth.parquet``, ``imu.parquet``, ``predictions.parquet`` where there are such, ``config.toml``, ``run.json``. While a
+run is on, finished chunks of records lie in ``chunks/``; closing it joins them. A run that was killed is read from
+its chunks.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from gpvo import __version__
+from gpvo.errors import SourceError
+from gpvo.geometry.se3 import Array
+from gpvo.io import run_table
+from gpvo.io.jsonfile import write_json
+from gpvo.io.parquet import concatenate, make_table, write_table
+from gpvo.io.run_read import Run, read_predictions, read_run
+from gpvo.io.toml import write_toml
+from gpvo.io.trajectory import tum_line
+from gpvo.types import ImuLog, Mounting, Prediction, StereoCamera, TruthLog, VoLog, VoRecord
+
+__all__ = ["Run", "RunWriter", "read_predictions", "read_run", "write_predictions", "write_run"]
+
+SCHEMA = 1
+_FILES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet")
+_OWN = (*_FILES, "config.toml", "run.json")
+
+
+class RunWriter:
+    """Writes a run folder as the records come; use as a context manager.
+
+    Parameters
+    ----------
+    path : the folder; made if need be. An older run in it is replaced, any other content refused.
+    camera, mounting, truth, imu : what the source knows, None where it does not.
+    config : the settings used, for ``config.toml``.
+    meta : further keys of ``run.json``, such as ``name``, ``source`` and ``source_format``.
+    calibration : the raw rig in plain numbers, for ``rig.json``.
+    chunk : records per chunk; a killed run loses at most so many.
+
+    Raises
+    ------
+    SourceError
+        Where the folder holds something that is not a run, or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        camera: StereoCamera | None = None,
+        mounting: Mounting | None = None,
+        truth: TruthLog | None = None,
+        imu: ImuLog | None = None,
+        config: Mapping[str, Any] | None = None,
+        meta: Mapping[str, Any] | None = None,
+        calibration: Mapping[str, Any] | None = None,
+        chunk: int = 100,
+    ) -> None:
+        self.path = Path(path)
+        self._chunks = self.path / "chunks"
+        self._meta = dict(meta or {})
+        self._chunk = max(1, chunk)
+        self._state = _State()
+        _prepare(self.path)
+        self._chunks.mkdir()
+        write_json(self.path / "rig.json", _rig(camera, mounting or Mounting(), calibration))
+        if truth is not None:
+            write_truth(self.path / "truth.parquet", truth)
+        if imu is not None:
+            write_imu(self.path / "imu.parquet", imu)
+        write_toml(self.path / "config.toml", dict(config or {}))
+        self._write_meta(complete=False)
+
+    def __enter__(self) -> RunWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(complete=error is None)
+
+    def append(self, record: VoRecord, prediction: Prediction | None = None) -> None:
+        """Add one record, and what a model predicted for it.
+
+        Raises
+        ------
+        ValueError
+            Where the stamp does not grow or the record starts from an unknown frame.
+        """
+        state = self._state
+        T_prev = state.poses.get(record.t_prev_ns)
+        if state.records_total and record.t_ns <= state.last_t_ns:
+            raise ValueError(f"record at {record.t_ns} ns does not follow {state.last_t_ns} ns")
+        if state.records_total and T_prev is None:
+            raise ValueError(f"record at {record.t_ns} ns starts from {record.t_prev_ns} ns, which is not in the run")
+        pose = record.T_prev_cur if T_prev is None else T_prev @ record.T_prev_cur
+        state.remember(record.t_ns, pose)
+        state.records.append(record)
+        state.lines.append(tum_line(record.t_ns, pose))
+        state.count(record)
+        if prediction is not None:
+            state.predictions.append(prediction)
+        if len(state.records) >= self._chunk:
+            self.flush()
+
+    def note(self, **meta: Any) -> None:
+        """Add keys to ``run.json``, written when the run closes."""
+        self._meta.update(meta)
+
+    def flush(self) -> None:
+        """Write the records so far as one chunk, which survives a kill."""
+        state = self._state
+        if state.records:
+            name = f"{state.chunks:06d}.parquet"
+            write_table(self._chunks / f"log_{name}", make_table(run_table.record_columns(state.records)))
+            if state.predictions:
+                columns = run_table.prediction_columns(state.predictions)
+                write_table(self._chunks / f"predictions_{name}", make_table(columns))
+            with (self.path / "trajectory.tum").open("a", encoding="ascii", newline="\n") as file:
+                file.writelines(line + "\n" for line in state.lines)
+            state.chunks += 1
+        state.records, state.predictions, state.lines = [], [], []
+
+    def close(self, *, complete: bool = True) -> None:
+        """Join the chunks and finish ``run.json``; ``complete=False`` marks a run that broke off."""
+        self.flush()
+        for kind, target in (("log", "vo_log.parquet"), ("predictions", "predictions.parquet")):
+            parts = sorted(self._chunks.glob(f"{kind}_*.parquet"))
+            if parts:
+                concatenate(parts, self.path / target, {"schema": str(SCHEMA)})
+        shutil.rmtree(self._chunks, ignore_errors=True)
+        self._write_meta(complete=complete)
+
+    def _write_meta(self, *, complete: bool) -> None:
+        state = self._state
+        write_json(
+            self.path / "run.json",
+            {
+                "schema": SCHEMA,
+                "name": self.path.resolve().name,
+                **self._meta,
+                "complete": complete,
+                "frames": state.records_total,
+                "statuses": dict(state.statuses),
+                "started": state.started,
+                "finished": datetime.now(timezone.utc).isoformat(timespec="seconds") if complete else None,
+                "wall_s": round(time.monotonic() - state.clock, 3),
+                "stage_ms_mean": {k: v / max(state.records_total, 1) for k, v in state.stage_ms.items()},
+                "versions": {"gpvo": __version__, "python": platform.python_version(), "numpy": np.__version__},
+            },
+        )
+
+
+@dataclass
+class _State:
+    """What the writer carries from record to record; its size does not grow with the run."""
+
+    records: list[VoRecord] = field(default_factory=list)
+    predictions: list[Prediction] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
+    poses: OrderedDict[int, Array] = field(default_factory=OrderedDict)
+    statuses: dict[str, int] = field(default_factory=dict)
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    records_total: int = 0
+    chunks: int = 0
+    last_t_ns: int = 0
+    started: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    clock: float = field(default_factory=time.monotonic)
+
+    def remember(self, t_ns: int, pose: Array) -> None:
+        """Keep the pose as a possible start of later motions, for the last 20,000 frames."""
+        self.poses[t_ns] = pose
+        if len(self.poses) > 20_000:
+            self.poses.popitem(last=False)
+
+    def count(self, record: VoRecord) -> None:
+        """Add to the sums of ``run.json``."""
+        self.records_total += 1
+        self.last_t_ns = record.t_ns
+        self.statuses[record.status.value] = self.statuses.get(record.status.value, 0) + 1
+        for stage, ms in record.stage_ms.items():
+            self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + ms
+
+
+def write_run(path: str | Path, log: VoLog, *, predictions: Sequence[Prediction] = (), **known: Any) -> None:
+    """Write a whole run at once; ``known`` are the keyword arguments of :class:`RunWriter` but ``camera``."""
+    by_stamp = {p.t_ns: p for p in predictions}
+    with RunWriter(path, camera=log.camera, chunk=1000, **known) as writer:
+        for record in log:
+            writer.append(record, by_stamp.get(record.t_ns))
+
+
+def write_truth(path: Path, truth: TruthLog) -> None:
+    """Write ``truth.parquet``."""
+    metadata = {
+        "schema": str(SCHEMA),
+        "sigma_translation_m": repr(float(truth.sigma_translation_m)),
+        "sigma_rotation_rad": repr(float(truth.sigma_rotation_rad)),
+    }
+    write_table(path, make_table(run_table.truth_columns(truth), metadata))
+
+
+def write_imu(path: Path, imu: ImuLog) -> None:
+    """Write ``imu.parquet``."""
+    metadata = {"schema": str(SCHEMA)}
+    if imu.noise is not None:
+        metadata["noise"] = json.dumps(asdict(imu.noise))
+    write_table(path, make_table(run_table.imu_columns(imu), metadata))
+
+
+def write_predictions(path: str | Path, predictions: Sequence[Prediction]) -> None:
+    """Write predictions as a Parquet file of their own, as ``gpvo predict`` does."""
+    write_table(Path(path), make_table(run_table.prediction_columns(predictions), {"schema": str(SCHEMA)}))
+
+
+def _rig(camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "camera": None if camera is None else asdict(camera),
+        "T_body_cam": None if mounting.T_body_cam is None else mounting.T_body_cam.tolist(),
+        "T_imu_cam": None if mounting.T_imu_cam is None else mounting.T_imu_cam.tolist(),
+        "calibration": None if calibration is None else dict(calibration),
+    }
+
+
+def _prepare(path: Path) -> None:
+    """Make the folder; clear an older run of exactly the files that a run has."""
+    if path.exists() and not path.is_dir():
+        raise SourceError("is a file, not a folder for a run", where=path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        present = {p.name for p in path.iterdir()}
+        if present and "run.json" not in present:
+            raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
+        shutil.rmtree(path / "chunks", ignore_errors=True)
+        for name in _OWN:
+            (path / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None

@@ -1,0 +1,216 @@
+"""Reading run folders: finished ones, killed ones, and refusing damaged ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import SourceError
+from gpvo.geometry.se3 import Array
+from gpvo.io import run_table
+from gpvo.io.jsonfile import read_json
+from gpvo.io.parquet import read_columns
+from gpvo.types import ImuLog, ImuNoise, Mounting, Prediction, StereoCamera, TruthLog, VoLog, field_names
+
+_MAX_SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder in memory. ``meta`` is ``run.json``; ``meta["complete"]`` is False for a run that broke off."""
+
+    path: Path
+    name: str
+    log: VoLog
+    truth: TruthLog | None
+    imu: ImuLog | None
+    mounting: Mounting
+    predictions: list[Prediction]
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        parts = [f"{len(self.log)} records"]
+        parts += [word for word, has in (("truth", self.truth), ("imu", self.imu)) if has is not None]
+        parts += [f"{len(self.predictions)} predictions"] if self.predictions else []
+        return f"{self.name}: {', '.join(parts)}"
+
+
+def is_run(path: str | Path) -> bool:
+    """Whether a path looks like a run folder."""
+    p = Path(path)
+    return (p / "run.json").is_file() and ((p / "vo_log.parquet").is_file() or (p / "chunks").is_dir())
+
+
+def read_run(path: str | Path) -> Run:
+    """Read a run folder; of a killed run what its complete chunks hold.
+
+    Raises
+    ------
+    SourceError
+        Where it is not a run folder, is newer than this version, or a file in it is damaged.
+    """
+    p = Path(path)
+    if not p.is_dir():
+        raise SourceError("no such run folder", where=p, cure="make one with 'gpvo run SOURCE -o RUN'")
+    if not (p / "run.json").is_file():
+        raise SourceError("is not a run folder: it lacks run.json", where=p, cure="make one with 'gpvo run'")
+    meta = read_json(p / "run.json")
+    schema = meta.get("schema")
+    if not isinstance(schema, int) or schema > _MAX_SCHEMA:
+        raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=p / "run.json", cure="upgrade")
+    camera, mounting = _read_rig(p / "rig.json")
+    log = _read_log(p, camera)
+    return Run(
+        path=p,
+        name=str(meta.get("name") or p.resolve().name),
+        log=log,
+        truth=_read_truth(p / "truth.parquet"),
+        imu=_read_imu(p / "imu.parquet"),
+        mounting=mounting,
+        predictions=_read_predictions_of(p),
+        meta=meta,
+    )
+
+
+def read_predictions(path: str | Path) -> list[Prediction]:
+    """Predictions of a Parquet file.
+
+    Raises
+    ------
+    SourceError
+        Where it is damaged or holds something else.
+    """
+    p = Path(path)
+    columns, _ = read_columns(p)
+    return _guarded(p, lambda: run_table.predictions_from(columns))
+
+
+def _guarded(path: Path, make: Any) -> Any:
+    """Turn a missing or malformed column into one line."""
+    try:
+        return make()
+    except KeyError as error:
+        raise SourceError(f"lacks the column {error}", where=path, cure="was it made by gpvo?") from None
+    except (ValueError, TypeError, OverflowError) as error:
+        raise SourceError(f"is not what it should be: {error}", where=path) from None
+
+
+def _parts(path: Path, joined: str, kind: str) -> list[Path]:
+    """The joined file, else the chunks of a run that never closed."""
+    if (path / joined).is_file():
+        return [path / joined]
+    return sorted((path / "chunks").glob(f"{kind}_*.parquet"))
+
+
+def _read_log(path: Path, camera: StereoCamera | None) -> VoLog:
+    parts = _parts(path, "vo_log.parquet", "log")
+    if not parts:
+        raise SourceError(
+            "holds no records: the run broke off before its first chunk", where=path, cure="run the sequence again"
+        )
+    records = []
+    for part in parts:
+        columns, _ = read_columns(part)
+        records += _guarded(part, lambda columns=columns: run_table.records_from(columns))
+    log = VoLog(records, camera)
+    _check_log(log, path / "vo_log.parquet")
+    return log
+
+
+def _check_log(log: VoLog, path: Path) -> None:
+    t = log.t_ns
+    if len(t) == 0:
+        raise SourceError("holds no records", where=path)
+    if (np.diff(t) <= 0).any():
+        raise SourceError("its stamps do not grow", where=path, cure="run the sequence again")
+    known = set(t.tolist())
+    if any(r.t_prev_ns not in known or r.t_prev_ns > r.t_ns for r in log.records[1:]):
+        raise SourceError("a record starts from a frame that is not in it", where=path, cure="run the sequence again")
+    _check_poses(log.T_prev_cur, path)
+
+
+def _check_poses(T: Array, path: Path) -> None:
+    R = T[:, :3, :3]
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(T).all(axis=(1, 2))
+        good &= np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) < 1e-6
+    if not good.all():
+        raise SourceError(f"row {int(np.flatnonzero(~good)[0])} holds no rigid motion", where=path)
+
+
+def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
+    if not path.is_file():
+        return None, Mounting()
+    document = read_json(path)
+
+    def pose(key: str) -> Array | None:
+        if document.get(key) is None:
+            return None
+        T = np.asarray(document[key], dtype=np.float64)
+        if T.shape != (4, 4):
+            raise ValueError(f"{key} has shape {T.shape}")
+        _check_poses(T[None], path)
+        return T
+
+    def make() -> tuple[StereoCamera | None, Mounting]:
+        raw = document.get("camera")
+        camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
+        if camera is not None and not (camera.fx_px > 0 and camera.fy_px > 0 and camera.baseline_m > 0):
+            raise ValueError("focal length or baseline is not positive")
+        return camera, Mounting(T_body_cam=pose("T_body_cam"), T_imu_cam=pose("T_imu_cam"))
+
+    result: tuple[StereoCamera | None, Mounting] = _guarded(path, make)
+    return result
+
+
+def _read_truth(path: Path) -> TruthLog | None:
+    if not path.is_file():
+        return None
+    columns, metadata = read_columns(path)
+
+    def make() -> TruthLog:
+        t, T = _stamps(columns), run_table.poses_from(columns)
+        _check_poses(T, path)
+        sigma_t, sigma_r = (float(metadata.get(k, 0.0)) for k in ("sigma_translation_m", "sigma_rotation_rad"))
+        return TruthLog(t, T, sigma_t, sigma_r)
+
+    truth: TruthLog = _guarded(path, make)
+    return truth
+
+
+def _read_imu(path: Path) -> ImuLog | None:
+    if not path.is_file():
+        return None
+    columns, metadata = read_columns(path)
+
+    def make() -> ImuLog:
+        import json
+
+        _stamps(columns)
+        raw = run_table.imu_from(columns)
+        noise = None
+        if "noise" in metadata:
+            numbers = json.loads(metadata["noise"])
+            noise = ImuNoise(**{k: float(numbers[k]) for k in field_names(ImuNoise)})
+        return ImuLog(raw.t_ns, raw.gyro_radps, raw.acc_mps2, noise)
+
+    imu: ImuLog = _guarded(path, make)
+    return imu
+
+
+def _stamps(columns: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+    t = np.asarray(columns["t_ns"], dtype=np.int64)
+    if (np.diff(t) <= 0).any():
+        raise ValueError("stamps do not grow")
+    return t
+
+
+def _read_predictions_of(path: Path) -> list[Prediction]:
+    out: list[Prediction] = []
+    for part in _parts(path, "predictions.parquet", "predictions"):
+        out += read_predictions(part)
+    return out

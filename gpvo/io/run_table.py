@@ -1,0 +1,253 @@
+"""Columns of the run folder's tables: records, truth, IMU and predictions as flat tables and back, bit for bit.
+
+Units stand in the names. A pose is ``p_x_m p_y_m p_z_m`` and ``R_00`` ... ``R_22`` (exact); ``q_x q_y q_z q_w`` repeats
+the rotation for people. A 6x6 covariance is its upper triangle, row by row, ``cov_<method>_<i><j>`` with i, j in 0..5
+for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is the 3x3 of the translation [m^2];
+``stage_<name>_ms`` are times. A null means that the producer did not know.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.types import ImuLog, Prediction, Status, TruthLog, VoRecord
+
+Columns = dict[str, list[Any]]
+
+_AXES = ("x", "y", "z")
+_POSITION = tuple(f"p_{a}_m" for a in _AXES)
+_QUATERNION = ("q_x", "q_y", "q_z", "q_w")
+_ROTATION = tuple(f"R_{i}{j}" for i in range(3) for j in range(3))
+_TWIST = tuple(f"v_{a}_mps" for a in _AXES) + tuple(f"w_{a}_radps" for a in _AXES)
+_COUNTS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
+_FLOATS = (
+    "reproj_rms_px",
+    "disparity_p10_px",
+    "disparity_p50_px",
+    "disparity_p90_px",
+    "spread_u",
+    "spread_v",
+    "log10_condition",
+    "brightness",
+    "contrast",
+    "sharpness",
+    "noise_level",
+)
+_IMU = {
+    "imu_gyro_mean_radps": "imu_gyro_mean_{}_radps",
+    "imu_gyro_std_radps": "imu_gyro_std_{}_radps",
+    "imu_acc_mean_mps2": "imu_acc_mean_{}_mps2",
+    "imu_acc_std_mps2": "imu_acc_std_{}_mps2",
+}
+_UPPER6 = tuple((i, j) for i in range(6) for j in range(i, 6))
+_UPPER3 = tuple((i, j) for i in range(3) for j in range(i, 3))
+_METHOD = re.compile(r"(cov|vt)_([A-Za-z][A-Za-z0-9_]*)_00")
+_SIGMA6 = tuple(f"{a}_m" for a in _AXES) + tuple(f"r{a}_rad" for a in _AXES)
+
+
+def pose_columns(T: Array) -> dict[str, NDArray[np.float64]]:
+    """(N, 4, 4) poses as columns of length N."""
+    T = np.asarray(T, dtype=np.float64).reshape(-1, 4, 4)
+    q = se3.rotation_to_quaternion_xyzw(T[:, :3, :3])
+    out = {name: T[:, i, 3] for i, name in enumerate(_POSITION)}
+    out.update({name: q[:, i] for i, name in enumerate(_QUATERNION)})
+    out.update({name: T[:, i // 3, i % 3] for i, name in enumerate(_ROTATION)})
+    return out
+
+
+def poses_from(columns: Mapping[str, NDArray[Any]]) -> Array:
+    """(N, 4, 4) poses of :func:`pose_columns`."""
+    R = np.stack([columns[c] for c in _ROTATION], axis=-1).reshape(-1, 3, 3)
+    t = np.stack([columns[c] for c in _POSITION], axis=-1)
+    return se3.from_rt(R, t)
+
+
+def record_columns(records: Sequence[VoRecord]) -> Columns:
+    """Records as columns; methods and stages are the union over the records."""
+    out: Columns = {
+        "t_ns": [r.t_ns for r in records],
+        "t_prev_ns": [r.t_prev_ns for r in records],
+        "dt_s": [r.dt_s for r in records],
+        "status": [r.status.value for r in records],
+        "reason": [r.reason for r in records],
+        "is_reference": [r.is_reference for r in records],
+    }
+    T = np.array([r.T_prev_cur for r in records], dtype=np.float64).reshape(-1, 4, 4)
+    out.update({k: list(v) for k, v in pose_columns(T).items()})
+    dt = np.array([r.dt_s for r in records])
+    twist = se3.log(T) / np.where(dt > 0, dt, np.nan)[:, None]
+    out.update({name: _nulls(twist[:, i]) for i, name in enumerate(_TWIST)})
+    for name in _COUNTS:
+        out[name] = [v if v >= 0 else None for v in (getattr(r, name) for r in records)]
+    out["inlier_ratio"] = _nulls([r.inlier_ratio for r in records])
+    for name in _FLOATS:
+        out[name] = _nulls([getattr(r, name) for r in records])
+    for name, pattern in _IMU.items():
+        vectors = [getattr(r, name) for r in records]
+        for i, axis in enumerate(_AXES):
+            out[pattern.format(axis)] = [None if v is None else float(v[i]) for v in vectors]
+    _put_matrices(out, "cov", [r.covariances for r in records], _UPPER6)
+    _put_matrices(out, "vt", [r.v_t for r in records], _UPPER3)
+    for stage in _union(r.stage_ms for r in records):
+        out[f"stage_{stage}_ms"] = [r.stage_ms.get(stage) for r in records]
+    return out
+
+
+def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
+    """Records of :func:`record_columns`; nulls come as NaN in float columns.
+
+    Raises
+    ------
+    KeyError, ValueError
+        Where a column is absent or a status unknown.
+    """
+    T = poses_from(columns)
+    n = len(T)
+    counts = {c: np.where(np.isnan(f := _float(columns, c, n)), -1, f).astype(np.int64) for c in _COUNTS}
+    floats = {c: _float(columns, c, n) for c in _FLOATS}
+    imu = {c: np.stack([_float(columns, p.format(a), n) for a in _AXES], 1) for c, p in _IMU.items()}
+    imu_known = {c: p.format("x") in columns for c, p in _IMU.items()}
+    cov, v_t = _get_matrices(columns, "cov", _UPPER6, 6), _get_matrices(columns, "vt", _UPPER3, 3)
+    stages = {c[6:-3]: _float(columns, c, n) for c in columns if c.startswith("stage_") and c.endswith("_ms")}
+
+    def known(k: int) -> dict[str, Any]:
+        out: dict[str, Any] = {c: int(v[k]) for c, v in counts.items()}
+        out.update({c: float(v[k]) for c, v in floats.items()})
+        out.update({c: v[k] if imu_known[c] and not np.isnan(v[k]).all() else None for c, v in imu.items()})
+        return out
+
+    return [
+        VoRecord(
+            t_ns=int(columns["t_ns"][k]),
+            t_prev_ns=int(columns["t_prev_ns"][k]),
+            status=Status(columns["status"][k]),
+            T_prev_cur=T[k],
+            is_reference=bool(columns["is_reference"][k]),
+            reason=str(columns["reason"][k] or ""),
+            **known(k),
+            covariances={m: C[k] for m, C in cov.items() if not np.isnan(C[k, 0, 0])},
+            v_t={m: C[k] for m, C in v_t.items() if not np.isnan(C[k, 0, 0])},
+            stage_ms={s: float(v[k]) for s, v in stages.items() if not np.isnan(v[k])},
+        )
+        for k in range(n)
+    ]
+
+
+def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
+    """Predictions as columns: ``mean_*``, ``cov_total_<i><j>``, ``cov_<part>_<i><j>``, ``bias_tau_*_s``, ..."""
+    out: Columns = {
+        "t_ns": [p.t_ns for p in predictions],
+        "dt_s": [p.dt_s for p in predictions],
+        "status": [p.status.value for p in predictions],
+        "confidence": [float(p.confidence) for p in predictions],
+        "in_domain": [float(p.in_domain) for p in predictions],
+    }
+    for i, axis in enumerate(_SIGMA6):
+        out[f"mean_{axis}"] = [float(p.mean[i]) for p in predictions]
+    for i, axis in enumerate(_SIGMA6):
+        out[f"epistemic_var_{axis.rsplit('_', 1)[0]}"] = [float(p.epistemic[i]) for p in predictions]
+        out[f"bias_tau_{axis.rsplit('_', 1)[0]}_s"] = [float(p.bias_tau_s[i]) for p in predictions]
+    _put_matrices(out, "cov", [{"total": p.covariance, **p.parts} for p in predictions], _UPPER6)
+    return out
+
+
+def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
+    """Predictions of :func:`prediction_columns`.
+
+    Raises
+    ------
+    KeyError, ValueError
+        Where a column is absent or a status unknown.
+    """
+    n = len(columns["t_ns"])
+    short = [a.rsplit("_", 1)[0] for a in _SIGMA6]
+    mean = np.stack([columns[f"mean_{a}"] for a in _SIGMA6], axis=-1)
+    epistemic = np.stack([columns[f"epistemic_var_{a}"] for a in short], axis=-1)
+    tau = np.stack([columns[f"bias_tau_{a}_s"] for a in short], axis=-1)
+    matrices = _get_matrices(columns, "cov", _UPPER6, 6)
+    total = matrices.pop("total")
+    return [
+        Prediction(
+            t_ns=int(columns["t_ns"][k]),
+            dt_s=float(columns["dt_s"][k]),
+            mean=mean[k],
+            covariance=total[k],
+            parts={name: C[k] for name, C in matrices.items()},
+            bias_tau_s=tau[k],
+            epistemic=epistemic[k],
+            confidence=float(columns["confidence"][k]),
+            in_domain=float(columns["in_domain"][k]),
+            status=Status(columns["status"][k]),
+        )
+        for k in range(n)
+    ]
+
+
+def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:
+    """Truth as columns."""
+    return {"t_ns": truth.t_ns, **pose_columns(truth.T_world_cam)}
+
+
+def imu_columns(imu: ImuLog) -> dict[str, NDArray[Any]]:
+    """IMU samples as columns."""
+    out: dict[str, NDArray[Any]] = {"t_ns": imu.t_ns}
+    for i, axis in enumerate(_AXES):
+        out[f"gyro_{axis}_radps"] = imu.gyro_radps[:, i]
+    for i, axis in enumerate(_AXES):
+        out[f"acc_{axis}_mps2"] = imu.acc_mps2[:, i]
+    return out
+
+
+def imu_from(columns: Mapping[str, NDArray[Any]]) -> ImuLog:
+    """IMU samples of :func:`imu_columns`, without their noise."""
+    gyro = np.stack([columns[f"gyro_{a}_radps"] for a in _AXES], axis=-1)
+    acc = np.stack([columns[f"acc_{a}_mps2"] for a in _AXES], axis=-1)
+    return ImuLog(t_ns=np.asarray(columns["t_ns"], dtype=np.int64), gyro_radps=gyro, acc_mps2=acc)
+
+
+def _nulls(values: Iterable[float]) -> list[float | None]:
+    """NaN becomes null."""
+    return [None if np.isnan(v) else float(v) for v in values]
+
+
+def _union(maps: Iterable[Mapping[str, Any]]) -> list[str]:
+    seen: dict[str, None] = {}
+    for m in maps:
+        seen.update(dict.fromkeys(m))
+    return list(seen)
+
+
+def _put_matrices(
+    out: Columns, prefix: str, maps: Sequence[Mapping[str, Array]], upper: tuple[tuple[int, int], ...]
+) -> None:
+    for method in _union(maps):
+        for i, j in upper:
+            out[f"{prefix}_{method}_{i}{j}"] = [float(m[method][i, j]) if method in m else None for m in maps]
+
+
+def _get_matrices(
+    columns: Mapping[str, NDArray[Any]], prefix: str, upper: tuple[tuple[int, int], ...], size: int
+) -> dict[str, Array]:
+    out = {}
+    for name in columns:
+        match = _METHOD.fullmatch(name)
+        if match is None or match[1] != prefix:
+            continue
+        method = match[2]
+        C = np.empty((len(columns[name]), size, size))
+        for i, j in upper:
+            C[:, i, j] = C[:, j, i] = columns[f"{prefix}_{method}_{i}{j}"]
+        out[method] = C
+    return out
+
+
+def _float(columns: Mapping[str, NDArray[Any]], name: str, n: int) -> Array:
+    """A column as float64; NaN throughout where it is absent."""
+    return np.asarray(columns[name], dtype=np.float64) if name in columns else np.full(n, np.nan)

@@ -1,0 +1,158 @@
+"""What a sequence looks like to the odometry, and how a path becomes one.
+
+A source is an iterable of frames that are already rectified, with what the data set knows beside them. Packages
+outside gpvo add sources through the entry point group ``gpvo.sources``: a class with the same constructor and the
+class method ``recognises(path) -> bool``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import SourceError
+from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TrackFrame, TruthLog
+
+
+@dataclass
+class SourceReport:
+    """What was found wrong while reading; filled as the frames are drawn.
+
+    ``frames``: pairs handed out. ``missing``: stamps that only one camera has, or whose file is not there.
+    ``unreadable``: files that are no image or of another size. ``duplicate``: stamps seen before. ``out_of_order``:
+    stamps before an earlier one. ``gaps``: intervals of more than 1.75 times the usual one. ``notes``: in words.
+    """
+
+    frames: int = 0
+    missing: int = 0
+    unreadable: int = 0
+    duplicate: int = 0
+    out_of_order: int = 0
+    gaps: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    def note(self, text: str) -> None:
+        """Add a remark once, and no more than fifty of them."""
+        if text not in self.notes and len(self.notes) < 50:
+            self.notes.append(text)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for ``run.json``."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        names = ("missing", "unreadable", "duplicate", "out_of_order", "gaps")
+        bad = [f"{getattr(self, n)} {n.replace('_', '-')}" for n in names if getattr(self, n)]
+        return f"{self.frames} frames" + (f" ({', '.join(bad)})" if bad else "")
+
+
+@runtime_checkable
+class Source(Protocol):
+    """A stereo sequence, rectified, or stereo tracks.
+
+    ``kind``: ``"images"`` yields :class:`StereoFrame` (8 bit, rectified), ``"tracks"`` yields :class:`TrackFrame`.
+    ``mask`` (H, W) is True where the rectified left image holds a picture, None for everywhere. ``truth`` is of the
+    rectified left camera. ``calibration`` describes the raw rig, for the run folder. ``len`` is the number of pairs
+    expected, exact unless frames turn out to be bad.
+    """
+
+    name: str
+    path: Path
+    format: str
+    kind: Literal["images", "tracks"]
+    camera: StereoCamera
+    mask: NDArray[np.bool_] | None
+    mounting: Mounting
+    imu: ImuLog | None
+    truth: TruthLog | None
+    report: SourceReport
+    calibration: dict[str, Any] | None
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[StereoFrame] | Iterator[TrackFrame]: ...
+
+
+# Order of the guesses: the strictest test first. Modules are imported when asked.
+BUILT_IN: dict[str, str] = {
+    "tracks": "gpvo.io.tracks:TracksSource",
+    "euroc": "gpvo.io.euroc:EurocSource",
+    "kitti": "gpvo.io.kitti:KittiSource",
+    "folder": "gpvo.io.folder:FolderSource",
+}
+
+
+def _load(target: str) -> Any:
+    module, attribute = target.split(":")
+    return getattr(import_module(module), attribute)
+
+
+def source_kinds() -> dict[str, Callable[[], Any]]:
+    """Names of all sources with a loader of each class, those of other packages after the built-in ones."""
+    kinds: dict[str, Callable[[], Any]] = {}
+    for name, target in BUILT_IN.items():
+        kinds[name] = partial(_load, target)
+    for entry in entry_points(group="gpvo.sources"):
+        kinds.setdefault(entry.name, entry.load)
+    return kinds
+
+
+def guess(path: str | Path) -> str:
+    """Name of the source that recognises a path.
+
+    Raises
+    ------
+    SourceError
+        Where the path does not exist, is empty, or nothing recognises it.
+    """
+    p = Path(path)
+    if not p.exists():
+        raise SourceError("no such file or folder", where=p)
+    if p.is_dir() and not any(p.iterdir()):
+        raise SourceError("the folder is empty", where=p, cure="give the folder that holds the sequence")
+    if p.is_file() and p.stat().st_size == 0:
+        raise SourceError("the file is empty", where=p)
+    for name, load in source_kinds().items():
+        if load().recognises(p):
+            return name
+    raise SourceError(
+        "not recognised as a stereo sequence",
+        where=p,
+        cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap), image"
+        " pairs with a camchain.yaml, and tracks (.npz); name one with --source",
+    )
+
+
+def open_source(path: str | Path, kind: str | None = None, **options: Any) -> Source:
+    """Open a sequence; ``kind`` overrides the guess, ``options`` go to the source.
+
+    Options of all image sources: ``hfov_deg`` and ``size`` of the rectified view, ``mask_left``, ``mask_right``
+    (image files), ``calibration`` (a file in place of the one found), ``prefetch`` (decode ahead in a thread).
+
+    Raises
+    ------
+    SourceError, CalibrationError
+        One line that names the file and the cure.
+    """
+    kinds = source_kinds()
+    if kind is not None and kind not in kinds:
+        raise SourceError(f"there is no source '{kind}'", cure=f"choose one of {', '.join(kinds)}")
+    name = kind if kind is not None else guess(path)
+    if not Path(path).exists():
+        raise SourceError("no such file or folder", where=path)
+    chosen = kinds[name]()
+    try:
+        return chosen(Path(path), **options)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        option = str(error).split("'")[1]
+        raise SourceError(f"the source '{name}' has no option '{option}'", where=path) from None

@@ -1,0 +1,184 @@
+"""Stereo tracks: pixel tracks of a rectified pair in place of images ("bring your own front end").
+
+An ``.npz`` with one row per observation: ``frame`` (M,), ``track`` (M,), ``uv_left``, ``uv_right`` (M, 2) [px]; per
+frame ``t_s`` (N,); ``fx fy cx cy`` [px] and ``baseline_m``. Where present: ``T_world_cam`` (N, 4, 4) truth of the left
+camera, ``gyro_body_radps`` and ``acc_body_mps2`` (N, 3) in body axes with ``R_cam_body`` (3, 3) and
+``p_body_cam_in_body_m`` (3,), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.cameras.models import PinholeRadtan
+from gpvo.cameras.rig import StereoRig
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.io.source import SourceReport
+from gpvo.io.stamps import in_order
+from gpvo.io.truth import GPS_INS, TruthNoise
+from gpvo.types import ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog
+
+_REQUIRED = ("t_s", "frame", "track", "uv_left", "uv_right", "fx", "fy", "cx", "cy", "baseline_m")
+_MAX_UNPACKED_BYTES = 4_000_000_000
+
+
+class TracksSource:
+    """Frames of tracks from one ``.npz`` file.
+
+    The gyroscope, sampled once per frame, becomes an :class:`ImuLog` in body axes; without an accelerometer in the
+    file its ``acc_mps2`` is NaN throughout, which says "none", never zero.
+    """
+
+    kind: Literal["images", "tracks"] = "tracks"
+    format = "tracks"
+
+    def __init__(self, path: Path, *, truth_noise: TruthNoise | None = None) -> None:
+        self.path, self.name = path, path.stem
+        data = load_arrays(path, _REQUIRED)
+        self._data, self.report = data, SourceReport()
+        self._t_ns = np.rint(_shaped(data, "t_s", (None,), path) * 1e9).astype(np.int64)
+        self._observations()
+        self.camera = self._make_camera()
+        self.mask: NDArray[np.bool_] | None = None
+        T_body_cam = self._body_cam()
+        self.mounting = Mounting(T_body_cam=T_body_cam, T_imu_cam=T_body_cam)
+        self.imu = self._make_imu()
+        self.truth = self._make_truth(truth_noise)
+        self.calibration: dict[str, Any] | None = None
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """An ``.npz`` file."""
+        return path.is_file() and path.suffix.lower() == ".npz"
+
+    def __len__(self) -> int:
+        return len(self._t_ns)
+
+    def __iter__(self) -> Iterator[TrackFrame]:
+        self.report = report = SourceReport()
+        for frame in in_order(self._frames(), report):
+            report.frames += 1
+            yield frame
+
+    def _frames(self) -> Iterator[TrackFrame]:
+        for k, t in enumerate(self._t_ns):
+            rows = self._rows[self._starts[k] : self._starts[k + 1]]
+            yield TrackFrame(int(t), self._track[rows], self._uv_left[rows], self._uv_right[rows])
+
+    def _observations(self) -> None:
+        """Sort the rows by frame and check them."""
+        d, path, n = self._data, self.path, len(self._t_ns)
+        frame = _shaped(d, "frame", (None,), path).astype(np.int64)
+        m = len(frame)
+        self._track = _shaped(d, "track", (m,), path).astype(np.int64)
+        self._uv_left = _shaped(d, "uv_left", (m, 2), path)
+        self._uv_right = _shaped(d, "uv_right", (m, 2), path)
+        if n == 0 or m == 0:
+            raise SourceError("holds no observations", where=path)
+        if frame.min() < 0 or frame.max() >= n:
+            raise SourceError(f"'frame' goes to {frame.max()}, but 't_s' has {n} stamps", where=path)
+        self._rows = np.argsort(frame, kind="stable")
+        self._starts = np.searchsorted(frame[self._rows], np.arange(n + 1))
+
+    def _make_camera(self) -> StereoCamera:
+        fx, fy, cx, cy, b = (
+            float(_shaped(self._data, k, (), self.path)) for k in ("fx", "fy", "cx", "cy", "baseline_m")
+        )
+        both = np.concatenate([self._uv_left, self._uv_right])
+        if "width" in self._data and "height" in self._data:
+            width, height = int(self._data["width"]), int(self._data["height"])
+        else:
+            # Not stated: large enough for every observation and for a principal point in the middle.
+            width = max(int(np.ceil(both[:, 0].max())) + 1, round(2 * cx) + 1)
+            height = max(int(np.ceil(both[:, 1].max())) + 1, round(2 * cy) + 1)
+        lens = PinholeRadtan(fx, fy, cx, cy, width, height)
+        T = np.eye(4)
+        T[0, 3] = -b
+        StereoRig(left=lens, right=lens, T_right_left=T, where=str(self.path))
+        return StereoCamera(fx, fy, cx, cy, b, width, height)
+
+    def _body_cam(self) -> Array | None:
+        if "R_cam_body" not in self._data:
+            return None
+        R_cam_body = _shaped(self._data, "R_cam_body", (3, 3), self.path)
+        p = np.zeros(3)
+        if "p_body_cam_in_body_m" in self._data:
+            p = _shaped(self._data, "p_body_cam_in_body_m", (3,), self.path)
+        return se3.orthonormalise(se3.from_rt(R_cam_body.T, p))
+
+    def _make_imu(self) -> ImuLog | None:
+        n = len(self._t_ns)
+        if "gyro_body_radps" not in self._data:
+            return None
+        gyro = _shaped(self._data, "gyro_body_radps", (n, 3), self.path)
+        acc = np.full((n, 3), np.nan)
+        if "acc_body_mps2" in self._data:
+            acc = _shaped(self._data, "acc_body_mps2", (n, 3), self.path)
+        keep = _growing(self._t_ns)
+        return ImuLog(self._t_ns[keep], gyro[keep], acc[keep])
+
+    def _make_truth(self, noise: TruthNoise | None) -> TruthLog | None:
+        if "T_world_cam" not in self._data:
+            return None
+        T = _shaped(self._data, "T_world_cam", (len(self._t_ns), 4, 4), self.path)
+        keep = _growing(self._t_ns)
+        stated = [self._data.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
+        if noise is None and all(s is not None and s.shape == () for s in stated):
+            noise = TruthNoise(*(float(s) for s in stated if s is not None))
+        noise = noise or GPS_INS
+        return TruthLog(self._t_ns[keep], se3.orthonormalise(T[keep]), noise.translation_m, noise.rotation_rad)
+
+
+def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Numeric arrays of an ``.npz``, with its sizes checked before anything is unpacked and nothing unpickled.
+
+    Raises
+    ------
+    SourceError
+        Where the file is damaged, too large, or lacks an array.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _MAX_UNPACKED_BYTES:
+                raise SourceError("unpacks to more than 4 GB", where=path)
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: np.asarray(file[name]) for name in file.files}
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror or error}", where=path) from None
+    except (zipfile.BadZipFile, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
+        raise SourceError(
+            f"not readable as .npz: {str(error).splitlines()[0] if str(error) else error!r}", where=path
+        ) from None
+    absent = [k for k in required if k not in data]
+    if absent:
+        raise SourceError(f"lacks {', '.join(absent)}", where=path, cure=f"tracks need {', '.join(required)}")
+    return data
+
+
+def _shaped(data: dict[str, NDArray[Any]], key: str, shape: tuple[int | None, ...], path: Path) -> Array:
+    """``data[key]`` as finite float64 of the given shape; None matches any length."""
+    array = data[key]
+    fits = array.ndim == len(shape) and all(s is None or s == n for s, n in zip(shape, array.shape))
+    if not fits:
+        wanted = tuple("N" if s is None else s for s in shape)
+        raise SourceError(f"'{key}' has shape {array.shape}, expected {wanted}", where=path)
+    if array.dtype.kind not in "fiu":
+        raise SourceError(f"'{key}' holds {array.dtype}, not numbers", where=path)
+    out = array.astype(np.float64)
+    if not np.isfinite(out).all():
+        first = int(np.argwhere(~np.isfinite(np.atleast_1d(out)))[0][0])
+        raise SourceError(f"'{key}' is NaN or infinite at row {first}", where=path, cure="drop that row")
+    return out
+
+
+def _growing(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) whether each stamp is later than all before it."""
+    return np.concatenate([[True], t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]])

@@ -1,0 +1,235 @@
+"""Trajectory files: TUM, KITTI and EuRoC CSV, read strictly and written as evo reads them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns
+
+# Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
+_UNIT_TOLERANCE = 1e-2
+_MAX_BYTES = 2_000_000_000
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of one moving frame: ``t_ns`` (N,) int64, strictly growing, and ``T_world_body`` (N, 4, 4)."""
+
+    t_ns: NDArray[np.int64]
+    T_world_body: Array
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """TUM lines ``t[s] tx ty tz qx qy qz qw``; ``#`` starts a comment.
+
+    Raises
+    ------
+    SourceError
+        Naming file and line: wrong number of fields, NaN, stamps that do not grow, quaternions that are not unit.
+    """
+    p = Path(path)
+    rows = _rows(p, None, exactly=8, stamp=seconds_text_to_ns, what="t tx ty tz qx qy qz qw")
+    return _from_rows(p, rows, q_columns=(3, 4, 5, 6))
+
+
+def read_euroc_csv(path: str | Path) -> Trajectory:
+    """EuRoC ground truth ``t[ns], p xyz, q wxyz, ...`` of at least 8 columns.
+
+    Raises
+    ------
+    SourceError
+        As :func:`read_tum`.
+    """
+    p = Path(path)
+    rows = _rows(p, ",", at_least=8, stamp=_integer_ns, what="t[ns],px,py,pz,qw,qx,qy,qz")
+    return _from_rows(p, rows, q_columns=(4, 5, 6, 3))
+
+
+def read_kitti_poses(path: str | Path) -> Array:
+    """KITTI poses, 12 numbers a line, as (N, 4, 4).
+
+    Raises
+    ------
+    SourceError
+        Naming file and line.
+    """
+    p = Path(path)
+    out = []
+    for number, fields in _fields(p, None):
+        values = _floats(p, number, fields)
+        if len(values) != 12:
+            raise SourceError(f"line {number} holds {len(values)} numbers, expected 12 (a 3x4 matrix)", where=p)
+        out.append(values.reshape(3, 4))
+    if not out:
+        raise SourceError("holds no poses", where=p)
+    M = np.stack(out)
+    T = se3.from_rt(M[:, :, :3], M[:, :, 3])
+    deviation = np.abs(M[:, :, :3] @ np.swapaxes(M[:, :, :3], 1, 2) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((deviation > _UNIT_TOLERANCE) | (np.linalg.det(M[:, :, :3]) < 0))
+    if len(bad):
+        raise SourceError(f"pose {bad[0] + 1} is no rigid transform", where=p, cure="12 numbers: rows of [R | t]")
+    return se3.orthonormalise(T)
+
+
+def read_times(path: str | Path) -> NDArray[np.int64]:
+    """KITTI's ``times.txt`` (seconds) as (N,) nanoseconds, in the order of the file.
+
+    Raises
+    ------
+    SourceError
+        Naming file and line.
+    """
+    p = Path(path)
+    stamps = []
+    for number, fields in _fields(p, None):
+        try:
+            if len(fields) != 1:
+                raise ValueError(f"{len(fields)} fields, expected 1")
+            stamps.append(seconds_text_to_ns(fields[0]))
+        except ValueError as error:
+            raise SourceError(f"line {number}: {error}", where=p) from None
+    return np.array(stamps, dtype=np.int64)
+
+
+def write_tum(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) -> None:
+    """Write TUM lines, stamps and values with nine decimals."""
+    _write(Path(path), (tum_line(t, T) for t, T in zip(t_ns, T_world_body, strict=True)))
+
+
+def tum_line(t_ns: int, T_world_body: Array) -> str:
+    """One TUM line, without the line end."""
+    q = se3.rotation_to_quaternion_xyzw(T_world_body[:3, :3])
+    return " ".join([ns_to_seconds_text(int(t_ns)), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
+
+
+def write_kitti_poses(path: str | Path, T_world_body: Array) -> None:
+    """Write KITTI poses, 12 numbers a line."""
+    _write(Path(path), (" ".join(f"{v:.9e}" for v in T[:3].ravel()) for T in T_world_body))
+
+
+def write_euroc_csv(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) -> None:
+    """Write EuRoC's eight columns: stamp [ns], position, quaternion w x y z."""
+
+    def lines() -> Iterator[str]:
+        yield "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+        for t, T in zip(t_ns, T_world_body, strict=True):
+            q = se3.rotation_to_quaternion_xyzw(T[:3, :3])[[3, 0, 1, 2]]
+            yield ",".join([str(int(t)), *(f"{v:.9f}" for v in (*T[:3, 3], *q))])
+
+    _write(Path(path), lines())
+
+
+def _write(path: Path, lines: Iterator[str]) -> None:
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(line + "\n" for line in lines)
+    os.replace(temporary, path)
+
+
+def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers and fields of the lines that hold something; comments and one header line are skipped."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise SourceError("is larger than 2 GB: not a trajectory", where=path)
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                text = line.strip().removeprefix("\ufeff")
+                if text and not text.startswith("#"):
+                    yield number, [f.strip() for f in text.split(separator)]
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+
+
+def _floats(path: Path, number: int, fields: list[str]) -> Array:
+    try:
+        values = np.array([float(f) for f in fields])
+    except ValueError:
+        raise SourceError(f"line {number} holds something that is not a number", where=path) from None
+    if not np.isfinite(values).all():
+        raise SourceError(
+            f"line {number} holds NaN or infinity", where=path, cure="remove the line: a gap is better than a lie"
+        )
+    return values
+
+
+def _integer_ns(text: str) -> int:
+    # Some exporters write stamps like 1.4036365e+18; those digits are lost for good.
+    if not text.lstrip("-").isdigit():
+        raise ValueError(f"'{text}' is not a whole number of nanoseconds")
+    return int(text)
+
+
+def _rows(
+    path: Path,
+    separator: str | None,
+    *,
+    stamp: Callable[[str], int],
+    what: str,
+    exactly: int | None = None,
+    at_least: int = 0,
+) -> Iterator[tuple[int, int, Array]]:
+    """(line number, stamp, the seven numbers of the pose) of each line."""
+    for number, fields in _fields(path, separator):
+        if len(fields) < at_least or (exactly is not None and len(fields) != exactly):
+            wanted = f"{exactly}" if exactly is not None else f"at least {at_least}"
+            raise SourceError(f"line {number} holds {len(fields)} fields, expected {wanted}: {what}", where=path)
+        try:
+            t_ns = stamp(fields[0])
+        except ValueError as error:
+            raise SourceError(f"line {number}: {error}", where=path) from None
+        yield number, t_ns, _floats(path, number, fields[1:8])
+
+
+def _from_rows(
+    path: Path, rows: Iterator[tuple[int, int, Array]], *, q_columns: tuple[int, int, int, int]
+) -> Trajectory:
+    numbers, stamps, values = [], [], []
+    for number, t_ns, pose in rows:
+        numbers.append(number)
+        stamps.append(t_ns)
+        values.append(pose)
+    if not stamps:
+        raise SourceError("holds no poses", where=path)
+    t = np.array(stamps, dtype=np.int64)
+    data = np.stack(values)
+    check_growing(path, t, numbers)
+    q_xyzw = data[:, q_columns]
+    check_unit(path, q_xyzw, numbers)
+    return Trajectory(t, se3.from_quaternion(data[:, :3], q_xyzw))
+
+
+def check_growing(path: Path, t_ns: NDArray[np.int64], lines: list[int]) -> None:
+    """Refuse stamps that repeat or go back, naming the line."""
+    bad = np.flatnonzero(np.diff(t_ns) <= 0)
+    if len(bad):
+        k = int(bad[0])
+        word = "repeats" if t_ns[k + 1] == t_ns[k] else "goes back"
+        raise SourceError(
+            f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(int(t_ns[k + 1]))} s {word}",
+            where=path,
+            cure="sort the file by time and drop repeated lines",
+        )
+
+
+def check_unit(path: Path, q_xyzw: Array, lines: list[int]) -> None:
+    """Refuse quaternions whose length is not 1 to a hundredth, naming the line."""
+    norm = np.linalg.norm(q_xyzw, axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)
+    if len(bad):
+        raise SourceError(
+            f"line {lines[int(bad[0])]}: the quaternion has length {norm[bad[0]]:.4f}, not 1",
+            where=path,
+            cure="check the order of the columns",
+        )

@@ -1,0 +1,223 @@
+"""The run folder: bit-exact round trip, interrupted runs, damaged files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.io.run import RunWriter, read_predictions, read_run, write_predictions, write_run
+from gpvo.io.run_read import is_run
+from gpvo.types import (
+    ImuLog,
+    ImuNoise,
+    Mounting,
+    Prediction,
+    Status,
+    StereoCamera,
+    TruthLog,
+    VoLog,
+    VoRecord,
+)
+
+CAMERA = StereoCamera(400.0, 401.0, 319.5, 239.5, 0.1, 640, 480)
+
+
+def _spd(rng: np.random.Generator, n: int) -> np.ndarray:
+    A = rng.normal(size=(n, n))
+    C = A @ A.T
+    return 0.5 * (C + C.T)
+
+
+def make_records(n: int, seed: int = 0) -> list[VoRecord]:
+    rng = np.random.default_rng(seed)
+    start = 1_520_530_308_199_447_626
+    out = [VoRecord(start, start, Status.START, np.eye(4), stage_ms={"detect": 1.5})]
+    for k in range(1, n):
+        lost = k % 17 == 5
+        imu = {} if k % 3 else {"imu_gyro_mean_radps": rng.normal(size=3), "imu_acc_std_mps2": rng.normal(size=3)}
+        out.append(
+            VoRecord(
+                start + k * 50_000_001,
+                start + (k - 1) * 50_000_001,
+                Status.LOST if lost else Status.OK,
+                np.eye(4) if lost else se3.exp(0.1 * rng.normal(size=6)),
+                reason="too few matches" if lost else "",
+                n_inliers=-1 if lost else int(rng.integers(10, 500)),
+                n_tracked=500,
+                reproj_rms_px=np.nan if lost else float(rng.uniform()),
+                covariances={} if lost else {"triangulation": _spd(rng, 6), "pointing_matching": _spd(rng, 6)},
+                v_t={} if lost else {"triangulation": _spd(rng, 3)},
+                stage_ms={"detect": float(rng.uniform()), "match": 2.0},
+                **imu,
+            )
+        )
+    return out
+
+
+def make_prediction(record: VoRecord, rng: np.random.Generator) -> Prediction:
+    parts = {name: _spd(rng, 6) for name in ("jitter", "white", "bias")}
+    return Prediction(
+        record.t_ns, record.dt_s, rng.normal(size=6), sum(parts.values()), parts, np.full(6, 10.0), rng.uniform(size=6),
+        0.7, 0.9, Status.OK,
+    )  # fmt: skip
+
+
+def assert_same(a: object, b: object) -> None:
+    for f in fields(a):  # type: ignore[arg-type]
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, dict):
+            assert set(x) == set(y), f.name
+            for key in x:
+                np.testing.assert_array_equal(x[key], y[key], err_msg=f.name)
+        elif x is None or isinstance(x, (str, Status)):
+            assert x == y, f.name
+        else:
+            np.testing.assert_array_equal(x, y, err_msg=f.name)
+
+
+def test_round_trip_is_bit_exact(tmp_path):
+    rng = np.random.default_rng(1)
+    records = make_records(250)
+    predictions = [make_prediction(r, rng) for r in records[1:]]
+    truth = TruthLog(np.arange(5) * 10, se3.exp(rng.normal(size=(5, 6))), 3e-3, 2e-4)
+    imu = ImuLog(np.arange(7) * 3, rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), ImuNoise(1e-3, 2e-3, 3e-5, 4e-4))
+    mounting = Mounting(T_body_cam=se3.exp(rng.normal(size=6)), T_imu_cam=None)
+    config = {"preset": "fast", "n": 3, "nested": {"a": [1.5, 2.0], "on": True, "none": None}}
+    with RunWriter(
+        tmp_path / "run", camera=CAMERA, mounting=mounting, truth=truth, imu=imu, config=config, chunk=60,
+        meta={"source_format": "euroc", "bad": float("nan")},
+    ) as writer:  # fmt: skip
+        for record, prediction in zip(records, [None, *predictions], strict=True):
+            writer.append(record, prediction)
+        writer.note(fps=30.0)
+    run = read_run(tmp_path / "run")
+    assert len(run.log) == 250
+    for a, b in zip(records, run.log.records, strict=True):
+        assert_same(a, b)
+    for p, q in zip(predictions, run.predictions, strict=True):
+        assert_same(p, q)
+    assert run.truth is not None
+    assert run.imu is not None
+    assert_same(truth, run.truth)
+    assert run.imu.noise == imu.noise
+    np.testing.assert_array_equal(run.imu.acc_mps2, imu.acc_mps2)
+    assert run.log.camera == CAMERA
+    np.testing.assert_array_equal(run.mounting.T_body_cam, mounting.T_body_cam)
+    assert run.mounting.T_imu_cam is None
+    assert run.meta["complete"] is True
+    assert run.meta["fps"] == 30.0
+    assert run.meta["bad"] is None
+    assert run.meta["frames"] == 250
+    tomllib = pytest.importorskip("tomllib")
+    assert tomllib.loads((tmp_path / "run" / "config.toml").read_text())["nested"] == {"a": [1.5, 2.0], "on": True}
+    assert not (tmp_path / "run" / "chunks").exists()
+    lines = (tmp_path / "run" / "trajectory.tum").read_text().splitlines()
+    last = np.array([float(v) for v in lines[-1].split()[1:4]])
+    np.testing.assert_allclose(last, run.log.trajectory()[-1, :3, 3], atol=1e-8)
+    assert len(lines) == 250
+
+
+def test_killed_run_reads_up_to_the_last_chunk(tmp_path):
+    writer = RunWriter(tmp_path / "run", camera=CAMERA, chunk=40)
+    records = make_records(130)
+    for record in records:
+        writer.append(record)
+    # No close: as after a kill.
+    assert is_run(tmp_path / "run")
+    run = read_run(tmp_path / "run")
+    assert len(run.log) == 120
+    assert run.meta["complete"] is False
+    assert_same(run.log.records[-1], records[119])
+    # A new run in the same place starts afresh.
+    write_run(tmp_path / "run", VoLog(records[:10], CAMERA))
+    assert len(read_run(tmp_path / "run").log) == 10
+
+
+def _interrupted_run(path) -> None:
+    with RunWriter(path, chunk=40) as writer:
+        for record in make_records(130):
+            writer.append(record)
+        raise RuntimeError
+
+
+def test_an_exception_leaves_every_record(tmp_path):
+    with pytest.raises(RuntimeError):
+        _interrupted_run(tmp_path / "run")
+    run = read_run(tmp_path / "run")
+    assert len(run.log) == 130
+    assert run.meta["complete"] is False
+    assert run.truth is None
+    assert run.log.camera is None
+
+
+def test_foreign_folder_is_not_overwritten(tmp_path):
+    (tmp_path / "precious.txt").write_text("mine")
+    with pytest.raises(SourceError, match="not a run"):
+        RunWriter(tmp_path)
+    assert (tmp_path / "precious.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["vo_log.parquet", "truth.parquet", "rig.json", "run.json", "predictions.parquet"])
+@pytest.mark.parametrize("how", ["cut", "flip", "empty", "garbage"])
+def test_damaged_files_are_refused_in_one_line(tmp_path, name, how):
+    rng = np.random.default_rng(0)
+    records = make_records(50)
+    truth = TruthLog(np.arange(50) * 10, se3.exp(rng.normal(size=(50, 6))))
+    predictions = [make_prediction(r, rng) for r in records[1:]]
+    write_run(tmp_path / "run", VoLog(records, CAMERA), truth=truth, predictions=predictions)
+    file = tmp_path / "run" / name
+    raw = bytearray(file.read_bytes())
+    if how == "flip":
+        # Inside the first data page for tables, so that only a checksum can tell.
+        position = 40 if name.endswith("parquet") else 2
+        raw[position] ^= 0xFF
+    new = {"cut": raw[: len(raw) // 2], "flip": raw, "empty": b"", "garbage": b"\x00\xff" * 300}[how]
+    file.write_bytes(bytes(new))
+    with pytest.raises(SourceError) as caught:
+        read_run(tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert name in str(caught.value)
+
+
+def test_missing_column_and_newer_schema(tmp_path):
+    pd = pytest.importorskip("pandas")
+    write_run(tmp_path / "run", VoLog(make_records(20), CAMERA))
+    table = pd.read_parquet(tmp_path / "run" / "vo_log.parquet")
+    assert {"v_x_mps", "cov_triangulation_00", "vt_triangulation_22", "stage_match_ms"} <= set(table.columns)
+    table.assign(extra=1.0).to_parquet(tmp_path / "run" / "vo_log.parquet")
+    assert len(read_run(tmp_path / "run").log) == 20
+    table.drop(columns=["p_x_m"]).to_parquet(tmp_path / "run" / "vo_log.parquet")
+    with pytest.raises(SourceError, match="p_x_m"):
+        read_run(tmp_path / "run")
+    meta = json.loads((tmp_path / "run" / "run.json").read_text())
+    (tmp_path / "run" / "run.json").write_text(json.dumps({**meta, "schema": 99}))
+    with pytest.raises(SourceError, match="schema 99"):
+        read_run(tmp_path / "run")
+
+
+def test_not_a_run(tmp_path):
+    with pytest.raises(SourceError, match="no such run folder"):
+        read_run(tmp_path / "nothing")
+    with pytest.raises(SourceError, match=r"lacks run\.json"):
+        read_run(tmp_path)
+
+
+def test_writer_refuses_records_that_do_not_chain(tmp_path):
+    a, b, c = make_records(3)
+    late = VoRecord(c.t_ns, a.t_ns, Status.OK, np.eye(4))
+    with pytest.raises(ValueError, match="does not follow"):
+        write_run(tmp_path / "r1", VoLog([a, late, b]))
+    with pytest.raises(ValueError, match="not in the run"):
+        write_run(tmp_path / "r2", VoLog([a, c]))
+
+
+def test_predictions_file(tmp_path):
+    rng = np.random.default_rng(3)
+    predictions = [make_prediction(r, rng) for r in make_records(5)[1:]]
+    write_predictions(tmp_path / "p.parquet", predictions)
+    for p, q in zip(predictions, read_predictions(tmp_path / "p.parquet"), strict=True):
+        assert_same(p, q)
