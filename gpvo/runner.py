@@ -49,8 +49,8 @@ def run(
 ) -> RunSummary:
     """Run stereo VO over a source and write the run folder ``out``.
 
-    ``on_frame`` is called after every frame, for progress bars and live views. An interrupted run leaves a folder that can be
-    read up to its last complete chunk.
+    ``on_frame`` is called after every frame, for progress bars and live views. An interrupted run leaves a folder that
+    can be read up to its last complete chunk.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def run(
         If the source holds no frames, or its left and right images look swapped.
     """
     config = config or VoConfig()
-    meta = {"source": str(source.name), "format": source.format, "kind": source.kind}
+    meta = {"source": str(source.name), "source_format": source.format, "kind": source.kind}
     if predictor is not None:
         meta["model_digest"] = predictor.digest
     status: Counter[str] = Counter()
@@ -88,7 +88,7 @@ def run(
         if frames == 0:
             raise SourceError("no readable stereo pair", where=source.path, cure="look at the images of both cameras")
         summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report))
-        writer.finish(source_report=source.report.as_dict(), summary=asdict(summary))
+        writer.note(source_report=source.report.as_dict(), summary=asdict(summary))
     return summary
 
 
@@ -129,7 +129,7 @@ def _refuse_swapped(source: Source, config: VoConfig) -> None:
     swapped = StereoOdometry(source.camera, config).step(frame)
     if swapped.n_stereo >= config.weak_inliers:
         raise SourceError(
-            f"left and right look swapped: the first pair has {swapped.n_stereo} matches only with its images exchanged",
+            f"left and right look swapped: only exchanged does the first pair match ({swapped.n_stereo} points)",
             where=source.path,
             cure="exchange the two cameras, or the sign of the baseline",
         )

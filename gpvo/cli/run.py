@@ -12,7 +12,7 @@ from gpvo.errors import GpvoError
 
 def run(
     source: Annotated[
-        Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, ROS bag, image folder, or tracks (.npz).")
+        Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
     model: Annotated[Path | None, typer.Option(help="Error model: predict as it goes.")] = None,

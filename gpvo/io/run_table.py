@@ -29,6 +29,8 @@ _TWIST = tuple(f"v_{a}_mps" for a in _AXES) + tuple(f"w_{a}_radps" for a in _AXE
 _COUNTS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
 _FLOATS = (
     "reproj_rms_px",
+    "residual_sigma_p_px",
+    "residual_sigma_m_px",
     "disparity_p10_px",
     "disparity_p50_px",
     "disparity_p90_px",

@@ -68,7 +68,7 @@ def describe(image: Image, points: Points, *, quick: bool) -> tuple[Points, NDAr
     ``quick`` builds one octave and one layer only: the same bits at corners of that scale, at a quarter of the cost.
     The key point size must not be 1, which silently gives all-zero descriptors.
     """
-    akaze = cv2.AKAZE_create(nOctaves=1, nOctaveLayers=1) if quick else cv2.AKAZE_create()
+    akaze = cv2.AKAZE.create(nOctaves=1, nOctaveLayers=1) if quick else cv2.AKAZE.create()
     keypoints = [cv2.KeyPoint(float(x), float(y), 8.0, -1, 0, 0, 0) for x, y in points]
     kept, descriptors = akaze.compute(image, keypoints)
     if descriptors is None:
