@@ -1,0 +1,23 @@
+"""Fixtures for every test."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+# Helper modules lie beside the tests that use them.
+for folder in {p.parent for p in Path(__file__).parent.rglob("*.py")}:
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real sequences named by GPVO_DATA; the test is skipped where it is unset."""
+    folder = os.environ.get("GPVO_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("set GPVO_DATA to the folder of real sequences to run this test")
+    return Path(folder)
