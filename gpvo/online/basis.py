@@ -186,7 +186,11 @@ class SharedBasis:
             noise = None
             if f"{prefix}noise.weights" in arrays:
                 own = f"{prefix}noise.points" in arrays
-                found = {n: np.asarray(arrays[f"{prefix}noise.{n}"], np.float64) for n in _GP_FIELDS if own or n in _SHARED_FIELDS}
+                found = {
+                    n: np.asarray(arrays[f"{prefix}noise.{n}"], np.float64)
+                    for n in _GP_FIELDS
+                    if own or n in _SHARED_FIELDS
+                }
                 noise = ProjectedGP(**{n: found[n] if n in found else getattr(mean, n) for n in _GP_FIELDS})
             return cls(mean, noise, np.asarray(arrays[f"{prefix}log_noise_offset"], np.float64))
         except KeyError as missing:
