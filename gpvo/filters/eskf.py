@@ -1,0 +1,257 @@
+"""Error-state Kalman filter: 15 states driven by an IMU, a cloned pose, the jitter of its frame, a VO bias.
+
+Joint error state (39): position, velocity (world), attitude (body), accelerometer and gyroscope bias; the cloned
+pose of VO's reference frame; that frame's jitter; the normalised VO bias; and, while an update runs, the jitter of the
+current frame, which then replaces the reference's. So two motions that share a frame are not taken as independent.
+
+J. Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), sections 5 to 7; stochastic cloning:
+S. Roumeliotis, J. Burdick (2002). Arrays carry a leading axis of B members that see the same clock and statuses: 1 in
+flight, many where one run is filtered under many noise settings.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters import kernels
+from gpvo.filters import measurement as me
+from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu, MotionNoise
+from gpvo.filters.propagation import (
+    BA,
+    BG,
+    CORE,
+    TH,
+    ConstantVelocityNoise,
+    Nominal,
+    P,
+    V,
+    constant_velocity_densities,
+    constant_velocity_step,
+    identity_transition,
+    imu_densities,
+    imu_step,
+    process_noise,
+)
+from gpvo.types import ImuNoise
+
+Array = NDArray[np.float64]
+
+_POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
+_EYE = np.eye(JOINT)
+GRAVITY_MPS2 = 9.80665
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """One update: ``residual`` (B, 6), its covariance ``S`` (B, 6, 6), ``nis`` (B,) and whether it was used (B,)."""
+
+    residual: Array
+    S: Array
+    nis: Array
+    passed: NDArray[np.bool_]
+    used: NDArray[np.bool_]
+
+
+class ErrorStateFilter:
+    """The state, its covariance and the three things that happen to them: propagate, update, clone.
+
+    Parameters
+    ----------
+    nominal : estimate to start from, arrays of B members.
+    covariance : (15, 15) or (B, 15, 15), symmetric positive definite.
+    T_imu_cam : (4, 4) extrinsics, None where the state is the camera's own.
+    imu_noise : densities of the IMU; None selects the constant-velocity model.
+    motion_noise : of the constant-velocity model.
+    gravity_world : (3,) [m/s^2]; default 9.80665 along -z.
+    """
+
+    def __init__(
+        self,
+        nominal: Nominal,
+        covariance: Array,
+        *,
+        T_imu_cam: Array | None = None,
+        imu_noise: ImuNoise | None = None,
+        motion_noise: ConstantVelocityNoise | None = None,
+        gravity_world: Array | None = None,
+    ) -> None:
+        self.x = nominal.copy()
+        self.batch = len(nominal.position)
+        self.camera = CameraOnImu.of(T_imu_cam)
+        self.gravity = np.array([0.0, 0.0, -GRAVITY_MPS2]) if gravity_world is None else np.asarray(gravity_world)
+        self._densities = (
+            constant_velocity_densities(motion_noise or ConstantVelocityNoise())
+            if imu_noise is None
+            else imu_densities(imu_noise)
+        )
+        self.P = np.zeros((self.batch, JOINT, JOINT))
+        self.P[:, :CORE, :CORE] = covariance
+        self.P[:, BIAS, BIAS] = np.eye(6)
+        self.dx = np.zeros((self.batch, JOINT))
+        self.jitter_mean = np.zeros((self.batch, 6))
+        self.bias_mean = np.zeros((self.batch, 6))
+        self.jitter_known = False
+        self._F = identity_transition(self.batch)
+        self._H = np.zeros((self.batch, 6, JOINT))
+        self._H[:, :, JITTER_CUR] = np.eye(6)
+        self._FP = np.empty((self.batch, CORE, JOINT))
+        self._Q: tuple[float, Array] = (-1.0, np.zeros((CORE, CORE)))
+        self.clone()
+
+    @property
+    def covariance(self) -> Array:
+        """(B, 15, 15) of the error (position, velocity, attitude, accelerometer bias, gyroscope bias)."""
+        return self.P[:, :CORE, :CORE]
+
+    def copy(self) -> ErrorStateFilter:
+        """An independent filter in the same state."""
+        other = copy.copy(self)
+        other.x = self.x.copy()
+        for name in ("P", "dx", "jitter_mean", "bias_mean", "clone_R", "clone_p", "_F", "_H", "_FP"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
+
+    # -- time ---------------------------------------------------------------------------------------------------
+
+    def propagate_imu(self, dt: float, gyro0: Array, acc0: Array, gyro1: Array, acc1: Array) -> None:
+        """Move over one IMU interval of ``dt`` seconds with raw samples (b, 3) at both ends."""
+        imu_step(self.x, self._F, dt, gyro0, acc0, gyro1, acc1, self.gravity)
+        self._propagate_covariance(dt)
+
+    def propagate_constant_velocity(self, dt: float) -> None:
+        """Move ``dt`` seconds without an IMU."""
+        constant_velocity_step(self.x, self._F, dt)
+        self._propagate_covariance(dt)
+
+    def _propagate_covariance(self, dt: float) -> None:
+        if self._Q[0] != dt:
+            self._Q = (dt, process_noise(self._densities, dt))
+        FP = np.matmul(self._F, self.P[:, :CORE, :], out=self._FP)
+        core = FP[:, :, :CORE] @ kernels.transpose(self._F)
+        core += kernels.transpose(core)
+        core *= 0.5
+        core += self._Q[1]
+        self.P[:, :CORE, :CORE] = core
+        rest = FP[:, :, CORE:KEPT]
+        self.P[:, :CORE, CORE:KEPT] = rest
+        self.P[:, CORE:KEPT, :CORE] = kernels.transpose(rest)
+
+    def add_uncertainty(self, variances: Array) -> None:
+        """Widen the core by variances (15,), as over a gap in the IMU."""
+        self.P[:, range(CORE), range(CORE)] += variances
+
+    def decay_bias(self, dt: float, tau_s: Array) -> None:
+        """Let the normalised VO bias forget over ``dt``: phi = exp(-dt / tau), variance kept at one."""
+        phi = np.exp(-dt / np.maximum(tau_s, 1e-9))
+        self.bias_mean *= phi
+        self.P[:, BIAS, :] *= phi[:, None]
+        self.P[:, :, BIAS] *= phi
+        self.P[:, range(BIAS.start, BIAS.stop), range(BIAS.start, BIAS.stop)] += 1.0 - phi * phi
+
+    # -- measurements ---------------------------------------------------------------------------------------------
+
+    def update_motion(self, T_est: Array, noise: MotionNoise, gate: Gate | None = None) -> Innovation:
+        """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame."""
+        gate = gate or Gate()
+        if noise.jitter is not None:
+            half = 0.5 * noise.jitter
+            self.P[:, JITTER_CUR, JITTER_CUR] = half
+            if not self.jitter_known:
+                self.P[:, JITTER_REF, JITTER_REF] = half
+                self.jitter_known = True
+        R_ref, p_ref = self.camera.pose(self.clone_p, self.clone_R)
+        R_cur, p_cur = self.camera.pose(self.x.position, self.x.R_world_imu)
+        R_rel, t_rel = me.relative_motion(R_ref, p_ref, R_cur, p_cur)
+        H = self._H
+        me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise.bias_root)
+        r = me.residual(R_rel, t_rel, T_est, noise.mean)
+        expected = H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None] + H[:, :, BIAS] @ self.bias_mean[:, :, None]
+        innovation = self.correct(H, r - expected[:, :, 0], noise.white, gate)
+        if innovation.used.any():
+            self.inject()
+        return innovation
+
+    def correct(self, H: Array, residual: Array, R: Array, gate: Gate | None = None) -> Innovation:
+        """Linear update of the error's mean and covariance, Joseph form; :meth:`inject` moves it into the estimate.
+
+        ``H`` (B, m, 39), ``residual`` (B, m) at the estimate, ``R`` (b, m, m).
+        """
+        r = residual - (H @ self.dx[:, :, None])[:, :, 0]
+        PHt = self.P @ kernels.transpose(H)
+        S = H @ PHt + R
+        L = np.linalg.cholesky(S)
+        whitened = np.linalg.solve(L, np.concatenate([kernels.transpose(PHt), r[:, :, None]], axis=2))
+        z = whitened[:, :, -1]
+        nis = (z * z).sum(1)
+        passed = nis <= gate.threshold(H.shape[1]) if gate else np.ones(self.batch, dtype=bool)
+        used = passed
+        if gate and not passed.all():
+            if gate.on_fail == "inflate":
+                alpha = np.maximum(nis / gate.threshold(H.shape[1]), 1.0)
+                # S becomes alpha S, so the same factor divides the gain and the whitened innovation's square.
+                R = R + (alpha - 1.0)[:, None, None] * S
+                L = np.sqrt(alpha)[:, None, None] * L
+                whitened = whitened / np.sqrt(alpha)[:, None, None]
+            if gate.on_fail != "discard":
+                used = np.ones_like(passed)
+        if not used.any():
+            return Innovation(r, S, nis, passed, used)
+        K = kernels.transpose(np.linalg.solve(kernels.transpose(L), whitened[:, :, :-1]))
+        if not used.all():
+            K = K * used[:, None, None]
+        A = _EYE - K @ H
+        new = A @ self.P @ kernels.transpose(A) + K @ R @ kernels.transpose(K)
+        self.P = 0.5 * (new + kernels.transpose(new))
+        self.dx += (K @ r[:, :, None])[:, :, 0]
+        return Innovation(r, S, nis, passed, used)
+
+    def inject(self) -> None:
+        """Move the error's mean into the estimate and carry the covariance to the new attitudes."""
+        dx, x = self.dx, self.x
+        E, J = kernels.exp_and_right_jacobian(dx[:, TH])
+        E_clone, J_clone = kernels.exp_and_right_jacobian(dx[:, me.CLONE_TH])
+        x.position = x.position + dx[:, P]
+        x.velocity = x.velocity + dx[:, V]
+        x.R_world_imu = kernels.orthonormalise(x.R_world_imu @ E)
+        x.acc_bias = x.acc_bias + dx[:, BA]
+        x.gyro_bias = x.gyro_bias + dx[:, BG]
+        self.clone_p = self.clone_p + dx[:, me.CLONE_P]
+        self.clone_R = kernels.orthonormalise(self.clone_R @ E_clone)
+        self.jitter_mean = self.jitter_mean + dx[:, JITTER_REF]
+        self.jitter_cur_mean = dx[:, JITTER_CUR].copy()
+        self.bias_mean = self.bias_mean + dx[:, BIAS]
+        for block, G in ((TH, J), (me.CLONE_TH, J_clone)):
+            self.P[:, block, :] = G @ self.P[:, block, :]
+            self.P[:, :, block] = self.P[:, :, block] @ kernels.transpose(G)
+        dx[:] = 0.0
+
+    def clone(self, *, measured: bool = False) -> None:
+        """Make the present pose the reference of the next motion.
+
+        ``measured``: the present frame ended an update of this moment, so its jitter becomes the reference's;
+        otherwise the new reference's jitter is taken from the next motion's noise.
+        """
+        self.clone_p, self.clone_R = self.x.position.copy(), self.x.R_world_imu.copy()
+        self.P[:, CLONE, :] = self.P[:, _POSE, :]
+        self.P[:, :, CLONE] = self.P[:, :, _POSE]
+        if measured:
+            self.P[:, JITTER_REF, :] = self.P[:, JITTER_CUR, :]
+            self.P[:, :, JITTER_REF] = self.P[:, :, JITTER_CUR]
+            self.jitter_mean = self.jitter_cur_mean
+        else:
+            self.P[:, JITTER_REF, :] = 0.0
+            self.P[:, :, JITTER_REF] = 0.0
+            self.jitter_mean = np.zeros((self.batch, 6))
+        self.jitter_known = measured
+        self.forget_current()
+
+    def forget_current(self) -> None:
+        """Drop the present frame's jitter: it is not the reference of what follows."""
+        self.P[:, JITTER_CUR, :] = 0.0
+        self.P[:, :, JITTER_CUR] = 0.0
+        self.jitter_cur_mean = np.zeros((self.batch, 6))

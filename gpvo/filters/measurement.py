@@ -1,0 +1,106 @@
+"""A relative motion of the camera as a measurement of the IMU's state and of a cloned earlier pose.
+
+The measured motion is ``T_est = Exp(-n_ref) T_true Exp(n_cur + b + w)``: the noise of each frame enters the motion
+that ends there and, with opposite sign, the motion that starts there; ``b`` persists; ``w`` is independent. With
+``r = Log(T_pred^-1 T_est)`` and right perturbations eta of the camera poses,
+
+    r = eta_cur - Ad(T_pred^-1) (eta_ref + n_ref) + n_cur + b + w        (first order)
+    eta = Ad(T_cam_imu) [R_world_imu^T dp ; dtheta]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters import kernels
+from gpvo.filters.propagation import TH, P
+
+Array = NDArray[np.float64]
+
+# Joint error state: the core, the cloned pose of the reference frame, the reference frame's jitter, the
+# normalised VO bias, and the jitter of the current frame while an update runs.
+CLONE, CLONE_P, CLONE_TH = slice(15, 21), slice(15, 18), slice(18, 21)
+JITTER_REF, BIAS, JITTER_CUR = slice(21, 27), slice(27, 33), slice(33, 39)
+KEPT, JOINT = 33, 39
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """What one measured motion's error looks like, for B filter members or one for all (leading axis 1).
+
+    ``mean`` (b, 6) is taken off the measurement; ``jitter`` (b, 6, 6) is the covariance that both end frames share
+    half and half, ``white`` (b, 6, 6) that of the motion alone; ``bias_root`` (b, 6, 6) times a unit-variance
+    first-order Gauss-Markov 6-vector of time constants ``bias_tau_s`` (6,) is what persists. [m, rad].
+    """
+
+    mean: Array
+    white: Array
+    jitter: Array | None = None
+    bias_root: Array | None = None
+    bias_tau_s: Array | None = None
+
+    @property
+    def bias_covariance(self) -> Array | float:
+        """(b, 6, 6) covariance of the persistent part, 0 without one."""
+        return 0.0 if self.bias_root is None else self.bias_root @ kernels.transpose(self.bias_root)
+
+
+@dataclass(frozen=True)
+class CameraOnImu:
+    """Extrinsics ``T_imu_cam`` taken apart once for all updates: ``R_imu_cam``, ``t_imu_cam`` and products."""
+
+    R_imu_cam: Array
+    t_imu_cam: Array
+    R_cam_imu: Array
+    lever: Array  # -R_cam_imu [t_imu_cam]x: what an IMU rotation moves the camera by
+
+    @staticmethod
+    def of(T_imu_cam: Array | None) -> CameraOnImu:
+        """From a 4x4 pose; None means that the state is the camera's own."""
+        T = np.eye(4) if T_imu_cam is None else np.asarray(T_imu_cam, dtype=np.float64)
+        R, t = T[:3, :3].copy(), T[:3, 3].copy()
+        return CameraOnImu(R, t, R.T.copy(), -R.T @ kernels.skew(t[None])[0])
+
+    def pose(self, position: Array, R_world_imu: Array) -> tuple[Array, Array]:
+        """Camera rotations (B, 3, 3) and positions (B, 3) in the world."""
+        return R_world_imu @ self.R_imu_cam, position + R_world_imu @ self.t_imu_cam
+
+
+def relative_motion(R_ref: Array, p_ref: Array, R_cur: Array, p_cur: Array) -> tuple[Array, Array]:
+    """``T_ref_cur`` as rotations (B, 3, 3) and translations (B, 3), from camera poses in the world."""
+    Rt = kernels.transpose(R_ref)
+    return Rt @ R_cur, (Rt @ (p_cur - p_ref)[:, :, None])[:, :, 0]
+
+
+def jacobian(
+    H: Array, camera: CameraOnImu, R_ref: Array, R_cur: Array, R_rel: Array, t_rel: Array, bias_root: Array | None
+) -> None:
+    """Write d(measured motion)/d(joint error state) into ``H`` (B, 6, 39), in the right tangent of the prediction."""
+    Rt = kernels.transpose(R_rel)
+    inv_adjoint = np.zeros((len(H), 6, 6))
+    inv_adjoint[:, :3, :3] = inv_adjoint[:, 3:, 3:] = Rt
+    inv_adjoint[:, :3, 3:] = -Rt @ kernels.skew(t_rel)
+
+    eta_ref = np.zeros((len(H), 6, 6))
+    eta_ref[:, :3, :3] = kernels.transpose(R_ref)
+    eta_ref[:, :3, 3:] = camera.lever
+    eta_ref[:, 3:, 3:] = camera.R_cam_imu
+
+    H[:, :3, P] = kernels.transpose(R_cur)
+    H[:, :3, TH] = camera.lever
+    H[:, 3:, TH] = camera.R_cam_imu
+    np.negative(inv_adjoint @ eta_ref, out=H[:, :, CLONE])
+    np.negative(inv_adjoint, out=H[:, :, JITTER_REF])
+    H[:, :, BIAS] = 0.0 if bias_root is None else bias_root
+
+
+def residual(R_rel: Array, t_rel: Array, T_est: Array, mean: Array) -> Array:
+    """``Log(T_pred^-1 T_est Exp(-mean))`` (B, 6), of predictions (B, ...) and one measured motion (4, 4)."""
+    R_m, t_m = kernels.motion_exp(-mean)
+    R_est = T_est[:3, :3] @ R_m
+    t_est = t_m @ T_est[:3, :3].T + T_est[:3, 3]
+    Rt = kernels.transpose(R_rel)
+    return kernels.motion_log(Rt @ R_est, (Rt @ (t_est - t_rel)[:, :, None])[:, :, 0])

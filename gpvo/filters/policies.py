@@ -1,0 +1,121 @@
+"""Where the measurement noise of VO comes from: the ways that are compared with one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters.measurement import MotionNoise
+from gpvo.types import Prediction, VoRecord
+
+Array = NDArray[np.float64]
+
+CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT = "constant", "constant_best", "constant_hindsight"
+TRIANGULATION, POINTING_MATCHING, LEARNED = "triangulation", "pointing_matching", "learned"
+POLICIES = (CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT, TRIANGULATION, POINTING_MATCHING, LEARNED)
+
+_ZERO_MEAN = np.zeros((1, 6))
+_ZERO_MEAN.setflags(write=False)
+
+
+class Policy(Protocol):
+    """Gives the noise of one measured motion, None where it has nothing to say about it."""
+
+    name: str
+
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None: ...
+
+
+@dataclass(frozen=True)
+class ConstantPolicy:
+    """One diagonal covariance for every motion.
+
+    ``mean_squares`` (6,) [m^2, rad^2] per motion of ``dt_s`` seconds; ``scalars`` (b, 2) multiply the translation
+    and the rotation variances, b > 1 to filter under many at once. A motion that spans more frames (its reference is
+    older) gets proportionally more, as a walk would.
+    """
+
+    mean_squares: Array
+    dt_s: float
+    scalars: Array | None = None
+    name: str = CONSTANT
+
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise:
+        """The constant, widened for a motion over several frames."""
+        scalars = np.ones((1, 2)) if self.scalars is None else np.atleast_2d(self.scalars)
+        frames = max(1.0, round(record.dt_s / self.dt_s)) if self.dt_s > 0 else 1.0
+        diagonal = np.repeat(scalars, 3, axis=1) * (np.asarray(self.mean_squares) * frames)
+        return MotionNoise(_ZERO_MEAN, diagonal[:, :, None] * np.eye(6))
+
+
+@dataclass(frozen=True)
+class GeometricPolicy:
+    """The covariance that VO's geometry gives by one method, as it stands."""
+
+    name: str
+
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
+        """The record's own covariance; None where the method has none for this frame."""
+        covariance = record.covariances.get(self.name)
+        if covariance is None or not np.isfinite(covariance).all():
+            return None
+        return MotionNoise(_ZERO_MEAN, np.asarray(covariance, dtype=np.float64)[None])
+
+
+@dataclass(frozen=True)
+class LearnedPolicy:
+    """The predicted error: its mean taken off, its covariance in the parts by which it accumulates.
+
+    ``use_parts`` False treats the total as independent from motion to motion, to show what the parts are worth.
+    """
+
+    name: str = LEARNED
+    use_parts: bool = True
+
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
+        """The prediction's parts as filter noise; None without a prediction for this frame."""
+        if prediction is None or not np.isfinite(prediction.covariance).all():
+            return None
+        mean = np.asarray(prediction.mean, dtype=np.float64)[None]
+        if not self.use_parts:
+            return MotionNoise(mean, prediction.covariance[None])
+        return split_noise(mean, prediction.covariance, prediction.parts, prediction.bias_tau_s)
+
+
+def split_noise(mean: Array, covariance: Array, parts: Mapping[str, Array], bias_tau_s: Array) -> MotionNoise:
+    """Filter noise from a total covariance (6, 6) and its parts; ``mean`` is (1, 6).
+
+    What the parts leave of the total counts as white, and so does a bias without a time constant.
+    """
+    zero = np.zeros((6, 6))
+    jitter, bias = parts.get("jitter", zero), parts.get("bias", zero)
+    tau = np.asarray(bias_tau_s, dtype=np.float64)
+    if not (bias.any() and np.all(tau > 0)):
+        bias = zero
+    white = covariance - jitter - bias
+    return MotionNoise(
+        mean,
+        0.5 * (white + white.T)[None],
+        jitter[None] if jitter.any() else None,
+        _symmetric_root(bias)[None] if bias.any() else None,
+        tau if bias.any() else None,
+    )
+
+
+def _symmetric_root(C: Array) -> Array:
+    """Root of a positive semidefinite matrix that changes little when the matrix does."""
+    diagonal = np.diagonal(C)
+    if np.count_nonzero(C) == np.count_nonzero(diagonal):
+        return np.diag(np.sqrt(np.maximum(diagonal, 0.0)))
+    values, vectors = np.linalg.eigh(C)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
+def constant_from_errors(xi: Array) -> Array:
+    """Per-axis mean square (6,) of relative-motion errors (M, 6) of training runs."""
+    xi = np.asarray(xi, dtype=np.float64)
+    return (xi**2).mean(axis=0)

@@ -1,0 +1,160 @@
+"""How the state moves between two samples, and how its error moves with it.
+
+With an IMU: the trapezoidal strapdown rule. Over one interval of length dt with samples at both ends,
+
+    E = Exp((w0 + w1) / 2 dt)        R1 = R0 E
+    a = (R0 f0 + R1 f1) / 2 + g      v1 = v0 + a dt,  p1 = p0 + v0 dt + a dt^2 / 2
+
+whose global error falls with the square of dt. ``w`` and ``f`` are gyroscope and specific force less their
+biases. Without an IMU: constant velocity and turn rate in the body's own axes.
+
+The error state is (dp world, dv world, dtheta body, dba, dbg), R = R_hat Exp(dtheta); J. Sola, "Quaternion
+kinematics for the error-state Kalman filter" (2017), sections 5 and 7 (local angular error), derived there for the
+Euler rule and here for the trapezoid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters import kernels
+from gpvo.types import ImuNoise
+
+Array = NDArray[np.float64]
+
+P, V, TH, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+CORE = 15
+
+# A consumer-grade MEMS IMU, for logs that do not say what theirs is.
+DEFAULT_IMU_NOISE = ImuNoise(
+    gyro_density_radps_sqrthz=2e-4,
+    acc_density_mps2_sqrthz=2e-3,
+    gyro_walk_radps2_sqrthz=2e-5,
+    acc_walk_mps3_sqrthz=3e-3,
+)
+
+
+@dataclass
+class Nominal:
+    """The estimate itself, B members at once: position [m] and velocity [m/s] of the IMU in the world, attitude
+    ``R_world_imu`` and the biases [m/s^2, rad/s]. Without an IMU the gyroscope slot holds the turn rate."""
+
+    position: Array
+    velocity: Array
+    R_world_imu: Array
+    acc_bias: Array
+    gyro_bias: Array
+
+    def copy(self) -> Nominal:
+        """An independent copy."""
+        return Nominal(*(getattr(self, name).copy() for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class ConstantVelocityNoise:
+    """White acceleration [m/s^2/sqrt(Hz)] and angular acceleration [rad/s^2/sqrt(Hz)] that bend the motion."""
+
+    acceleration: float = 1.0
+    angular_acceleration: float = 0.5
+
+
+def identity_transition(batch: int) -> Array:
+    """(B, 15, 15) identities to be filled by the functions below, which touch only what varies."""
+    return np.broadcast_to(np.eye(CORE), (batch, CORE, CORE)).copy()
+
+
+def imu_step(x: Nominal, F: Array, dt: float, gyro0: Array, acc0: Array, gyro1: Array, acc1: Array, g: Array) -> None:
+    """Move ``x`` over one IMU interval in place and write the error transition into ``F`` (B, 15, 15).
+
+    ``gyro0, acc0, gyro1, acc1`` (B, 3) or (1, 3): raw samples at both ends; ``g`` (3,): gravity in the world [m/s^2].
+    """
+    R0 = x.R_world_imu
+    E, J = kernels.exp_and_right_jacobian((0.5 * (gyro0 + gyro1) - x.gyro_bias) * dt)
+    R1 = R0 @ E
+    f0, f1 = acc0 - x.acc_bias, acc1 - x.acc_bias
+    half0 = 0.5 * (R0 @ kernels.skew(f0))
+    half1 = 0.5 * (R1 @ kernels.skew(f1))
+    a = 0.5 * ((R0 @ f0[:, :, None])[:, :, 0] + (R1 @ f1[:, :, None])[:, :, 0]) + g
+    a_th = -(half0 + half1 @ kernels.transpose(E))
+    a_ba = -0.5 * (R0 + R1)
+    J *= dt
+    a_bg = half1 @ J
+
+    F[:, TH, TH] = kernels.transpose(E)
+    np.negative(J, out=F[:, TH, BG])
+    for block, column in ((a_th, TH), (a_ba, BA), (a_bg, BG)):
+        dv = F[:, V, column]
+        np.multiply(block, dt, out=dv)
+        np.multiply(dv, 0.5 * dt, out=F[:, P, column])
+    F[:, 0, 3] = F[:, 1, 4] = F[:, 2, 5] = dt
+
+    x.position = x.position + (dt * x.velocity + (0.5 * dt * dt) * a)
+    x.velocity = x.velocity + dt * a
+    x.R_world_imu = R1
+
+
+def constant_velocity_step(x: Nominal, F: Array, dt: float) -> None:
+    """Move ``x`` with constant body velocity and turn rate, in place; the transition goes into ``F`` (B, 15, 15)."""
+    R0, rate = x.R_world_imu, x.gyro_bias
+    E, J = kernels.exp_and_right_jacobian(rate * dt)
+    R1 = R0 @ E
+    u = kernels.transpose(R0) @ x.velocity[:, :, None]
+    v1 = R1 @ u
+    turned = kernels.skew((E @ u)[:, :, 0])
+    straight = kernels.skew(u[:, :, 0])
+    J *= dt
+
+    A = R1 @ kernels.transpose(R0)
+    B = R0 @ (E @ straight - turned)
+    C = -(R1 @ straight) @ J
+    F[:, V, V], F[:, V, TH], F[:, V, BG] = A, B, C
+    # The position moves with the mean of the two velocities.
+    F[:, P, V] = 0.5 * dt * (A + np.eye(3))
+    F[:, P, TH], F[:, P, BG] = 0.5 * dt * B, 0.5 * dt * C
+    F[:, TH, TH], F[:, TH, BG] = kernels.transpose(E), J
+
+    x.position = x.position + 0.5 * dt * (x.velocity + v1[:, :, 0])
+    x.velocity = v1[:, :, 0]
+    x.R_world_imu = R1
+
+
+@dataclass(frozen=True)
+class Densities:
+    """White noise that drives the error state: ``diagonal`` (15,) spectral densities, of which the position is driven
+    through the velocity by ``acceleration``, and (constant velocity only) the attitude through the rate by
+    ``angular_acceleration``."""
+
+    diagonal: Array
+    acceleration: float
+    angular_acceleration: float = 0.0
+
+
+def imu_densities(noise: ImuNoise) -> Densities:
+    """Spectral densities of an IMU-driven state."""
+    q = np.zeros(CORE)
+    q[V] = noise.acc_density_mps2_sqrthz**2
+    q[TH] = noise.gyro_density_radps_sqrthz**2
+    q[BA] = noise.acc_walk_mps3_sqrthz**2
+    q[BG] = noise.gyro_walk_radps2_sqrthz**2
+    return Densities(q, float(q[3]))
+
+
+def constant_velocity_densities(noise: ConstantVelocityNoise) -> Densities:
+    """The same for the constant-velocity model: the turn rate walks and the attitude integrates it."""
+    q = np.zeros(CORE)
+    q[V] = noise.acceleration**2
+    q[BG] = noise.angular_acceleration**2
+    return Densities(q, noise.acceleration**2, noise.angular_acceleration**2)
+
+
+def process_noise(densities: Densities, dt: float) -> Array:
+    """(15, 15) covariance added over ``dt``: white noise, integrated once more into position (and attitude)."""
+    Q = np.diag(densities.diagonal * dt)
+    for slow, fast, q in ((P, V, densities.acceleration), (TH, BG, densities.angular_acceleration)):
+        if q > 0:
+            Q[slow, slow] += np.eye(3) * (q * dt**3 / 3.0)
+            Q[slow, fast] = Q[fast, slow] = np.eye(3) * (q * dt * dt / 2.0)
+    return Q

@@ -1,0 +1,273 @@
+"""One run through the filter: the same start, gate and handling of lost frames for every policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import GpvoError
+from gpvo.filters import metrics
+from gpvo.filters.eskf import GRAVITY_MPS2, ErrorStateFilter
+from gpvo.filters.gate import Gate
+from gpvo.filters.policies import Policy
+from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, ConstantVelocityNoise, Nominal
+from gpvo.filters.start import Start, StartSigmas, StaticTest, from_rest, from_truth, heading
+from gpvo.filters.timeline import Step, Timeline
+from gpvo.geometry import se3
+from gpvo.types import ImuLog, Prediction, VoRecord
+
+Array = NDArray[np.float64]
+
+# Truth whose vertical is further than this from +z [rad] is taken to be in another frame, and gravity is measured.
+_LEVEL_RAD = 0.17
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One run as the filters take it.
+
+    ``records`` in order of arrival; ``predictions`` by ``t_ns``; ``imu`` and ``T_imu_cam`` (4, 4) or None;
+    ``T_world_cam`` (N, 4, 4) true poses at the records' stamps where ``truth_valid`` (N,), None without truth.
+    """
+
+    name: str
+    records: Sequence[VoRecord]
+    imu: ImuLog | None = None
+    T_imu_cam: Array | None = None
+    T_world_cam: Array | None = None
+    truth_valid: NDArray[np.bool_] | None = None
+    predictions: Mapping[int, Prediction] = field(default_factory=dict)
+
+    @property
+    def T_world_imu(self) -> Array:
+        """(N, 4, 4) true poses of the filter's state: the IMU, or the camera without one."""
+        if self.T_world_cam is None:
+            raise GpvoError("this run has no ground truth", where=self.name)
+        return self.T_world_cam if self.T_imu_cam is None else self.T_world_cam @ se3.inverse(self.T_imu_cam)
+
+    @property
+    def first(self) -> int:
+        """Index of the record to start from: the first with truth, else the first."""
+        return 0 if self.truth_valid is None else int(np.argmax(self.truth_valid))
+
+
+@dataclass(frozen=True)
+class FuseOptions:
+    """What all policies share."""
+
+    init: Literal["truth", "static"] = "truth"
+    gate: Gate = field(default_factory=Gate)
+    sigmas: StartSigmas = field(default_factory=StartSigmas)
+    motion_noise: ConstantVelocityNoise | None = None
+    history_s: float = 2.0
+    score_gap_s: float = 0.0  # leave out of the NEES what comes this soon after the start
+
+
+@dataclass(frozen=True)
+class FusedRun:
+    """The filtered run of one policy at its n records: poses, core covariances, innovations, counts and scores."""
+
+    name: str
+    policy: str
+    t_ns: NDArray[np.int64]
+    T_world_imu: Array
+    T_world_cam: Array
+    covariance: Array
+    steps: Sequence[Step]
+    nis: Array
+    counts: Mapping[str, int]
+    scores: metrics.Scores | None
+    note: str = ""
+
+
+def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
+    """The start that every policy shares, and the gravity vector where it is not the usual one."""
+    k = flight.first
+    t0 = flight.records[k].t_ns
+    known = flight.T_world_cam is not None
+    if options.init == "static":
+        if flight.imu is None:
+            raise GpvoError("a static start needs an IMU", where=flight.name, cure="use --init truth")
+        still = StaticTest(sigmas=options.sigmas)
+        if not known:
+            return from_rest(flight.imu, t0, still), None
+        rest = from_rest(flight.imu, t0, still).nominal.R_world_imu[0]
+        yaw = heading(flight.T_world_imu[k, :3, :3], rest.T @ np.array([0.0, 0.0, 1.0]))
+        return from_rest(flight.imu, t0, still, yaw_rad=yaw, position=flight.T_world_imu[k, :3, 3]), None
+    if not known:
+        raise GpvoError("--init truth needs ground truth", where=flight.name, cure="use --init static")
+    valid = np.flatnonzero(np.ones(len(flight.records), bool) if flight.truth_valid is None else flight.truth_valid)
+    if len(valid) < 2:
+        raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
+    t = np.array([flight.records[i].t_ns for i in valid[:5]], dtype=np.int64)
+    start = from_truth(t, flight.T_world_imu[valid[:5]], options.sigmas, with_imu=flight.imu is not None)
+    return _aligned_with_gravity(flight, start, valid)
+
+
+def _aligned_with_gravity(flight: Flight, start: Start, valid: NDArray[np.int64]) -> tuple[Start, Array | None]:
+    """Where truth's z is not up, measure gravity in truth's world and admit what that costs in tilt."""
+    if flight.imu is None:
+        return start, None
+    up = vertical_in_world(flight.imu, np.array([flight.records[i].t_ns for i in valid]), flight.T_world_imu[valid])
+    if np.arccos(np.clip(up[2], -1.0, 1.0)) < _LEVEL_RAD:
+        return start, None
+    C = start.covariance.copy()
+    C[TH, TH] += np.eye(3) * 0.01**2
+    note = start.note + "; truth's z axis is not up: gravity measured from the IMU"
+    return Start(start.nominal, C, note), -GRAVITY_MPS2 * up
+
+
+def vertical_in_world(imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array) -> Array:
+    """Unit vector (3,) of the vertical: the mean specific force turned into the world, less the mean acceleration."""
+    seconds = (t_ns - t_ns[0]) * 1e-9
+    force = np.stack([np.interp(seconds, (imu.t_ns - t_ns[0]) * 1e-9, imu.acc_mps2[:, i]) for i in range(3)], axis=1)
+    world = (T_world_imu[:, :3, :3] @ force[:, :, None])[:, :, 0].mean(axis=0)
+    p, m = T_world_imu[:, :3, 3], min(5, len(t_ns) - 1)
+    v_end = (p[-1] - p[-1 - m]) / (seconds[-1] - seconds[-1 - m])
+    v_start = (p[m] - p[0]) / (seconds[m] - seconds[0])
+    up = world - (v_end - v_start) / max(seconds[-1], 1e-9)
+    return up / np.linalg.norm(up)
+
+
+def make_filter(
+    flight: Flight, start: Start, gravity: Array | None, batch: int, options: FuseOptions
+) -> ErrorStateFilter:
+    """A filter of ``batch`` equal members at the start."""
+    nominal = Nominal(
+        *(np.repeat(getattr(start.nominal, name), batch, axis=0) for name in start.nominal.__dataclass_fields__)
+    )
+    with_imu = flight.imu is not None
+    return ErrorStateFilter(
+        nominal,
+        start.covariance,
+        T_imu_cam=flight.T_imu_cam,
+        imu_noise=(flight.imu.noise or DEFAULT_IMU_NOISE) if flight.imu is not None else None,
+        motion_noise=options.motion_noise or (None if with_imu else constant_velocity_noise(flight.records)),
+        gravity_world=gravity,
+    )
+
+
+def fuse_flight(
+    flight: Flight, policy: Policy, options: FuseOptions | None = None, *, batch: int = 1
+) -> list[FusedRun]:
+    """Filter one run under one policy; one result per member (a policy may set several noises side by side)."""
+    options = options or FuseOptions()
+    start, gravity = begin(flight, options)
+    records = flight.records[flight.first :]
+    filter = make_filter(flight, start, gravity, batch, options)
+    timeline = Timeline(
+        filter,
+        records[0].t_ns,
+        policy,
+        gate=options.gate,
+        with_imu=flight.imu is not None,
+        history_s=options.history_s if batch == 1 else 0.0,
+    )
+    states: dict[int, tuple[Nominal, Array]] = {}
+    steps: dict[int, Step] = {}
+    samples = _Samples(flight.imu)
+    for record in records:
+        samples.feed(timeline, record.t_ns)
+        for step in timeline.add_vo(record, flight.predictions.get(record.t_ns)):
+            steps[step.t_ns] = step
+            states[step.t_ns] = (timeline.filter.x.copy(), timeline.filter.covariance.copy())
+    return [_member(flight, policy.name, b, states, steps, timeline, start.note, options) for b in range(batch)]
+
+
+class _Samples:
+    """Hands IMU samples over up to the first one past a stamp, which interpolation needs."""
+
+    def __init__(self, imu: ImuLog | None) -> None:
+        self.imu, self.next = imu, 0
+
+    def feed(self, timeline: Timeline, t_ns: int) -> None:
+        imu = self.imu
+        if imu is None:
+            return
+        while self.next < len(imu.t_ns) and (self.next == 0 or imu.t_ns[self.next - 1] < t_ns):
+            i = self.next
+            timeline.add_imu(int(imu.t_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
+            self.next += 1
+
+
+def _member(
+    flight: Flight,
+    policy: str,
+    b: int,
+    states: Mapping[int, tuple[Nominal, Array]],
+    steps: Mapping[int, Step],
+    timeline: Timeline,
+    note: str,
+    options: FuseOptions,
+) -> FusedRun:
+    t_ns = np.array(sorted(states), dtype=np.int64)
+    ordered = [steps[int(t)] for t in t_ns]
+    nominal = [states[int(t)][0] for t in t_ns]
+    T_imu = se3.from_rt(np.array([x.R_world_imu[b] for x in nominal]), np.array([x.position[b] for x in nominal]))
+    T_cam = T_imu if flight.T_imu_cam is None else T_imu @ flight.T_imu_cam
+    covariance = np.array([states[int(t)][1][b] for t in t_ns])
+    nis = np.array([np.nan if s.innovation is None else s.innovation.nis[b] for s in ordered])
+    failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[b])
+    counts = {**timeline.counts, "rejected": failed}
+    scores = None
+    if flight.T_world_cam is not None:
+        scores = _score(flight, t_ns, T_imu, T_cam, covariance, nis, failed, options.score_gap_s)
+    return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, note)
+
+
+def _score(
+    flight: Flight,
+    t_ns: NDArray[np.int64],
+    T_imu: Array,
+    T_cam: Array,
+    covariance: Array,
+    nis: Array,
+    rejected: int,
+    score_gap_s: float,
+) -> metrics.Scores:
+    index = {r.t_ns: i for i, r in enumerate(flight.records)}
+    rows = np.array([index[int(t)] for t in t_ns])
+    valid = np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]
+    assert flight.T_world_cam is not None
+    truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
+    est, imu, C = T_cam[valid], T_imu[valid], covariance[valid]
+    error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
+    path = metrics.path_length(truth_cam[:, :3, 3])
+    counted = (t_ns[valid] - t_ns[0]) > score_gap_s * 1e9
+    finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
+    position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3])
+    attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9])
+    measured = nis[np.isfinite(nis)] / 6.0
+    return metrics.Scores(
+        ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),
+        final_error_m=float(error[-1]),
+        drift_percent=float(100.0 * error[-1] / path) if path > 0 else float("nan"),
+        nees_position=float(position.mean()) if len(position) else float("nan"),
+        nees_attitude=float(attitude.mean()) if len(attitude) else float("nan"),
+        nis_dof=float(measured.mean()) if len(measured) else float("nan"),
+        nis_interval=metrics.nis_interval(measured),
+        rejected=rejected,
+        diverged=metrics.diverged(error, path),
+        frames=int(valid.sum()),
+    )
+
+
+def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNoise:
+    """How much the vehicle's velocity and turn rate walk, from the log itself: robust spread of their changes.
+
+    VO's own noise is in these changes too, which errs on the wide side.
+    """
+    usable = [r for r in records if r.usable and r.dt_s > 0]
+    if len(usable) < 3:
+        return ConstantVelocityNoise()
+    dt = np.array([r.dt_s for r in usable])
+    twist = se3.log(np.array([r.T_prev_cur for r in usable])) / dt[:, None]
+    change = np.abs(np.diff(twist, axis=0)) / np.sqrt(dt[1:, None])
+    # 1.4826 times the median absolute value is the standard deviation of a Gaussian; the mean of heavy tails.
+    linear, angular = change[:, :3].max(axis=1), change[:, 3:].max(axis=1)
+    sigma = [max(1.4826 * float(np.median(c)), float(np.quantile(c, 0.9)) / 2, 1e-3) for c in (linear, angular)]
+    return ConstantVelocityNoise(acceleration=sigma[0], angular_acceleration=sigma[1])

@@ -1,0 +1,154 @@
+"""Where a filter starts, and how sure it says it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import GpvoError
+from gpvo.filters import kernels
+from gpvo.filters.eskf import GRAVITY_MPS2
+from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V
+from gpvo.geometry import se3
+from gpvo.types import ImuLog
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StartSigmas:
+    """Standard deviations of the initial state, one per axis of each block."""
+
+    position_m: float = 1e-3
+    velocity_mps: float = 0.02
+    tilt_rad: float = 5e-4
+    yaw_rad: float = 5e-4
+    acc_bias_mps2: float = 0.05
+    gyro_bias_radps: float = 3e-3
+    turn_rate_radps: float = 0.5  # constant-velocity model: nothing is known about the turn rate
+
+
+@dataclass(frozen=True)
+class Start:
+    """An initial estimate (one member) with its covariance (15, 15) and a line that says where it came from."""
+
+    nominal: Nominal
+    covariance: Array
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class StaticTest:
+    """When an IMU counts as at rest: limits on the spread over the window, and on the mean rate."""
+
+    window_s: float = 0.5
+    gyro_std_radps: float = 0.05
+    acc_std_mps2: float = 0.5
+    gyro_mean_radps: float = 0.1
+    sigmas: StartSigmas = field(default_factory=StartSigmas)
+
+
+def _member(p: Array, v: Array, R: Array, ba: Array, bg: Array) -> Nominal:
+    return Nominal(*(np.asarray(a, dtype=np.float64)[None].copy() for a in (p, v, R, ba, bg)))
+
+
+def from_truth(
+    t_ns: NDArray[np.int64], T_world_imu: Array, sigmas: StartSigmas | None = None, *, with_imu: bool = True
+) -> Start:
+    """Start on the true pose of the first frame.
+
+    ``t_ns`` (n,), ``T_world_imu`` (n, 4, 4): true poses near the start, the first is the start. The velocity is the
+    slope of a parabola through the first poses; the biases start at zero.
+    """
+    sigmas = sigmas or StartSigmas()
+    if len(t_ns) < 2:
+        raise GpvoError("a start from truth needs true poses of the first two frames", cure="use --init static")
+    n = min(len(t_ns), 5)
+    s = (np.asarray(t_ns[:n]) - t_ns[0]) * 1e-9
+    design = np.vander(s, min(3, n), increasing=True)
+    slope = np.linalg.lstsq(design, T_world_imu[:n, :3, 3], rcond=None)[0][1]
+    R = T_world_imu[0, :3, :3]
+    rate = np.zeros(3) if with_imu else se3.so3_log(R.T @ T_world_imu[1, :3, :3]) / s[1]
+    C = _diagonal(sigmas, with_imu)
+    # Tilt and yaw are about world axes; the error state's attitude is about the body's.
+    world = np.diag([sigmas.tilt_rad**2, sigmas.tilt_rad**2, sigmas.yaw_rad**2])
+    C[TH, TH] = R.T @ world @ R
+    note = f"truth: position {sigmas.position_m:g} m, velocity {sigmas.velocity_mps:g} m/s (1 sigma)"
+    return Start(_member(T_world_imu[0, :3, 3], slope, R, np.zeros(3), rate), C, note)
+
+
+def from_rest(
+    imu: ImuLog, t_ns: int, test: StaticTest | None = None, *, yaw_rad: float = 0.0, position: Array | None = None
+) -> Start:
+    """Start from a vehicle at rest at ``t_ns``: tilt from gravity, gyroscope bias from the mean rate.
+
+    An accelerometer bias tilts the horizon by bias / g; the covariance carries that correlation. Raises
+    ``GpvoError`` where the IMU says that the vehicle moves.
+    """
+    test = test or StaticTest()
+    sigmas, span = test.sigmas, round(test.window_s * 1e9)
+    window = (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
+    before = (imu.t_ns >= t_ns - span) & (imu.t_ns <= t_ns)
+    window = before if before.sum() >= 10 else window
+    if window.sum() < 10:
+        raise GpvoError(f"a static start needs 10 IMU samples within {test.window_s} s of the first frame")
+    gyro, acc = imu.gyro_radps[window], imu.acc_mps2[window]
+    _require_rest(gyro, acc, test)
+
+    f = acc.mean(axis=0)
+    up = f / np.linalg.norm(f)
+    R = _leveled(up, yaw_rad)
+    C = _diagonal(sigmas, with_imu=True)
+    U = kernels.skew(up[None])[0] / GRAVITY_MPS2
+    cov_acc = C[BA, BA] + np.diag(acc.var(axis=0) / len(acc))
+    C[TH, TH] = U @ cov_acc @ U.T + np.outer(up, up) * sigmas.yaw_rad**2
+    # A little more than the model says keeps the attitude's covariance positive definite along every axis.
+    C[TH, TH] += np.eye(3) * 1e-8
+    C[TH, BA] = U @ C[BA, BA]
+    C[BA, TH] = C[TH, BA].T
+    C[BG, BG] = np.diag(gyro.var(axis=0) / len(gyro) + 1e-10)
+    C[V, V] = np.eye(3) * 1e-4
+    origin = np.zeros(3) if position is None else position
+    note = f"static: {int(window.sum())} IMU samples at rest, tilt {np.degrees(np.sqrt(C[6, 6])):.2f} deg (1 sigma)"
+    return Start(_member(origin, np.zeros(3), R, np.zeros(3), gyro.mean(axis=0)), C, note)
+
+
+def _require_rest(gyro: Array, acc: Array, test: StaticTest) -> None:
+    moving = [
+        f"gyroscope spread {gyro.std(axis=0).max():.2g} rad/s" * (gyro.std(axis=0).max() > test.gyro_std_radps),
+        f"accelerometer spread {acc.std(axis=0).max():.2g} m/s^2" * (acc.std(axis=0).max() > test.acc_std_mps2),
+        f"mean turn rate {abs(gyro.mean(axis=0)).max():.2g} rad/s"
+        * (abs(gyro.mean(axis=0)).max() > test.gyro_mean_radps),
+    ]
+    reasons = ", ".join(filter(None, moving))
+    if reasons:
+        raise GpvoError(f"the vehicle is not at rest at the start: {reasons}", cure="use --init truth")
+
+
+def _leveled(up_imu: Array, yaw_rad: float) -> Array:
+    """``R_world_imu`` that turns the measured vertical to +z, with the IMU's heading axis at ``yaw_rad``.
+
+    The heading axis is the IMU's x axis, or its z axis where x is nearly vertical (a camera-like mounting).
+    """
+    axis = np.array([1.0, 0, 0]) if abs(up_imu[0]) < 0.8 else np.array([0.0, 0, 1.0])
+    level = axis - up_imu * (axis @ up_imu)
+    x = level / np.linalg.norm(level)
+    R_level_imu = np.stack([x, np.cross(up_imu, x), up_imu])
+    return se3.so3_exp(np.array([0.0, 0.0, yaw_rad])) @ R_level_imu
+
+
+def heading(R_world_imu: Array, up_imu: Array) -> float:
+    """The yaw [rad] that :func:`from_rest` needs to agree with a known attitude."""
+    return float(se3.so3_log(R_world_imu @ _leveled(up_imu, 0.0).T)[2])
+
+
+def _diagonal(sigmas: StartSigmas, with_imu: bool) -> Array:
+    C = np.zeros((CORE, CORE))
+    C[P, P] = np.eye(3) * sigmas.position_m**2
+    C[V, V] = np.eye(3) * sigmas.velocity_mps**2
+    C[TH, TH] = np.eye(3) * sigmas.tilt_rad**2
+    C[BA, BA] = np.eye(3) * sigmas.acc_bias_mps2**2
+    C[BG, BG] = np.eye(3) * (sigmas.gyro_bias_radps if with_imu else sigmas.turn_rate_radps) ** 2
+    return C

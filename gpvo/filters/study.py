@@ -1,0 +1,203 @@
+"""All policies over many runs: the scalars of the tuned constants, paired differences with intervals, every run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters.metrics import Scores
+from gpvo.filters.policies import (
+    CONSTANT,
+    CONSTANT_BEST,
+    CONSTANT_HINDSIGHT,
+    LEARNED,
+    POINTING_MATCHING,
+    TRIANGULATION,
+    ConstantPolicy,
+    GeometricPolicy,
+    LearnedPolicy,
+    Policy,
+)
+from gpvo.filters.run import Flight, FuseOptions, fuse_flight
+from gpvo.stats.bootstrap import Interval, sequence_bootstrap
+
+Array = NDArray[np.float64]
+
+Progress = Callable[[str], None]
+
+# Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
+_COARSE = 4.0 ** np.arange(-4, 3)
+_FINE = 4.0 ** np.array([-0.67, -0.33, 0.0, 0.33, 0.67])
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Per-axis mean squares (6,) [m^2, rad^2] per motion of ``dt_s``, and the two scalars best on training runs."""
+
+    mean_squares: Array
+    dt_s: float
+    best: tuple[float, float] | None = None
+    hindsight: tuple[float, float] | None = None
+
+
+def grid_scores(
+    flights: Sequence[Flight], constants: Constants, grid: Array, options: FuseOptions, progress: Progress | None = None
+) -> Array:
+    """Mean ATE [m] over runs (G,) of the constant times each pair of scalars in ``grid`` (G, 2).
+
+    A run that left the truth counts with its ATE, infinite where that is no number.
+    """
+    policy = ConstantPolicy(constants.mean_squares, constants.dt_s, grid)
+    total = np.zeros(len(grid))
+    for flight in flights:
+        if progress:
+            progress(flight.name)
+        scores = [run.scores for run in fuse_flight(flight, policy, options, batch=len(grid))]
+        total += [np.nan if s is None else s.ate_rmse_m for s in scores]
+    return np.where(np.isfinite(total), total / max(len(flights), 1), np.inf)
+
+
+def fit_scalars(
+    flights: Sequence[Flight],
+    constants: Constants,
+    options: FuseOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> tuple[float, float]:
+    """One translation and one rotation scalar on the variances that minimise the mean ATE over ``flights``.
+
+    On training runs this is ``constant_best``; on the test runs themselves, ``constant_hindsight``.
+    """
+    options = options or FuseOptions()
+    with np.errstate(all="ignore"):
+        coarse = _pairs(_COARSE, _COARSE)
+        centre = coarse[np.argmin(grid_scores(flights, constants, coarse, options, progress))]
+        fine = _pairs(_FINE * centre[0], _FINE * centre[1])
+        best = fine[np.argmin(grid_scores(flights, constants, fine, options, progress))]
+    return float(best[0]), float(best[1])
+
+
+def fit_constant_best(
+    training: Sequence[Flight], constants: Constants, options: FuseOptions | None = None
+) -> Constants:
+    """The constants with the scalars that are best on the training runs."""
+    return replace(constants, best=fit_scalars(training, constants, options))
+
+
+def _pairs(a: Array, b: Array) -> Array:
+    return np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def make_policies(
+    constants: Constants | None, *, names: Sequence[str], learned: bool
+) -> dict[str, Policy | None]:
+    """The named policies; None for one that lacks what it needs."""
+    out: dict[str, Policy | None] = {}
+    for name in names:
+        out[name] = None
+        if name in (TRIANGULATION, POINTING_MATCHING):
+            out[name] = GeometricPolicy(name)
+        elif name == LEARNED:
+            out[name] = LearnedPolicy() if learned else None
+        elif constants is not None:
+            scalars = {CONSTANT: (1.0, 1.0), CONSTANT_BEST: constants.best, CONSTANT_HINDSIGHT: constants.hindsight}
+            if scalars.get(name) is not None:
+                out[name] = ConstantPolicy(constants.mean_squares, constants.dt_s, np.array([scalars[name]]), name)
+    return out
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One policy less another, run by run: mean ATE gain in percent and the paired interval of the difference [m]."""
+
+    policy: str
+    against: str
+    gain_percent: float
+    difference_m: Interval
+
+    @property
+    def better(self) -> bool:
+        """Whether the interval of the difference lies wholly below zero."""
+        return self.difference_m.high < 0.0
+
+    def __str__(self) -> str:
+        d = self.difference_m
+        return (
+            f"{self.policy} less {self.against}: ATE {d.mean:+.4f} m [{d.low:+.4f}, {d.high:+.4f}], "
+            f"gain {self.gain_percent:.1f} %"
+        )
+
+
+@dataclass(frozen=True)
+class Study:
+    """Scores of every run under every policy: ``scores[policy][run]``, None where the policy could not run."""
+
+    runs: tuple[str, ...]
+    scores: Mapping[str, tuple[Scores | None, ...]]
+    constants: Constants | None = None
+
+    def column(self, policy: str, name: str) -> Array:
+        """(runs,) of one score, NaN where missing."""
+        return np.array([np.nan if s is None else float(getattr(s, name)) for s in self.scores[policy]])
+
+    def mean(self, policy: str, name: str) -> float:
+        """Mean over the runs that have it."""
+        values = self.column(policy, name)
+        values = values[~np.isnan(values)]
+        return float(values.mean()) if len(values) else float("nan")
+
+    def compare(self, policy: str, against: str) -> Comparison:
+        """Paired over the runs that both have."""
+        a, b = self.column(policy, "ate_rmse_m"), self.column(against, "ate_rmse_m")
+        both = np.isfinite(a) & np.isfinite(b)
+        a, b = a[both], b[both]
+        gain = 100.0 * (1.0 - a.mean() / b.mean()) if len(a) and b.mean() > 0 else float("nan")
+        return Comparison(policy, against, float(gain), sequence_bootstrap(a - b))
+
+
+def study(
+    flights: Sequence[Flight],
+    policies: Mapping[str, Policy | None],
+    options: FuseOptions | None = None,
+    *,
+    constants: Constants | None = None,
+    progress: Progress | None = None,
+) -> Study:
+    """Filter every run under every policy."""
+    scores: dict[str, list[Scores | None]] = {name: [] for name in policies}
+    for flight in flights:
+        if progress:
+            progress(flight.name)
+        for name, policy in policies.items():
+            usable = policy is not None and has_noise(flight, policy)
+            scores[name].append(fuse_flight(flight, policy, options)[0].scores if policy and usable else None)
+    return Study(tuple(f.name for f in flights), {k: tuple(v) for k, v in scores.items()}, constants)
+
+
+def has_noise(flight: Flight, policy: Policy) -> bool:
+    """Whether the policy can speak for at least half of the run's measured motions."""
+    usable = [r for r in flight.records if r.usable]
+    known = sum(policy.noise(r, flight.predictions.get(r.t_ns)) is not None for r in usable)
+    return bool(usable) and 2 * known >= len(usable)
+
+
+def table(study: Study) -> str:
+    """Mean of every policy and, below, the ATE of every run."""
+    names = list(study.scores)
+    head = f"{'policy':<20}{'ATE m':>9}{'final m':>9}{'drift %':>9}{'NEES p':>8}{'NEES a':>8}{'NIS':>7}{'rej':>7}{'div':>5}"
+    fields = (
+        ("ate_rmse_m", "9.4f"), ("final_error_m", "9.4f"), ("drift_percent", "9.3f"), ("nees_position", "8.2f"),
+        ("nees_attitude", "8.2f"), ("nis_dof", "7.2f"), ("rejected", "7.1f"),
+    )  # fmt: skip
+    lines = [head]
+    for name in names:
+        values = "".join(format(study.mean(name, f), spec) for f, spec in fields)
+        lines.append(f"{name:<20}{values}{int(np.nansum(study.column(name, 'diverged'))):>5d}")
+    lines += ["", "ATE m of every run", f"{'run':<28}" + "".join(f"{n[:18]:>19}" for n in names)]
+    for i, run in enumerate(study.runs):
+        ate = [study.column(n, "ate_rmse_m")[i] for n in names]
+        lines.append(f"{run[:27]:<28}" + "".join(f"{a:>19.4f}" for a in ate))
+    return "\n".join(lines)

@@ -1,0 +1,225 @@
+"""The filter on a clock: samples and frames as they arrive, late, twice or out of order.
+
+IMU samples are buffered; the state is carried to a frame's stamp when its record arrives, so the usual latency of
+VO costs nothing. A record older than the newest is put in its place: the filter goes back to the state before the
+records that follow it, and uses them again.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters.eskf import ErrorStateFilter, Innovation
+from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import MotionNoise
+from gpvo.filters.policies import Policy
+from gpvo.filters.propagation import BG, CORE, TH, V
+from gpvo.types import Prediction, Status, VoRecord
+
+Array = NDArray[np.float64]
+
+# An interval this many times the usual one, and at least this long, is a gap.
+_GAP_FACTOR, _GAP_S = 5.0, 0.05
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one record did: ``outcome`` is ``used``, ``rejected``, ``lost``, ``start``, ``no_reference`` or
+    ``no_covariance``; ``innovation`` is None where there was no measurement."""
+
+    t_ns: int
+    outcome: str
+    innovation: Innovation | None = None
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A used record with the filter, clock and reference as they were before it."""
+
+    record: VoRecord
+    noise: MotionNoise | None
+    filter: ErrorStateFilter
+    t_ns: int
+    reference_ns: int | None
+
+
+class Timeline:
+    """Feeds one filter in time order, whatever order its inputs arrive in.
+
+    Parameters
+    ----------
+    filter : started at ``t_ns``.
+    policy : gives each record's noise.
+    with_imu : False propagates by the filter's constant-velocity model.
+    history_s : how far back a late record can still be put in its place; 0 keeps nothing.
+    """
+
+    def __init__(
+        self,
+        filter: ErrorStateFilter,
+        t_ns: int,
+        policy: Policy,
+        *,
+        gate: Gate | None = None,
+        with_imu: bool = True,
+        history_s: float = 2.0,
+    ) -> None:
+        self.filter, self.t_ns, self.policy = filter, int(t_ns), policy
+        self.gate = gate or Gate()
+        self.counts: Counter[str] = Counter()
+        self._with_imu = with_imu
+        self._history_ns = round(history_s * 1e9)
+        self._history: deque[_Entry] = deque()
+        self._reference_ns: int | None = self.t_ns
+        self._newest_ns: int | None = None
+        self._imu_t: list[int] = []
+        self._imu: list[Array] = []
+        self._usual_ns = 0
+
+    # -- inputs -----------------------------------------------------------------------------------------------
+
+    def add_imu(self, t_ns: int, gyro_radps: Array, acc_mps2: Array) -> None:
+        """Take one IMU sample: (3,) each. One that is older than the newest, or not finite, is counted and dropped."""
+        sample = np.concatenate([gyro_radps, acc_mps2])
+        if self._imu_t and t_ns <= self._imu_t[-1]:
+            self.counts["imu_repeated" if t_ns == self._imu_t[-1] else "imu_out_of_order"] += 1
+        elif not np.isfinite(sample).all():
+            self.counts["imu_not_finite"] += 1
+        else:
+            if self._imu_t:
+                step = t_ns - self._imu_t[-1]
+                self._usual_ns = min(self._usual_ns or step, step)
+            self._imu_t.append(int(t_ns))
+            self._imu.append(sample)
+
+    def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
+        """Take one VO record; returns the steps done, more than one where later records were used again."""
+        if record.t_ns <= self.t_ns and self._already_seen(record.t_ns):
+            self.counts["repeated"] += 1
+            return []
+        noise = self.policy.noise(record, prediction) if record.usable else None
+        if record.t_ns >= self.t_ns:
+            return [self._step(record, noise)]
+        again = self._rewind(record.t_ns)
+        if again is None:
+            self.counts["too_late"] += 1
+            return []
+        self.counts["reordered"] += 1
+        return [self._step(record, noise), *(self._step(e.record, e.noise) for e in again)]
+
+    def _already_seen(self, t_ns: int) -> bool:
+        return t_ns == self._newest_ns or any(e.record.t_ns == t_ns for e in self._history)
+
+    def latest(self, t_ns: int | None = None) -> ErrorStateFilter:
+        """The filter carried forward to ``t_ns`` (default: the newest IMU sample), leaving this one where it is."""
+        target = t_ns if t_ns is not None else (self._imu_t[-1] if self._imu_t else self.t_ns)
+        ahead = self.filter.copy()
+        if target > self.t_ns:
+            self._propagate(ahead, self.t_ns, target, Counter())
+        return ahead
+
+    # -- one record -------------------------------------------------------------------------------------------
+
+    def _step(self, record: VoRecord, noise: MotionNoise | None) -> Step:
+        self._remember(record, noise)
+        self._propagate(self.filter, self.t_ns, record.t_ns, self.counts)
+        elapsed = (record.t_ns - self.t_ns) * 1e-9
+        self.t_ns = self._newest_ns = record.t_ns
+        if noise is not None and noise.bias_tau_s is not None:
+            self.filter.decay_bias(elapsed, noise.bias_tau_s)
+        step = self._measure(record, noise)
+        self.counts[step.outcome] += 1
+        if record.is_reference:
+            self.filter.clone(measured=step.innovation is not None)
+            self._reference_ns = record.t_ns
+        else:
+            self.filter.forget_current()
+        return step
+
+    def _measure(self, record: VoRecord, noise: MotionNoise | None) -> Step:
+        if record.status in (Status.START, Status.LOST):
+            return Step(record.t_ns, record.status.value)
+        if record.t_prev_ns != self._reference_ns:
+            return Step(record.t_ns, "no_reference")
+        if noise is None:
+            return Step(record.t_ns, "no_covariance")
+        innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate)
+        return Step(record.t_ns, "used" if innovation.passed.all() else "rejected", innovation)
+
+    def _remember(self, record: VoRecord, noise: MotionNoise | None) -> None:
+        if self._history_ns <= 0:
+            self._drop_imu_before(self.t_ns)
+            return
+        self._history.append(_Entry(record, noise, self.filter.copy(), self.t_ns, self._reference_ns))
+        while self._history[0].record.t_ns < record.t_ns - self._history_ns:
+            self._history.popleft()
+        self._drop_imu_before(self._history[0].t_ns)
+
+    def _rewind(self, t_ns: int) -> list[_Entry] | None:
+        """Go back to before the first record later than ``t_ns``; returns those records in order."""
+        later = [e for e in self._history if e.record.t_ns > t_ns]
+        if not later or later[0].t_ns > t_ns:
+            return None
+        first = later[0]
+        self.filter, self.t_ns, self._reference_ns = first.filter, first.t_ns, first.reference_ns
+        for entry in later:
+            self._history.remove(entry)
+        return later
+
+    # -- time ---------------------------------------------------------------------------------------------------
+
+    def _propagate(self, filter: ErrorStateFilter, start_ns: int, end_ns: int, counts: Counter[str]) -> None:
+        if end_ns <= start_ns:
+            return
+        if not self._with_imu:
+            filter.propagate_constant_velocity((end_ns - start_ns) * 1e-9)
+            return
+        if not self._imu_t:
+            raise ValueError("no IMU sample has arrived; give the timeline with_imu=False to do without")
+        i = bisect.bisect_right(self._imu_t, start_ns)
+        t, sample = start_ns, self._at(start_ns, i)
+        while t < end_ns:
+            inside = i < len(self._imu_t) and self._imu_t[i] <= end_ns
+            t1 = self._imu_t[i] if inside else end_ns
+            after = self._imu[i] if inside else self._at(end_ns, i)
+            dt = (t1 - t) * 1e-9
+            filter.propagate_imu(dt, sample[None, :3], sample[None, 3:], after[None, :3], after[None, 3:])
+            self._widen_over_gap(filter, i, dt, counts)
+            t, sample, i = t1, after, i + 1
+
+    def _at(self, t_ns: int, i: int) -> Array:
+        """Sample at ``t_ns``, between samples i-1 and i; held beyond the ends."""
+        if i == 0:
+            return self._imu[0]
+        if i >= len(self._imu_t) or self._imu_t[i - 1] == t_ns:
+            return self._imu[min(i, len(self._imu_t)) - 1]
+        t0, t1 = self._imu_t[i - 1], self._imu_t[i]
+        share = (t_ns - t0) / (t1 - t0)
+        return (1.0 - share) * self._imu[i - 1] + share * self._imu[i]
+
+    def _widen_over_gap(self, filter: ErrorStateFilter, i: int, dt: float, counts: Counter[str]) -> None:
+        """Across missing samples the motion is a guess: as uncertain as the samples nearby vary."""
+        usual = self._usual_ns * 1e-9
+        if dt < _GAP_S or dt < _GAP_FACTOR * usual:
+            return
+        counts["imu_gaps"] += 1
+        near = np.array(self._imu[max(0, i - 100) : i + 100])
+        spread = np.maximum(near.std(axis=0), np.abs(near[-1] - near[0]))
+        variances = np.zeros(CORE)
+        variances[TH] = (spread[:3].max() * dt) ** 2
+        variances[V] = (spread[3:].max() * dt) ** 2
+        variances[:3] = (0.5 * spread[3:].max() * dt * dt) ** 2
+        variances[BG] = 0.0
+        filter.add_uncertainty(variances)
+
+    def _drop_imu_before(self, t_ns: int) -> None:
+        keep = bisect.bisect_right(self._imu_t, t_ns) - 1
+        if keep > 1000:
+            del self._imu_t[:keep], self._imu[:keep]
+
+
