@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -28,8 +28,8 @@ Image8 = NDArray[np.uint8]
 T = TypeVar("T")
 
 
-def to_grey8(image: NDArray[Any], *, bgr: bool = True) -> Image8:
-    """(H, W) uint8 from a grey or colour image of 8 or 16 bit; 16 bit is scaled by 1/256 [full range]."""
+def to_grey8(image: NDArray[Any], *, bgr: bool = True, bits: int = 16) -> Image8:
+    """(H, W) uint8 from a grey or colour image of 8 or 16 bit, whose samples fill the lower ``bits`` of the 16."""
     if image.ndim == 3:
         channels = image.shape[2]
         if channels == 1:
@@ -40,11 +40,13 @@ def to_grey8(image: NDArray[Any], *, bgr: bool = True) -> Image8:
             image = np.asarray(cv2.cvtColor(image, code))
     if image.dtype == np.uint16:
         # Rounded, not cut: cutting would darken by half a step.
-        return np.asarray(np.minimum((image.astype(np.uint32) + 128) >> 8, 255), dtype=np.uint8)
+        shift = bits - 8
+        half = (1 << shift) >> 1
+        return np.asarray(np.minimum((image.astype(np.uint32) + half) >> shift, 255), dtype=np.uint8)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
-def read_grey8(path: Path) -> Image8 | None:
+def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
     """An image file as (H, W) uint8; None where it is missing, damaged or no image."""
     try:
         if not 0 < path.stat().st_size <= _MAX_IMAGE_BYTES:
@@ -52,10 +54,10 @@ def read_grey8(path: Path) -> Image8 | None:
         raw = np.fromfile(path, dtype=np.uint8)
     except OSError:
         return None
-    return decode_grey8(raw)
+    return decode_grey8(raw, bits)
 
 
-def decode_grey8(raw: NDArray[np.uint8]) -> Image8 | None:
+def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
     """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8, None where they are no image."""
     try:
         image = cv2.imdecode(raw, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
@@ -63,7 +65,7 @@ def decode_grey8(raw: NDArray[np.uint8]) -> Image8 | None:
         return None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
-    return to_grey8(image)
+    return to_grey8(image, bits=bits)
 
 
 def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
@@ -91,6 +93,10 @@ def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
             put(("end", None))
         except BaseException as error:
             put(("error", error))
+        finally:
+            # A generator's files belong to this thread: close them here, not wherever it is collected.
+            if isinstance(items, Generator):
+                items.close()
 
     thread = threading.Thread(target=work, name="gpvo-decode", daemon=True)
     thread.start()
@@ -131,12 +137,16 @@ class ImageSource:
         name: str,
         rig: StereoRig,
         *,
+        known: SourceReport | None = None,
         hfov_deg: float | None = None,
         size: tuple[int, int] | None = None,
         mask_left: str | Path | None = None,
         mask_right: str | Path | None = None,
+        bits: int = 16,
         prefetch: bool = True,
     ) -> None:
+        if not 8 <= bits <= 16:
+            raise SourceError(f"images of {bits} bits are not possible", cure="bits is from 8 to 16")
         if mask_left is not None or mask_right is not None:
             left, right = (None if m is None else read_mask(Path(m)) for m in (mask_left, mask_right))
             rig = rig.with_masks(left, right)
@@ -147,13 +157,12 @@ class ImageSource:
         self.mounting: Mounting = self.rectifier.mounting
         self.imu: ImuLog | None = None
         self.truth: TruthLog | None = None
-        self.report = SourceReport()
-        self._prefetch = prefetch
-
-    @property
-    def calibration(self) -> dict[str, Any] | None:
-        """The raw rig and the rectifying rotation, as plain numbers."""
-        return {**self.rig.describe(), "R_rect_left": self.rectifier.R_rect_left.tolist()}
+        self.known = SourceReport() if known is None else known
+        self.report = self._fresh_report()
+        R_rect_left = self.rectifier.R_rect_left.tolist()
+        self.calibration: dict[str, Any] | None = {**rig.describe(), "R_rect_left": R_rect_left}
+        self.bits, self._prefetch = bits, prefetch
+        self.span_ns: tuple[int, int] = (0, 0)
 
     def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
         """Stamps [ns] with decoded raw images, None for an image that is not readable."""
@@ -169,7 +178,7 @@ class ImageSource:
 
     def _fresh_report(self) -> SourceReport:
         """A report with what was already known when the source was opened."""
-        return SourceReport()
+        return replace(self.known, notes=list(self.known.notes))
 
     def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
         for frame in in_order(self._readable(report), report):
@@ -202,16 +211,13 @@ class FileSource(ImageSource):
     ) -> None:
         if not pairs:
             raise SourceError("holds no image pair with equal stamps", where=path)
-        super().__init__(path, name, rig, **options)
-        self._pairs, self._known = pairs, known
-        self.report = self._fresh_report()
+        super().__init__(path, name, rig, known=known, **options)
+        self._pairs = pairs
+        self.span_ns = (min(p.t_ns for p in pairs), max(p.t_ns for p in pairs))
         check_size(pairs, rig)
 
     def __len__(self) -> int:
         return len(self._pairs)
-
-    def _fresh_report(self) -> SourceReport:
-        return replace(self._known, notes=list(self._known.notes))
 
     def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
         """Decode pair by pair; a file that is not there counts as missing."""
@@ -221,7 +227,7 @@ class FileSource(ImageSource):
                 report.missing += 1
                 report.note(f"missing {absent[0].parent.name}/{absent[0].name}")
                 continue
-            yield pair.t_ns, read_grey8(pair.left), read_grey8(pair.right)
+            yield pair.t_ns, read_grey8(pair.left, self.bits), read_grey8(pair.right, self.bits)
 
 
 def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:

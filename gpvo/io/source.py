@@ -60,8 +60,8 @@ class Source(Protocol):
 
     ``kind``: ``"images"`` yields :class:`StereoFrame` (8 bit, rectified), ``"tracks"`` yields :class:`TrackFrame`.
     ``mask`` (H, W) is True where the rectified left image holds a picture, None for everywhere. ``truth`` is of the
-    rectified left camera. ``calibration`` describes the raw rig, for the run folder. ``len`` is the number of pairs
-    expected, exact unless frames turn out to be bad.
+    rectified left camera. ``calibration`` describes the raw rig, for the run folder. ``span_ns``: first and last stamp
+    expected. ``len`` is the number of pairs expected, exact unless frames turn out to be bad.
     """
 
     name: str
@@ -75,15 +75,17 @@ class Source(Protocol):
     truth: TruthLog | None
     report: SourceReport
     calibration: dict[str, Any] | None
+    span_ns: tuple[int, int]
 
     def __len__(self) -> int: ...
 
-    def __iter__(self) -> Iterator[StereoFrame] | Iterator[TrackFrame]: ...
+    def __iter__(self) -> Iterator[StereoFrame | TrackFrame]: ...
 
 
 # Order of the guesses: the strictest test first. Modules are imported when asked.
 BUILT_IN: dict[str, str] = {
     "tracks": "gpvo.io.tracks:TracksSource",
+    "rosbag": "gpvo.io.bags:BagSource",
     "euroc": "gpvo.io.euroc:EurocSource",
     "kitti": "gpvo.io.kitti:KittiSource",
     "folder": "gpvo.io.folder:FolderSource",
@@ -135,7 +137,8 @@ def open_source(path: str | Path, kind: str | None = None, **options: Any) -> So
     """Open a sequence; ``kind`` overrides the guess, ``options`` go to the source.
 
     Options of all image sources: ``hfov_deg`` and ``size`` of the rectified view, ``mask_left``, ``mask_right``
-    (image files), ``calibration`` (a file in place of the one found), ``prefetch`` (decode ahead in a thread).
+    (image files), ``calibration`` (a file in place of the one found), ``bits`` (depth of 16-bit images' samples),
+    ``prefetch`` (decode ahead in a thread).
 
     Raises
     ------

@@ -53,6 +53,7 @@ class TracksSource:
         self.imu = self._make_imu()
         self.truth = self._make_truth(truth_noise)
         self.calibration: dict[str, Any] | None = None
+        self.span_ns = (int(self._t_ns.min()), int(self._t_ns.max()))
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -1,0 +1,176 @@
+"""What any file is: the documents behind ``gpvo info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.errors import GpvoError, SourceError
+
+
+def describe(path: Path, kind: str | None = None) -> dict[str, Any]:
+    """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known of it.
+
+    Raises
+    ------
+    GpvoError
+        Where the path is nothing gpvo knows, or damaged.
+    """
+    from gpvo.io.bag_reader import is_bag
+    from gpvo.io.run_read import is_run
+    from gpvo.io.source import guess
+
+    if not path.exists():
+        raise SourceError("no such file or folder", where=path)
+    if kind is None:
+        if is_run(path):
+            return _run(path)
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return _calibration(path)
+        if path.suffix.lower() in (".safetensors", ".gpvo"):
+            return _model(path)
+        if path.suffix.lower() in (".txt", ".csv", ".tum"):
+            return _trajectory(path)
+        if is_bag(path):
+            return _bag(path)
+        if path.is_file() and path.suffix.lower() != ".npz" and _is_safetensors(path):
+            return _model(path)
+    return _sequence(path, kind or guess(path))
+
+
+def _sequence(path: Path, kind: str) -> dict[str, Any]:
+    from gpvo.io import open_source
+
+    source = open_source(path, kind)
+    camera, truth, imu = source.camera, source.truth, source.imu
+    duration = (source.span_ns[1] - source.span_ns[0]) * 1e-9
+    return {
+        "what": "sequence",
+        "format": source.format,
+        "kind": source.kind,
+        "frames": len(source),
+        "duration_s": duration,
+        "rate_hz": (len(source) - 1) / duration if duration > 0 else None,
+        "camera": camera.__dict__,
+        "rectified": None if source.calibration is None else source.calibration["left"]["model"],
+        "truth": None if truth is None else _poses(truth.t_ns, truth.T_world_cam),
+        "imu": None if imu is None else _imu(imu),
+        "notes": source.report.notes,
+    }
+
+
+def _imu(imu: Any) -> dict[str, Any]:
+    span = (imu.t_ns[-1] - imu.t_ns[0]) * 1e-9
+    return {
+        "samples": len(imu.t_ns),
+        "rate_hz": (len(imu.t_ns) - 1) / span if span > 0 else None,
+        "accelerometer": bool(np.isfinite(imu.acc_mps2).any()),
+        "noise": None if imu.noise is None else imu.noise.__dict__,
+    }
+
+
+def _poses(t_ns: Any, T: Any) -> dict[str, Any]:
+    return {
+        "poses": len(t_ns),
+        "duration_s": float(t_ns[-1] - t_ns[0]) * 1e-9,
+        "path_length_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
+    }
+
+
+def _run(path: Path) -> dict[str, Any]:
+    from gpvo.io.run import read_run
+
+    run = read_run(path)
+    log = run.log
+    return {
+        "what": "run",
+        "name": run.name,
+        "complete": bool(run.meta.get("complete")),
+        "source": run.meta.get("source"),
+        "frames": len(log),
+        "statuses": {s: int(n) for s, n in zip(*np.unique([r.status.value for r in log], return_counts=True))},
+        "methods": list(log.methods),
+        "camera": None if log.camera is None else log.camera.__dict__,
+        "odometry": _poses(log.t_ns, log.trajectory()),
+        "truth": None if run.truth is None else _poses(run.truth.t_ns, run.truth.T_world_cam),
+        "imu": None if run.imu is None else _imu(run.imu),
+        "predictions": len(run.predictions),
+    }
+
+
+def _trajectory(path: Path) -> dict[str, Any]:
+    from gpvo.io.foreign import guess_format, read_foreign
+    from gpvo.io.trajectory import read_kitti_poses
+
+    name = guess_format(path)
+    if name == "kitti":
+        T = read_kitti_poses(path)
+        return {"what": "trajectory", "format": name, **_poses(np.zeros(len(T)), T), "duration_s": None}
+    log = read_foreign(path, name)
+    return {
+        "what": "trajectory",
+        "format": name,
+        **_poses(log.t_ns, log.trajectory.T_world_body),
+        "covariance": log.covariance is not None,
+        "columns": list(log.columns),
+        "notes": list(log.notes),
+    }
+
+
+def _calibration(path: Path) -> dict[str, Any]:
+    from gpvo.cameras.readers import read_stereo_yaml
+
+    rig = read_stereo_yaml(path)
+    return {"what": "calibration", "baseline_m": rig.baseline_m, **rig.describe()}
+
+
+def _model(path: Path) -> dict[str, Any]:
+    from gpvo.online.modelfile import read_header
+
+    return {"what": "model", "header": read_header(path)}
+
+
+def _is_safetensors(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(9)
+    return len(head) == 9 and head[8:] == b"{" and int.from_bytes(head[:8], "little") < 100_000_000
+
+
+def _bag(path: Path) -> dict[str, Any]:
+    from gpvo.io.bag_reader import open_bag
+
+    with open_bag(path) as reader:
+        document: dict[str, Any] = {
+            "what": "bag",
+            "duration_s": reader.duration * 1e-9,
+            "topics": {n: {"type": t.msgtype, "messages": t.msgcount} for n, t in sorted(reader.topics.items())},
+        }
+    try:
+        document["sequence"] = _sequence(path, "rosbag")
+    except GpvoError as error:
+        document["sequence"] = None
+        document["notes"] = [str(error)]
+    return document
+
+
+def as_lines(document: dict[str, Any], indent: str = "") -> list[str]:
+    """A document as short lines for people; what is unknown or empty is left out."""
+    lines = []
+    for key, value in document.items():
+        if value is None or value in ([], {}):
+            continue
+        if isinstance(value, dict) and len(str(value)) > 90:
+            lines += [f"{indent}{key}:", *as_lines(value, indent + "  ")]
+        elif isinstance(value, dict):
+            lines.append(f"{indent}{key}: " + ", ".join(f"{k} {_short(v)}" for k, v in value.items()))
+        elif isinstance(value, list):
+            lines.append(f"{indent}{key}: " + ", ".join(_short(v) for v in value))
+        else:
+            lines.append(f"{indent}{key}: {_short(value)}")
+    return lines
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

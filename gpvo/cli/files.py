@@ -1,0 +1,126 @@
+"""``gpvo info`` and ``gpvo import``: what files are, and other people's logs as runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gpvo.errors import GpvoError
+
+
+def info(
+    path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
+    kind: Annotated[str | None, typer.Option("--source", help="Take it as a sequence of this format.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the document as JSON.")] = False,
+) -> None:
+    """Say what a file or folder is.
+
+    Example: gpvo info MH_01_easy/
+    """
+    from gpvo.cli.describe import as_lines, describe
+    from gpvo.cli.output import jsonable, print_json
+
+    document = jsonable(describe(path, kind))
+    if json_:
+        print_json({"schema": 1, "path": str(path), **document})
+    else:
+        print("\n".join([str(path), *as_lines(document, "  ")]))
+
+
+def import_(
+    log: Annotated[Path, typer.Argument(help="Trajectory, CSV or bag of another odometry.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
+    truth: Annotated[Path | None, typer.Option(help="Ground truth: a trajectory, CSV or bag.")] = None,
+    format_: Annotated[str | None, typer.Option("--format", help="tum, kitti, csv or bag; by default guessed.")] = None,
+    truth_format: Annotated[str | None, typer.Option(help="The same for the ground truth.")] = None,
+    map_: Annotated[
+        list[str] | None, typer.Option("--map", help="COLUMN=NAME of a CSV, e.g. var_x=cov_00; repeatable.")
+    ] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of the odometry in a bag.")] = None,
+    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
+    times: Annotated[Path | None, typer.Option(help="Seconds, a line per pose, for KITTI poses.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Rate, for KITTI poses without times.")] = None,
+    frame: Annotated[str, typer.Option(help="cam: poses of the left optical frame; body: of a FLU body.")] = "cam",
+    align: Annotated[str, typer.Option(help="rotation: fit the fixed rotation between log and truth; none.")] = "none",
+    time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's stamps, or auto.")] = "0",
+    truth_sigma: Annotated[str | None, typer.Option(help="White noise of the truth per pose, METRES,RADIANS.")] = None,
+    covariance_of: Annotated[str, typer.Option(help="What a CSV's covariances are of: pose or motion.")] = "pose",
+    covariance_axes: Annotated[str, typer.Option(help="Axes of a CSV's covariances: world or body.")] = "world",
+    json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Make a run of another odometry's log, for training and evaluation.
+
+    Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
+    """
+    from gpvo.cli.importing import ImportSettings, import_log
+    from gpvo.cli.output import print_json
+
+    summary = import_log(
+        ImportSettings(
+            log=log,
+            truth=truth,
+            kind=format_,
+            truth_kind=truth_format,
+            mapping=_mapping(map_ or []),
+            topic=topic,
+            truth_topic=truth_topic,
+            times=times,
+            rate_hz=rate_hz,
+            frame=_one_of("--frame", frame, ("cam", "body")),
+            align=_one_of("--align", align, ("none", "rotation")),
+            time_offset_s=None if time_offset == "auto" else _number("--time-offset", time_offset),
+            truth_sigma=None if truth_sigma is None else _sigma(truth_sigma),
+            covariance_of=_one_of("--covariance-of", covariance_of, ("pose", "motion")),
+            covariance_axes=_one_of("--covariance-axes", covariance_axes, ("world", "body")),
+        ),
+        out,
+    )
+    if json_:
+        print_json({"schema": 1, "run": str(out), **summary.__dict__})
+    else:
+        print(f"{out}: {summary}")
+
+
+def _mapping(texts: list[str]) -> dict[str, str]:
+    out = {}
+    for text in texts:
+        column, _, name = text.rpartition("=")
+        if not column or not name:
+            raise GpvoError(f"--map is '{text}'", cure="give COLUMN=NAME, such as var_x=cov_00")
+        out[column.strip()] = name.strip()
+    return out
+
+
+def _one_of(option: str, value: str, choices: tuple[str, ...]) -> str:
+    if value not in choices:
+        raise GpvoError(f"{option} is '{value}'", cure=f"choose {' or '.join(choices)}")
+    return value
+
+
+def _number(option: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < 1e10:
+        raise GpvoError(f"{option} is '{text}'", cure="give seconds, such as -0.02, or auto")
+    return value
+
+
+def _sigma(text: str) -> tuple[float, float]:
+    parts = text.split(",")
+    try:
+        translation, rotation = (float(p) for p in parts)
+    except ValueError:
+        translation = rotation = -1.0
+    if not (translation >= 0 and rotation >= 0):
+        raise GpvoError(f"--truth-sigma is '{text}'", cure="give metres,radians, such as 0.003,0.0002")
+    return translation, rotation
+
+
+def register(app: typer.Typer) -> None:
+    """Add this file's commands to the application."""
+    app.command()(info)
+    app.command("import")(import_)
