@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 
 def group_folds(groups: NDArray, max_folds: int) -> NDArray[np.int64]:
-    """(n,) fold of each row: no group is split, and folds are of similar size (largest group first, to the smallest fold).
+    """(n,) fold of each row: no group is split, and folds are of similar size (largest group first, to the smallest
+    fold).
 
     With one group alone: ``max_folds`` blocks of consecutive rows.
     """

@@ -1,8 +1,10 @@
-"""A GP of the log noise variance: started on the log squared residual, finished by Fisher scoring on the likelihood itself.
+"""A GP of the log noise variance: started on the log squared residual, finished by Fisher scoring on the likelihood
+itself.
 
-The log of a squared Gaussian residual is the log-variance plus log chi^2_1, of mean -1.2704 and variance pi^2 / 2; taking it for
-Gaussian noise wastes 60 % of the information. Scoring to the maximum a posteriori under the residual's own density (Gaussian or
-Student-t) wins it back: P. Green, B. Silverman, "Nonparametric Regression and Generalized Linear Models" (1994), section 5.3.
+The log of a squared Gaussian residual is the log-variance plus log chi^2_1, of mean -1.2704 and variance pi^2 / 2;
+taking it for Gaussian noise wastes 60 % of the information. Scoring to the maximum a posteriori under the residual's
+own density (Gaussian or Student-t) wins it back: P. Green, B. Silverman, "Nonparametric Regression and Generalized
+Linear Models" (1994), section 5.3.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ _STEPS = 30
 
 @dataclass(frozen=True)
 class Residuals:
-    """``square`` (n, D): squared out-of-fold residuals. ``base`` (n, D): log of a variance known per row (zeros without).
+    """``square`` (n, D): squared out-of-fold residuals. ``base`` (n, D): log of a variance known per row (zeros
+    without).
 
     ``mean_var`` (n, D): variance of the mean they are about. ``count`` (n,): how often a row counts.
     """
@@ -42,7 +45,7 @@ class Residuals:
         return Residuals(self.square[rows], self.base[rows], self.mean_var[rows], self.count[rows])
 
     def log_ratio(self) -> Array:
-        """(n, D) log of the squared residual over the base, its bias taken off; squares are floored at 1e-6 of their median."""
+        """(n, D) log of the squared residual over the base, unbiased; squares floored at 1e-6 of their median."""
         floor = 1e-6 * np.maximum(np.median(self.square, axis=0), 1e-300)
         return np.log(self.square + floor) - self.base - LOG_CHI2_MEAN
 
@@ -50,7 +53,8 @@ class Residuals:
 def score_log_variance(
     start: FittedGP, X: Array, residuals: Residuals, nu: Array, fold: NDArray[np.int64]
 ) -> tuple[ProjectedGP, dict[int, ProjectedGP]]:
-    """Posterior mode of the log squared scale under Student-t residuals of ``nu`` (D,), given all rows and without each fold.
+    """Posterior mode of the log squared scale under Student-t residuals of ``nu`` (D,), given all rows and without
+    each fold.
 
     ``start``: GP of :meth:`Residuals.log_ratio`, whose kernel, points and signal variances are kept.
     """
@@ -83,8 +87,9 @@ def _mode(
 ) -> ProjectedGP:
     """Fisher scoring from ``g`` (n, D); rows of zero ``count`` do not take part.
 
-    The working response ``g + score / fisher`` of noise variance ``1 / fisher`` has the mode as its fixed point. Where the
-    mean's own variance explains part of a residual the true information is smaller, so steps are cautious, never wild.
+    The working response ``g + score / fisher`` of noise variance ``1 / fisher`` has the mode as its fixed point.
+    Where the mean's own variance explains part of a residual the true information is smaller, so steps are cautious,
+    never wild.
     """
     gp = start.gp
     basis = Eigenbasis.of(sums, gp.points)

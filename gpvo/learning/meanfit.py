@@ -37,8 +37,9 @@ def fit_folded_mean(
 ) -> FoldedMean:
     """Posterior of the mean with the kernel of ``fitted`` on at most ``inducing`` points.
 
-    ``precision`` (n, 1): one profile for all outputs; (n, D): one per output, each then gets its own projection. Its scale is
-    arbitrary: signal and noise variances are learnt anew, per output, on all rows. ``count`` (n,): how often a row counts.
+    ``precision`` (n, 1): one profile for all outputs; (n, D): one per output, each then gets its own projection. Its
+    scale is arbitrary: signal and noise variances are learnt anew, per output, on all rows. ``count`` (n,): how often
+    a row counts.
     """
     gp = fitted.gp
     U = (X - gp.centre) / gp.lengthscale
@@ -118,15 +119,8 @@ def _stacked(parts: list[FoldedMean]) -> FoldedMean:
 
 def no_mean(d: int, D: int) -> ProjectedGP:
     """A GP that is zero everywhere, with certainty."""
-    return ProjectedGP(
-        np.zeros(d),
-        np.ones(d),
-        np.zeros((1, d)),
-        np.zeros((1, 1)),
-        *(np.zeros((D, 1)) for _ in range(2)),
-        np.zeros(D),
-        np.zeros(D),
-    )
+    none = np.zeros((D, 1))
+    return ProjectedGP(np.zeros(d), np.ones(d), np.zeros((1, d)), np.zeros((1, 1)), none, none, none[:, 0], none[:, 0])
 
 
 def only_outputs(gp: ProjectedGP, use: NDArray[np.bool_]) -> ProjectedGP:

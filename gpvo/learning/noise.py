@@ -1,8 +1,8 @@
 """Input-dependent noise: a GP of the mean error, and a second GP of the log of the noise variance.
 
-The second GP sees residuals of rows that their own mean never saw (out of fold, by sequence). Two GPs: P. Goldberg, C. Williams,
-C. Bishop, "Regression with Input-Dependent Noise" (1998); in turn: K. Kersting et al., "Most Likely Heteroscedastic Gaussian
-Process Regression" (2007), section 4.
+The second GP sees residuals of rows that their own mean never saw (out of fold, by sequence). Two GPs: P. Goldberg,
+C. Williams, C. Bishop, "Regression with Input-Dependent Noise" (1998); in turn: K. Kersting et al., "Most Likely
+Heteroscedastic Gaussian Process Regression" (2007), section 4.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ class HeteroscedasticFit:
     """Mean and noise model of D outputs, with what is needed to judge it honestly.
 
     ``basis``: the predictor. ``mean_fit``: the last fit of the mean on the outputs that use one, None if none does.
-    ``use_mean`` (D,) bool. ``nu`` (D,): degrees of freedom of the residuals' Student-t, inf where a Gaussian does; the published
-    noise variance is the second moment ``scale nu / (nu - 2)``, already inside ``basis``. Out of fold (hyperparameters and
-    tail of all rows, posterior of mean and of noise without the row's own fold): ``oof_mean``, ``oof_epistemic_var``,
-    ``oof_log_noise_var`` (n, D), the last without the base; ``fold`` (n,): which fold each row was in.
+    ``use_mean`` (D,) bool. ``nu`` (D,): degrees of freedom of the residuals' Student-t, inf where a Gaussian does;
+    the published noise variance is the second moment ``scale nu / (nu - 2)``, already inside ``basis``. Out of fold
+    (hyperparameters and tail of all rows, posterior of mean and of noise without the row's own fold): ``oof_mean``,
+    ``oof_epistemic_var``, ``oof_log_noise_var`` (n, D), the last without the base; ``fold`` (n,): which fold each row
+    was in.
     """
 
     basis: SharedBasis
@@ -98,15 +99,15 @@ def fit_heteroscedastic(
 ) -> HeteroscedasticFit:
     """Fit ``y_j = f_j(x) + e_j``, ``e_j ~ t_nu(0, exp(base_j + g_j(x)))`` with Gaussian processes f and g.
 
-    X (n, d), Y (n, D) finite; ``groups`` (n,) labels (sequence of each row): a row's residual is always taken from a fit
-    without its group; with fewer than two groups, without its block of consecutive rows. ``base_log_var`` (n, D): log of a
-    variance known per row (the geometric covariance); g is then the log of the ratio to it. ``use_mean`` (D,): False fixes
-    f_j to zero. ``sample_weight`` (n,): how often a row counts.
+    X (n, d), Y (n, D) finite; ``groups`` (n,) labels (sequence of each row): a row's residual is always taken from a
+    fit without its group; with fewer than two groups, without its block of consecutive rows. ``base_log_var`` (n, D):
+    log of a variance known per row (the geometric covariance); g is then the log of the ratio to it. ``use_mean``
+    (D,): False fixes f_j to zero. ``sample_weight`` (n,): how often a row counts.
 
-    Options: ``regressor`` of the mean (name or object); ``heavy_tails`` False for Gaussian residuals; ``isotropic`` kernels;
-    at most ``inducing`` points for the mean and ``noise_inducing`` for the noise; ``profile`` "common" weights the rows of
-    all outputs by one profile, "output" each by its own (one projection per output); ``rounds``: how often mean and noise
-    are fitted in turn; ``noise_rows``: at most so many random rows teach the noise.
+    Options: ``regressor`` of the mean (name or object); ``heavy_tails`` False for Gaussian residuals; ``isotropic``
+    kernels; at most ``inducing`` points for the mean and ``noise_inducing`` for the noise; ``profile`` "common"
+    weights the rows of all outputs by one profile, "output" each by its own (one projection per output); ``rounds``:
+    how often mean and noise are fitted in turn; ``noise_rows``: at most so many random rows teach the noise.
     """
     options = options or HeteroscedasticOptions()
     X, Y, _, count = checked(X, Y, None, sample_weight)

@@ -6,10 +6,10 @@ All outputs share the squared-exponential kernel and its points, ``k_i(x) = exp(
     mean_j = offset_j + sum_r A_jr z_r
     var_j  = s_j^2 - sum_r W_jr z_r^2
 
-P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs squares of z alone. One P serves
-all outputs, exactly, while the rows' noise weights are one common profile times a scale per output; otherwise P has one slice
-per output. Mean and variance: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), equations
-2.25 and 2.26; with inducing points M. Titsias (2009), equation 6.
+P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs squares of z alone. One
+P serves all outputs, exactly, while the rows' noise weights are one common profile times a scale per output;
+otherwise P has one slice per output. Mean and variance: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for
+Machine Learning" (2006), equations 2.25 and 2.26; with inducing points M. Titsias (2009), equation 6.
 """
 
 from __future__ import annotations
@@ -104,10 +104,11 @@ class ProjectedGP:
 class BasisPrediction(NamedTuple):
     """What the GPs say, each (n, D) for many rows or (D,) for one.
 
-    ``mean``: of the error. ``epistemic_var``: variance of that mean, grows away from the training data. ``log_noise_var``: log
-    of the expected squared noise; with a base log-variance the model was trained as a ratio to it, so add the base.
-    ``log_noise_spread``: variance of the log noise variance, whose half is already inside ``log_noise_var``:
-    ``exp(log_noise_var) (1 - exp(-log_noise_spread / 2))`` is the part of the noise variance owed to ignorance.
+    ``mean``: of the error. ``epistemic_var``: variance of that mean, grows away from the training data.
+    ``log_noise_var``: log of the expected squared noise; with a base log-variance the model was trained as a ratio to
+    it, so add the base. ``log_noise_spread``: variance of the log noise variance, whose half is already inside
+    ``log_noise_var``: ``exp(log_noise_var) (1 - exp(-log_noise_spread / 2))`` is the part of the noise variance owed
+    to ignorance.
     """
 
     mean: Array
@@ -119,9 +120,10 @@ class BasisPrediction(NamedTuple):
 class SharedBasis:
     """Mean, epistemic variance and input-dependent noise of D outputs, from features alone; NumPy only.
 
-    ``mean``: GP of the error. ``noise``: GP of the log of the noise variance (or of its ratio to a base), None for constant
-    noise; where it is built on the very arrays ``points`` and ``projection`` of ``mean``, kernel and projection are computed
-    once. ``log_noise_offset`` (D,): added to the log-variance (tail and calibration constants; all of it if ``noise`` is None).
+    ``mean``: GP of the error. ``noise``: GP of the log of the noise variance (or of its ratio to a base), None for
+    constant noise; where it is built on the very arrays ``points`` and ``projection`` of ``mean``, kernel and
+    projection are computed once. ``log_noise_offset`` (D,): added to the log-variance (tail and calibration
+    constants; all of it if ``noise`` is None).
 
     ``predict_one`` reuses its buffers: one instance per thread.
     """
@@ -164,7 +166,7 @@ class SharedBasis:
         return BasisPrediction(mean, var, log_noise + 0.5 * spread + self.log_noise_offset, spread)
 
     def predict_one(self, x: Array) -> BasisPrediction:
-        """One row x (d,), float64: the same numbers from a float32 projection, in buffers made once; fresh arrays out."""
+        """One row x (d,), float64: the same from a float32 projection, in buffers made once; fresh arrays out."""
         if self._row is None:
             self._row = _RowPlan(self)
         return BasisPrediction(*self._row(x))
@@ -202,8 +204,8 @@ class SharedBasis:
 class _RowPlan:
     """Everything :meth:`SharedBasis.predict_one` can prepare: stacked matrices and buffers.
 
-    With v = [u, 1, -|u|^2/2 of each kernel] all exponents are one product ``G v``; with f = [z, z^2] all outputs are one
-    product ``H f``. Exponents are float64 (they cancel), projections float32.
+    With v = [u, 1, -|u|^2/2 of each kernel] all exponents are one product ``G v``; with f = [z, z^2] all outputs are
+    one product ``H f``. Exponents are float64 (they cancel), projections float32.
     """
 
     def __init__(self, basis: SharedBasis) -> None:

@@ -1,8 +1,8 @@
 """The model file: one safetensors file whose metadata holds a JSON header. Loading runs no code.
 
-Layout: as any safetensors file, with the single metadata entry ``gpvo``: a JSON object with ``schema``, ``kind``, ``digest`` and
-``header`` (the caller's). ``digest`` is the SHA-256 of the canonical header and of every array's name, type, shape and bytes.
-Equal content gives equal bytes.
+Layout: as any safetensors file, with the single metadata entry ``gpvo``: a JSON object with ``schema``, ``kind``,
+``digest`` and ``header`` (the caller's). ``digest`` is the SHA-256 of the canonical header and of every array's name,
+type, shape and bytes. Equal content gives equal bytes.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], heade
 
 
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Arrays and header of a model file. Raises ModelError (one line) if it is missing, damaged, truncated or too new."""
+    """Arrays and header of a model file; ModelError (one line) if it is missing, damaged, truncated or too new."""
     path = Path(path)
     document, size = _read_document(path)
     _check_document(document, path)
@@ -84,7 +84,7 @@ def read_header(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _read_document(path: Path) -> tuple[dict[str, Any], int]:
-    """The ``gpvo`` document and the file's size, after every declared size was compared with the bytes that are there."""
+    """The ``gpvo`` document and the file's size, after every declared size was held against the bytes there are."""
     try:
         with path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size

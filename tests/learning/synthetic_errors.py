@@ -14,7 +14,7 @@ RUN_ROWS = 500
 
 @dataclass(frozen=True)
 class Problem:
-    """X (n, 8) inputs, Y (n, 6) outputs, ``mean`` and ``sigma`` (n, 6) of their true Gaussian density, ``run`` (n,) labels."""
+    """X (n, 8) inputs, Y (n, 6) outputs, ``mean`` and ``sigma`` (n, 6) of the true density, ``run`` (n,) labels."""
 
     X: Array
     Y: Array

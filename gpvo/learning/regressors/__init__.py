@@ -1,4 +1,4 @@
-"""GP regressors behind one small protocol, chosen by name; others join through the entry point group ``gpvo.regressors``."""
+"""GP regressors behind one protocol, chosen by name; others join by the entry point group ``gpvo.regressors``."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ def regressor_names() -> tuple[str, ...]:
 def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Regressor:
     """A regressor by name; ``auto`` is ``exact`` up to 2,000 rows and ``sparse`` above.
 
-    ``options`` go to the regressor: all take ``isotropic``, ``threads`` and ``hyper`` (fixed hyperparameters); ``sparse`` and
-    ``svgp`` also ``inducing``; ``exact`` and ``svgp`` ``device`` ("auto", "cpu", "cuda"). Raises GpvoError for unknown names.
+    ``options`` go to the regressor: all take ``isotropic``, ``threads`` and ``hyper`` (fixed hyperparameters);
+    ``sparse`` and ``svgp`` also ``inducing``; ``exact`` and ``svgp`` ``device`` ("auto", "cpu", "cuda"). Raises
+    GpvoError for unknown names.
     """
     if name == "auto":
         name = "exact" if n_rows is not None and n_rows <= EXACT_ROWS else "sparse"

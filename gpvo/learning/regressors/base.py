@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 class Hyperparameters:
     """Of a squared-exponential kernel shared by D outputs of d inputs, in the units of the data.
 
-    ``lengthscale`` (d,); ``signal_var``, ``noise_var`` (D,). A row of noise weight w has noise variance ``noise_var / w``.
+    ``lengthscale`` (d,); ``signal_var``, ``noise_var`` (D,). A row of noise weight w has noise variance ``noise_var /
+    w``.
     """
 
     lengthscale: Array
@@ -29,9 +30,9 @@ class Hyperparameters:
 class FittedGP:
     """A fitted GP: its posterior in projected form, in the units of the data.
 
-    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.basis``). ``hyper``: what was learnt. ``log_evidence``:
-    log marginal likelihood of the optimised rows, or its lower bound, in nats and in the units of the data.
-    ``regressor``: name. ``n_rows``: rows conditioned on.
+    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.basis``). ``hyper``: what was learnt.
+    ``log_evidence``: log marginal likelihood of the optimised rows, or its lower bound, in nats and in the units of
+    the data. ``regressor``: name. ``n_rows``: rows conditioned on.
     """
 
     gp: ProjectedGP
@@ -46,7 +47,7 @@ class FittedGP:
 
 
 class Regressor(Protocol):
-    """Fits D outputs that share one kernel. Options are constructor arguments; fitting the same data twice gives the same bits."""
+    """Fits D outputs that share one kernel. Options go to the constructor; the same data gives the same bits."""
 
     name: str
 
@@ -61,7 +62,8 @@ class Regressor(Protocol):
     ) -> FittedGP:
         """Learn the hyperparameters and the posterior.
 
-        X (n, d) and Y (n, D) finite. ``noise_weight`` (n,): precision of each row relative to ``1 / noise_var``, one profile
-        for all outputs. ``sample_weight`` (n,): how often a row counts. Raises ValueError on shapes that do not fit.
+        X (n, d) and Y (n, D) finite. ``noise_weight`` (n,): precision of each row relative to ``1 / noise_var``, one
+        profile for all outputs. ``sample_weight`` (n,): how often a row counts. Raises ValueError on shapes that do
+        not fit.
         """
         ...

@@ -1,7 +1,8 @@
 """The collapsed variational bound of sparse GP regression, its closed-form gradient, and the posterior it implies.
 
-M. Titsias, "Variational Learning of Inducing Variables in Sparse Gaussian Processes" (2009), equation 9, with a weight per row.
-Everything the bound needs of the rows is a sum over them, so rows may stream and folds may be subtracted.
+M. Titsias, "Variational Learning of Inducing Variables in Sparse Gaussian Processes" (2009), equation 9, with a
+weight per row. Everything the bound needs of the rows is a sum over them, so rows may stream and folds may be
+subtracted.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def accumulate(rows: Iterable[Chunk], points: Array, lengthscale: Array) -> Sums
 
 
 class CollapsedBound:
-    """Negative bound on the log marginal likelihood of rows held in memory, summed over outputs, inducing points fixed."""
+    """Negative bound on the log marginal likelihood of rows in memory, over all outputs, points fixed."""
 
     def __init__(self, Xs: Array, Ys: Array, w: Array, count: Array, points: Array) -> None:
         self.rows = (Xs, Ys, w, count)
@@ -171,7 +172,7 @@ def _bound(sums: Sums, kk: Tensor, ky: Tensor, R: Tensor, logs: Tensor) -> Tenso
 
 @dataclass(frozen=True)
 class Eigenbasis:
-    """Directions that diagonalise the rows' statistics: ``P`` (m, m), ``eigenvalues`` (m,) falling, ``z_y`` (m, D) = P ky."""
+    """Directions that diagonalise the rows' statistics: ``P`` (m, m), ``eigenvalues`` (m,), ``z_y`` (m, D) = P ky."""
 
     P: Tensor
     eigenvalues: Array

@@ -39,9 +39,10 @@ BOUND_POINTS = 128
 class ExactRegressor:
     """For up to a few thousand rows: O(n^2) memory, O(n^3) per step.
 
-    ``isotropic``: one length scale for all inputs. ``hyper``: fixed hyperparameters, in the units of the data; nothing is
-    learnt then. ``centre_outputs``: subtract the outputs' weighted mean first (a constant mean function). ``polish``: steps
-    on the exact likelihood of all rows, after the climb on its bound, where there are more than a few hundred.
+    ``isotropic``: one length scale for all inputs. ``hyper``: fixed hyperparameters, in the units of the data;
+    nothing is learnt then. ``centre_outputs``: subtract the outputs' weighted mean first (a constant mean function).
+    ``polish``: steps on the exact likelihood of all rows, after the climb on its bound, where there are more than a
+    few hundred.
     """
 
     isotropic: bool = False
@@ -104,8 +105,8 @@ def learn(
 ) -> Hyperparameters:
     """Maximise the log marginal likelihood of standardised data.
 
-    Beyond a few hundred rows an exact step costs seconds, so the climb is made on a subset, then on the collapsed bound of
-    all rows, and ``polish`` last steps on the exact likelihood.
+    Beyond a few hundred rows an exact step costs seconds, so the climb is made on a subset, then on the collapsed
+    bound of all rows, and ``polish`` last steps on the exact likelihood.
     """
     n = len(Xs)
     if n <= START_ROWS:
@@ -120,7 +121,7 @@ def learn(
 
 
 def start(Xs: Array, Ys: Array, w: Array, *, isotropic: bool, seed: int) -> Hyperparameters:
-    """Where to start from: the exact likelihood of a few hundred random rows of standardised data, roughly maximised."""
+    """Where to start from: the exact likelihood of a few hundred standardised rows, roughly maximised."""
     rows = np.sort(np.random.default_rng(seed).permutation(len(Xs))[:START_ROWS])
     evidence = ExactEvidence(Xs[rows], Ys[rows], w[rows], torch.device("cpu"))
     return _maximise(evidence, first_guess(Xs.shape[1], Ys.shape[1]), isotropic, START_ITERATIONS)
@@ -182,8 +183,8 @@ def condition(
 ) -> ProjectedGP:
     """Posterior given standardised hyperparameters, on all training points.
 
-    With C = W^1/2 R W^1/2 = V diag(l) V^T and eta_j = noise / signal, ``(R + eta W^-1)^-1 = W^1/2 V (l + eta)^-1 V^T W^1/2``:
-    one factorisation serves every output, whatever its eta.
+    With C = W^1/2 R W^1/2 = V diag(l) V^T and eta_j = noise / signal, ``(R + eta W^-1)^-1 = W^1/2 V (l + eta)^-1 V^T
+    W^1/2``: one factorisation serves every output, whatever its eta.
     """
     lengthscale = hyper.lengthscale * scaling.x_scale
     points = (X - scaling.x_centre) / lengthscale

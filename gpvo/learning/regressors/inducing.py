@@ -1,7 +1,7 @@
 """Choice of inducing points: greedy conditional variance, that is, pivoted Cholesky of the kernel matrix.
 
-D. R. Burt, C. E. Rasmussen, M. van der Wilk, "Convergence of Sparse Variational Inference in Gaussian Processes Regression"
-(2020), section 7.2.
+D. R. Burt, C. E. Rasmussen, M. van der Wilk, "Convergence of Sparse Variational Inference in Gaussian Processes
+Regression" (2020), section 7.2.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _CANDIDATES = 8000
 def greedy_points(U: Array, m: int, *, seed: int = 0, tolerance: float = 1e-6) -> Array:
     """At most m of the rows U (n, d), inputs over length scales, each the least explained by those before it.
 
-    Stops early where every candidate is explained to ``tolerance``; all rows if there are no more than m and none repeats
-    another. Of more than 8,000 rows a random 8,000 are candidates.
+    Stops early where every candidate is explained to ``tolerance``; all rows if there are no more than m and none
+    repeats another. Of more than 8,000 rows a random 8,000 are candidates.
     """
     n = len(U)
     if n > _CANDIDATES:

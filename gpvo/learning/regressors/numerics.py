@@ -1,4 +1,4 @@
-"""Shared pieces of the regressors: threads, scaling, the unit kernel and its length-scale gradient, small factorisations."""
+"""Shared pieces of the regressors: threads, scaling, the unit kernel and its gradient, factorisations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LOG_NOISE_BOUNDS = (np.log(1e-6), np.log(1e2))
 
 @contextmanager
 def fixed_threads(n: int) -> Iterator[None]:
-    """Run linear algebra on exactly ``n`` threads: a sum split differently rounds differently, and a fit must repeat."""
+    """Run linear algebra on exactly ``n`` threads: sums split otherwise round otherwise, and a fit must repeat."""
     before = torch.get_num_threads()
     torch.set_num_threads(n)
     try:
@@ -98,7 +98,7 @@ def checked(
 
 
 def unit_kernel(A: Tensor, B: Tensor) -> Tensor:
-    """``exp(-|a - b|^2 / 2)`` between the rows of A (n, d) and B (m, d), already divided by the length scales: (n, m)."""
+    """``exp(-|a - b|^2 / 2)`` between the rows of A (n, d) and B (m, d), over the length scales: (n, m)."""
     e = torch.addmm(0.5 * (A * A).sum(1)[:, None] + 0.5 * (B * B).sum(1)[None], A, B.T, alpha=-1.0)
     return e.clamp_min_(0.0).neg_().exp_()
 
@@ -109,7 +109,7 @@ def length_gradient(W: Tensor, A: Tensor, B: Tensor) -> Tensor:
 
 
 def cholesky(K: Tensor) -> Tensor:
-    """Lower factor of a unit kernel matrix, with the least jitter of 1e-10, 1e-8, 1e-6, 1e-4 that makes it positive definite."""
+    """Lower factor of a unit kernel matrix, with the least jitter from 1e-10 to 1e-4 that will do."""
     eye = torch.eye(len(K), dtype=K.dtype, device=K.device)
     for jitter in (1e-10, 1e-8, 1e-6, 1e-4):
         L, info = torch.linalg.cholesky_ex(K + jitter * eye)

@@ -1,4 +1,4 @@
-"""Sparse GP regression: inducing points by pivoted Cholesky, hyperparameters by the collapsed bound, one pass over all rows."""
+"""Sparse GP regression: points by pivoted Cholesky, hyperparameters by the collapsed bound, one pass over all rows."""
 
 from __future__ import annotations
 
