@@ -228,6 +228,7 @@ class ErrorStateFilter:
         for block, G in ((TH, J), (me.CLONE_TH, J_clone)):
             self.P[:, block, :] = G @ self.P[:, block, :]
             self.P[:, :, block] = self.P[:, :, block] @ kernels.transpose(G)
+        self.P = 0.5 * (self.P + kernels.transpose(self.P))
         dx[:] = 0.0
 
     def clone(self, *, measured: bool = False) -> None:

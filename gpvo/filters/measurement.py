@@ -98,9 +98,10 @@ def jacobian(
 
 
 def residual(R_rel: Array, t_rel: Array, T_est: Array, mean: Array) -> Array:
-    """``Log(T_pred^-1 T_est Exp(-mean))`` (B, 6), of predictions (B, ...) and one measured motion (4, 4)."""
+    """``Log(T_pred^-1 T_est Exp(-mean))`` (B, 6), of predictions (B, ...) and measured motions (4, 4) or (B, 4, 4)."""
     R_m, t_m = kernels.motion_exp(-mean)
-    R_est = T_est[:3, :3] @ R_m
-    t_est = t_m @ T_est[:3, :3].T + T_est[:3, 3]
+    R_est, t_est = T_est[..., :3, :3], T_est[..., :3, 3:]
     Rt = kernels.transpose(R_rel)
-    return kernels.motion_log(Rt @ R_est, (Rt @ (t_est - t_rel)[:, :, None])[:, :, 0])
+    R = Rt @ (R_est @ R_m)
+    t = Rt @ (R_est @ t_m[:, :, None] + t_est - t_rel[:, :, None])
+    return kernels.motion_log(R, t[:, :, 0])
