@@ -49,7 +49,10 @@ class CameraModel(Protocol):
 
 def _smallest_positive_root(coefficients_ascending: tuple[float, ...], default: float) -> float:
     """Smallest positive real root of a polynomial, or ``default`` where there is none."""
-    roots = np.roots(np.trim_zeros(np.asarray(coefficients_ascending[::-1], dtype=np.float64), "f"))
+    descending = np.asarray(coefficients_ascending[::-1], dtype=np.float64)
+    # A vanishing leading coefficient puts its root out of any lens and spoils the others.
+    descending[np.abs(descending) < 1e-12] = 0.0
+    roots = np.roots(np.trim_zeros(descending, "f"))
     real = roots[np.abs(roots.imag) <= 1e-9 * (1.0 + np.abs(roots.real))].real
     positive = real[real > 1e-9]
     return float(positive.min()) if len(positive) else default

@@ -34,7 +34,7 @@ for _tag in ("tag:yaml.org,2002:opencv-matrix", "!opencv-matrix"):
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; ``!!opencv-matrix`` becomes an array (rows, cols).
 
-    OpenCV's first line ``%YAML:1.0`` is no YAML and is dropped; duplicate anchors and Python tags are refused.
+    OpenCV's first line ``%YAML:1.0`` is no YAML and is dropped; tags that would build Python objects are refused.
 
     Raises
     ------
