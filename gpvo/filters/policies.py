@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.filters.measurement import MotionNoise
+from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import Prediction, VoRecord
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ class GeometricPolicy:
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
         """The record's own covariance; None where the method has none for this frame."""
         covariance = record.covariances.get(self.name)
-        if covariance is None or not np.isfinite(covariance).all():
+        if covariance is None or not is_positive_definite(covariance):
             return None
         return MotionNoise(_ZERO_MEAN, np.asarray(covariance, dtype=np.float64)[None])
 
@@ -78,7 +79,7 @@ class LearnedPolicy:
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
         """The prediction's parts as filter noise; None without a prediction for this frame."""
-        if prediction is None or not np.isfinite(prediction.covariance).all():
+        if prediction is None or not is_positive_definite(prediction.covariance):
             return None
         mean = np.asarray(prediction.mean, dtype=np.float64)[None]
         if not self.use_parts:

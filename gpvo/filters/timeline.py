@@ -29,8 +29,8 @@ _GAP_FACTOR, _GAP_S = 5.0, 0.05
 
 @dataclass(frozen=True)
 class Step:
-    """What one record did: ``outcome`` is ``used``, ``rejected``, ``lost``, ``start``, ``no_reference`` or
-    ``no_covariance``; ``innovation`` is None where there was no measurement."""
+    """What one record did: ``outcome`` is ``used``, ``rejected``, ``lost``, ``start``, ``no_reference``,
+    ``not_finite`` or ``no_covariance``; ``innovation`` is None where there was no measurement."""
 
     t_ns: int
     outcome: str
@@ -146,6 +146,8 @@ class Timeline:
             return Step(record.t_ns, record.status.value)
         if record.t_prev_ns != self._reference_ns:
             return Step(record.t_ns, "no_reference")
+        if not np.isfinite(record.T_prev_cur).all():
+            return Step(record.t_ns, "not_finite")
         if noise is None:
             return Step(record.t_ns, "no_covariance")
         innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate)

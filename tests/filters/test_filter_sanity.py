@@ -1,0 +1,99 @@
+"""Bad input to a filter: one clear line each, and none for a good flight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpvo.errors import GpvoError
+from gpvo.filters.run import Flight
+from gpvo.filters.sanity import check_flight, require_sane
+from gpvo.filters.synthetic import synthetic_flight, with_geometric
+from gpvo.types import ImuLog
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return synthetic_flight(4, duration_s=20)
+
+
+def _with_imu(flight: Flight, change: Callable[[ImuLog], ImuLog]) -> Flight:
+    assert flight.imu is not None
+    return replace(flight, imu=change(flight.imu))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_good_flight_has_no_findings(seed: int) -> None:
+    assert check_flight(synthetic_flight(seed, duration_s=20)) == []
+
+
+@pytest.mark.parametrize(
+    "change, kind, words",
+    [
+        (lambda i: replace(i, acc_mps2=i.acc_mps2 / 9.80665), "acc_unit", "in g"),
+        (lambda i: replace(i, gyro_radps=np.degrees(i.gyro_radps)), "gyro_unit", "degrees per second"),
+        (lambda i: replace(i, gyro_radps=i.gyro_radps[:, [1, 0, 2]]), "gyro_axes", "axes renamed to (y, x, z)"),
+        (lambda i: replace(i, gyro_radps=i.gyro_radps * [1, -1, -1]), "gyro_axes", "(x, -y, -z)"),
+        (lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 1, 0]]), "acc_axes", "accelerometer's axes renamed"),
+        (
+            lambda i: replace(i, acc_mps2=i.acc_mps2[:, [2, 0, 1]], gyro_radps=i.gyro_radps[:, [2, 0, 1]]),
+            "gyro_axes",
+            "axes renamed to (y, z, x)",
+        ),
+        (lambda i: replace(i, t_ns=i.t_ns + 10**12), "clock", "do not overlap"),
+    ],
+)
+def test_a_wrong_imu_is_named(flight: Flight, change: Callable[[ImuLog], ImuLog], kind: str, words: str) -> None:
+    wrong = _with_imu(flight, change)
+    found = [f for f in check_flight(wrong) if f.fatal]
+    assert any(f.kind == kind and words in f.text for f in found), [str(f) for f in found]
+    with pytest.raises(GpvoError) as error:
+        require_sane(wrong)
+    assert "\n" not in str(error.value)
+
+
+def test_linear_acceleration_is_not_specific_force(flight: Flight) -> None:
+    assert flight.imu is not None
+    up = flight.T_world_imu[:, 2, :3]
+    nearest = np.minimum(np.arange(len(flight.imu.t_ns)) // 10, len(up) - 1)
+    wrong = _with_imu(flight, lambda i: replace(i, acc_mps2=i.acc_mps2 - 9.80665 * up[nearest]))
+    assert [f.kind for f in check_flight(wrong)] == ["acc_unit"]
+    assert "gravity has been taken out" in check_flight(wrong)[0].text
+
+
+def test_gaps_and_bad_samples_are_said_but_not_fatal(flight: Flight) -> None:
+    assert flight.imu is not None
+    keep = np.ones(len(flight.imu.t_ns), bool)
+    keep[1000:1100] = False
+    acc = flight.imu.acc_mps2.copy()
+    acc[5] = np.nan
+    gappy = ImuLog(flight.imu.t_ns[keep], flight.imu.gyro_radps[keep], acc[keep], flight.imu.noise)
+    found = require_sane(replace(flight, imu=gappy))
+    assert any("1 gaps in the IMU, the longest 0.5" in f.text for f in found)
+    assert any("1 of" in f.text and "not finite" in f.text for f in found)
+
+
+def test_bad_covariances_are_counted(flight: Flight) -> None:
+    good = np.eye(6) * 1e-4
+    some = with_geometric(flight, good)
+    records = list(some.records)
+    indefinite = good.copy()
+    indefinite[0, 0] = -1e-4
+    records[3] = replace(records[3], covariances={"triangulation": indefinite})
+    records[4] = replace(records[4], covariances={"triangulation": good * np.nan})
+    found = [str(f) for f in require_sane(replace(some, records=records))]
+    assert len(found) == 2
+    assert all("triangulation" in line and "t_ns" in line for line in found)
+    with pytest.raises(GpvoError, match="not symmetric positive definite"):
+        require_sane(with_geometric(flight, -good))
+
+
+def test_a_level_flight_without_rotation_in_degrees(flight: Flight) -> None:
+    assert flight.imu is not None
+    still = [replace(r, T_prev_cur=np.eye(4)) for r in flight.records]
+    gyro = np.full_like(flight.imu.gyro_radps, 20.0)
+    found = check_flight(replace(flight, records=still, imu=replace(flight.imu, gyro_radps=gyro)))
+    assert any(f.kind == "gyro_unit" for f in found)
