@@ -55,7 +55,7 @@ class EurocSource(FileSource):
         self.imu = _read_imu(path, mav, rig)
         self.truth = self._read_truth(mav, truth_noise)
         if self.truth is None and (mav / "leica0").is_dir():
-            known.note("leica0 gives positions only: not used as truth of motions")
+            self.remark("leica0 gives positions only: not used as truth of motions")
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

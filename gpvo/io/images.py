@@ -18,7 +18,7 @@ from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import in_order
+from gpvo.io.stamps import in_order, usual_interval
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
@@ -59,10 +59,15 @@ def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
 
 def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
     """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8, None where they are no image."""
+    # A damaged image is counted and reported by us; OpenCV need not warn as well.
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
         image = cv2.imdecode(raw, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
     except cv2.error:
         return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
     return to_grey8(image, bits=bits)
@@ -163,6 +168,7 @@ class ImageSource:
         self.calibration: dict[str, Any] | None = {**rig.describe(), "R_rect_left": R_rect_left}
         self.bits, self._prefetch = bits, prefetch
         self.span_ns: tuple[int, int] = (0, 0)
+        self.usual_interval_ns: float | None = None
 
     def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
         """Stamps [ns] with decoded raw images, None for an image that is not readable."""
@@ -176,12 +182,17 @@ class ImageSource:
         frames = self._frames(report)
         return prefetched(frames) if self._prefetch else frames
 
+    def remark(self, text: str) -> None:
+        """Add a remark to this and every later report."""
+        self.known.note(text)
+        self.report.note(text)
+
     def _fresh_report(self) -> SourceReport:
         """A report with what was already known when the source was opened."""
         return replace(self.known, notes=list(self.known.notes))
 
     def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
-        for frame in in_order(self._readable(report), report):
+        for frame in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
             yield StereoFrame(frame.t_ns, *self.rectifier.apply(frame.left, frame.right))
         if report.frames == 0:
@@ -214,6 +225,7 @@ class FileSource(ImageSource):
         super().__init__(path, name, rig, known=known, **options)
         self._pairs = pairs
         self.span_ns = (min(p.t_ns for p in pairs), max(p.t_ns for p in pairs))
+        self.usual_interval_ns = usual_interval(p.t_ns for p in pairs)
         check_size(pairs, rig)
 
     def __len__(self) -> int:

@@ -46,14 +46,15 @@ class _Stamped(Protocol):
 F = TypeVar("F", bound=_Stamped)
 
 
-def in_order(frames: Iterable[F], report: SourceReport) -> Iterator[F]:
+def in_order(frames: Iterable[F], report: SourceReport, usual_ns: float | None = None) -> Iterator[F]:
     """The frames whose stamps grow; repeated and out-of-order stamps are dropped and counted, long gaps counted.
 
     Looks one frame ahead, so that a single stamp far in the future is dropped instead of everything behind it.
+    ``usual_ns``: the usual interval where it is known beforehand, else the median of the last ones.
     """
+    gaps = _GapWatch(report, usual_ns)
     last: int | None = None
     pending: F | None = None
-    intervals: deque[int] = deque(maxlen=_WINDOW)
     for frame in frames:
         if pending is None:
             pending = frame
@@ -66,22 +67,40 @@ def in_order(frames: Iterable[F], report: SourceReport) -> Iterator[F]:
             if last is None or frame.t_ns > last:
                 pending = frame
         else:
-            _watch_gap(last, pending.t_ns, intervals, report)
+            gaps.see(pending.t_ns)
             yield pending
             last, pending = pending.t_ns, frame
     if pending is not None:
-        _watch_gap(last, pending.t_ns, intervals, report)
+        gaps.see(pending.t_ns)
         yield pending
 
 
-def _watch_gap(last: int | None, t_ns: int, intervals: deque[int], report: SourceReport) -> None:
-    if last is None:
-        return
-    interval = t_ns - last
-    if len(intervals) >= 3 and interval > GAP_FACTOR * float(np.median(intervals)):
-        report.gaps += 1
-        report.note(f"gap of {interval * 1e-9:.3f} s before {t_ns} ns")
-    intervals.append(interval)
+class _GapWatch:
+    """Counts intervals that are too long."""
+
+    def __init__(self, report: SourceReport, usual_ns: float | None) -> None:
+        self._report, self._usual_ns = report, usual_ns
+        self._last: int | None = None
+        self._intervals: deque[int] = deque(maxlen=_WINDOW)
+
+    def see(self, t_ns: int) -> None:
+        """Take the next stamp."""
+        if self._last is not None:
+            interval = t_ns - self._last
+            usual = self._usual_ns
+            if usual is None and len(self._intervals) >= 3:
+                usual = float(np.median(self._intervals))
+            if usual is not None and interval > GAP_FACTOR * usual:
+                self._report.gaps += 1
+                self._report.note(f"gap of {interval * 1e-9:.3f} s before {t_ns} ns")
+            self._intervals.append(interval)
+        self._last = t_ns
+
+
+def usual_interval(t_ns: Iterable[int]) -> float | None:
+    """Median interval of stamps [ns], whatever their order; None for fewer than three."""
+    stamps = np.unique(np.fromiter(t_ns, dtype=np.int64))
+    return float(np.median(np.diff(stamps))) if len(stamps) > 2 else None
 
 
 def match_equal(

@@ -298,6 +298,6 @@ def test_real_t265(real_data):
     rectifier = Rectifier(rig.with_masks(*masks))
     assert rectifier.camera.width == 848
     assert rectifier.mask is None or rectifier.mask.mean() > 0.9
-    wide = Rectifier(rig.with_masks(*masks), hfov_deg=140.0)
+    wide = Rectifier(rig.with_masks(*masks), hfov_deg=155.0)
     assert wide.mask is not None
     assert 0.3 < wide.mask.mean() < 0.99

@@ -1,0 +1,356 @@
+"""Sequences from folders: pairing, damage, truth, and what is refused."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import sequences as seq
+from gpvo.errors import CalibrationError, GpvoError, SourceError
+from gpvo.geometry import se3
+from gpvo.io import guess, open_source
+from gpvo.io.source import Source, source_kinds
+
+MAKERS = {"euroc": seq.write_euroc, "kitti": seq.write_kitti, "folder": seq.write_folder}
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+@pytest.mark.parametrize("prefetch", [True, False])
+def test_every_frame_comes_once_and_in_order(tmp_path, kind, prefetch):
+    path = MAKERS[kind](tmp_path / "s")
+    assert guess(path) == kind
+    source = open_source(path, prefetch=prefetch)
+    assert isinstance(source, Source)
+    assert (source.format, source.kind, len(source)) == (kind, "images", 12)
+    assert source.camera.baseline_m == pytest.approx(0.1)
+    frames = seq.frames_of(source)
+    assert [k for _, k in frames] == list(range(12))
+    assert str(source.report) == "12 frames"
+    # And once more, with a fresh report.
+    assert seq.frames_of(source) == frames
+    assert source.report.frames == 12
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_missing_and_unreadable_images_shift_nothing(tmp_path, kind):
+    path = MAKERS[kind](tmp_path / "s", 24)
+    folders = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1")}
+    left, right = [path / f for f in folders.get(kind, ("left", "right"))]
+    name = sorted(p.name for p in left.iterdir())
+    (left / name[2]).unlink()
+    (right / name[4]).unlink()
+    (left / name[6]).write_bytes(b"no image")
+    (right / name[7]).write_bytes((right / name[7]).read_bytes()[:40])
+    seq.write_image(left / name[9], np.zeros((10, 10), np.uint8))
+    source = open_source(path)
+    frames = seq.frames_of(source)
+    assert [k for _, k in frames] == [0, 1, 3, 5, 8, *range(10, 24)]
+    step = frames[1][0] - frames[0][0]
+    assert [round((t - frames[0][0]) / step) for t, _ in frames] == [k for _, k in frames]
+    report = source.report
+    assert (report.missing, report.unreadable, report.frames) == (2, 3, 19)
+    assert report.gaps == 4
+    assert report.notes
+
+
+def test_euroc_lists_with_every_disorder(tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    t = seq.stamps(12)
+    lists = {c: path / "mav0" / c / "data.csv" for c in ("cam0", "cam1")}
+    # Left: 5 before 4, 7 twice, one far in the future. Right: 3 not listed, one line of rubbish.
+    order = [0, 1, 2, 3, 5, 4, 6, 7, 7, 8, 9, 10, 11]
+    future = t[0] + 10**15
+    shutil.copy(path / f"mav0/cam0/data/{t[0]}.png", path / f"mav0/cam0/data/{future}.png")
+    left = [f"{t[k]},{t[k]}.png" for k in order]
+    left.insert(10, f"{future},{future}.png")
+    lists["cam0"].write_text("#head\n" + "\n".join(left) + "\n")
+    right = [f"{t[k]},{t[k]}.png" for k in range(12) if k != 3] + ["rubbish", "12,../../../etc/passwd"]
+    lists["cam1"].write_text("\n".join([*right, f"{future},{future}.png"]) + "\n")
+    shutil.copy(path / f"mav0/cam0/data/{future}.png", path / f"mav0/cam1/data/{future}.png")
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 4, 6, 7, 8, 9, 10, 11]
+    report = source.report
+    assert (report.duplicate, report.out_of_order, report.missing, report.unreadable) == (1, 2, 1, 2)
+
+
+def test_kitti_times_with_disorder(tmp_path):
+    path = seq.write_kitti(tmp_path / "s")
+    times = [0.0, 0.1, 0.2, 0.2, 0.4, 99.0, 0.6, 0.7, 0.65, 0.9, 1.0, 1.1]
+    (path / "times.txt").write_text("".join(f"{t}\n" for t in times))
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 4, 6, 8, 9, 10, 11]
+    assert (source.report.duplicate, source.report.out_of_order) == (1, 2)
+
+
+def test_kitti_more_images_than_times(tmp_path):
+    path = seq.write_kitti(tmp_path / "s", poses=False)
+    (path / "times.txt").write_text("".join(f"{k * 0.1}\n" for k in range(9)))
+    source = open_source(path)
+    assert len(seq.frames_of(source)) == 9
+    assert source.report.missing == 3
+
+
+def test_kitti_colour_and_poses_beside_the_sequences(tmp_path):
+    path = seq.write_kitti(tmp_path / "sequences" / "07", folders=("image_2", "image_3"))
+    (tmp_path / "poses").mkdir()
+    shutil.move(path / "poses.txt", tmp_path / "poses" / "07.txt")
+    source = open_source(path)
+    assert len(source) == 12
+    # Camera 2 sits 5 cm to the left of camera 0, whose poses these are.
+    offset = se3.exp(np.array([-0.05, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12) @ offset, atol=1e-5)
+    assert source.truth.sigma_translation_m == 3e-3
+
+
+def test_euroc_truth_is_of_the_rectified_left_camera(tmp_path):
+    source = open_source(seq.write_euroc(tmp_path / "s"))
+    assert source.truth is not None
+    assert source.imu is not None
+    expected = seq.true_poses(12) @ source.mounting.T_imu_cam
+    np.testing.assert_allclose(source.truth.T_world_cam, expected, atol=1e-9)
+    np.testing.assert_allclose(source.mounting.T_imu_cam, seq.T_BODY_LEFT, atol=1e-9)
+    assert source.truth.sigma_translation_m == 0.0
+    np.testing.assert_array_equal(source.imu.gyro_radps[0], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(source.imu.acc_mps2[0], [0, 0, 9.81])
+    assert source.mounting.T_body_cam is None
+
+
+def test_body_that_says_it_is_flu_and_stated_noise(tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    (path / "mav0" / "body.yaml").write_text("comment: made\naxes: FLU\n")
+    sensor = path / "mav0" / "state_groundtruth_estimate0" / "sensor.yaml"
+    sensor.write_text("sigma_translation_m: 0.002\nsigma_rotation_rad: 0.001\n")
+    source = open_source(path)
+    np.testing.assert_allclose(source.mounting.T_body_cam, seq.T_BODY_LEFT, atol=1e-9)
+    assert (source.truth.sigma_translation_m, source.truth.sigma_rotation_rad) == (0.002, 0.001)
+
+
+def test_vicon_marker_and_leica(tmp_path):
+    path = seq.write_euroc(tmp_path / "s", truth=False)
+    (path / "mav0" / "leica0").mkdir()
+    (path / "mav0" / "leica0" / "data.csv").write_text("#t,x,y,z\n1,2,3,4\n")
+    assert open_source(path).truth is None
+    assert any("leica0" in note for note in open_source(path).report.notes)
+    seq.write_euroc_truth(path / "mav0" / "vicon0" / "data.csv", 12)
+    T_body_marker = se3.exp(np.array([0.1, 0.0, 0.05, 0.0, 0.1, 0.0]))
+    (path / "mav0" / "vicon0" / "sensor.yaml").write_text(seq.sensor_yaml(T_body_marker))
+    source = open_source(path)
+    expected = seq.true_poses(12) @ se3.inverse(T_body_marker) @ seq.T_BODY_LEFT
+    np.testing.assert_allclose(source.truth.T_world_cam, expected, atol=1e-9)
+    assert source.truth.sigma_rotation_rad == 8e-4
+
+
+@pytest.mark.parametrize(
+    ("left", "right"), [("cam0", "cam1"), ("left/data", "right/data"), ("image_left", "image_right")]
+)
+def test_folder_names(tmp_path, left, right):
+    source = open_source(seq.write_folder(tmp_path / "s", left=left, right=right))
+    assert [k for _, k in seq.frames_of(source)] == list(range(12))
+
+
+def test_one_folder_with_sides_and_times(tmp_path):
+    for k in range(12):
+        for side in ("left", "right"):
+            if (k, side) not in {(3, "left"), (8, "right")}:
+                seq.write_image(tmp_path / f"frame_{k:04d}_{side}.png", seq.grey(k))
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    with pytest.raises(SourceError, match=r"no times\.txt"):
+        open_source(tmp_path)
+    assert [k for _, k in seq.frames_of(open_source(tmp_path, rate_hz=20.0))] == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
+    (tmp_path / "times.txt").write_text("".join(f"{10 + 0.05 * k:.3f}\n" for k in range(12)))
+    source = open_source(tmp_path)
+    frames = seq.frames_of(source)
+    assert [k for _, k in frames] == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
+    assert [t for t, _ in frames] == [10_000_000_000 + 50_000_000 * k for _, k in frames]
+    assert source.report.missing == 2
+
+
+def test_folder_with_truth_and_imu(tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    euroc = seq.write_euroc(tmp_path / "e")
+    shutil.copy(euroc / "mav0" / "imu0" / "data.csv", path / "imu.csv")
+    from gpvo.io.trajectory import write_tum
+
+    write_tum(path / "truth.tum", np.array(seq.stamps(12)), seq.true_poses(12))
+    source = open_source(path)
+    assert source.imu is not None
+    np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12), atol=1e-8)
+
+
+def test_sixteen_bit_images(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 4)
+    for side in ("left", "right"):
+        for k, file in enumerate(sorted((path / side).iterdir())):
+            seq.write_image(file, seq.grey(k).astype(np.uint16) * 256)
+    assert [k for _, k in seq.frames_of(open_source(path))] == [0, 1, 2, 3]
+    for side in ("left", "right"):
+        for k, file in enumerate(sorted((path / side).iterdir())):
+            seq.write_image(file, seq.grey(k).astype(np.uint16) * 16)
+    assert [k for _, k in seq.frames_of(open_source(path, bits=12))] == [0, 1, 2, 3]
+
+
+def test_user_mask_reaches_the_source(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 3)
+    mask = np.full((seq.HEIGHT, seq.WIDTH), 255, np.uint8)
+    mask[:, :10] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    source = open_source(path, mask_left=tmp_path / "mask.png")
+    assert source.mask is not None
+    assert not source.mask[20, 5]
+    assert source.mask[20, 30]
+
+
+def test_stopping_early_ends_the_thread(tmp_path):
+    import threading
+
+    source = open_source(seq.write_folder(tmp_path / "s"))
+    iterator = iter(source)
+    next(iterator)
+    iterator.close()
+    assert not any(t.name == "gpvo-decode" for t in threading.enumerate())
+
+
+# What is refused, each in one line that names the file and the cure.
+
+
+def _one_line(caught) -> str:
+    text = str(caught.value)
+    assert "\n" not in text
+    assert len(text) < 600
+    return text
+
+
+def test_empty_folder(tmp_path):
+    with pytest.raises(SourceError, match="the folder is empty") as caught:
+        open_source(tmp_path)
+    assert str(tmp_path) in _one_line(caught)
+
+
+def test_nothing_there_and_nothing_known(tmp_path):
+    with pytest.raises(SourceError, match="no such file"):
+        open_source(tmp_path / "nowhere")
+    (tmp_path / "readme.md").write_text("hello")
+    with pytest.raises(SourceError, match="not recognised"):
+        open_source(tmp_path)
+    with pytest.raises(SourceError, match="there is no source 'x'"):
+        open_source(tmp_path, kind="x")
+    with pytest.raises(SourceError, match="no option 'colour'"):
+        open_source(seq.write_folder(tmp_path / "s"), colour=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "files", "cure"),
+    [
+        ("euroc", ("mav0/cam0/sensor.yaml",), r"camchain\.yaml"),
+        ("kitti", ("calib.txt",), r"calib\.txt"),
+        ("folder", ("camchain.yaml",), r"camchain\.yaml"),
+    ],
+)
+def test_missing_calibration(tmp_path, kind, files, cure):
+    path = MAKERS[kind](tmp_path / "s")
+    for file in files:
+        (path / file).unlink()
+    with pytest.raises(CalibrationError, match="no calibration") as caught:
+        open_source(path)
+    assert re.search(cure, _one_line(caught))
+
+
+@pytest.mark.parametrize("kind", ["euroc", "folder"])
+def test_wrong_resolution(tmp_path, kind):
+    path = MAKERS[kind](tmp_path / "s")
+    for file in [*path.rglob("sensor.yaml"), *path.rglob("camchain.yaml")]:
+        file.write_text(file.read_text().replace("[64, 48]", "[128, 96]"))
+    with pytest.raises(CalibrationError, match="64x48, its calibration is for 128x96") as caught:
+        open_source(path)
+    assert ".png" in _one_line(caught)
+
+
+def test_swapped_cameras(tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    a, b = (path / "mav0" / c / "sensor.yaml" for c in ("cam0", "cam1"))
+    text = a.read_text()
+    a.write_text(b.read_text())
+    b.write_text(text)
+    with pytest.raises(CalibrationError, match="left and right are swapped") as caught:
+        open_source(path)
+    _one_line(caught)
+
+
+def test_nan_in_truth_names_the_line(tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    truth = path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    lines = truth.read_text().splitlines()
+    lines[5] = lines[5].split(",")[0] + ",nan" * 9
+    truth.write_text("\n".join(lines))
+    with pytest.raises(SourceError, match="line 6 holds NaN") as caught:
+        open_source(path)
+    assert str(truth) in _one_line(caught)
+
+
+def test_nan_in_kitti_poses_names_the_line(tmp_path):
+    path = seq.write_kitti(tmp_path / "s")
+    lines = (path / "poses.txt").read_text().splitlines()
+    lines[3] = "nan " + lines[3].split(" ", 1)[1]
+    (path / "poses.txt").write_text("\n".join(lines))
+    with pytest.raises(SourceError, match="line 4 holds NaN"):
+        open_source(path)
+
+
+def test_truth_of_another_time(tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    truth = path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    truth.write_text(truth.read_text().replace("\n14036", "\n15036"))
+    with pytest.raises(SourceError, match="does not overlap") as caught:
+        open_source(path)
+    assert str(truth) in _one_line(caught)
+
+
+def test_kitti_poses_of_another_length(tmp_path):
+    path = seq.write_kitti(tmp_path / "s")
+    lines = (path / "poses.txt").read_text().splitlines()
+    (path / "poses.txt").write_text("\n".join(lines[:-2]))
+    with pytest.raises(SourceError, match="10 poses for the 12 lines"):
+        open_source(path)
+
+
+def test_all_images_unreadable(tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    for file in path.rglob("*.png"):
+        file.write_bytes(b"")
+    with pytest.raises(SourceError, match="not one readable"):
+        list(open_source(path))
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_no_traceback_whatever_is_cut(tmp_path, kind):
+    """Any one text file cut short or filled with rubbish gives a GpvoError or works, nothing else."""
+    shown = []
+    for how in (lambda raw: raw[: len(raw) // 3], lambda raw: b"\xff\xfe\x00" * 50, lambda raw: b""):
+        path = MAKERS[kind](tmp_path / "s", 4)
+        files = [p for p in path.rglob("*") if p.suffix in (".csv", ".yaml", ".txt")]
+        for file in files:
+            raw = file.read_bytes()
+            file.write_bytes(how(raw))
+            try:
+                list(open_source(path))
+            except GpvoError as error:
+                shown.append(str(error))
+            file.write_bytes(raw)
+        shutil.rmtree(path)
+    assert shown
+    assert not any("\n" in text for text in shown)
+
+
+def test_sources_of_other_packages(monkeypatch):
+    class Entry:
+        name = "mine"
+
+        @staticmethod
+        def load():
+            return dict
+
+    monkeypatch.setattr("gpvo.io.source.entry_points", lambda group: [Entry] if group == "gpvo.sources" else [])
+    assert source_kinds()["mine"]() is dict
