@@ -93,6 +93,9 @@ class ErrorStateFilter:
         self.P[:, :CORE, :CORE] = covariance
         self.P[:, BIAS, BIAS] = np.eye(6)
         self.dx = np.zeros((self.batch, JOINT))
+        self.clone_p: Array = self.x.position
+        self.clone_R: Array = self.x.R_world_imu
+        self.jitter_cur_mean = np.zeros((self.batch, 6))
         self.jitter_mean = np.zeros((self.batch, 6))
         self.bias_mean = np.zeros((self.batch, 6))
         self.jitter_known = False
@@ -184,7 +187,7 @@ class ErrorStateFilter:
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ kernels.transpose(H)
         S = H @ PHt + R
-        L = np.linalg.cholesky(S)
+        L: Array = np.linalg.cholesky(S)
         whitened = np.linalg.solve(L, np.concatenate([kernels.transpose(PHt), r[:, :, None]], axis=2))
         z = whitened[:, :, -1]
         nis = (z * z).sum(1)

@@ -32,24 +32,28 @@ def skew(v: Array) -> Array:
 def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:
     """sin(t)/t, (1 - cos t)/t^2, (t - sin t)/t^3 of t^2 (B,)."""
     if len(theta2) == 1:
-        t2 = float(theta2[0])
-        if t2 < _SMALL_ANGLE_2:
-            a, b, c = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
-        else:
-            t = math.sqrt(t2)
-            s = math.sin(t)
-            a, b = s / t, 2.0 * math.sin(0.5 * t) ** 2 / t2
-            # t - sin t loses digits below a hundredth of a radian.
-            c = (t - s) / (t2 * t) if t2 > 1e-4 else 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0
-        return np.array([a]), np.array([b]), np.array([c])
+        return _coefficients_of_one(float(theta2[0]))
     safe2 = np.maximum(theta2, _SMALL_ANGLE_2)
     t = np.sqrt(safe2)
     s = np.sin(t)
     small = theta2 < _SMALL_ANGLE_2
     a = np.where(small, 1.0 - theta2 / 6.0, s / t)
     b = np.where(small, 0.5 - theta2 / 24.0, 2.0 * np.sin(0.5 * t) ** 2 / safe2)
+    # t - sin t loses digits below a hundredth of a radian.
     c = np.where(theta2 < 1e-4, 1.0 / 6.0 - theta2 / 120.0 + theta2**2 / 5040.0, (t - s) / (safe2 * t))
     return a, b, c
+
+
+def _coefficients_of_one(t2: float) -> tuple[Array, Array, Array]:
+    """The same of one value, by scalar functions: several times as fast."""
+    if t2 < _SMALL_ANGLE_2:
+        a, b, c = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
+    else:
+        t = math.sqrt(t2)
+        s = math.sin(t)
+        a, b = s / t, 2.0 * math.sin(0.5 * t) ** 2 / t2
+        c = (t - s) / (t2 * t) if t2 > 1e-4 else 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0
+    return np.array([a]), np.array([b]), np.array([c])
 
 
 def exp_and_right_jacobian(phi: Array) -> tuple[Array, Array]:

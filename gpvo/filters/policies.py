@@ -26,7 +26,8 @@ _ZERO_MEAN.setflags(write=False)
 class Policy(Protocol):
     """Gives the noise of one measured motion, None where it has nothing to say about it."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None: ...
 

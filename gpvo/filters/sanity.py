@@ -94,10 +94,12 @@ def _clocks(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
 
 
 def _samples(imu: ImuLog) -> Iterator[Finding]:
-    bad = ~(np.isfinite(imu.gyro_radps).all(axis=1) & np.isfinite(imu.acc_mps2).all(axis=1))
+    bad = ~np.isfinite(np.concatenate([imu.gyro_radps, imu.acc_mps2], axis=1)).all(axis=1)
     if bad.any():
         every = bool(bad.mean() > 0.5)
-        yield Finding("imu", f"{int(bad.sum())} of {len(bad)} IMU samples are not finite and are dropped", fatal=every)
+        yield Finding(
+            "imu", f"{int(bad.sum())} of {len(imu.t_ns)} IMU samples are not finite and are dropped", fatal=every
+        )
 
 
 # -- units and axes -------------------------------------------------------------------------------------------------

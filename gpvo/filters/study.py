@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 # Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
-_COARSE = 4.0 ** np.arange(-4, 3)
-_FINE = 4.0 ** np.array([-0.67, -0.33, 0.0, 0.33, 0.67])
+_COARSE: Array = np.power(4.0, np.arange(-4, 3))
+_FINE: Array = np.power(4.0, [-0.67, -0.33, 0.0, 0.33, 0.67])
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,7 @@ def _pairs(a: Array, b: Array) -> Array:
     return np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def make_policies(
-    constants: Constants | None, *, names: Sequence[str], learned: bool
-) -> dict[str, Policy | None]:
+def make_policies(constants: Constants | None, *, names: Sequence[str], learned: bool) -> dict[str, Policy | None]:
     """The named policies; None for one that lacks what it needs."""
     out: dict[str, Policy | None] = {}
     for name in names:
@@ -187,15 +185,19 @@ def has_noise(flight: Flight, policy: Policy) -> bool:
 def table(study: Study) -> str:
     """Mean of every policy and, below, the ATE of every run."""
     names = list(study.scores)
-    head = f"{'policy':<20}{'ATE m':>9}{'final m':>9}{'drift %':>9}{'NEES p':>8}{'NEES a':>8}{'NIS':>7}{'rej':>7}{'div':>5}"
-    fields = (
-        ("ate_rmse_m", "9.4f"), ("final_error_m", "9.4f"), ("drift_percent", "9.3f"), ("nees_position", "8.2f"),
-        ("nees_attitude", "8.2f"), ("nis_dof", "7.2f"), ("rejected", "7.1f"),
-    )  # fmt: skip
-    lines = [head]
+    columns = (
+        ("ATE m", "ate_rmse_m", 4),
+        ("final m", "final_error_m", 4),
+        ("drift %", "drift_percent", 3),
+        ("NEES pos", "nees_position", 2),
+        ("NEES att", "nees_attitude", 2),
+        ("NIS", "nis_dof", 2),
+        ("rejected", "rejected", 1),
+    )
+    lines = [f"{'policy':<20}" + "".join(f"{title:>10}" for title, _, _ in columns) + f"{'diverged':>10}"]
     for name in names:
-        values = "".join(format(study.mean(name, f), spec) for f, spec in fields)
-        lines.append(f"{name:<20}{values}{int(np.nansum(study.column(name, 'diverged'))):>5d}")
+        values = "".join(f"{study.mean(name, key):>10.{digits}f}" for _, key, digits in columns)
+        lines.append(f"{name:<20}{values}{int(np.nansum(study.column(name, 'diverged'))):>10d}")
     lines += ["", "ATE m of every run", f"{'run':<28}" + "".join(f"{n[:18]:>19}" for n in names)]
     for i, run in enumerate(study.runs):
         ate = [study.column(n, "ate_rmse_m")[i] for n in names]

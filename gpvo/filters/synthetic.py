@@ -131,9 +131,7 @@ def _noisy_imu(
     dt = t[1] - t[0]
 
     def channel(clean: Array, density: float, walk: float, first: float) -> Array:
-        bias = first * rng.standard_normal(3) + np.cumsum(
-            walk * np.sqrt(dt) * rng.standard_normal(clean.shape), axis=0
-        )
+        bias = first * rng.standard_normal(3) + np.cumsum(walk * np.sqrt(dt) * rng.standard_normal(clean.shape), axis=0)
         return clean + bias + density / np.sqrt(dt) * rng.standard_normal(clean.shape)
 
     gyro = channel(omega, noise.gyro_density_radps_sqrthz, noise.gyro_walk_radps2_sqrthz, turn_on[1])
@@ -170,14 +168,20 @@ def _vo(
         if _inside(seconds[k], events.frozen):
             T_est = se3.exp(1e-3 * law.jitter * rng.standard_normal(6))
         known = scale[k] * np.exp(knowledge_error * rng.standard_normal())
-        parts = {
-            name: np.diag((getattr(law, name) * known) ** 2) for name in ("jitter", "white", "bias")
-        }
+        parts = {name: np.diag((getattr(law, name) * known) ** 2) for name in ("jitter", "white", "bias")}
         total = sum(parts.values(), np.zeros((6, 6)))
         records.append(VoRecord(t, t_ref, Status.OK, T_est))
         predictions.append(
             Prediction(
-                t, (t - t_ref) * 1e-9, np.zeros(6), total, parts, np.full(6, law.bias_tau_s), np.zeros(6), 1.0, 1.0,
+                t,
+                (t - t_ref) * 1e-9,
+                np.zeros(6),
+                total,
+                parts,
+                np.full(6, law.bias_tau_s),
+                np.zeros(6),
+                1.0,
+                1.0,
                 Status.OK,
             )
         )

@@ -223,5 +223,3 @@ class Timeline:
         keep = bisect.bisect_right(self._imu_t, t_ns) - 1
         if keep > 1000:
             del self._imu_t[:keep], self._imu[:keep]
-
-

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from gpvo.errors import GpvoError
 from gpvo.filters.run import Flight
 from gpvo.filters.sanity import check_flight, require_sane

@@ -6,9 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from gpvo.filters import measurement as me
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate
@@ -21,8 +18,11 @@ from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, smooth_path
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import ImuLog, Status, VoRecord
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 ACCEPT = Gate(on_fail="accept")
+GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 
 def _nominal(batch: int = 1, velocity: float = 0.0) -> Nominal:
@@ -30,6 +30,10 @@ def _nominal(batch: int = 1, velocity: float = 0.0) -> Nominal:
     v = zero.copy()
     v[:, 0] = velocity
     return Nominal(zero.copy(), v, np.broadcast_to(np.eye(3), (batch, 3, 3)).copy(), zero.copy(), zero.copy())
+
+
+def _filter(covariance: np.ndarray) -> ErrorStateFilter:
+    return ErrorStateFilter(_nominal(), covariance, imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA)
 
 
 def _noise(rng: np.random.Generator, scale: float = 1e-3, parts: bool = True) -> MotionNoise:
@@ -46,7 +50,9 @@ def _noise(rng: np.random.Generator, scale: float = 1e-3, parts: bool = True) ->
 @given(seed=st.integers(0, 10**6), log_scale=st.floats(-6, 1), dt=st.floats(1e-3, 0.1), parts=st.booleans())
 def test_covariance_stays_symmetric_positive_definite(seed: int, log_scale: float, dt: float, parts: bool) -> None:
     rng = np.random.default_rng(seed)
-    filter = ErrorStateFilter(_nominal(), np.diag(rng.uniform(1e-8, 1.0, CORE)), imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA)
+    filter = ErrorStateFilter(
+        _nominal(), np.diag(rng.uniform(1e-8, 1.0, CORE)), imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA
+    )
     for k in range(60):
         samples = rng.standard_normal((4, 1, 3)) * np.array([1, 10, 1, 10])[:, None, None]
         filter.propagate_imu(dt, *samples)
@@ -74,7 +80,7 @@ def test_covariance_after_5000_steps() -> None:
 
 def _long_run(steps: int) -> None:
     rng = np.random.default_rng(1)
-    filter = ErrorStateFilter(_nominal(), np.eye(CORE) * 1e-4, imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA)
+    filter = _filter(np.eye(CORE) * 1e-4)
     for k in range(steps):
         gyro = np.array([[0.1 * np.sin(k / 50), 0.05, 0.2 * np.cos(k / 80)]])
         acc = np.array([[np.sin(k / 30), 0.3, 9.80665]])
@@ -104,7 +110,7 @@ def _own_rule_flight(seed: int, n: int = 2000, every: int = 10, with_lost: bool 
     poses = [np.eye(4)]
     for k in range(n):
         dt = 0.005
-        imu_step(x, F, dt, omega[k][None], force[k][None], omega[k + 1][None], force[k + 1][None], np.array([0, 0, -9.80665]))
+        imu_step(x, F, dt, omega[k][None], force[k][None], omega[k + 1][None], force[k + 1][None], GRAVITY)
         poses.append(se3.from_rt(x.R_world_imu[0], x.position[0]))
     t_ns = np.round(t * 1e9).astype(np.int64)
     T_cam = np.array(poses)[::every] @ FORWARD_CAMERA
@@ -151,7 +157,7 @@ def _integrate(rate_hz: int) -> tuple[float, float]:
     F = np.tile(np.eye(CORE), (1, 1, 1))
     for k in range(len(t) - 1):
         args = (omega[k][None], force[k][None], omega[k + 1][None], force[k + 1][None])
-        imu_step(x, F, 1.0 / rate_hz, *args, np.array([0, 0, -9.80665]))
+        imu_step(x, F, 1.0 / rate_hz, *args, GRAVITY)
     attitude = np.linalg.norm(se3.so3_log(R[-1].T @ x.R_world_imu[0]))
     return float(np.linalg.norm(x.position[0] - position[-1])), float(attitude)
 
@@ -164,7 +170,9 @@ def test_integration_converges_with_the_square_of_the_step() -> None:
 
 def test_two_updates_at_the_same_state_commute() -> None:
     rng = np.random.default_rng(0)
-    base = ErrorStateFilter(_nominal(), np.diag(rng.uniform(1e-4, 1e-2, CORE)), imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA)
+    base = ErrorStateFilter(
+        _nominal(), np.diag(rng.uniform(1e-4, 1e-2, CORE)), imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA
+    )
     for _ in range(20):
         base.propagate_imu(0.01, *rng.standard_normal((4, 1, 3)))
     H = [rng.standard_normal((1, 6, me.JOINT)), rng.standard_normal((1, 6, me.JOINT))]
@@ -215,7 +223,7 @@ def _linear_regime(batch: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     w1, f1 = noisy(omega[0], bg, MEMS.gyro_density_radps_sqrthz), noisy(force[0], ba, MEMS.acc_density_mps2_sqrthz)
     for k in range(n):
         ends = (omega[k][None], force[k][None], omega[k + 1][None], force[k + 1][None])
-        imu_step(truth, F, 1 / rate, *ends, np.array([0, 0, -9.80665]))
+        imu_step(truth, F, 1 / rate, *ends, GRAVITY)
         bg = bg + MEMS.gyro_walk_radps2_sqrthz / np.sqrt(rate) * rng.standard_normal((batch, 3))
         ba = ba + MEMS.acc_walk_mps3_sqrthz / np.sqrt(rate) * rng.standard_normal((batch, 3))
         w0, f0 = w1, f1

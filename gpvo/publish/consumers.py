@@ -1,0 +1,183 @@
+"""What the numbers become inside the filters that people fly, and which parameter stands in the way.
+
+PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
+libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp before and after pull request 32084, which merged in February 2026.
+robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import GpvoError
+from gpvo.publish.odometry import Odometry
+
+Array = NDArray[np.float64]
+
+CONSUMERS = ("px4", "ardupilot", "robot_localization")
+
+
+@dataclass(frozen=True)
+class Px4Parameters:
+    """PX4's parameters of external vision, at their defaults; ``*_minimum`` is the least each may be set to."""
+
+    EKF2_EV_NOISE_MD: int = 0
+    EKF2_EVP_NOISE: float = 0.1
+    EKF2_EVV_NOISE: float = 0.1
+    EKF2_EVA_NOISE: float = 0.1
+
+    @staticmethod
+    def minimum(name: str) -> float:
+        """Smallest value that the parameter accepts."""
+        return {"EKF2_EVP_NOISE": 0.01, "EKF2_EVV_NOISE": 0.01, "EKF2_EVA_NOISE": 0.05}[name]
+
+
+def px4_sigmas(odometry: Odometry, parameters: Px4Parameters | None = None) -> dict[str, Array]:
+    """Standard deviations that EKF2 uses: position (3,), velocity (3,), yaw (1,).
+
+    Only diagonals are read, and of the attitude only yaw. In mode 0 the parameters are lower bounds; in mode 1 they
+    replace the message.
+    """
+    p = parameters or Px4Parameters()
+    pose = np.sqrt(np.diagonal(odometry.pose_covariance))
+    twist = np.full(6, np.nan) if odometry.twist_covariance is None else np.sqrt(np.diagonal(odometry.twist_covariance))
+    sent = {"position": pose[:3], "velocity": twist[:3], "yaw": pose[5:6]}
+    floor = {"position": p.EKF2_EVP_NOISE, "velocity": p.EKF2_EVV_NOISE, "yaw": p.EKF2_EVA_NOISE}
+    if p.EKF2_EV_NOISE_MD == 1:
+        return {k: np.full_like(v, floor[k]) for k, v in sent.items()}
+    return {k: np.maximum(v, floor[k]) for k, v in sent.items()}
+
+
+@dataclass(frozen=True)
+class ArduPilotParameters:
+    """ArduPilot's parameters of visual odometry, at their defaults."""
+
+    VISO_POS_M_NSE: float = 0.2
+    VISO_YAW_M_NSE: float = 0.2
+    VISO_VEL_M_NSE: float = 0.1
+    VISO_QUAL_MIN: int = 0
+
+
+def ardupilot_errors(
+    pose_covariance: Array, parameters: ArduPilotParameters | None = None, *, before_2026: bool = False
+) -> tuple[float, float]:
+    """Position [m] and angle [rad] error that EKF3 takes from a pose covariance (6, 6), after its clamps.
+
+    ``before_2026``: the cube root of the sum of squared variances, which is no standard deviation; since then the root
+    of their sum. NaN in element 0 means unknown: the parameters are used.
+    """
+    p = parameters or ArduPilotParameters()
+    c = np.diagonal(pose_covariance)
+    if np.isnan(c[0]):
+        return p.VISO_POS_M_NSE, p.VISO_YAW_M_NSE
+    if before_2026:
+        position, angle = np.cbrt((c[:3] ** 2).sum()), np.cbrt((c[3:] ** 2).sum())
+    else:
+        position, angle = np.sqrt(c[:3].sum()), np.sqrt(c[3:].sum())
+    return float(np.clip(position, p.VISO_POS_M_NSE, 100.0)), float(np.clip(angle, p.VISO_YAW_M_NSE, 1.5))
+
+
+def robot_localization_covariance(covariance: Array) -> Array:
+    """(6, 6) as its update uses it: negative variances by their absolute value, variances under 1e-9 set to 1e-9."""
+    out = np.array(covariance, dtype=np.float64)
+    diagonal = np.abs(np.diagonal(out))
+    np.fill_diagonal(out, np.maximum(diagonal, 1e-9))
+    return out
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a consumer does with one quantity: the share of frames in which its floor hides what was predicted."""
+
+    quantity: str
+    parameter: str
+    value: float
+    hidden_percent: float
+    predicted: tuple[float, float, float]  # 5th, 50th and 95th percentile of the predicted sigma
+    unit: str
+    advice: str = ""
+
+    def __str__(self) -> str:
+        low, middle, high = self.predicted
+        line = (
+            f"{self.quantity}: predicted sigma {low:.3g} / {middle:.3g} / {high:.3g} {self.unit} (5, 50, 95 %); "
+            f"{self.parameter} = {self.value:g} hides it in {self.hidden_percent:.0f} % of frames"
+        )
+        return line + (f". {self.advice}" if self.advice else "")
+
+
+def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
+    """What ``consumer`` will do with these messages. Raises ``GpvoError`` for an unknown one or no tracked frame."""
+    good = [o for o in odometry if o.twist_covariance is not None]
+    if not good:
+        raise GpvoError("no frame of this run has a motion to publish")
+    pose = np.array([np.diagonal(o.pose_covariance) for o in good])
+    twist = np.array([np.diagonal(o.twist_covariance) for o in good if o.twist_covariance is not None])
+    if consumer == "px4":
+        return _check_px4(np.sqrt(pose), np.sqrt(twist))
+    if consumer == "ardupilot":
+        return _check_ardupilot(pose, twist, good)
+    if consumer == "robot_localization":
+        return [
+            _verdict("twist", "variance floor", 1e-9, np.sqrt(twist).min(axis=1), "m/s, rad/s", floor=1e-9**0.5),
+            _verdict("pose", "variance floor", 1e-9, np.sqrt(pose).min(axis=1), "m, rad", floor=1e-9**0.5),
+        ]
+    raise GpvoError(f"unknown consumer '{consumer}'", cure=f"choose {', '.join(CONSUMERS)}")
+
+
+def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
+    p = Px4Parameters()
+    out = []
+    for quantity, name, sigma, unit in (
+        ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
+        ("position", "EKF2_EVP_NOISE", pose[:, :3], "m"),
+        ("yaw", "EKF2_EVA_NOISE", pose[:, 5:6], "rad"),
+    ):
+        value = getattr(p, name)
+        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=p.minimum(name)))
+    return out
+
+
+def _check_ardupilot(pose: Array, twist: Array, good: Sequence[Odometry]) -> list[Verdict]:
+    p = ArduPilotParameters()
+    out = []
+    for quantity, name, old, new, unit in (
+        ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
+        ("angle", "VISO_YAW_M_NSE", np.cbrt((pose[:, 3:] ** 2).sum(1)), np.sqrt(pose[:, 3:].sum(1)), "rad"),
+    ):
+        value = getattr(p, name)
+        out.append(_verdict(quantity, name, value, new, unit, minimum=0.05))
+        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit, minimum=0.05))
+    low, middle, high = np.quantile(np.sqrt(twist[:, :3]).max(axis=1), [0.05, 0.5, 0.95])
+    lever = "VISO_QUAL_MIN lets quality decide frame by frame"
+    out.append(
+        Verdict(
+            "velocity",
+            "VISO_VEL_M_NSE",
+            p.VISO_VEL_M_NSE,
+            100.0,
+            (float(low), float(middle), float(high)),
+            "m/s",
+            "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request "
+            f"32478), or set VISO_VEL_M_NSE to {max(middle, 0.05):.2g}; {lever}",
+        )
+    )
+    return out
+
+
+def _verdict(
+    quantity: str, name: str, value: float, sigma: Array, unit: str, *, minimum: float = 0.0, floor: float | None = None
+) -> Verdict:
+    low, middle, high = (float(q) for q in np.quantile(sigma, [0.05, 0.5, 0.95]))
+    hidden = 100.0 * float((sigma < (value if floor is None else floor)).mean())
+    advice = ""
+    if hidden > 1.0 and floor is None:
+        wanted = max(low, minimum)
+        advice = f"Set {name} to {wanted:.2g}"
+        if low < minimum:
+            advice += f", the least it accepts; a sigma of {low:.2g} {unit} stays hidden"
+    return Verdict(quantity, name, value, hidden, (low, middle, high), unit, advice)

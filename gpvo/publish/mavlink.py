@@ -1,0 +1,210 @@
+"""MAVLink 2 for flight controllers: ODOMETRY, VISION_SPEED_ESTIMATE and HEARTBEAT, to a file, UDP or serial.
+
+FRD and NED live in this module alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w, x, y, z, upper triangles
+row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.geometry import se3
+from gpvo.geometry.frames import R_FRD_FLU, rotate_covariance
+from gpvo.publish.odometry import Odometry
+
+Array = NDArray[np.float64]
+
+COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+_LOCAL_FRD, _BODY_FRD, _ESTIMATOR_VISION = 20, 12, 2
+_UPPER = np.triu_indices(6)
+
+
+def dialect() -> ModuleType:
+    """pymavlink's MAVLink 2 dialect. Raises ``MissingExtraError`` without pymavlink."""
+    try:
+        from pymavlink.dialects.v20 import common
+    except ImportError:
+        raise MissingExtraError("pymavlink", "mavlink") from None
+    module: ModuleType = common
+    return module
+
+
+def quality(odometry: Odometry) -> int:
+    """MAVLink quality: -1 lost or out of domain, 0 no model, else 1 to 100 from the confidence."""
+    if not odometry.tracked or (odometry.in_domain is not None and odometry.in_domain <= 0.0):
+        return -1
+    if odometry.confidence is None:
+        return 0
+    return int(np.clip(round(100 * odometry.confidence), 1, 100))
+
+
+def upper_triangle(covariance: Array | None) -> list[float]:
+    """21 floats of a (6, 6) covariance; unknown is NaN in element 0 and zeros after it."""
+    if covariance is None:
+        return [float("nan")] + [0.0] * 20
+    if not np.isfinite(covariance).all():
+        raise ValueError("a covariance must be finite everywhere, or None")
+    return [float(v) for v in covariance[_UPPER]]
+
+
+class Sender:
+    """Makes messages as the VIO component of the vehicle ``system``."""
+
+    def __init__(self, system: int = 1, component: int = COMPONENT) -> None:
+        self._dialect: Any = dialect()
+        self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+
+    def odometry(self, odometry: Odometry) -> bytes:
+        """ODOMETRY of one frame, tracked or not."""
+        R = R_FRD_FLU @ odometry.T_odom_body[:3, :3] @ R_FRD_FLU
+        position = R_FRD_FLU @ odometry.T_odom_body[:3, 3]
+        x, y, z, w = se3.rotation_to_quaternion_xyzw(R)
+        twist = np.full(6, np.nan)
+        velocity_covariance = None
+        if odometry.twist_body is not None and odometry.twist_covariance is not None:
+            twist = np.concatenate([R_FRD_FLU @ odometry.twist_body[:3], R_FRD_FLU @ odometry.twist_body[3:]])
+            velocity_covariance = rotate_covariance(R_FRD_FLU, odometry.twist_covariance)
+        message = self._link.odometry_encode(
+            odometry.t_ns // 1000,
+            _LOCAL_FRD,
+            _BODY_FRD,
+            *(float(v) for v in position),
+            [float(w), float(x), float(y), float(z)],
+            *(float(v) for v in twist),
+            upper_triangle(rotate_covariance(R_FRD_FLU, odometry.pose_covariance) if odometry.tracked else None),
+            upper_triangle(velocity_covariance),
+            odometry.reset_counter,
+            _ESTIMATOR_VISION,
+            quality(odometry),
+        )
+        return self._packed(message)
+
+    def speed(self, odometry: Odometry) -> bytes | None:
+        """VISION_SPEED_ESTIMATE: velocity in local FRD axes with its full 3x3, row-major. None for a lost frame.
+
+        LOCAL_FRD serves as the local NED frame where the vehicle's heading is given to the autopilot by vision too.
+        """
+        if odometry.twist_body is None or odometry.twist_covariance is None:
+            return None
+        R = R_FRD_FLU @ odometry.T_odom_body[:3, :3]
+        velocity = R @ odometry.twist_body[:3]
+        covariance = R @ odometry.twist_covariance[:3, :3] @ R.T
+        message = self._link.vision_speed_estimate_encode(
+            odometry.t_ns // 1000,
+            *(float(v) for v in velocity),
+            [float(v) for v in covariance.reshape(9)],
+            odometry.reset_counter,
+        )
+        return self._packed(message)
+
+    def heartbeat(self) -> bytes:
+        """HEARTBEAT, due once a second."""
+        m = self._dialect
+        message = self._link.heartbeat_encode(
+            m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE
+        )
+        return self._packed(message)
+
+    def _packed(self, message: Any) -> bytes:
+        packed: bytes = message.pack(self._link)
+        # The sequence number is the link's: without it a receiver counts every message as lost.
+        self._link.seq = (self._link.seq + 1) % 256
+        return packed
+
+
+def stream(odometry: Iterable[Odometry], sender: Sender, emit: Callable[[int, bytes], None]) -> int:
+    """Hand ``emit(t_ns, bytes)`` every message of a run: odometry, speed and a heartbeat a second; returns frames."""
+    next_beat, count = None, 0
+    for item in odometry:
+        if next_beat is None or item.t_ns >= next_beat:
+            emit(item.t_ns, sender.heartbeat())
+            next_beat = item.t_ns + 10**9
+        emit(item.t_ns, sender.odometry(item))
+        speed = sender.speed(item)
+        if speed is not None:
+            emit(item.t_ns, speed)
+        count += 1
+    return count
+
+
+def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
+    """Write a telemetry log: every message after its time, 8 bytes big-endian microseconds. Returns frames."""
+    path = Path(path)
+    sender = Sender(system)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+    try:
+        with os.fdopen(handle, "wb") as file:
+
+            def emit(t_ns: int, message: bytes) -> None:
+                file.write(struct.pack(">Q", t_ns // 1000) + message)
+
+            count = stream(odometry, sender, emit)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    return count
+
+
+@dataclass
+class Link:
+    """A live connection: ``udp:HOST:PORT`` or ``serial:DEVICE:BAUD`` (pyserial)."""
+
+    address: str
+    system: int = 1
+
+    def __post_init__(self) -> None:
+        self.sender = Sender(self.system)
+        self._next_beat = 0
+        kind, _, rest = self.address.partition(":")
+        place, _, number = rest.rpartition(":")
+        if kind not in ("udp", "serial") or not place or not number.isdigit():
+            raise GpvoError(f"'{self.address}' is no address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
+        self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))
+
+    def send(self, odometry: Odometry) -> None:
+        """Send one frame now, and a heartbeat where one is due."""
+        if odometry.t_ns >= self._next_beat:
+            self._send(self.sender.heartbeat())
+            self._next_beat = odometry.t_ns + 10**9
+        for message in (self.sender.odometry(odometry), self.sender.speed(odometry)):
+            if message is not None:
+                self._send(message)
+
+
+def _udp(host: str, port: int) -> Callable[[bytes], object]:
+    try:
+        family, kind, protocol, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    except OSError as error:
+        raise GpvoError(f"cannot reach {host}: {error.strerror}") from None
+    connection = socket.socket(family, kind, protocol)
+    return lambda data: connection.sendto(data, target)
+
+
+def _serial(device: str, baud: int) -> Callable[[bytes], object]:
+    try:
+        import serial
+    except ImportError:
+        raise MissingExtraError("pyserial", "mavlink") from None
+    try:
+        port = serial.Serial(device, baud)
+    except (OSError, ValueError) as error:
+        raise GpvoError(f"cannot open {device}: {error}") from None
+    return lambda data: port.write(data)

@@ -1,0 +1,142 @@
+"""``nav_msgs/Odometry`` in ROS 1 bags, ROS 2 sqlite3 bags and MCAP, by the ``rosbags`` library; no ROS needed.
+
+REP 103: quaternion x, y, z, w; covariance row-major 6x6, order (x, y, z, rotation about X, Y, Z) in fixed axes; pose
+in ``header.frame_id``, twist in ``child_frame_id``. Lost frames are not written: a receiver would fuse them.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.publish.odometry import Odometry
+
+TOPIC = "/gpvo/odometry"
+_TYPE = "nav_msgs/msg/Odometry"
+
+
+def odometry_message(odometry: Odometry, types: dict[str, Any], *, seq: int | None = None) -> Any:
+    """``nav_msgs/Odometry`` of one tracked frame; ``types`` is a typestore's, ``seq`` for ROS 1 only."""
+    if odometry.twist_body is None or odometry.twist_covariance is None:
+        raise ValueError("a frame without a motion has no Odometry message")
+    q = se3.rotation_to_quaternion_xyzw(odometry.T_odom_body[:3, :3])
+    linear, angular = odometry.twist_body[:3], odometry.twist_body[3:]
+    point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
+    pose = types["geometry_msgs/msg/Pose"](
+        point(*odometry.T_odom_body[:3, 3]), types["geometry_msgs/msg/Quaternion"](*q)
+    )
+    twist = types["geometry_msgs/msg/Twist"](vector(*linear), vector(*angular))
+    stamp = types["builtin_interfaces/msg/Time"](odometry.t_ns // 10**9, odometry.t_ns % 10**9)
+    numbered = {} if seq is None else {"seq": seq}
+    return types[_TYPE](
+        header=types["std_msgs/msg/Header"](**numbered, stamp=stamp, frame_id=odometry.frame_id),
+        child_frame_id=odometry.child_frame_id,
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose, _flat(odometry.pose_covariance)),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, _flat(odometry.twist_covariance)),
+    )
+
+
+def _flat(covariance: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
+
+
+def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:
+    """Write a ROS 1 bag; returns the number of messages."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+
+    def fill(temporary: Path) -> int:
+        count = 0
+        with Ros1Writer(temporary) as writer:
+            connection = writer.add_connection(topic, _TYPE, typestore=store)
+            for item in odometry:
+                if item.twist_body is not None:
+                    message = odometry_message(item, store.types, seq=count)
+                    writer.write(connection, item.t_ns, store.serialize_ros1(message, _TYPE))
+                    count += 1
+        return count
+
+    return _replacing(Path(path), fill)
+
+
+def write_ros2(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, *, mcap: bool = False) -> int:
+    """Write a ROS 2 bag folder, sqlite3 or MCAP; returns the number of messages."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+
+    def fill(temporary: Path) -> int:
+        count = 0
+        with Ros2Writer(temporary, version=9, storage_plugin=plugin) as writer:
+            connection = writer.add_connection(topic, _TYPE, typestore=store)
+            for item in odometry:
+                if item.twist_body is not None:
+                    message = odometry_message(item, store.types)
+                    writer.write(connection, item.t_ns, store.serialize_cdr(message, _TYPE))
+                    count += 1
+        return count
+
+    return _replacing(Path(path), fill)
+
+
+def _replacing(path: Path, fill: Any) -> int:
+    """Write beside the target and move it there when done; an older bag of ours is replaced, nothing else."""
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise GpvoError("is a folder that holds something else", where=path, cure="choose another -o")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        holder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+    try:
+        # A bag's files carry its name inside, so the temporary one has the same name in a folder of its own.
+        count: int = fill(holder / path.name)
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(holder / path.name, path)
+    finally:
+        shutil.rmtree(holder, ignore_errors=True)
+    return count
+
+
+def robot_localization_yaml(topic: str = TOPIC, *, rate_hz: float = 30.0) -> str:
+    """Parameters for robot_localization that use the twist alone, as its manual advises for odometry.
+
+    The pose of an odometry is its integrated twist: fusing both would count one measurement twice.
+    """
+    row = "false, false, false"
+    use = "true,  true,  true "
+    return f"""# robot_localization (ekf_node) fed by gpvo: body twist with its full covariance.
+# gpvo publishes {topic} in odom -> base_link and broadcasts no transform; this node does.
+ekf_filter_node:
+  ros__parameters:
+    frequency: {rate_hz:.1f}
+    sensor_timeout: 0.2
+    two_d_mode: false
+    publish_tf: true
+    map_frame: map
+    odom_frame: odom
+    base_link_frame: base_link
+    world_frame: odom
+    odom0: {topic}
+    # x, y, z | roll, pitch, yaw | vx, vy, vz | vroll, vpitch, vyaw | ax, ay, az
+    odom0_config: [{row},
+                   {row},
+                   {use},
+                   {use},
+                   {row}]
+    odom0_differential: false
+    odom0_relative: false
+    odom0_queue_size: 10
+    odom0_twist_rejection_threshold: 3.0
+"""
