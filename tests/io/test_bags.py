@@ -1,0 +1,208 @@
+"""ROS 1 bags, ROS 2 bags and MCAP: written by rosbags, read as sequences and as other people's odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sequences as seq
+from bag_maker import BagMaker, stereo_bag
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.geometry import se3
+from gpvo.io import guess, open_source
+from gpvo.io.foreign import read_foreign, to_records
+
+KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
+
+
+def _write(tmp_path, kind, maker_of=stereo_bag, **options):
+    ros1, mcap, name = KINDS[kind]
+    return maker_of(ros1, **options).write(tmp_path / name, mcap=mcap)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stereo_bag(tmp_path, kind):
+    path = _write(tmp_path, kind)
+    assert guess(path) == "rosbag"
+    source = open_source(path)
+    assert len(source) == 12
+    assert seq.frames_of(source) == list(zip(seq.stamps(12), range(12), strict=True))
+    assert str(source.report) == "12 frames"
+    assert source.camera.baseline_m == pytest.approx(0.1)
+    assert source.imu is not None
+    np.testing.assert_array_equal(source.imu.acc_mps2[0], [0, 0, 9.81])
+    assert len(source.imu.t_ns) == 60
+    np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12), atol=1e-9)
+    assert source.truth.sigma_rotation_rad == 8e-4
+
+
+def test_single_storage_files(tmp_path):
+    folder = _write(tmp_path, "mcap")
+    assert len(seq.frames_of(open_source(next(folder.glob("*.mcap"))))) == 12
+    folder = _write(tmp_path / "b", "sqlite3")
+    assert len(seq.frames_of(open_source(next(folder.glob("*.db3"))))) == 12
+
+
+def test_missing_images_shift_nothing(tmp_path):
+    path = _write(tmp_path, "ros1", skip={(2, "left"), (5, "right"), (6, "right"), (9, "left")})
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 3, 4, 7, 8, 10, 11]
+    assert source.report.missing == 4
+
+
+def test_lone_camera_does_not_pile_up(tmp_path):
+    path = _write(tmp_path, "ros1", n=60, skip={(k, "right") for k in range(10, 50)})
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [*range(10), *range(50, 60)]
+    assert source.report.missing == 40
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "bgra8", "mono16", "8UC1", "bayer_rggb8"])
+def test_encodings(tmp_path, encoding):
+    maker = BagMaker(ros1=True)
+    for k, t in enumerate(seq.stamps(3)):
+        image = seq.grey(k)
+        channels = {"rgb8": 3, "bgr8": 3, "bgra8": 4}.get(encoding, 1)
+        if channels > 1:
+            image = np.repeat(image[:, :, None], channels, axis=2)
+        if encoding == "mono16":
+            image = image.astype(np.uint16) * 256
+        for side, tx in (("left", 0.0), ("right", -6.0)):
+            maker.image(f"/{side}/image_raw", t, image, encoding)
+            maker.camera_info(f"/{side}/camera_info", t, tx)
+    source = open_source(maker.write(tmp_path / "a.bag"))
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2]
+
+
+def test_compressed_images_with_camchain_beside(tmp_path):
+    maker = BagMaker(ros1=False)
+    for k, t in enumerate(seq.stamps(3)):
+        for camera in ("cam0", "cam1"):
+            maker.compressed(f"/{camera}/image_raw/compressed", t, seq.grey(k))
+    path = maker.write(tmp_path / "bag")
+    with pytest.raises(CalibrationError, match="no calibration") as caught:
+        open_source(path)
+    assert "camchain.yaml" in str(caught.value)
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    assert [k for _, k in seq.frames_of(open_source(path))] == [0, 1, 2]
+
+
+def test_topics_by_name_and_by_choice(tmp_path):
+    maker = BagMaker(ros1=True)
+    for k, t in enumerate(seq.stamps(3)):
+        for topic in ("front", "back", "down"):
+            maker.image(f"/{topic}/image_raw", t, seq.grey(k))
+    path = maker.write(tmp_path / "a.bag")
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    with pytest.raises(SourceError, match="--left-topic"):
+        open_source(path)
+    with pytest.raises(SourceError, match="no images on '/x'"):
+        open_source(path, left_topic="/x", right_topic="/y")
+    with pytest.raises(SourceError, match="same topic"):
+        open_source(path, left_topic="/front/image_raw", right_topic="/front/image_raw")
+    source = open_source(path, left_topic="/front/image_raw", right_topic="/back/image_raw")
+    assert len(seq.frames_of(source)) == 3
+
+
+def test_wrong_resolution_and_swapped(tmp_path):
+    path = _write(tmp_path, "ros1", infos=False)
+    chain = tmp_path / "camchain.yaml"
+    chain.write_text(seq.camchain_yaml().replace("[64, 48]", "[128, 96]"))
+    with pytest.raises(CalibrationError, match="64x48, the calibration is for 128x96"):
+        open_source(path)
+    chain.unlink()
+    with pytest.raises(CalibrationError, match="no calibration"):
+        open_source(path)
+    both = stereo_bag(True).write(tmp_path / "both.bag")
+    with pytest.raises(CalibrationError, match="left and right are swapped"):
+        open_source(both, left_topic="/camera/right/image_raw", right_topic="/camera/left/image_raw")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("how", ["cut", "zero", "empty"])
+def test_unreadable_bags_in_one_line(tmp_path, kind, how):
+    path = _write(tmp_path, kind)
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix in (".db3", ".mcap"))
+    raw = file.read_bytes()
+    file.write_bytes({"cut": raw[: len(raw) // 2], "zero": bytes(len(raw)), "empty": b""}[how])
+    with pytest.raises(SourceError) as caught:
+        list(open_source(path))
+    text = str(caught.value)
+    assert "\n" not in text
+    assert str(path) in text
+    assert "unreadable bag" in text or "empty" in text
+
+
+def test_bag_without_images(tmp_path):
+    maker = BagMaker(ros1=True)
+    maker.imu("/imu0", seq.START_NS)
+    with pytest.raises(SourceError, match="no stereo pair"):
+        open_source(maker.write(tmp_path / "a.bag"))
+
+
+def test_truth_frame_and_overlap(tmp_path):
+    path = _write(tmp_path, "ros1")
+    with pytest.raises(CalibrationError, match="where the IMU sits"):
+        open_source(path, truth_frame="imu")
+    late = BagMaker(ros1=True)
+    late.messages = stereo_bag(True).messages
+    late.messages = [m for m in late.messages if "vicon" not in m[1]]
+    for k, t in enumerate(seq.stamps(12)):
+        late.transform("/mocap/pose", t + 10**12, seq.true_poses(12)[k])
+    with pytest.raises(SourceError, match="does not overlap"):
+        open_source(late.write(tmp_path / "late.bag"))
+
+
+def _odometry_bag(ros1: bool, twist: bool) -> BagMaker:
+    maker = BagMaker(ros1)
+    C = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
+    pose = C.copy()
+    T = seq.true_poses(20)
+    for k, t in enumerate(seq.stamps(20)):
+        if k:
+            A = se3.adjoint(se3.inverse(se3.inverse(T[k - 1]) @ T[k]))
+            pose = A @ pose @ A.T + C
+        B = np.zeros((6, 6))
+        B[:3, :3] = B[3:, 3:] = T[k, :3, :3]
+        maker.odometry("/odom", t, T[k], B @ pose @ B.T, C if twist else np.zeros((6, 6)))
+    return maker
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_odometry_of_others(tmp_path, kind):
+    path = _write(tmp_path, kind, lambda ros1: _odometry_bag(ros1, twist=True))
+    records, notes = to_records(read_foreign(path))
+    assert len(records) == 20
+    assert not notes
+    T = seq.true_poses(20)
+    np.testing.assert_allclose(records[3].T_prev_cur, se3.inverse(T[2]) @ T[3], atol=1e-9)
+    # Variance of velocity over the step of 50 ms.
+    expected = np.array([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6]) * 0.05**2
+    np.testing.assert_allclose(np.diag(records[3].covariances["imported"]), expected, rtol=1e-9)
+    assert not records[0].covariances
+
+
+def test_pose_covariance_gives_the_growth(tmp_path):
+    path = _write(tmp_path, "ros1", lambda ros1: _odometry_bag(ros1, twist=False))
+    records, notes = to_records(read_foreign(path))
+    assert not notes
+    expected = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
+    for record in records[1:]:
+        np.testing.assert_allclose(record.covariances["imported"], expected, atol=1e-12)
+
+
+def test_which_topic(tmp_path):
+    maker = _odometry_bag(True, twist=True)
+    maker.odometry("/other", seq.START_NS, np.eye(4), np.eye(6), np.eye(6))
+    path = maker.write(tmp_path / "a.bag")
+    with pytest.raises(SourceError, match=r"which topic\? \(poses on: /odom, /other\)"):
+        read_foreign(path)
+    assert len(read_foreign(path, topic="/odom").t_ns) == 20
+    with pytest.raises(SourceError, match="no poses on '/x'"):
+        read_foreign(path, topic="/x")
+
+
+def test_real_ground_robots(real_data):
+    for name, count in (("rl_test1", 3952), ("rl_test2", 3060)):
+        records, _ = to_records(read_foreign(real_data / "bags" / f"{name}.bag"))
+        assert abs(len(records) - count) < 5
+        assert all(r.covariances for r in records[1:])
