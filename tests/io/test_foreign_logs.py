@@ -1,0 +1,172 @@
+"""Other people's logs as records: CSV by name and by mapping, formats by their look, covariances of every kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.io.foreign import T_FLU_OPTICAL, guess_format, read_foreign, to_records
+from gpvo.io.trajectory import write_euroc_csv, write_kitti_poses, write_tum
+from gpvo.types import Status
+
+N = 25
+T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
+POSES = se3.exp(np.outer(np.arange(N), [0.02, 0.01, 0.1, 0.01, 0.02, -0.01]))
+MOTIONS = se3.inverse(POSES[:-1]) @ POSES[1:]
+
+
+def _csv(path, header, extra=(), separator=",", stamp="{}"):
+    lines = [header]
+    for k in range(N):
+        q = se3.rotation_to_quaternion_xyzw(POSES[k, :3, :3])
+        values = [stamp.format(T_NS[k]), *(repr(float(v)) for v in (*POSES[k, :3, 3], *q))]
+        lines.append(separator.join([*values, *(str(e[k]) for e in extra)]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "separator"),
+    [
+        ("t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w", ","),
+        ("timestamp;tx;ty;tz;qx;qy;qz;qw", ";"),
+        ("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_x [], q_RS_y [], q_RS_z [], q_RS_w []", ","),
+        ("time\tx\ty\tz\tqx\tqy\tqz\tqw", "\t"),
+        ("# from somewhere\n# t px py pz qx qy qz qw", " "),
+        (
+            "%time,field.pose.pose.position.x,field.pose.pose.position.y,field.pose.pose.position.z,"
+            "field.pose.pose.orientation.x,field.pose.pose.orientation.y,field.pose.pose.orientation.z,"
+            "field.pose.pose.orientation.w",
+            ",",
+        ),
+        ("stamp,pos_x,pos_y,pos_z,quat_x,quat_y,quat_z,quat_w", ","),
+    ],
+)
+def test_columns_by_name(tmp_path, header, separator):
+    log = read_foreign(_csv(tmp_path / "a.csv", header, separator=separator), "csv")
+    np.testing.assert_array_equal(log.t_ns, T_NS)
+    np.testing.assert_allclose(log.trajectory.T_world_body, POSES, atol=1e-12)
+    assert log.covariance is None
+
+
+def test_columns_by_mapping_with_counts_and_covariance(tmp_path):
+    header = "when,e,n,u,a,b,c,d,vx,vy,vz,vroll,vpitch,vyaw,matches,blur"
+    variances = [[(i + 1) * 1e-4 + k * 1e-6 for k in range(N)] for i in range(6)]
+    counts, blur = [100 + k for k in range(N)], [0.5 * k for k in range(N)]
+    path = _csv(tmp_path / "a.csv", header, [*variances, counts, blur])
+    names = {"when": "t_ns", "e": "p_x", "n": "p_y", "u": "p_z", "a": "q_x", "b": "q_y", "c": "q_z", "d": "q_w"}
+    names |= {v: f"cov_{i}{i}" for i, v in enumerate(("vx", "vy", "vz", "vroll", "vpitch", "vyaw"))}
+    names |= {"matches": "n_inliers", "blur": "sharpness"}
+    log = read_foreign(path, mapping=names, covariance_of="motion", covariance_axes="body")
+    records, notes = to_records(log)
+    assert not notes
+    assert records[0].status is Status.START
+    assert records[7].n_inliers == 107
+    assert records[7].sharpness == 3.5
+    np.testing.assert_allclose(np.diag(records[7].covariances["imported"]), [v[7] for v in variances])
+    np.testing.assert_allclose(records[7].T_prev_cur, MOTIONS[6], atol=1e-9)
+    assert records[7].t_prev_ns == T_NS[6]
+
+
+def test_world_axes_are_turned_into_the_body(tmp_path):
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
+    path = _csv(tmp_path / "a.csv", header, [[1e-4 * (i + 1)] * N for i in range(6)])
+    log = read_foreign(path, covariance_of="motion")
+    R = POSES[9, :3, :3]
+    np.testing.assert_allclose(log.covariance[9][:3, :3], R.T @ np.diag([1e-4, 2e-4, 3e-4]) @ R, atol=1e-12)
+
+
+def test_pose_covariance_of_a_filter_is_not_passed_off_as_a_motions(tmp_path):
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
+    path = _csv(tmp_path / "a.csv", header, [[1e-4] * N] * 6)
+    records, notes = to_records(read_foreign(path))
+    assert "imported_pose" in notes[0]
+    assert set(records[5].covariances) == {"imported_pose"}
+
+
+def test_rows_without_a_pose_are_left_out_and_counted(tmp_path):
+    path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
+    lines = path.read_text().splitlines()
+    lines[5] = lines[5].split(",")[0] + ",nan" * 7
+    lines[6] = lines[6].split(",")[0] + "," * 7
+    path.write_text("\n".join(lines))
+    records, notes = to_records(read_foreign(path))
+    assert len(records) == N - 2
+    assert notes == ["2 rows without a pose were left out"]
+    assert records[4].dt_s == pytest.approx(0.15)
+    with pytest.raises(SourceError, match="line 6 holds NaN"):
+        read_foreign(path, complete=True)
+
+
+def test_formats_by_their_look(tmp_path):
+    write_tum(tmp_path / "a", T_NS, POSES)
+    write_kitti_poses(tmp_path / "b", POSES)
+    write_euroc_csv(tmp_path / "c", T_NS, POSES)
+    assert [guess_format(tmp_path / n) for n in "abc"] == ["tum", "kitti", "csv"]
+    np.testing.assert_array_equal(read_foreign(tmp_path / "a").t_ns, T_NS)
+    np.testing.assert_array_equal(read_foreign(tmp_path / "c").t_ns, T_NS)
+    np.testing.assert_allclose(read_foreign(tmp_path / "c").trajectory.T_world_body, POSES, atol=1e-8)
+    with pytest.raises(SourceError, match="no stamps"):
+        read_foreign(tmp_path / "b")
+    assert read_foreign(tmp_path / "b", rate_hz=10.0).t_ns[3] == 300_000_000
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * k:.4f}\n" for k in range(N)))
+    assert read_foreign(tmp_path / "b").t_ns[3] == 300_000_000
+
+
+def test_body_becomes_camera(tmp_path):
+    """A FLU body that drives along its x axis is a camera that moves along z."""
+    poses = se3.exp(np.outer(np.arange(N), [1.0, 0, 0, 0, 0, 0.1]))
+    write_tum(tmp_path / "a.tum", T_NS, poses)
+    records, _ = to_records(read_foreign(tmp_path / "a.tum").seen_from(T_FLU_OPTICAL))
+    xi = se3.log(records[1].T_prev_cur)
+    np.testing.assert_allclose(xi, [0, 0, 1, 0, -0.1, 0], atol=1e-6)
+
+
+def test_covariance_follows_the_frame(tmp_path):
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
+    path = _csv(tmp_path / "a.csv", header, [[1e-4 * (i + 1)] * N for i in range(6)])
+    log = read_foreign(path, covariance_of="motion", covariance_axes="body").seen_from(T_FLU_OPTICAL)
+    np.testing.assert_allclose(np.diag(log.covariance[3]), [2e-4, 3e-4, 1e-4, 5e-4, 6e-4, 4e-4])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "like no trajectory"),
+        ("a,b,c\n1,2,3\n", r"no column for t_s, p_x.*--map COLUMN=t_s"),
+        ("t,x,y,z,qx,qy,qz,qw\n", "no rows"),
+        ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0\n", "line 2 holds 7 fields"),
+        ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,x\n", "line 2"),
+        ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n", "line 3: the stamp .* repeats"),
+        ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,3\n", "length 3.0000"),
+        ("1,0,0,0,0,0,0,1\n", "no header line"),
+        ("1 2 3\n", "like no trajectory"),
+    ],
+)
+def test_bad_logs_in_one_line(tmp_path, text, reason):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=reason) as caught:
+        read_foreign(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_mapping(tmp_path):
+    path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
+    with pytest.raises(SourceError, match="there is no 'speed'"):
+        read_foreign(path, mapping={"p_x": "speed"})
+    with pytest.raises(SourceError, match="no column 'foo'"):
+        read_foreign(path, mapping={"foo": "p_x"})
+
+
+def test_real_logs(real_data):
+    vo, _ = to_records(read_foreign(real_data / "kitti_stereo_vo" / "00_est.txt"))
+    assert len(vo) == 4541
+    openvins, notes = to_records(read_foreign(real_data / "openvins_mh01_cov" / "MH01_ov_est.csv"))
+    assert set(openvins[9].covariances) == {"imported_pose"}
+    assert notes
+    for name in ("odometry", "of_opencv_odometry", "optical_flow_odometry"):
+        records, _ = to_records(read_foreign(real_data / "euroc_v1_01_vo" / f"stamped_{name}_trajectory_all.txt"))
+        assert len(records) > 2600
