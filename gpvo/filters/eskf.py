@@ -187,8 +187,8 @@ class ErrorStateFilter:
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ kernels.transpose(H)
         S = H @ PHt + R
-        L: Array = np.linalg.cholesky(S)
-        whitened = np.linalg.solve(L, np.concatenate([kernels.transpose(PHt), r[:, :, None]], axis=2))
+        L = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
+        whitened: Array = np.linalg.solve(L, np.concatenate([kernels.transpose(PHt), r[:, :, None]], axis=2))
         z = whitened[:, :, -1]
         nis = (z * z).sum(1)
         passed = nis <= gate.threshold(H.shape[1]) if gate else np.ones(self.batch, dtype=bool)
@@ -198,13 +198,13 @@ class ErrorStateFilter:
                 alpha = np.maximum(nis / gate.threshold(H.shape[1]), 1.0)
                 # S becomes alpha S, so the same factor divides the gain and the whitened innovation's square.
                 R = R + (alpha - 1.0)[:, None, None] * S
-                L = np.sqrt(alpha)[:, None, None] * L
-                whitened = whitened / np.sqrt(alpha)[:, None, None]
+                L = np.asarray(np.sqrt(alpha)[:, None, None] * L, dtype=np.float64)
+                whitened = np.asarray(whitened / np.sqrt(alpha)[:, None, None], dtype=np.float64)
             if gate.on_fail != "discard":
                 used = np.ones_like(passed)
         if not used.any():
             return Innovation(r, S, nis, passed, used)
-        K = kernels.transpose(np.linalg.solve(kernels.transpose(L), whitened[:, :, :-1]))
+        K = np.asarray(np.linalg.solve(kernels.transpose(L), whitened[:, :, :-1]), dtype=np.float64).transpose(0, 2, 1)
         if not used.all():
             K = K * used[:, None, None]
         A = _EYE - K @ H

@@ -1,7 +1,8 @@
 """What the numbers become inside the filters that people fly, and which parameter stands in the way.
 
 PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
-libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp before and after pull request 32084, which merged in February 2026.
+libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026) and
+libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the clamps).
 robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2.
 """
 

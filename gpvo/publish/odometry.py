@@ -93,7 +93,7 @@ class OdometryBuilder:
         self._T_body_cam = forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64)
         self._Ad = se3.adjoint(self._T_body_cam)
         self._chain: dict[int, _Chain] = {}
-        self._last: tuple[int, Array, Array] | None = None  # stamp, T_first_cam and own noise of the last good frame
+        self._last: tuple[int, Array, Array] | None = None  # stamp, T_first_cam, noise of the last good frame
         self._speed = np.zeros(6)
         self._resets = 0
         self._first_jitter: Array | None = None
@@ -119,7 +119,7 @@ class OdometryBuilder:
             self._first_jitter = own
         twist, twist_covariance = self._twist(record, prediction, chain, own, white + root @ root.T)
         self._remember(record, chain)
-        self._last = (record.t_ns, chain.T_first_cam, own)
+        self._last = (record.t_ns, chain.T_first_cam, own + white)
         A = se3.adjoint(se3.inverse(chain.T_first_cam))
         total = chain.walked + own + A @ self._first_jitter @ A.T
         return self._message(record, prediction, chain, total, twist, twist_covariance)
@@ -148,7 +148,7 @@ class OdometryBuilder:
         Usually that frame is the reference. Where it is not (the vehicle stood still, or a keyframe is kept), the
         motion is the difference of two motions from one reference, whose noise cancels; both frames' noise remains.
         """
-        t_last, T_last, own_last = self._last or (record.t_prev_ns, se3.inverse(record.T_prev_cur), own)
+        t_last, T_last, noise_last = self._last or (record.t_prev_ns, se3.inverse(record.T_prev_cur), own)
         dt = (record.t_ns - t_last) * 1e-9
         if t_last == record.t_prev_ns:
             xi, T_rel = se3.log(record.T_prev_cur), record.T_prev_cur
@@ -161,7 +161,7 @@ class OdometryBuilder:
             covariance = independent + 2.0 * own
         else:
             A = se3.adjoint(se3.inverse(T_rel))
-            covariance = independent + own + A @ own_last @ A.T
+            covariance = independent + own + A @ noise_last @ A.T
         self._speed = xi / dt
         twist = self._Ad @ xi / dt
         moved = self._Ad @ covariance @ self._Ad.T / dt**2

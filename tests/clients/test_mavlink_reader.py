@@ -1,0 +1,131 @@
+"""pymavlink's own parser reads back what was sent: all 21 values of both covariances, from file and socket."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError
+from gpvo.publish.mavlink import COMPONENT, Link, quality, write_tlog
+from gpvo.publish.odometry import Odometry
+
+pytest.importorskip("pymavlink")
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common
+
+FLIP = np.array([1.0, -1, -1, 1, -1, -1])
+
+
+def _read(path: Path) -> list:
+    log = mavutil.mavlink_connection(str(path), dialect="common")
+    out = []
+    while (message := log.recv_match()) is not None:
+        out.append(message)
+    return out
+
+
+def _full(upper: list[float]) -> np.ndarray:
+    C = np.zeros((6, 6))
+    C[np.triu_indices(6)] = upper
+    return C + np.triu(C, 1).T
+
+
+@pytest.fixture(scope="module")
+def received(odometry: list[Odometry], tmp_path_factory: pytest.TempPathFactory) -> list:
+    path = tmp_path_factory.mktemp("mavlink") / "flight.tlog"
+    assert write_tlog(path, odometry) == len(odometry)
+    return _read(path)
+
+
+def test_odometry_comes_back_in_frd(odometry: list[Odometry], received: list) -> None:
+    got = [m for m in received if m.get_type() == "ODOMETRY"]
+    for message, sent in zip(got, odometry, strict=True):
+        assert message.time_usec == sent.t_ns // 1000
+        assert (message.frame_id, message.child_frame_id) == (20, 12)
+        assert (message.get_srcSystem(), message.get_srcComponent()) == (1, COMPONENT)
+        assert message.estimator_type == common.MAV_ESTIMATOR_TYPE_VISION
+        position = sent.T_odom_body[:3, 3] * FLIP[:3]
+        np.testing.assert_allclose([message.x, message.y, message.z], position, rtol=1e-6, atol=1e-6)
+        assert message.quality == quality(sent)
+        twist = [message.vx, message.vy, message.vz, message.rollspeed, message.pitchspeed, message.yawspeed]
+        if sent.twist_body is None:
+            assert np.isnan(twist).all()
+            assert np.isnan(message.velocity_covariance[0])
+            assert not any(message.velocity_covariance[1:])
+            # The first frame has no motion yet, but a pose; a lost frame's pose is only held.
+            assert np.isnan(message.pose_covariance[0]) == (not sent.tracked)
+            continue
+        np.testing.assert_allclose(twist, sent.twist_body * FLIP, rtol=1e-6, atol=1e-7)
+        for wire, C in (
+            (message.pose_covariance, sent.pose_covariance),
+            (message.velocity_covariance, sent.twist_covariance),
+        ):
+            assert len(wire) == 21
+            np.testing.assert_allclose(_full(wire), C * np.outer(FLIP, FLIP), rtol=1e-6, atol=1e-12)
+
+
+def test_quaternion_turns_body_frd_into_local_frd(odometry: list[Odometry], received: list) -> None:
+    got = [m for m in received if m.get_type() == "ODOMETRY"]
+    for message, sent in zip(got, odometry, strict=True):
+        w, x, y, z = message.q
+        R = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        F = np.diag(FLIP[:3])
+        np.testing.assert_allclose(R, F @ sent.T_odom_body[:3, :3] @ F, atol=1e-6)
+
+
+def test_speed_is_in_local_axes_with_nine_covariances(odometry: list[Odometry], received: list) -> None:
+    got = [m for m in received if m.get_type() == "VISION_SPEED_ESTIMATE"]
+    tracked = [o for o in odometry if o.twist_body is not None]
+    for message, sent in zip(got, tracked, strict=True):
+        R = np.diag(FLIP[:3]) @ sent.T_odom_body[:3, :3]
+        np.testing.assert_allclose([message.x, message.y, message.z], R @ sent.twist_body[:3], rtol=1e-5, atol=1e-6)
+        C = R @ sent.twist_covariance[:3, :3] @ R.T
+        np.testing.assert_allclose(np.reshape(message.covariance, (3, 3)), C, rtol=1e-5, atol=1e-12)
+
+
+def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None:
+    beats = [m for m in received if m.get_type() == "HEARTBEAT"]
+    assert len(beats) in (4, 5)
+    numbers = np.array([m.get_seq() for m in received])
+    assert set(np.diff(numbers) % 256) == {1}
+
+
+@pytest.mark.parametrize(
+    "change, expected",
+    [
+        ({"confidence": 0.8, "in_domain": 0.9}, 80),
+        ({"confidence": 0.0, "in_domain": 0.9}, 1),
+        ({"confidence": 1.0, "in_domain": 1.0}, 100),
+        ({"confidence": 0.7, "in_domain": 0.0}, -1),
+        ({"confidence": None, "in_domain": None}, 0),
+        ({"tracked": False}, -1),
+    ],
+)
+def test_quality(odometry: list[Odometry], change: dict, expected: int) -> None:
+    assert quality(replace(odometry[5], **change)) == expected
+
+
+def test_udp(odometry: list[Odometry]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        link = Link(f"udp:127.0.0.1:{receiver.getsockname()[1]}")
+        link.send(odometry[5])
+        parser = common.MAVLink(None)
+        names = [parser.decode(bytearray(receiver.recv(1000))).get_type() for _ in range(3)]
+    assert names == ["HEARTBEAT", "ODOMETRY", "VISION_SPEED_ESTIMATE"]
+
+
+@pytest.mark.parametrize("address", ["udp:localhost", "tcp:localhost:1", "serial::9600", "serial:/nowhere:57600"])
+def test_a_bad_address_is_one_line(address: str) -> None:
+    with pytest.raises(GpvoError):
+        Link(address)

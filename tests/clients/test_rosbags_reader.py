@@ -1,0 +1,55 @@
+"""Round trips through the rosbags library: ROS 1, ROS 2 sqlite3, MCAP."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.publish.odometry import Odometry
+from gpvo.publish.ros import TOPIC, robot_localization_yaml, write_ros1, write_ros2
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_every_number_comes_back(odometry: list[Odometry], tmp_path: Path, kind: str) -> None:
+    path = tmp_path / ("odometry.bag" if kind == "ros1" else "odometry")
+    count = write_ros1(path, odometry) if kind == "ros1" else write_ros2(path, odometry, mcap=kind == "mcap")
+    tracked = [o for o in odometry if o.twist_body is not None]
+    assert count == len(tracked) < len(odometry)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    with AnyReader([path], default_typestore=store) as reader:
+        assert [c.topic for c in reader.connections] == [TOPIC]
+        assert [c.msgtype for c in reader.connections] == ["nav_msgs/msg/Odometry"]
+        for sent, (connection, t_ns, raw) in zip(tracked, reader.messages(), strict=True):
+            got = reader.deserialize(raw, connection.msgtype)
+            assert t_ns == sent.t_ns == got.header.stamp.sec * 10**9 + got.header.stamp.nanosec
+            assert (got.header.frame_id, got.child_frame_id) == ("odom", "base_link")
+            p, q = got.pose.pose.position, got.pose.pose.orientation
+            T = se3.from_quaternion(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+            np.testing.assert_allclose(T, sent.T_odom_body, atol=1e-12)
+            v, w = got.twist.twist.linear, got.twist.twist.angular
+            np.testing.assert_array_equal([v.x, v.y, v.z, w.x, w.y, w.z], sent.twist_body)
+            np.testing.assert_array_equal(got.pose.covariance.reshape(6, 6), sent.pose_covariance)
+            np.testing.assert_array_equal(got.twist.covariance.reshape(6, 6), sent.twist_covariance)
+
+
+def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_path: Path) -> None:
+    write_ros2(tmp_path / "bag", odometry)
+    assert write_ros2(tmp_path / "bag", odometry[:10], mcap=True) == 9
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").write_bytes(b"")
+    with pytest.raises(GpvoError, match="something else"):
+        write_ros2(tmp_path / "photos", odometry)
+
+
+def test_yaml_fuses_the_twist_alone() -> None:
+    parameters = yaml.safe_load(robot_localization_yaml())["ekf_filter_node"]["ros__parameters"]
+    assert parameters["odom0"] == TOPIC
+    assert parameters["odom0_config"] == [False] * 6 + [True] * 6 + [False] * 3
+    assert parameters["world_frame"] == "odom"

@@ -1,0 +1,98 @@
+"""Independent models of what three consumers read, in the terms of their own source, against ours.
+
+PX4: src/modules/mavlink/mavlink_receiver.cpp, src/modules/ekf2 (EKF2_EV_NOISE_MD, EKF2_EV*_NOISE). ArduPilot:
+libraries/GCS_MAVLink/GCS_Common.cpp and libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp. robot_localization:
+src/ros_filter.cpp and src/ekf.cpp.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError
+from gpvo.filters.synthetic import ErrorLaw, synthetic_flight
+from gpvo.publish import consumers
+from gpvo.publish.mavlink import upper_triangle
+from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
+
+
+@pytest.fixture(scope="module")
+def odometry() -> list[Odometry]:
+    flight = synthetic_flight(5, duration_s=5, law=ErrorLaw(burst_factor=10.0))
+    return list(messages(flight.records, flight.predictions, OdometryBuilder()))[1:]
+
+
+def _px4_intake(wire: list[float], floor: float) -> list[float]:
+    """mavlink_receiver takes elements 0, 6, 11 as variances; EKF2 takes max(variance, floor^2)."""
+    return [math.sqrt(max(wire[i], floor**2)) for i in (0, 6, 11)]
+
+
+def test_px4_reads_diagonals_and_floors_them(odometry: list[Odometry]) -> None:
+    for item in odometry:
+        ours = consumers.px4_sigmas(item)
+        np.testing.assert_allclose(ours["velocity"], _px4_intake(upper_triangle(item.twist_covariance), 0.1))
+        np.testing.assert_allclose(ours["position"], _px4_intake(upper_triangle(item.pose_covariance), 0.1))
+        yaw = math.sqrt(max(upper_triangle(item.pose_covariance)[20], 0.1**2))
+        np.testing.assert_allclose(ours["yaw"], [yaw])
+
+
+def test_px4_mode_one_ignores_the_message(odometry: list[Odometry]) -> None:
+    sigmas = consumers.px4_sigmas(odometry[0], consumers.Px4Parameters(EKF2_EV_NOISE_MD=1, EKF2_EVV_NOISE=0.3))
+    np.testing.assert_array_equal(sigmas["velocity"], [0.3] * 3)
+
+
+def _ardupilot_intake(wire: list[float], *, old: bool) -> tuple[float, float]:
+    position = angle = 0.0
+    if not math.isnan(wire[0]):
+        if old:
+            position = (wire[0] ** 2 + wire[6] ** 2 + wire[11] ** 2) ** (1 / 3)
+            angle = (wire[15] ** 2 + wire[18] ** 2 + wire[20] ** 2) ** (1 / 3)
+        else:
+            position = math.sqrt(wire[0] + wire[6] + wire[11])
+            angle = math.sqrt(wire[15] + wire[18] + wire[20])
+    return min(max(position, 0.2), 100.0), min(max(angle, 0.2), 1.5)
+
+
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e10])
+def test_ardupilot_collapses_and_clamps(odometry: list[Odometry], old: bool, scale: float) -> None:
+    for item in odometry[::10]:
+        C = item.pose_covariance * scale
+        ours = consumers.ardupilot_errors(C, before_2026=old)
+        np.testing.assert_allclose(ours, _ardupilot_intake(upper_triangle(C), old=old), rtol=1e-9)
+    assert consumers.ardupilot_errors(np.full((6, 6), np.nan), before_2026=old) == (0.2, 0.2)
+
+
+def test_robot_localization_floors_and_takes_absolutes() -> None:
+    C = np.eye(6)
+    C[1, 1], C[2, 2] = -0.5, 1e-12
+    C[0, 3] = C[3, 0] = 0.4
+    used = consumers.robot_localization_covariance(C)
+    np.testing.assert_array_equal(np.diagonal(used), [1, 0.5, 1e-9, 1, 1, 1])
+    assert used[0, 3] == 0.4
+
+
+def test_check_names_the_parameter_that_hides_the_prediction(odometry: list[Odometry]) -> None:
+    calm = [replace(o, twist_covariance=np.eye(6) * 0.02**2) for o in odometry]
+    velocity = next(v for v in consumers.check(calm, "px4") if v.quantity == "velocity")
+    assert velocity.hidden_percent == 100.0
+    assert "Set EKF2_EVV_NOISE to 0.02" in str(velocity)
+    loud = [replace(o, twist_covariance=np.eye(6)) for o in odometry]
+    velocity = next(v for v in consumers.check(loud, "px4") if v.quantity == "velocity")
+    assert velocity.hidden_percent == 0.0
+    assert not velocity.advice
+    tiny = [replace(o, twist_covariance=np.eye(6) * 1e-3**2) for o in odometry]
+    velocity = next(v for v in consumers.check(tiny, "px4") if v.quantity == "velocity")
+    assert "Set EKF2_EVV_NOISE to 0.01, the least it accepts" in velocity.advice
+
+
+def test_check_of_the_others(odometry: list[Odometry]) -> None:
+    ardupilot = [str(v) for v in consumers.check(odometry, "ardupilot")]
+    assert any("VISO_POS_M_NSE" in line for line in ardupilot)
+    assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
+    assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
+    with pytest.raises(GpvoError, match="unknown consumer"):
+        consumers.check(odometry, "betaflight")

@@ -1,0 +1,133 @@
+"""Body odometry from camera motions: frames, lever arm, accumulation, floors, lost frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError
+from gpvo.filters.synthetic import ErrorLaw, Events, synthetic_flight
+from gpvo.geometry import se3
+from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.publish.odometry import Floors, OdometryBuilder, lift, messages
+from gpvo.types import Prediction, Status, VoRecord
+
+MOUNT = se3.from_rt(R_FLU_OPTICAL @ se3.so3_exp(np.array([0.1, 0.2, 0.05])), np.array([0.4, 0.1, -0.2]))
+TINY = Floors(0.0, 0.0, 0.0, 0.0)
+
+
+def _prediction(t_ns: int, jitter: np.ndarray, white: np.ndarray, bias: np.ndarray, tau: float = 5.0) -> Prediction:
+    parts = {"jitter": jitter, "white": white, "bias": bias}
+    total, zero = jitter + white + bias, np.zeros(6)
+    return Prediction(t_ns, 0.1, zero, total, parts, np.full(6, tau), zero, 0.8, 1.0, Status.OK)
+
+
+def _spd(rng: np.random.Generator, scale: float) -> np.ndarray:
+    A = rng.standard_normal((6, 6)) * scale
+    return A @ A.T + 0.1 * scale**2 * np.eye(6)
+
+
+def test_twist_of_a_spinning_body_has_the_lever_arm_taken_out() -> None:
+    rate = np.array([0.0, 0.0, 0.7])
+    T_body = se3.exp(np.concatenate([[1.0, 0.0, 0.0], rate]) * 0.1)
+    T_cam = se3.inverse(MOUNT) @ T_body @ MOUNT
+    record = VoRecord(10**8, 0, Status.OK, T_cam)
+    C = _spd(np.random.default_rng(0), 1e-3)
+    out = OdometryBuilder(MOUNT, floors=TINY).step(record, _prediction(10**8, 0 * C, C, 0 * C))
+    assert out.twist_body is not None
+    np.testing.assert_allclose(out.twist_body, [1, 0, 0, *rate], atol=1e-9)
+    A = se3.adjoint(MOUNT)
+    np.testing.assert_allclose(out.twist_covariance, A @ C @ A.T / 0.01, rtol=1e-9)
+    np.testing.assert_allclose(out.T_odom_body, T_body, atol=1e-12)
+
+
+@pytest.mark.parametrize("parts", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.7, 0.5, 0.3)])
+def test_accumulated_pose_covariance_against_monte_carlo(parts: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(3)
+    n, frames, tau, dt = 4000, 15, 0.5, 0.1
+    J, W, B = (s**2 * _spd(rng, 2e-3) for s in parts)
+    motions = [se3.exp(np.array([0.02, 0.05, 0.3, 0.02, 0.1, -0.03]) * rng.uniform(0.5, 1.5)) for _ in range(frames)]
+    builder = OdometryBuilder(MOUNT, floors=TINY)
+    truth = np.eye(4)
+
+    def draw(C: np.ndarray) -> np.ndarray:
+        values, vectors = np.linalg.eigh(C)
+        return rng.standard_normal((n, 6)) @ (vectors * np.sqrt(np.maximum(values, 0))).T
+
+    n_first = n_ref = draw(J / 2)
+    b = draw(B)
+    estimate = np.tile(np.eye(4), (n, 1, 1))
+    for k, T in enumerate(motions, start=1):
+        if k > 1:
+            phi = np.exp(-dt / tau)
+            b = phi * b + np.sqrt(1 - phi**2) * draw(B)
+        n_cur = draw(J / 2)
+        estimate = estimate @ se3.exp(-n_ref) @ T @ se3.exp(n_cur) @ se3.exp(b + draw(W))
+        n_ref, truth = n_cur, truth @ T
+        t = round(k * dt * 1e9)
+        total = J + W + B + 1e-14 * np.eye(6)
+        prediction = replace(_prediction(t, J, W, B, tau), covariance=total)
+        out = builder.step(VoRecord(t, round((k - 1) * dt * 1e9), Status.OK, T), prediction)
+    assert n_first is not None
+    body = MOUNT @ estimate @ se3.inverse(MOUNT)
+    T_true = MOUNT @ truth @ se3.inverse(MOUNT)
+    R = T_true[:3, :3]
+    error = se3.log(se3.inverse(T_true) @ body)
+    error = np.concatenate([error[:, :3] @ R.T, error[:, 3:] @ R.T], axis=1)
+    measured = error.T @ error / n
+    np.testing.assert_allclose(np.diagonal(out.pose_covariance), np.diagonal(measured), rtol=0.12)
+
+
+def test_lost_frames_hold_the_pose_and_widen_it() -> None:
+    flight = synthetic_flight(0, duration_s=6, events=Events(dark=(2.0, 4.0)))
+    out = list(messages(flight.records, flight.predictions, OdometryBuilder(floors=TINY)))
+    lost = [o for o in out if o.status is Status.LOST]
+    assert len(lost) == 40
+    assert all(o.twist_body is None and not o.tracked for o in lost)
+    assert np.trace(lost[-1].pose_covariance[:3, :3]) > 100 * np.trace(out[39].pose_covariance[:3, :3])
+    after = out[out.index(lost[-1]) + 1]
+    # The motion over the dark stretch starts from the last good frame: nothing jumps and nothing is reset.
+    assert after.reset_counter == out[1].reset_counter
+    assert np.trace(after.pose_covariance[:3, :3]) < np.trace(lost[-1].pose_covariance[:3, :3])
+
+
+def test_a_vehicle_at_rest_against_one_reference_does_not_drift() -> None:
+    C = 1e-6 * np.eye(6)
+    builder = OdometryBuilder(floors=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    first = last = None
+    for k in range(1, 200):
+        T = se3.exp(1e-4 * np.random.default_rng(k).standard_normal(6))
+        record = VoRecord(k * 10**8, 0, Status.OK, T, is_reference=False)
+        last = builder.step(record, _prediction(record.t_ns, 0 * C, C, 0 * C))
+        first = first or last
+    assert last is not None
+    np.testing.assert_allclose(last.pose_covariance, first.pose_covariance, rtol=1e-2, atol=1e-12)
+    assert np.abs(last.twist_body).max() < 1e-2
+    # Twice the noise over the frame's own interval, not over the time since the reference.
+    assert 0.5 * 2e-6 / 0.01 < last.twist_covariance[0, 0] < 1.5 * 2e-6 / 0.01
+
+
+def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
+    C = _spd(np.random.default_rng(1), 1e-6)
+    out = lift(C, 1e-6, 1e-4)
+    assert (np.diagonal(out) >= [1e-6] * 3 + [1e-4] * 3).all()
+    np.linalg.cholesky(out)
+    np.testing.assert_allclose(lift(np.eye(6), 1e-6, 1e-6), np.eye(6))
+
+
+def test_no_covariance_is_one_clear_line() -> None:
+    with pytest.raises(GpvoError, match="neither a prediction nor a 'triangulation'"):
+        OdometryBuilder(method="triangulation").step(VoRecord(10**8, 0, Status.OK, np.eye(4)))
+    bad = replace(_prediction(10**8, *(np.eye(6),) * 3), covariance=-np.eye(6))
+    with pytest.raises(GpvoError, match="not symmetric positive definite"):
+        OdometryBuilder().step(VoRecord(10**8, 0, Status.OK, np.eye(4)), bad)
+
+
+def test_every_covariance_of_a_bursty_flight_is_positive_definite() -> None:
+    flight = synthetic_flight(1, duration_s=10, law=ErrorLaw(burst_factor=10.0))
+    for out in messages(flight.records, flight.predictions, OdometryBuilder(MOUNT)):
+        np.linalg.cholesky(out.pose_covariance)
+        if out.twist_covariance is not None:
+            np.linalg.cholesky(out.twist_covariance)
