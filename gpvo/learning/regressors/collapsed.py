@@ -17,6 +17,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpvo.learning.regressors.base import Hyperparameters
+from gpvo.learning.regressors.inducing import greedy_points
 from gpvo.learning.regressors.numerics import (
     LOG_NOISE_BOUNDS,
     LOG_SIGNAL_BOUNDS,
@@ -33,6 +34,13 @@ from gpvo.online.basis import ProjectedGP
 Array = NDArray[np.float64]
 
 CHUNK_ROWS = 8192
+FEW_POINTS = 128
+
+TIGHT = 0.05
+"""Slack of the bound, in nats per row and output, from which on more points are worth their time."""
+
+_RANK_TOLERANCE = 1e-11
+"""Directions of the points' kernel matrix below this share of the largest are rounding, not information."""
 
 Chunk = tuple[Array, Array, Array, Array]
 """Standardised inputs (b, d), standardised outputs (b, D), precision weights (b,), counts (b,)."""
@@ -132,6 +140,16 @@ class CollapsedBound:
         grown = grown.sum(keepdims=True) if n_lengths < self.d else grown
         return value / self.weight, np.concatenate([grown, tail]) / self.weight
 
+    def slack(self, hyper: Hyperparameters) -> float:
+        """What the points leave unexplained of the rows' prior variance, as the bound charges it [nats/row/output].
+
+        Where this is large the bound's maximum calls structure noise, because the points cannot hold it.
+        """
+        points = self.points.numpy() / hyper.lengthscale
+        sums = accumulate(chunks(*self.rows), points, hyper.lengthscale)
+        lost = sums.c - float(Eigenbasis.of(sums, points).eigenvalues.sum())
+        return float(0.5 * lost * (hyper.signal_var / hyper.noise_var).sum() / self.weight)
+
     def maximise(self, hyper: Hyperparameters, *, isotropic: bool, iterations: int) -> Hyperparameters:
         """Better hyperparameters by L-BFGS."""
         theta = pack(hyper, isotropic)
@@ -170,9 +188,21 @@ def _bound(sums: Sums, kk: Tensor, ky: Tensor, R: Tensor, logs: Tensor) -> Tenso
     return 0.5 * (log_det + fit + lost + constant)
 
 
+def tight_bound(rows: Chunk, hyper: Hyperparameters, max_points: int, *, seed: int) -> tuple[CollapsedBound, float]:
+    """The bound on as few greedy points as hold the rows at ``hyper``, and its slack there; ``max_points`` at most."""
+    m = FEW_POINTS
+    while True:
+        points = greedy_points(rows[0] / hyper.lengthscale, min(m, max_points), seed=seed) * hyper.lengthscale
+        bound = CollapsedBound(*rows, points)
+        slack = bound.slack(hyper)
+        if slack < TIGHT or m >= min(max_points, len(rows[0])):
+            return bound, slack
+        m *= 2
+
+
 @dataclass(frozen=True)
 class Eigenbasis:
-    """Directions that diagonalise the rows' statistics: ``P`` (m, m), ``eigenvalues`` (m,), ``z_y`` (m, D) = P ky."""
+    """Directions diagonalising the rows' sums: ``P`` (r, m), ``eigenvalues`` (r,), ``z_y`` (r, D) = P ky; r <= m."""
 
     P: Tensor
     eigenvalues: Array
@@ -182,11 +212,12 @@ class Eigenbasis:
     def of(cls, sums: Sums, points: Array) -> Eigenbasis:
         """From the sums and the scaled inducing points (m, d)."""
         Z = torch.tensor(points)
-        L = cholesky(unit_kernel(Z, Z))
-        half = torch.linalg.solve_triangular(L, sums.kk, upper=False)
-        S = torch.linalg.solve_triangular(L, half.T, upper=False)
+        prior, V = torch.linalg.eigh(unit_kernel(Z, Z))
+        kept = prior > _RANK_TOLERANCE * prior[-1]
+        whiten = V[:, kept].T / prior[kept].sqrt()[:, None]
+        S = whiten @ sums.kk @ whiten.T
         eigenvalues, U = torch.linalg.eigh(0.5 * (S + S.T))
-        P = torch.linalg.solve_triangular(L.T, U.flip(1), upper=True).T.contiguous()
+        P = (U.flip(1).T @ whiten).contiguous()
         return cls(P, eigenvalues.flip(0).clamp_min(0.0).numpy(), (P @ sums.ky).numpy())
 
     def value_and_gradient(self, sums: Sums, output: int, logs: Array) -> tuple[float, Array]:

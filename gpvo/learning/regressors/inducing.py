@@ -17,14 +17,15 @@ _CANDIDATES = 8000
 def greedy_points(U: Array, m: int, *, seed: int = 0, tolerance: float = 1e-6) -> Array:
     """At most m of the rows U (n, d), inputs over length scales, each the least explained by those before it.
 
-    Stops early where every candidate is explained to ``tolerance``; all rows if there are no more than m and none
-    repeats another. Of more than 8,000 rows a random 8,000 are candidates.
+    All rows if there are no more than m. Otherwise stops early where every candidate is explained to ``tolerance``;
+    of more than 8,000 rows a random 8,000 are candidates.
     """
     n = len(U)
+    if n <= m:
+        return U
     if n > _CANDIDATES:
         U = U[np.sort(np.random.default_rng(seed).permutation(n)[:_CANDIDATES])]
         n = _CANDIDATES
-    m = min(m, n)
     left = np.ones(n)
     rows, factor = [], np.zeros((m, n))
     half = 0.5 * (U * U).sum(1)

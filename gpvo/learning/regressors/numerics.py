@@ -137,6 +137,6 @@ def bounds(theta: Array, D: int) -> list[tuple[float, float]]:
     return [LOG_LENGTH_BOUNDS] * n_lengths + [LOG_SIGNAL_BOUNDS] * D + [LOG_NOISE_BOUNDS] * D
 
 
-def first_guess(d: int, D: int) -> Hyperparameters:
-    """For standardised data: long-ish scales (typical distances grow with sqrt(d)), half signal, half noise."""
-    return Hyperparameters(np.full(d, 0.7 * np.sqrt(d) + 0.3), np.full(D, 0.5), np.full(D, 0.5))
+def first_guess(d: int, D: int, length: float) -> Hyperparameters:
+    """For standardised data: ``length`` times sqrt(d) for every input, half signal, half noise."""
+    return Hyperparameters(np.full(d, length * np.sqrt(d)), np.full(D, 0.5), np.full(D, 0.5))

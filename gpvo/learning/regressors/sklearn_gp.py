@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from gpvo.learning.regressors.base import FittedGP, Hyperparameters
-from gpvo.learning.regressors.exact import condition
+from gpvo.learning.regressors.exact import Spectrum
 from gpvo.learning.regressors.numerics import Scaling, checked, fixed_threads
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class SklearnRegressor:
         Xs, Ys = scaling.inputs(X), scaling.outputs(Y)
         with fixed_threads(self.threads):
             hyper, evidence = self._learn(Xs, Ys, w, seed, None if self.hyper is None else scaling.scaled(self.hyper))
-            gp = condition(X, scaling, Ys, w, hyper, torch.device("cpu"))
+            gp = Spectrum.of(Xs, Ys, w, hyper, torch.device("cpu")).posterior(Xs, hyper, scaling)
         evidence -= len(X) * float(np.log(scaling.y_scale).sum())
         return FittedGP(gp, scaling.unscaled(hyper), evidence, self.name, len(X))
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.learning.regressors import exact
 from gpvo.learning.regressors.base import FittedGP, Hyperparameters
-from gpvo.learning.regressors.collapsed import Chunk, CollapsedBound, Eigenbasis, accumulate
+from gpvo.learning.regressors.collapsed import Chunk, Eigenbasis, accumulate, tight_bound
 from gpvo.learning.regressors.inducing import greedy_points
+from gpvo.learning.regressors.likelihood import start
 from gpvo.learning.regressors.numerics import Scaling, checked, fixed_threads
 from gpvo.learning.regressors.rows import ArrayRows, RawChunk, Rows, draw
+
+if TYPE_CHECKING:
+    from gpvo.learning.regressors.svgp import SvgpRegressor
 
 Array = NDArray[np.float64]
 
@@ -50,7 +54,12 @@ class SparseRegressor:
         return self.fit_rows(ArrayRows(*checked(X, Y, noise_weight, sample_weight)), seed=seed)
 
     def fit_rows(self, rows: Rows, *, seed: int = 0) -> FittedGP:
-        """The same from rows that may stream; they are read three times, and at most 8,000 are held."""
+        """The same from rows that may stream; they are read three times, and at most 8,000 are held.
+
+        With every row an inducing point the posterior is the exact one, and is computed as such.
+        """
+        if len(rows) <= self.inducing:
+            return exact_instead(rows, self, seed)
         with fixed_threads(self.threads):
             scaling = streamed_scaling(rows, centre_outputs=self.centre_outputs)
             sample = standardised(draw(rows, max(8000, self.optimise_rows), seed), scaling)
@@ -65,11 +74,23 @@ class SparseRegressor:
         """First guess from the exact likelihood of a few hundred rows, then the bound of ``optimise_rows`` rows."""
         some = np.sort(np.random.default_rng(seed).permutation(len(sample[0]))[: self.optimise_rows])
         Xs, Ys, w, count = (part[some] for part in sample)
-        hyper = exact.start(Xs, Ys, w * count, isotropic=self.isotropic, seed=seed)
-        m = min(self.inducing, exact.BOUND_POINTS)
-        points = greedy_points(Xs / hyper.lengthscale, m, seed=seed) * hyper.lengthscale
-        bound = CollapsedBound(Xs, Ys, w, count, points)
+        hyper = start(Xs, Ys, w * count, isotropic=self.isotropic, seed=seed)
+        bound, _ = tight_bound((Xs, Ys, w, count), hyper, self.inducing, seed=seed)
         return bound.maximise(hyper, isotropic=self.isotropic, iterations=self.max_iterations)
+
+
+def exact_instead(rows: Rows, like: SparseRegressor | SvgpRegressor, seed: int) -> FittedGP:
+    """The exact fit of few rows, under the name and options of ``like``."""
+    X, Y, w, count = draw(rows, len(rows), seed)
+    regressor = exact.ExactRegressor(
+        isotropic=like.isotropic,
+        hyper=like.hyper,
+        centre_outputs=like.centre_outputs,
+        threads=like.threads,
+        device="cpu",
+    )
+    fitted = regressor.fit(X, Y, noise_weight=w, sample_weight=count, seed=seed)
+    return replace(fitted, regressor=like.name)
 
 
 def streamed_scaling(rows: Rows, *, centre_outputs: bool) -> Scaling:

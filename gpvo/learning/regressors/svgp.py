@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpvo.learning.regressors import exact
 from gpvo.learning.regressors.base import FittedGP, Hyperparameters
 from gpvo.learning.regressors.collapsed import Chunk
 from gpvo.learning.regressors.inducing import greedy_points
+from gpvo.learning.regressors.likelihood import start
 from gpvo.learning.regressors.numerics import checked, fixed_threads, pick_device
 from gpvo.learning.regressors.rows import ArrayRows, Rows, draw
-from gpvo.learning.regressors.sparse import close, standardised, streamed_scaling
+from gpvo.learning.regressors.sparse import close, exact_instead, standardised, streamed_scaling
 
 Array = NDArray[np.float64]
 
@@ -64,6 +64,8 @@ class SvgpRegressor:
 
     def fit_rows(self, rows: Rows, *, seed: int = 0) -> FittedGP:
         """The same from rows that may stream; they are read as often as the steps need."""
+        if len(rows) <= self.inducing:
+            return exact_instead(rows, self, seed)
         with fixed_threads(self.threads):
             scaling = streamed_scaling(rows, centre_outputs=self.centre_outputs)
             first = standardised(draw(rows, 8000, seed), scaling)
@@ -71,10 +73,10 @@ class SvgpRegressor:
                 hyper = scaling.scaled(self.hyper)
                 points = greedy_points(first[0] / hyper.lengthscale, self.inducing, seed=seed)
             else:
-                start = exact.start(first[0], first[1], first[2] * first[3], isotropic=self.isotropic, seed=seed)
-                points = greedy_points(first[0] / start.lengthscale, self.inducing, seed=seed) * start.lengthscale
+                guess = start(first[0], first[1], first[2] * first[3], isotropic=self.isotropic, seed=seed)
+                points = greedy_points(first[0] / guess.lengthscale, self.inducing, seed=seed) * guess.lengthscale
                 batches = (standardised(chunk, scaling) for chunk in _endless(rows))
-                hyper, points = self._learn(_minibatches(batches, self.batch, seed), start, points, len(rows), seed)
+                hyper, points = self._learn(_minibatches(batches, self.batch, seed), guess, points, len(rows), seed)
             return close(rows, scaling, hyper, points, self.name, relearn=self.hyper is None)
 
     def _learn(

@@ -1,0 +1,244 @@
+"""Regressors: gradients, repeatability, units, weights, streaming, choice by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from gpvo.errors import GpvoError
+from gpvo.learning.regressors import Hyperparameters, Regressor, get_regressor, regressor_names
+from gpvo.learning.regressors.collapsed import CollapsedBound, Eigenbasis, accumulate, chunks
+from gpvo.learning.regressors.exact import Spectrum
+from gpvo.learning.regressors.inducing import greedy_points
+from gpvo.learning.regressors.likelihood import ExactEvidence
+from gpvo.learning.regressors.numerics import pack
+from gpvo.learning.regressors.rows import ArrayRows, ParquetRows, draw
+from gpvo.learning.regressors.sparse import SparseRegressor, streamed_scaling
+from gpvo.learning.regressors.svgp import SvgpRegressor
+from synthetic_errors import gaussian_nll, make_problem
+
+QUICK = {
+    "exact": {},
+    "sparse": {"inducing": 48},
+    "svgp": {"inducing": 32, "steps": 20, "batch": 128},
+    "sklearn": {},
+}
+
+
+def rows(n: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    problem = make_problem(n, seed)
+    return problem.X, problem.Y[:, :3]
+
+
+def numerical(f, theta: np.ndarray, h: float = 1e-5) -> np.ndarray:
+    out = np.empty_like(theta)
+    for i in range(len(theta)):
+        step = np.zeros_like(theta)
+        step[i] = h
+        out[i] = (f(theta + step) - f(theta - step)) / (2 * h)
+    return out
+
+
+@pytest.mark.parametrize("isotropic", [True, False])
+@pytest.mark.parametrize("kind", ["exact", "bound"])
+def test_gradient_is_the_derivative(kind: str, isotropic: bool) -> None:
+    X, Y = rows(60)
+    rng = np.random.default_rng(1)
+    w, count = rng.uniform(0.5, 2.0, 60), rng.uniform(0.5, 3.0, 60)
+    if kind == "exact":
+        objective = ExactEvidence(X, Y, w, torch.device("cpu")).value_and_gradient
+    else:
+        objective = CollapsedBound(X, Y, w, count, X[:15] + 0.1).value_and_gradient
+    theta = np.concatenate([np.full(1 if isotropic else 8, 0.6), [-0.3, 0.2, 0.1], [-0.7, -0.5, -1.0]])
+    value, gradient = objective(theta)
+    expected = numerical(lambda t: objective(t)[0], theta)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * abs(value))
+
+
+def test_gradient_of_variances_in_the_eigenbasis() -> None:
+    X, Y = rows(60)
+    points = greedy_points(X / 2.0, 20)
+    sums = accumulate(chunks(X, Y, np.ones(60), np.ones(60)), points, np.full(8, 2.0))
+    basis = Eigenbasis.of(sums, points)
+    theta = np.array([-0.4, -0.9])
+    _, gradient = basis.value_and_gradient(sums, 1, theta)
+    np.testing.assert_allclose(gradient, numerical(lambda t: basis.value_and_gradient(sums, 1, t)[0], theta), rtol=1e-6)
+
+
+def test_gradient_of_variances_in_the_spectrum() -> None:
+    X, Y = rows(60)
+    w, device = np.random.default_rng(1).uniform(0.5, 2.0, 60), torch.device("cpu")
+    hyper = Hyperparameters(np.full(8, 2.0), np.array([0.5, 0.7, 0.9]), np.array([0.4, 0.3, 0.2]))
+    spectrum = Spectrum.of(X, Y, w, hyper, device)
+    theta = np.array([-0.4, -0.9])
+    _, gradient = spectrum.value_and_gradient(1, theta)
+    np.testing.assert_allclose(gradient, numerical(lambda t: spectrum.value_and_gradient(1, t)[0], theta), rtol=1e-6)
+    value, _ = ExactEvidence(X, Y, w, device).value_and_gradient(pack(hyper, isotropic=False))
+    assert spectrum.log_evidence(hyper) == pytest.approx(-value, rel=1e-8)
+
+
+def test_a_rough_function_is_not_called_noise() -> None:
+    """Two inputs, many periods: a few points cannot hold it, and their bound would prefer pure noise."""
+    rng = np.random.default_rng(0)
+    X = rng.uniform(-5, 5, (600, 2))
+    Y = (np.sin(3 * X[:, :1]) * np.cos(3 * X[:, 1:])) + 0.02 * rng.standard_normal((600, 1))
+    assert get_regressor("sparse", inducing=512).fit(X, Y).hyper.noise_var[0] < 0.05
+    assert get_regressor("exact").fit(X, Y).hyper.noise_var[0] < 0.03**2
+
+
+def test_a_row_counted_twice_is_two_rows() -> None:
+    X, Y = rows(80)
+    twice = np.where(np.arange(80) < 30, 2.0, 1.0)
+    doubled_X, doubled_Y = np.vstack([X, X[:30]]), np.vstack([Y, Y[:30]])
+    fixed = get_regressor("sparse", inducing=20).fit(X, Y).hyper
+    a = SparseRegressor(hyper=fixed, inducing=200).fit(X, Y, sample_weight=twice)
+    b = SparseRegressor(hyper=fixed, inducing=200).fit(doubled_X, doubled_Y)
+    for one, other in zip(a.predict(X), b.predict(X), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    points, unit = X[:20], np.ones(8)
+    one = accumulate(chunks(X, Y, np.full(80, 1.5), twice), points, unit)
+    other = accumulate(chunks(doubled_X, doubled_Y, np.full(110, 1.5), np.ones(110)), points, unit)
+    for name, value in vars(one).items():
+        np.testing.assert_allclose(value, vars(other)[name], rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_units_do_not_matter(name: str) -> None:
+    X, Y = rows(150)
+    x_unit, y_unit = np.array([1e-3, 1, 1e3, 1, 1, 50, 1, 1]), np.array([1e-4, 1.0, 30.0])
+    plain = get_regressor(name, **QUICK[name]).fit(X, Y)
+    other = get_regressor(name, **QUICK[name]).fit(X * x_unit + 7.0, Y * y_unit + 2.0)
+    (m1, v1), (m2, v2) = plain.predict(X[:20]), other.predict(X[:20] * x_unit + 7.0)
+    np.testing.assert_allclose((m2 - 2.0) / y_unit, m1, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(v2 / y_unit**2, v1, rtol=1e-2, atol=1e-4)
+    assert other.log_evidence == pytest.approx(plain.log_evidence - 150 * np.log(y_unit).sum(), abs=2.0)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_the_same_data_and_seed_give_the_same_bits(name: str) -> None:
+    X, Y = rows(200)
+    a, b = (get_regressor(name, **QUICK[name]).fit(X, Y, seed=3) for _ in range(2))
+    for field in ("points", "projection", "weights", "reduction", "signal_var", "offset", "lengthscale", "centre"):
+        assert getattr(a.gp, field).tobytes() == getattr(b.gp, field).tobytes(), field
+
+
+def test_sparse_is_close_to_exact_and_better_than_constants() -> None:
+    train, test = make_problem(900, 1), make_problem(1000, 2)
+    scores = {}
+    for name in ("exact", "sparse"):
+        fit = get_regressor(name, threads=1).fit(train.X, train.Y)
+        mean, var = fit.predict(test.X)
+        scores[name] = gaussian_nll(test.Y, mean, var + fit.hyper.noise_var)
+    constant = gaussian_nll(test.Y, train.Y.mean(0), train.Y.var(0))
+    assert abs(scores["sparse"] - scores["exact"]) < 0.005
+    assert scores["exact"] < constant - 0.05
+
+
+def test_duplicate_rows_and_constant_columns_do_no_harm() -> None:
+    X, Y = rows(100)
+    X = np.vstack([X, X])
+    X[:, 3] = 5.0
+    Y = np.vstack([Y, Y])
+    Y[:, 2] = 0.25
+    for name in ("exact", "sparse"):
+        mean, var = get_regressor(name, **QUICK[name]).fit(X, Y).predict(X)
+        assert np.isfinite(mean).all()
+        assert (var >= 0).all()
+        np.testing.assert_allclose(mean[:, 2], 0.25, atol=1e-6)
+
+
+def test_greedy_points_are_rows_without_repeats() -> None:
+    X, _ = rows(100)
+    U = np.vstack([X, X])
+    points = greedy_points(U, 150)
+    assert len(points) <= 100
+    assert greedy_points(X, 100) is X
+    assert len(np.unique(points, axis=0)) == len(points)
+    assert {p.tobytes() for p in points} <= {u.tobytes() for u in U}
+
+
+@pytest.fixture
+def parquet(tmp_path: Path) -> Path:
+    X, Y = rows(700)
+    frame = pd.DataFrame(np.hstack([X, Y]), columns=[f"x{i}" for i in range(8)] + ["a", "b", "c"])
+    frame["w"] = np.random.default_rng(0).uniform(0.5, 2.0, 700)
+    path = tmp_path / "rows.parquet"
+    frame.to_parquet(path, row_group_size=128)
+    return path
+
+
+def streamed(path: Path, **more: object) -> ParquetRows:
+    return ParquetRows(path, [f"x{i}" for i in range(8)], ["a", "b", "c"], noise_weight="w", **more)
+
+
+def test_streaming_from_parquet_equals_memory(parquet: Path) -> None:
+    X, Y = rows(700)
+    w = pd.read_parquet(parquet)["w"].to_numpy()
+    for regressor in (SparseRegressor(inducing=32), SvgpRegressor(inducing=16, steps=5, batch=100)):
+        one = regressor.fit_rows(streamed(parquet, chunk_rows=100))
+        again = regressor.fit_rows(streamed(parquet, chunk_rows=100))
+        assert one.gp.weights.tobytes() == again.gp.weights.tobytes()
+    in_memory, from_file = (SparseRegressor(inducing=32) for _ in range(2))
+    a, b = in_memory.fit(X, Y, noise_weight=w), from_file.fit_rows(streamed(parquet, chunk_rows=100))
+    for m, n in zip(a.predict(X), b.predict(X), strict=True):
+        np.testing.assert_allclose(m, n, rtol=1e-3, atol=1e-4)
+
+
+def test_streamed_moments_and_draws(parquet: Path) -> None:
+    X, Y = rows(700)
+    scaling = streamed_scaling(ArrayRows(X, Y, np.ones(700), np.ones(700), chunk_rows=64), centre_outputs=True)
+    np.testing.assert_allclose(scaling.x_centre, X.mean(0), atol=1e-12)
+    np.testing.assert_allclose(scaling.y_scale, Y.std(0), rtol=1e-12)
+    some = draw(streamed(parquet, chunk_rows=90), 50, seed=1)
+    assert [part.shape for part in some] == [(50, 8), (50, 3), (50,), (50,)]
+
+
+def test_parquet_rows_that_are_not_finite_are_skipped(parquet: Path) -> None:
+    frame = pd.read_parquet(parquet)
+    frame.loc[::10, "x3"] = np.nan
+    frame.to_parquet(parquet)
+    assert sum(len(chunk[0]) for chunk in streamed(parquet)) == 630
+    assert len(draw(streamed(parquet), 5000, seed=0)[0]) == 630
+
+
+def test_parquet_complaints(parquet: Path, tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match="lacks the columns z"):
+        ParquetRows(parquet, ["x0", "z"], ["a"])
+    with pytest.raises(GpvoError, match="no such file"):
+        ParquetRows(tmp_path / "none.parquet", ["x0"], ["a"])
+
+
+def test_choice_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert get_regressor("auto", n_rows=2000).name == "exact"
+    assert get_regressor("auto", n_rows=2001).name == "sparse"
+    assert {"exact", "sparse", "svgp", "sklearn"} <= set(regressor_names())
+    with pytest.raises(GpvoError, match=r"no regressor 'magic'.*exact, sparse"):
+        get_regressor("magic")
+
+
+def test_regressors_of_other_packages_join(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Entry:
+        name = "mine"
+
+        @staticmethod
+        def load() -> type[Regressor]:
+            return SparseRegressor
+
+    monkeypatch.setattr("gpvo.learning.regressors.entry_points", lambda group: [Entry()])
+    assert "mine" in regressor_names()
+    assert get_regressor("mine", inducing=7).inducing == 7
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_bad_shapes_and_values_are_refused(name: str) -> None:
+    X, Y = rows(20)
+    regressor = get_regressor(name)
+    with pytest.raises(ValueError, match=r"\(20, 8\) and \(19, 3\)"):
+        regressor.fit(X, Y[:19])
+    with pytest.raises(ValueError, match="finite"):
+        regressor.fit(np.where(X[0, 0] == X, np.nan, X), Y)
+    with pytest.raises(ValueError, match="noise_weight"):
+        regressor.fit(X, Y, noise_weight=np.zeros(20))
