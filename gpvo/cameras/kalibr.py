@@ -106,8 +106,9 @@ def make_lens(
             where=where,
             cure="calibrate as pinhole with radtan, or with equidistant distortion for a fisheye",
         )
-    if name in ("radtan", "radial-tangential", "plumb-bob", "none", ""):
-        if len(distortion) > 5 and any(distortion[5:]):
+    if name in ("radtan", "radial-tangential", "plumb-bob", "rational-polynomial", "none", ""):
+        # The rational model with zeros beyond the fifth coefficient is the common one.
+        if any(distortion[5:]):
             raise CalibrationError("more than five distortion coefficients are not supported", where=where)
         k = (*distortion[:5], *([0.0] * (5 - len(distortion[:5]))))
         return PinholeRadtan(fx, fy, cx, cy, width, height, k)

@@ -54,6 +54,7 @@ def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]
     fx, fy, cx, cy = P_left[0, 0], P_left[1, 1], P_left[0, 2], P_left[1, 2]
     if fx <= 1:
         raise CalibrationError(f"P{left} has focal length {fx:g} px", where=path)
+    _check_centre(float(cx), float(cy), size, path)
     # Both matrices place their camera relative to camera 0; K^-1 p is the translation from it.
     K = P_left[:, :3]
     try:
@@ -67,6 +68,17 @@ def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]
         raise CalibrationError(f"P{left} and P{right} do not sit side by side", where=path)
     lens = PinholeRadtan(float(fx), float(fy), float(cx), float(cy), *size)
     return StereoRig(left=lens, right=lens, T_right_left=T_right_left, where=str(path))
+
+
+def _check_centre(cx: float, cy: float, size: tuple[int, int], path: Path) -> None:
+    """The file does not say its resolution; a principal point far from the middle tells that it is another."""
+    width, height = size
+    if not (0.3 < cx / width < 0.7 and 0.3 < cy / height < 0.7):
+        raise CalibrationError(
+            f"its principal point ({cx:.1f}, {cy:.1f}) is far from the middle of the {width}x{height} images",
+            where=path,
+            cure="is it the calibration of another resolution? Scale its first two rows as the images",
+        )
 
 
 def left_camera_offset(path: Path, left: int) -> Array:

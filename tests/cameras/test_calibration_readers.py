@@ -180,6 +180,12 @@ def test_kitti_pairs(write):
         read_kitti_calib(path, left=1, right=0, size=(1241, 376))
 
 
+@pytest.mark.parametrize("size", [(620, 188), (2482, 752)])
+def test_kitti_of_another_resolution(write, size):
+    with pytest.raises(CalibrationError, match="far from the middle"):
+        read_kitti_calib(write(KITTI, "calib.txt"), left=0, right=1, size=size)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [

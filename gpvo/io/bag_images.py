@@ -1,0 +1,94 @@
+"""Images of ROS messages, and the pairing of two image topics as they stream by."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.io.bag_reader import stamp_ns
+from gpvo.io.images import Image8, decode_grey8, to_grey8
+from gpvo.io.source import SourceReport
+
+# name: (type, channels, blue first)
+_ENCODINGS: dict[str, tuple[str, int, bool]] = {
+    "mono8": ("u1", 1, True),
+    "8uc1": ("u1", 1, True),
+    "mono16": ("u2", 1, True),
+    "16uc1": ("u2", 1, True),
+    "rgb8": ("u1", 3, False),
+    "bgr8": ("u1", 3, True),
+    "8uc3": ("u1", 3, True),
+    "rgba8": ("u1", 4, False),
+    "bgra8": ("u1", 4, True),
+    "rgb16": ("u2", 3, False),
+    "bgr16": ("u2", 3, True),
+}
+# OpenCV names the pattern by its second row and column.
+_BAYER = {
+    "bayer_rggb8": cv2.COLOR_BayerBG2GRAY,
+    "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2GRAY,
+    "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
+}
+# Pairs arrive within a few messages of one another; beyond that a message has lost its partner.
+_WAITING = 12
+
+
+def decode_message(message: Any, bits: int = 16) -> Image8 | None:
+    """A sensor_msgs Image or CompressedImage as (H, W) uint8; None where it is damaged or of unknown encoding."""
+    raw = np.asarray(message.data, dtype=np.uint8)
+    if not hasattr(message, "encoding"):
+        return decode_grey8(raw, bits)
+    name = str(message.encoding).lower()
+    kind, channels, bgr = _ENCODINGS.get(name, ("u1", 1, True))
+    if name not in _ENCODINGS and name not in _BAYER:
+        return None
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * channels * int(kind[1])
+    if not 0 < height <= 16384 or not 0 < width <= 16384 or step < row or len(raw) < height * step:
+        return None
+    packed = np.ascontiguousarray(raw[: height * step].reshape(height, step)[:, :row])
+    pixels: NDArray[Any] = packed.view((">" if message.is_bigendian else "<") + kind)
+    if name in _BAYER:
+        return np.asarray(cv2.cvtColor(packed, _BAYER[name]), dtype=np.uint8)
+    pixels = pixels.astype(kind[0] + kind[1], copy=False).reshape(height, width, channels)
+    return to_grey8(pixels, bgr=bgr, bits=bits)
+
+
+def pair_streams(
+    stream: Iterable[tuple[str, Any]], left: str, tolerance_ns: int, report: SourceReport
+) -> Iterator[tuple[int, Any, Any]]:
+    """(left stamp, left message, right message) of messages whose stamps agree to ``tolerance_ns``.
+
+    A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
+    """
+    waiting: dict[bool, deque[tuple[int, Any]]] = {True: deque(), False: deque()}
+    for topic, message in stream:
+        is_left = topic == left
+        t = stamp_ns(message)
+        others = waiting[not is_left]
+        match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= tolerance_ns), None)
+        if match is None:
+            own = waiting[is_left]
+            own.append((t, message))
+            if len(own) > _WAITING:
+                _drop(own, 1, report)
+            continue
+        _drop(others, match, report)
+        _drop(waiting[is_left], len(waiting[is_left]), report)
+        s, other = others.popleft()
+        yield (t, message, other) if is_left else (s, other, message)
+    for queue in waiting.values():
+        _drop(queue, len(queue), report)
+
+
+def _drop(queue: deque[tuple[int, Any]], count: int, report: SourceReport) -> None:
+    for _ in range(count):
+        t, _message = queue.popleft()
+        report.missing += 1
+        report.note(f"no partner for the image at {t} ns")

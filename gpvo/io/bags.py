@@ -1,0 +1,273 @@
+"""Stereo images from ROS 1 bags, ROS 2 bags and MCAP files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.cameras.camera_info import CameraInfo, rig_from_camera_info
+from gpvo.cameras.kalibr import camchain_topics
+from gpvo.cameras.readers import find_calibration, read_stereo_yaml
+from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.yamlfile import read_yaml
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.io.bag_images import decode_message, pair_streams
+from gpvo.io.bag_reader import (
+    IMAGE_TYPES,
+    IMU_TYPE,
+    INFO_TYPE,
+    POSE_TYPES,
+    is_bag,
+    messages,
+    open_bag,
+    read_poses,
+    stamp_ns,
+    topics_of,
+)
+from gpvo.io.images import Image8, ImageSource
+from gpvo.io.imu import make_imu
+from gpvo.io.source import SourceReport
+from gpvo.io.stamps import usual_interval
+from gpvo.io.trajectory import Trajectory
+from gpvo.io.truth import MOTION_CAPTURE, UNKNOWN, TruthNoise, carry, check_overlap
+from gpvo.types import ImuLog, TruthLog
+
+# How drivers name the two cameras of one head.
+_SIDES = (
+    ("left", "right"),
+    ("cam0", "cam1"),
+    ("fisheye1", "fisheye2"),
+    ("infra1", "infra2"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("cam_0", "cam_1"),
+    ("camera1", "camera2"),
+)
+_TRUTH_NAMES = ("vicon", "mocap", "optitrack", "vrpn", "qualisys", "ground_truth", "groundtruth", "truth")
+_CAPTURE_NAMES = _TRUTH_NAMES[:5]
+
+
+@dataclass(frozen=True)
+class _Topics:
+    left: str
+    right: str
+    imu: str | None
+    truth: str | None
+    count: int
+
+
+class BagSource(ImageSource):
+    """A pair of image topics with CameraInfo, or a Kalibr camera chain beside the bag.
+
+    Topics are guessed from the calibration's ``rostopic`` or the drivers' habits; ``left_topic``, ``right_topic``,
+    ``imu_topic`` and ``truth_topic`` override. Stamps of a pair may differ by ``tolerance_s``. ``truth_frame``
+    (``"imu"`` or ``"cam"``) says whose poses the truth topic holds: the IMU's where its place is known, unless stated.
+    ``bits`` is the depth of the samples in 16-bit images.
+    """
+
+    format = "rosbag"
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        left_topic: str | None = None,
+        right_topic: str | None = None,
+        imu_topic: str | None = None,
+        truth_topic: str | None = None,
+        truth_frame: str | None = None,
+        truth_noise: TruthNoise | None = None,
+        tolerance_s: float = 0.002,
+        calibration: str | Path | None = None,
+        **options: Any,
+    ) -> None:
+        if truth_frame not in (None, "imu", "cam"):
+            raise SourceError(f"truth frame '{truth_frame}' is neither 'imu' nor 'cam'")
+        chain = Path(calibration) if calibration is not None else _calibration_beside(path)
+        with open_bag(path) as reader:
+            asked = (left_topic, right_topic, imu_topic, truth_topic)
+            self._topics = _choose_topics(reader, path, chain, asked)
+            size, span = _first_images(reader, path, self._topics)
+            rig = read_stereo_yaml(chain, size=size[0]) if chain else _rig_from_bag(reader, path, self._topics)
+            _check_sizes(size, rig, path, self._topics)
+        super().__init__(path, path.stem, rig, **options)
+        self.span_ns = span
+        self._tolerance_ns = round(tolerance_s * 1e9)
+        if self._topics.imu is not None:
+            self.imu = _read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s)
+        if self._topics.truth is not None:
+            self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A ``.bag``, ``.db3`` or ``.mcap`` file, or a ROS 2 bag folder."""
+        return is_bag(path)
+
+    def __len__(self) -> int:
+        return self._topics.count
+
+    def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
+        """Pairs in the order of recording, decoded."""
+        topics = self._topics
+        with open_bag(self.path) as reader:
+            stream = messages(reader, [topics.left, topics.right])
+            for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report):
+                yield t_ns, decode_message(left, self.bits), decode_message(right, self.bits)
+
+    def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
+        t, T, _ = read_poses(self.path, topic)
+        if frame == "imu" and self.mounting.T_imu_cam is None:
+            raise CalibrationError("does not say where the IMU sits", where=self.path, cure="use --truth-frame cam")
+        whose = frame or ("cam" if self.mounting.T_imu_cam is None else "imu")
+        place = self.rectifier.T_left_cam if whose == "cam" else self.mounting.T_imu_cam
+        assert place is not None
+        self.remark(f"truth on '{topic}' taken as poses of the {whose} frame")
+        usual = MOTION_CAPTURE if any(n in topic.lower() for n in _CAPTURE_NAMES) else UNKNOWN
+        truth = carry(Trajectory(t, T), place, noise or usual)
+        check_overlap(truth, np.array(self.span_ns, dtype=np.int64), self.path)
+        return truth
+
+
+def _calibration_beside(path: Path) -> Path | None:
+    folders = (path, path.parent) if path.is_dir() else (path.parent,)
+    return next((found for folder in folders if (found := find_calibration(folder))), None)
+
+
+def _choose_topics(reader: Any, path: Path, chain: Path | None, asked: tuple[str | None, ...]) -> _Topics:
+    left, right, imu, truth = asked
+    images = topics_of(reader, IMAGE_TYPES)
+    for topic in (left, right):
+        if topic is not None and topic not in images:
+            raise SourceError(f"has no images on '{topic}' (images on: {', '.join(images) or 'none'})", where=path)
+    if left is None or right is None:
+        pair = _guess_pair(list(images), chain)
+        if pair is None:
+            found = ", ".join(images) or "none"
+            raise SourceError(
+                f"no stereo pair among its image topics ({found})",
+                where=path,
+                cure="name them with --left-topic and --right-topic" if images else "is this the bag with the images?",
+            )
+        left, right = left or pair[0], right or pair[1]
+    if left == right:
+        raise SourceError(f"left and right are the same topic '{left}'", where=path)
+    imus = list(topics_of(reader, (IMU_TYPE,)))
+    poses = list(topics_of(reader, POSE_TYPES))
+    for topic, available in ((imu, imus), (truth, poses)):
+        if topic is not None and topic not in available:
+            raise SourceError(f"has nothing to read on '{topic}' (there are: {', '.join(available)})", where=path)
+    counts = [reader.topics[t].msgcount for t in (left, right)]
+    guessed_truth = next((t for n in _TRUTH_NAMES for t in poses if n in t.lower()), None)
+    return _Topics(left, right, imu or (imus[0] if imus else None), truth or guessed_truth, min(counts))
+
+
+def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None:
+    """Left and right topic by the calibration, by name, or because there are but two."""
+    if chain is not None and "cam0" in read_yaml(chain):
+        a, b = camchain_topics(chain)
+        if a in images and b in images and a is not None and b is not None:
+            return a, b
+    pairs = []
+    for rank, (one, other) in enumerate(_SIDES):
+        for topic in images:
+            partner = topic.replace(one, other)
+            if partner != topic and partner in images and "depth" not in topic:
+                # Raw before rectified before compressed.
+                pairs.append(("compressed" in topic, "rect" in topic, rank, topic, partner))
+    if pairs:
+        return min(pairs)[3:]
+    return (images[0], images[1]) if len(images) == 2 else None
+
+
+def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """(width, height) of the first readable image of each camera, and about the first and last stamp [ns].
+
+    The end is reckoned from the first intervals: the bag's own times are those of recording, of all its topics.
+    """
+    sizes: list[tuple[int, int]] = []
+    stamps: list[int] = []
+    for topic in (topics.left, topics.right):
+        stamps = []
+        found = False
+        for _, message in islice(messages(reader, [topic]), 20):
+            stamps.append(stamp_ns(message))
+            image = None if found else decode_message(message)
+            if image is not None:
+                sizes.append((image.shape[1], image.shape[0]))
+                found = True
+        if not found:
+            encoding = getattr(message, "encoding", getattr(message, "format", "?"))
+            raise SourceError(f"no readable image on '{topic}' (encoding '{encoding}')", where=path)
+        if stamps[0] == 0:
+            raise SourceError(f"images on '{topic}' carry no stamp", where=path, cure="the driver must set them")
+    return sizes, (min(stamps), min(stamps) + round((usual_interval(stamps) or 0.0) * (topics.count - 1)))
+
+
+def _check_sizes(sizes: list[tuple[int, int]], rig: StereoRig, path: Path, topics: _Topics) -> None:
+    for size, lens, topic in zip(sizes, (rig.left, rig.right), (topics.left, topics.right), strict=True):
+        if size != (lens.width, lens.height):
+            raise CalibrationError(
+                f"images on '{topic}' are {size[0]}x{size[1]}, the calibration is for {lens.width}x{lens.height}",
+                where=path,
+                cure="use the calibration of this resolution, or scale its intrinsics",
+            )
+
+
+def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
+    infos = []
+    available = topics_of(reader, (INFO_TYPE,))
+    for topic in (topics.left, topics.right):
+        base = re.sub(r"/(compressed|image/compressed)$", "", topic)
+        name = f"{base.rsplit('/', 1)[0]}/camera_info"
+        if name not in available:
+            raise CalibrationError(
+                f"no calibration: no CameraInfo on '{name}' and no camchain.yaml beside the bag",
+                where=path,
+                cure="put Kalibr's camchain.yaml beside the bag or name one with --calibration",
+            )
+        _, message = next(messages(reader, [name]))
+        infos.append(_camera_info(message, path, name))
+    rectified = all("rect" in t for t in (topics.left, topics.right))
+    return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
+
+
+def _camera_info(message: Any, path: Path, topic: str) -> CameraInfo:
+    """The message in gpvo's type; ROS 1 writes the matrices in capitals."""
+
+    def numbers(name: str) -> np.ndarray:
+        value = getattr(message, name, None)
+        return np.asarray(getattr(message, name.upper()) if value is None else value, dtype=np.float64)
+
+    D, K, R, P = (numbers(n) for n in ("d", "k", "r", "p"))
+    if not all(np.isfinite(m).all() for m in (D, K, R, P)):
+        raise CalibrationError(f"CameraInfo on '{topic}' holds NaN or infinity", where=path)
+    R = R.reshape(3, 3) if np.any(R) else np.eye(3)
+    return CameraInfo(
+        width=int(message.width),
+        height=int(message.height),
+        distortion_model=str(message.distortion_model),
+        D=D,
+        K=K.reshape(3, 3),
+        R=R,
+        P=P.reshape(3, 4),
+    )
+
+
+def _read_imu(path: Path, topic: str, shift_s: float) -> ImuLog | None:
+    stamps, rows = [], []
+    with open_bag(path) as reader:
+        for _, message in messages(reader, [topic]):
+            w, a = message.angular_velocity, message.linear_acceleration
+            stamps.append(stamp_ns(message))
+            rows.append((w.x, w.y, w.z, a.x, a.y, a.z))
+    data = np.array(rows, dtype=np.float64)
+    good = np.isfinite(data).all(axis=1)
+    if not good.any():
+        return None
+    return make_imu(np.array(stamps, dtype=np.int64)[good], data[good], shift_s=shift_s)

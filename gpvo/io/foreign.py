@@ -1,0 +1,272 @@
+"""Other people's odometry: a trajectory, CSV or bag of another VO as records of relative motions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import SourceError
+from gpvo.geometry import covariance as transport
+from gpvo.geometry import se3
+from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import Array
+from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
+from gpvo.io.foreign_csv import COUNT_FIELDS, FLOAT_FIELDS, Table, is_number, read_table
+from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
+from gpvo.types import Status, VoRecord
+
+FORMATS = ("tum", "kitti", "csv", "bag")
+# FLU body at the camera's own place, looking forward.
+T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+
+
+@dataclass(frozen=True)
+class ForeignLog:
+    """Poses of another odometry, with what else it said.
+
+    ``covariance`` (N, 6, 6) or None: NaN where unknown, house order, axes of the moving frame. ``covariance_of``:
+    ``"motion"`` from the row before, ``"pose"`` since the start. ``columns``: further fields of the records, (N,).
+    """
+
+    path: Path
+    trajectory: Trajectory
+    covariance: Array | None = None
+    covariance_of: str = "motion"
+    columns: Mapping[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        """(N,) stamps."""
+        return self.trajectory.t_ns
+
+    def shifted(self, seconds: float) -> ForeignLog:
+        """The same log with its stamps moved by ``seconds``."""
+        moved = Trajectory(self.t_ns + round(seconds * 1e9), self.trajectory.T_world_body)
+        return replace(self, trajectory=moved)
+
+    def seen_from(self, T_body_cam: Array) -> ForeignLog:
+        """The same log for a camera that sits at ``T_body_cam`` (4, 4) on the body it describes."""
+        cov = self.covariance
+        if cov is not None:
+            cov = transport.change_body(se3.inverse(T_body_cam), cov)
+        poses = Trajectory(self.t_ns, self.trajectory.T_world_body @ T_body_cam)
+        return replace(self, trajectory=poses, covariance=cov)
+
+
+def guess_format(path: Path) -> str:
+    """``tum``, ``kitti``, ``csv`` or ``bag`` by ending and first line.
+
+    Raises
+    ------
+    SourceError
+        Where the path is missing or like none of them.
+    """
+    if not path.exists():
+        raise SourceError("no such file", where=path)
+    if is_bag(path):
+        return "bag"
+    if path.is_dir():
+        raise SourceError("is a folder, not a log", where=path, cure="name the trajectory file or the bag")
+    with path.open(encoding="utf-8", errors="replace") as file:
+        lines = [line.strip() for _, line in zip(range(50), file)]
+    data = next((line for line in lines if line and not line.startswith("#")), "")
+    words = data.split()
+    if "," in data or ";" in data or (words and not all(is_number(w) for w in words)):
+        return "csv"
+    if len(words) in (8, 12):
+        return "tum" if len(words) == 8 else "kitti"
+    raise SourceError(
+        "is like no trajectory file", where=path, cure="TUM has 8 numbers a line, KITTI 12, CSV a header; see --format"
+    )
+
+
+def read_foreign(
+    path: str | Path,
+    kind: str | None = None,
+    *,
+    mapping: Mapping[str, str] | None = None,
+    topic: str | None = None,
+    times: str | Path | None = None,
+    rate_hz: float | None = None,
+    covariance_of: str | None = None,
+    covariance_axes: str = "world",
+    complete: bool = False,
+) -> ForeignLog:
+    """Read another odometry's log, or a ground truth.
+
+    Parameters
+    ----------
+    kind : one of :data:`FORMATS`, by default guessed.
+    mapping : for CSV, column -> target (:mod:`gpvo.io.foreign_csv`).
+    topic : for bags, the topic of poses; by default the only one, an Odometry first.
+    times, rate_hz : for KITTI poses, which have no stamps: a file with a line of seconds each, or the rate.
+    covariance_of : what covariance columns of a CSV are of, ``"pose"`` (default) or ``"motion"``.
+    complete : refuse rows of a CSV without a pose, as a ground truth must; else they are left out and counted.
+    covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
+
+    Raises
+    ------
+    SourceError
+        One line that names the file, the place and the cure.
+    """
+    p = Path(path)
+    name = kind or guess_format(p)
+    if name not in FORMATS:
+        raise SourceError(f"there is no format '{name}'", cure=f"choose one of {', '.join(FORMATS)}")
+    if not p.exists():
+        raise SourceError("no such file", where=p)
+    if name == "tum":
+        return ForeignLog(p, read_tum(p))
+    if name == "kitti":
+        return ForeignLog(p, _read_kitti(p, times, rate_hz))
+    if name == "csv":
+        return _from_table(p, read_table(p, mapping or {}), covariance_of or "pose", covariance_axes, complete)
+    return _read_bag(p, topic)
+
+
+def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
+    """Records of the motions between the rows of a log of the camera, and remarks for the user.
+
+    A covariance of motions becomes the method ``imported``. One of poses becomes the growth from row to row, if that
+    is positive definite for nearly all rows, as for an odometry that adds up its errors; a filter's is not, and stays
+    as it is under the name ``imported_pose``, which is of the pose, not of one motion.
+    """
+    T = log.trajectory.T_world_body
+    motions = se3.inverse(T[:-1]) @ T[1:]
+    name, cov, notes = _motion_covariances(log, motions)
+    t = log.t_ns
+    records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
+    for k, motion in enumerate(motions, 1):
+        stated: dict[str, Any] = {}
+        if cov is not None and transport.is_positive_definite(cov[k]):
+            stated = {"covariances": {name: cov[k]}, "v_t": {}}
+        records.append(VoRecord(int(t[k]), int(t[k - 1]), Status.OK, motion, **stated, **_fields(log, k)))
+    return records, [*log.notes, *notes]
+
+
+def _fields(log: ForeignLog, k: int) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, values in log.columns.items():
+        if np.isfinite(values[k]):
+            out[name] = int(values[k]) if name in COUNT_FIELDS else float(values[k])
+    return out
+
+
+def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | None, list[str]]:
+    """Name and (N, 6, 6) covariances by row, None where the log has none."""
+    if log.covariance is None:
+        return "", None, []
+    C = transport.symmetrise(log.covariance)
+    if log.covariance_of == "motion":
+        return "imported", C, []
+    A = se3.adjoint(se3.inverse(motions))
+    growth = np.full_like(C, np.nan)
+    growth[1:] = transport.symmetrise(C[1:] - A @ C[:-1] @ np.swapaxes(A, -1, -2))
+    share = float(np.mean([transport.is_positive_definite(g) for g in growth[1:]])) if len(motions) else 0.0
+    if share >= 0.95:
+        return "imported", growth, []
+    note = (
+        f"the covariances are of poses and grow in {100 * share:.0f} % of the steps only, as a filter's do: kept as"
+        " 'imported_pose', which is not the covariance of one motion"
+    )
+    return "imported_pose", C, [note]
+
+
+def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
+    if covariance_of not in ("pose", "motion") or axes not in ("world", "body"):
+        raise SourceError("covariances are of 'pose' or 'motion', in axes of 'world' or 'body'", where=path)
+    c = table.columns
+    pose = np.stack([c[n] for n in ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")], axis=1)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(pose).all(axis=1))
+    if not known.any():
+        raise SourceError("holds no complete pose", where=path)
+    if complete and not known.all():
+        line = table.lines[int(np.flatnonzero(~known)[0])]
+        cure = "remove the line: a gap is better than a lie"
+        raise SourceError(f"line {line} holds NaN or infinity", where=path, cure=cure)
+    lines = [n for n, k in zip(table.lines, known, strict=True) if k]
+    t, pose = table.t_ns[known], pose[known]
+    check_growing(path, t, lines)
+    check_unit(path, pose[:, 3:], lines)
+    trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
+    cov = _table_covariance(c, known)
+    if cov is not None and axes == "world":
+        cov = _into_body(trajectory, cov)
+    lost = int((~known).sum())
+    return ForeignLog(
+        path,
+        trajectory,
+        cov,
+        covariance_of,
+        {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
+        (f"{lost} rows without a pose were left out",) if lost else (),
+    )
+
+
+def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) -> Array | None:
+    """(N, 6, 6) of the covariance columns; what is not stated off the diagonal is zero."""
+    if not all(f"cov_{i}{i}" in columns for i in range(6)):
+        return None
+    C = np.zeros((int(known.sum()), 6, 6))
+    for i in range(6):
+        for j in range(6):
+            if f"cov_{i}{j}" in columns:
+                C[:, i, j] = columns[f"cov_{i}{j}"][known]
+                if f"cov_{j}{i}" not in columns:
+                    C[:, j, i] = C[:, i, j]
+    return C
+
+
+def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
+    """Covariances of fixed axes turned into those of the moving frame."""
+    Rt = np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2)
+    B = np.zeros_like(covariance)
+    B[:, :3, :3] = B[:, 3:, 3:] = Rt
+    turned: Array = B @ covariance @ np.swapaxes(B, -1, -2)
+    return turned
+
+
+def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> Trajectory:
+    T = read_kitti_poses(path)
+    if times is None and rate_hz is None and (path.parent / "times.txt").is_file():
+        times = path.parent / "times.txt"
+    if times is not None:
+        t = read_times(times)
+        if len(t) != len(T):
+            raise SourceError(f"holds {len(t)} stamps for the {len(T)} poses of {path.name}", where=times)
+        check_growing(Path(times), t, list(range(1, len(t) + 1)))
+    elif rate_hz is not None and rate_hz > 0:
+        t = np.rint(np.arange(len(T)) * (1e9 / rate_hz)).astype(np.int64)
+    else:
+        raise SourceError("KITTI poses have no stamps", where=path, cure="give --times FILE or --rate-hz RATE")
+    return Trajectory(t, T)
+
+
+def _read_bag(path: Path, topic: str | None) -> ForeignLog:
+    if topic is None:
+        with open_bag(path) as reader:
+            odometry = list(topics_of(reader, (ODOMETRY_TYPE,)))
+            poses = odometry or list(topics_of(reader, POSE_TYPES))
+        if len(poses) != 1:
+            found = ", ".join(poses) or "none"
+            raise SourceError(f"which topic? (poses on: {found})", where=path, cure="name one with --topic")
+        topic = poses[0]
+    t, T, read = read_poses(path, topic)
+    trajectory = Trajectory(t, T)
+    if not hasattr(read[0], "twist"):
+        return ForeignLog(path, trajectory)
+    # The twist's covariance is of the velocity in the child frame over the step that ends at the stamp.
+    twist = np.array([m.twist.covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
+    dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
+    if all(transport.is_positive_definite(C) for C in twist[: min(len(twist), 50)]):
+        return ForeignLog(path, trajectory, twist * dt[:, None, None] ** 2, "motion")
+    pose = np.array([m.pose.covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
+    if all(transport.is_positive_definite(C) for C in pose[: min(len(pose), 50)]):
+        return ForeignLog(path, trajectory, _into_body(trajectory, pose), "pose")
+    return ForeignLog(path, trajectory, notes=("its covariances are not positive definite and were left out",))

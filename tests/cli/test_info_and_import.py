@@ -1,0 +1,216 @@
+"""``gpvo info`` and ``gpvo import`` as a user runs them, in one process."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import sequences as seq
+from gpvo import cli
+from gpvo.cameras.models import PinholeRadtan
+from gpvo.geometry import se3
+from gpvo.io.run import read_run, write_run
+from gpvo.io.trajectory import write_euroc_csv, write_kitti_poses, write_tum
+from gpvo.types import Status, VoLog, VoRecord
+
+N = 400
+T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
+
+
+def _poses(n: int = N) -> np.ndarray:
+    """A camera on a winding path, smooth and exciting enough for every alignment."""
+    s = np.arange(n) * 0.05
+    t = np.stack([2 * np.sin(0.7 * s), 0.5 * np.sin(1.3 * s), s + 0.5 * np.cos(0.9 * s)], axis=1)
+    phi = np.stack([0.3 * np.sin(1.1 * s), 0.5 * np.sin(0.8 * s + 1), 0.2 * np.sin(1.7 * s)], axis=1)
+    return se3.from_rt(se3.so3_exp(phi), t)
+
+
+@pytest.fixture
+def gpvo(monkeypatch, capsys):
+    """Run the command line; gives (exit code, output, errors)."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["gpvo", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        out = capsys.readouterr()
+        code = stop.value.code
+        return (0 if code is None else int(code)), out.out, out.err
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("make", "what", "fmt"),
+    [
+        (seq.write_euroc, "sequence", "euroc"),
+        (seq.write_kitti, "sequence", "kitti"),
+        (seq.write_folder, "sequence", "folder"),
+    ],
+)
+def test_info_of_sequences(gpvo, tmp_path, make, what, fmt):
+    path = make(tmp_path / "s")
+    code, out, _ = gpvo("info", path, "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert (document["schema"], document["what"], document["format"]) == (1, what, fmt)
+    assert document["frames"] == 12
+    assert document["camera"]["baseline_m"] == pytest.approx(0.1)
+    code, out, _ = gpvo("info", path)
+    assert code == 0
+    assert "frames: 12" in out
+
+
+def test_info_of_other_files(gpvo, tmp_path):
+    poses = _poses()
+    write_tum(tmp_path / "a.txt", T_NS, poses)
+    write_kitti_poses(tmp_path / "b.txt", poses)
+    write_euroc_csv(tmp_path / "c.csv", T_NS, poses)
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    records = [VoRecord(0, 0, Status.START, np.eye(4)), VoRecord(10, 0, Status.OK, np.eye(4))]
+    write_run(tmp_path / "run", VoLog(records))
+    for name, what in (
+        ("a.txt", "trajectory"),
+        ("b.txt", "trajectory"),
+        ("c.csv", "trajectory"),
+        ("camchain.yaml", "calibration"),
+        ("run", "run"),
+    ):
+        code, out, _ = gpvo("info", tmp_path / name, "--json")
+        assert code == 0
+        assert json.loads(out)["what"] == what
+
+
+def test_info_of_a_bag(gpvo, tmp_path):
+    from bag_maker import BagMaker, stereo_bag
+
+    code, out, _ = gpvo("info", stereo_bag(True).write(tmp_path / "a.bag"), "--json")
+    assert code == 0
+    assert json.loads(out)["sequence"]["frames"] == 12
+    maker = BagMaker(False)
+    maker.imu("/imu0", seq.START_NS)
+    code, out, _ = gpvo("info", maker.write(tmp_path / "b"), "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["sequence"] is None
+    assert "/imu0" in document["topics"]
+
+
+@pytest.mark.parametrize("what", ["nothing", "empty", "rubbish.txt", "rubbish.bag", "rubbish.npz", "rubbish.yaml"])
+def test_info_of_what_is_not_known(gpvo, tmp_path, what):
+    path = tmp_path / what
+    if what == "empty":
+        path.mkdir()
+    elif what != "nothing":
+        path.write_bytes(b"\x00\x01rubbish\n" * 40)
+    code, out, err = gpvo("info", path)
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert str(path) in err
+
+
+def test_import_of_a_perfect_log(gpvo, tmp_path):
+    poses = _poses()
+    write_tum(tmp_path / "est.txt", T_NS, poses)
+    write_euroc_csv(tmp_path / "gt.csv", T_NS, poses)
+    code, out, err = gpvo(
+        "import", tmp_path / "est.txt", "--truth", tmp_path / "gt.csv", "-o", tmp_path / "run", "--json"
+    )
+    assert (code, err) == (0, "")
+    assert json.loads(out)["with_truth"] == N
+    run = read_run(tmp_path / "run")
+    assert len(run.log) == N
+    xi = se3.log(se3.inverse(run.log.trajectory()) @ se3.inverse(poses[0]) @ poses)
+    assert np.abs(xi).max() < 1e-7
+    assert run.truth is not None
+
+
+def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
+    """The truth is of a body turned against the camera, and the log's clock runs 120 ms late."""
+    poses = _poses()
+    R = se3.so3_exp(np.array([0.9, -1.2, 0.7]))
+    write_tum(tmp_path / "est.txt", T_NS + 120_000_000, poses)
+    write_tum(tmp_path / "gt.txt", T_NS, poses @ se3.from_rt(R, np.zeros(3)))
+    code, out, err = gpvo(
+        "import", tmp_path / "est.txt", "--truth", tmp_path / "gt.txt", "-o", tmp_path / "run",
+        "--align", "rotation", "--time-offset", "auto", "--json",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    assert document["time_offset_s"] == pytest.approx(-0.12, abs=2e-3)
+    run = read_run(tmp_path / "run")
+    from gpvo.dataset.errors import motion_errors
+
+    errors = motion_errors(run.log, run.truth)
+    assert len(errors.xi) > N - 10
+    step = np.median(np.linalg.norm(errors.T_true[:, :3, 3], axis=1))
+    assert np.median(np.linalg.norm(errors.xi[:, :3], axis=1)) < 0.05 * step
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["{log}", "-o", "{out}", "--frame", "world"], "--frame is 'world'"),
+        (["{log}", "-o", "{out}", "--time-offset", "soon"], "--time-offset is 'soon'"),
+        (["{log}", "-o", "{out}", "--time-offset", "auto"], "give --truth"),
+        (["{log}", "-o", "{out}", "--map", "abc"], "--map is 'abc'"),
+        (["{log}", "-o", "{out}", "--format", "xml"], "there is no format 'xml'"),
+        (["{log}", "-o", "{out}", "--truth-sigma", "1"], "--truth-sigma is '1'"),
+        (["{log}", "-o", "{out}", "--truth", "{late}"], "does not overlap"),
+        (["{log}", "-o", "{out}", "--truth", "{nan}"], "line 5 holds NaN"),
+        (["{missing}", "-o", "{out}"], "no such file"),
+        (["{log}", "-o", "{taken}"], "not a run"),
+    ],
+)
+def test_import_refuses_in_one_line(gpvo, tmp_path, words, reason):
+    files = {k: tmp_path / k for k in ("log", "out", "late", "nan", "missing", "taken")}
+    write_tum(files["log"], T_NS, _poses())
+    write_tum(files["late"], T_NS + 10**12, _poses())
+    write_tum(files["nan"], T_NS, _poses())
+    lines = files["nan"].read_text().splitlines()
+    lines[4] = lines[4].split(" ")[0] + " nan" * 7
+    files["nan"].write_text("\n".join(lines))
+    files["taken"].mkdir()
+    (files["taken"] / "mine.txt").write_text("mine")
+    code, out, err = gpvo("import", *(w.format(**files) for w in words))
+    assert code == 2
+    assert reason in err
+    assert err.count("\n") == 1
+    assert out == ""
+
+
+def test_import_of_real_logs(gpvo, real_data, tmp_path):
+    kitti, euroc = real_data / "kitti_stereo_vo", real_data / "euroc_v1_01_vo"
+    code, out, _ = gpvo("import", kitti / "07_est.txt", "--truth", kitti / "07_gt.txt", "-o", tmp_path / "k", "--json")
+    assert code == 0
+    assert json.loads(out)["with_truth"] == json.loads(out)["frames"]
+    code, out, _ = gpvo(
+        "import", euroc / "stamped_odometry_trajectory_all.txt", "--truth", euroc / "stamped_groundtruth.txt",
+        "--align", "rotation", "--time-offset", "auto", "-o", tmp_path / "e", "--json",
+    )  # fmt: skip
+    assert code == 0
+    document = json.loads(out)
+    assert abs(document["time_offset_s"]) < 0.2
+    assert document["rotation_deg"] > 1
+    from gpvo.dataset.errors import motion_errors
+
+    run = read_run(tmp_path / "e")
+    errors = motion_errors(run.log, run.truth)
+    true = np.median(np.linalg.norm(errors.T_true[:, :3, 3], axis=1))
+    assert np.median(np.linalg.norm(errors.xi[:, :3], axis=1)) < 0.5 * true
+    openvins = real_data / "openvins_mh01_cov"
+    code, out, _ = gpvo(
+        "import", openvins / "MH01_ov_est.csv", "--truth", openvins / "MH01_ov_gt.csv", "-o", tmp_path / "o", "--json"
+    )
+    assert code == 0
+    assert json.loads(out)["methods"] == ["imported_pose"]
+
+
+def test_a_camera_is_described_by_plain_numbers(tmp_path):
+    """What ``info`` prints of a calibration is JSON as it stands."""
+    from gpvo.cameras.rig import StereoRig
+
+    lens = PinholeRadtan(400.0, 400.0, 320.0, 240.0, 640, 480)
+    json.dumps(StereoRig(lens, lens, seq.T_RIGHT_LEFT).describe())
