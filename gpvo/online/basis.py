@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
+from gpvo.online.rowplan import RowPlan, stack
 
 Array = NDArray[np.float64]
 
@@ -136,7 +137,7 @@ class SharedBasis:
             raise ModelError(f"log_noise_offset has shape {self.log_noise_offset.shape}, expected ({mean.n_outputs},)")
         if noise is not None and (noise.n_inputs, noise.n_outputs) != (mean.n_inputs, mean.n_outputs):
             raise ModelError("the GPs of mean and noise differ in their number of inputs or outputs")
-        self._row: _RowPlan | None = None
+        self._row: RowPlan | None = None
 
     @property
     def n_inputs(self) -> int:
@@ -168,7 +169,7 @@ class SharedBasis:
     def predict_one(self, x: Array) -> BasisPrediction:
         """One row x (d,), float64: the same from a float32 projection, in buffers made once; fresh arrays out."""
         if self._row is None:
-            self._row = _RowPlan(self)
+            self._row = RowPlan(stack(self))
         return BasisPrediction(*self._row(x))
 
     def to_arrays(self, prefix: str = "") -> dict[str, Array]:
@@ -199,102 +200,3 @@ class SharedBasis:
             raise ModelError(f"the model file lacks the array {missing}") from None
         except (ValueError, IndexError) as wrong:
             raise ModelError(f"the model file's GP arrays do not fit together: {wrong}") from None
-
-
-class _RowPlan:
-    """Everything :meth:`SharedBasis.predict_one` can prepare: stacked matrices and buffers.
-
-    With v = [u, 1, -|u|^2/2 of each kernel] all exponents are one product ``G v``; all means are one product ``B k``
-    with ``B = A P``; all variances one product with the squares of z. Projections are float32, as squares forgive it;
-    exponents and means cancel and stay float64.
-    """
-
-    def __init__(self, basis: SharedBasis) -> None:
-        mean, noise = basis.mean, basis.noise
-        own = noise if noise is not None and not basis.shares_kernel else None
-        kernels = [mean] if own is None else [mean, own]
-        self._centre, self._inverse = mean.centre.copy(), 1.0 / mean.lengthscale
-        self._exponents(mean, kernels)
-        sizes = [len(gp.points) for gp in kernels]
-        flats = [np.ascontiguousarray(gp.flat_projection, dtype=np.float32) for gp in kernels]
-        lengths = [len(P) for P in flats]
-        self._k, self._k32 = np.empty(sum(sizes)), np.empty(sum(sizes), np.float32)
-        self._z = np.empty(sum(lengths), np.float32)
-        k_parts, z_parts = np.split(self._k32, np.cumsum(sizes)[:-1]), np.split(self._z, np.cumsum(lengths)[:-1])
-        self._products = list(zip(flats, k_parts, z_parts, strict=True))
-        starts = (0, 0) if own is None else (sizes[0], lengths[0])
-        self._outputs(basis, *starts)
-
-    def _exponents(self, mean: ProjectedGP, kernels: list[ProjectedGP]) -> None:
-        """G and the rows that give ``-|u|^2/2`` of each kernel from u*u, in the scaling of ``mean``."""
-        d, rows, squares = mean.n_inputs, [], []
-        for i, gp in enumerate(kernels):
-            ratio = mean.lengthscale / gp.lengthscale
-            points = gp.points + (gp.centre - mean.centre) / gp.lengthscale
-            one = np.zeros((len(points), len(kernels)))
-            one[:, i] = 1.0
-            rows.append(np.hstack([points * ratio, -0.5 * (points**2).sum(1)[:, None], one]))
-            squares.append(-0.5 * ratio**2)
-        self._G, self._Q = np.ascontiguousarray(np.vstack(rows)), np.array(squares)
-        self._v = np.zeros(d + 1 + len(kernels))
-        self._v[d] = 1.0
-        self._u, self._norms = self._v[:d], self._v[d + 1 :]
-        self._uu = np.empty(d)
-
-    def _outputs(self, basis: SharedBasis, k_start: int, z_start: int) -> None:
-        """B (2 D, M) for the means, H (3 D, R) for the variances, and what they add to (4, D).
-
-        ``k_start``, ``z_start``: where the noise's kernel and directions begin.
-        """
-        mean, noise, D = basis.mean, basis.noise, basis.n_outputs
-        B, H, offset = np.zeros((2, D, len(self._k))), np.zeros((3, D, len(self._z))), np.zeros((4, D))
-        B[0, :, : len(mean.points)] = _kernel_weights(mean)
-        _place(H[0], mean, -mean.reduction, 0)
-        offset[0], offset[1], offset[2] = mean.offset, mean.signal_var, basis.log_noise_offset
-        if noise is not None:
-            B[1, :, k_start : k_start + len(noise.points)] = _kernel_weights(noise)
-            _place(H[1], noise, -0.5 * noise.reduction, z_start)
-            _place(H[2], noise, -noise.reduction, z_start)
-            offset[2] += noise.offset + 0.5 * noise.signal_var
-            offset[3] = noise.signal_var
-        self._B = B.reshape(2 * D, -1)
-        self._H = np.ascontiguousarray(H.reshape(3 * D, -1), dtype=np.float32)
-        self._offset = offset
-        means, variances = np.empty(2 * D), np.empty(3 * D, np.float32)
-        self._flat_out = (means, variances)
-        self._out = (means.reshape(2, D), variances.reshape(3, D))
-
-    def __call__(self, x: Array) -> Array:
-        u, e = self._u, self._k
-        np.subtract(x, self._centre, out=u)
-        np.multiply(u, self._inverse, out=u)
-        np.multiply(u, u, out=self._uu)
-        np.dot(self._Q, self._uu, out=self._norms)
-        np.dot(self._G, self._v, out=e)
-        np.exp(e, out=e)
-        self._k32[:] = e
-        for P, k, z in self._products:
-            np.dot(P, k, out=z)
-        np.multiply(self._z, self._z, out=self._z)
-        np.dot(self._B, e, out=self._flat_out[0])
-        np.dot(self._H, self._z, out=self._flat_out[1])
-        out = self._offset.copy()
-        out[::2] += self._out[0]
-        out[1:] += self._out[1]
-        np.maximum(out[1::2], 0.0, out=out[1::2])
-        return out
-
-
-def _kernel_weights(gp: ProjectedGP) -> Array:
-    """(D, m) weights of the kernel itself: ``A P``."""
-    if gp.projection.ndim == 2:
-        return gp.weights @ gp.projection
-    return np.einsum("jr,jrm->jm", gp.weights, gp.projection)
-
-
-def _place(block: Array, gp: ProjectedGP, values: Array, start: int) -> None:
-    """Write per-output coefficients (D, r) into ``block`` (D, R) at the columns of the directions they multiply."""
-    D, r = values.shape
-    for j in range(D):
-        first = start + (j * r if gp.projection.ndim == 3 else 0)
-        block[j, first : first + r] = values[j]
