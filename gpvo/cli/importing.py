@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gpvo.dataset.align import estimate_fixed_rotation, estimate_time_offset, interpolate_truth
+from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import Array
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, read_foreign, to_records
 from gpvo.io.run import write_run
 from gpvo.io.truth import check_overlap
-from gpvo.types import Mounting, TruthLog, VoLog, VoRecord
+from gpvo.types import Mounting, TruthLog, VoLog
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,14 @@ class ImportSettings:
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """What came of an import. ``rotation_deg``: angle of the fitted fixed rotation, None without one."""
+    """What came of an import. ``rotation_deg``, ``lever_m``: the fitted fixed transform, None without one."""
 
     frames: int
     methods: list[str]
     with_truth: int
     time_offset_s: float
     rotation_deg: float | None
+    lever_m: float | None
     notes: list[str]
 
     def __str__(self) -> str:
@@ -55,6 +57,7 @@ class ImportSummary:
         parts += [f"covariances: {', '.join(self.methods)}"] if self.methods else []
         parts += [f"stamps moved by {self.time_offset_s:+.4f} s"] if self.time_offset_s else []
         parts += [f"truth turned by {self.rotation_deg:.2f} deg"] if self.rotation_deg is not None else []
+        parts += [f"moved by {1e3 * self.lever_m:.0f} mm"] if self.lever_m else []
         return "\n  ".join([", ".join(parts), *self.notes])
 
 
@@ -81,13 +84,13 @@ def import_log(settings: ImportSettings, out: Path) -> ImportSummary:
     truth = None if settings.truth is None else _read_truth(settings, settings.truth, place)
     log, offset_s = _shift(log, truth, settings)
     records, notes = to_records(log)
-    rotation_deg = None
+    fixed: FixedTransform | None = None
     if truth is not None and settings.truth is not None:
         check_overlap(truth, log.t_ns, settings.truth)
-        if settings.align == "rotation":
-            R = _fixed_rotation(records, truth, settings.truth)
-            truth = replace(truth, T_world_cam=truth.T_world_cam @ se3.from_rt(R.T, np.zeros(3)))
-            rotation_deg = float(np.rad2deg(np.linalg.norm(se3.so3_log(R))))
+        if settings.align != "none":
+            motions = windowed_motions(VoLog(records), truth)
+            fixed = fit_fixed_transform(*motions, lever_arm=settings.align == "transform")
+            truth = replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))
     write_run(
         out,
         VoLog(records),
@@ -97,7 +100,15 @@ def import_log(settings: ImportSettings, out: Path) -> ImportSummary:
         meta={"source": settings.log.name, "format": "import", "kind": "import", "notes": notes},
     )
     inside = 0 if truth is None else int(interpolate_truth(truth, log.t_ns)[1].sum())
-    return ImportSummary(len(records), list(VoLog(records).methods), inside, offset_s, rotation_deg, notes)
+    return ImportSummary(
+        frames=len(records),
+        methods=list(VoLog(records).methods),
+        with_truth=inside,
+        time_offset_s=offset_s,
+        rotation_deg=None if fixed is None else fixed.angle_deg,
+        lever_m=None if fixed is None else fixed.lever_m,
+        notes=notes,
+    )
 
 
 def _read_truth(settings: ImportSettings, path: Path, place: Array) -> TruthLog:
@@ -118,18 +129,7 @@ def _shift(log: ForeignLog, truth: TruthLog | None, settings: ImportSettings) ->
     if offset is None:
         if truth is None:
             raise SourceError("a time offset is estimated against a truth", cure="give --truth")
+        from gpvo.dataset.align import estimate_time_offset
+
         offset = estimate_time_offset(VoLog(to_records(log)[0]), truth)
     return (log.shifted(offset), offset) if offset else (log, 0.0)
-
-
-def _fixed_rotation(records: list[VoRecord], truth: TruthLog, path: Path) -> Array:
-    """R with ``R motion_true R^T ~ motion_est``, from all motions that have truth at both ends."""
-    motions = records[1:]
-    before, ok_before = interpolate_truth(truth, np.array([r.t_prev_ns for r in motions], dtype=np.int64))
-    after, ok_after = interpolate_truth(truth, np.array([r.t_ns for r in motions], dtype=np.int64))
-    use = ok_before & ok_after
-    if use.sum() < 10:
-        raise SourceError(f"only {int(use.sum())} motions have truth at both ends: no rotation to fit", where=path)
-    true = se3.inverse(before[use]) @ after[use]
-    estimated = np.array([r.T_prev_cur for r in motions])[use]
-    return estimate_fixed_rotation(estimated, true)

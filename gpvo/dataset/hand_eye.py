@@ -1,0 +1,144 @@
+"""The fixed transform between the frame of a log and that of its truth, from their motions alone.
+
+Both describe one rigid body, so their motions A (log) and B (truth) over the same times satisfy ``A X = X B`` with the
+unknown ``X = T_log_truth`` (Y. Shiu, S. Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
+transform equations of the form AX = XB", 1989).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpvo.dataset.align import interpolate_truth
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.types import TruthLog, VoLog
+
+# Over a second a hand-held or flying camera turns enough for its lever arm to show; its drift does not matter yet.
+WINDOW_S = 1.0
+# What a lever arm is believed to be before the motions speak: an axis about which nothing turns stays near zero.
+PRIOR_LEVER_M = 1.0
+_MIN_MOTIONS = 10
+_ITERATIONS = 30
+
+
+@dataclass(frozen=True)
+class FixedTransform:
+    """``T_log_truth`` (4, 4) and the robust spread of what it leaves, per axis: ``residual_m``, ``residual_rad``."""
+
+    T_log_truth: Array
+    residual_m: float
+    residual_rad: float
+    motions: int
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle between the two frames [deg]."""
+        return float(np.rad2deg(np.linalg.norm(se3.so3_log(self.T_log_truth[:3, :3]))))
+
+    @property
+    def lever_m(self) -> float:
+        """Distance of the two origins [m]."""
+        return float(np.linalg.norm(self.T_log_truth[:3, 3]))
+
+
+def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) -> tuple[Array, Array]:
+    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of ``window_s``, by half-windows.
+
+    Windows that hold a lost frame or lack truth at an end are left out.
+    """
+    t, T = log.t_ns, log.trajectory()
+    dt = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    span = max(1, round(window_s * 1e9 / dt)) if dt > 0 else 1
+    start = np.arange(0, len(t) - span, max(1, span // 2))
+    end = start + span
+    lost = np.cumsum(~log.usable)
+    whole = (lost[end] == lost[start]) & (t[end] - t[start] < 2 * max(window_s * 1e9, dt))
+    T_world, known = interpolate_truth(truth, t)
+    keep = whole & known[start] & known[end]
+    start, end = start[keep], end[keep]
+    return se3.inverse(T[start]) @ T[end], se3.inverse(T_world[start]) @ T_world[end]
+
+
+def fit_fixed_transform(A: Array, B: Array, *, lever_arm: bool = True) -> FixedTransform:
+    """``X`` with ``A X ~ X B``, robust against slips of the log.
+
+    Parameters
+    ----------
+    A, B : (M, 4, 4) motions of the log and of the truth over the same times.
+    lever_arm : estimate the translation as well; else both origins are taken as one.
+
+    Raises
+    ------
+    GpvoError
+        For fewer than ten motions, or motions that do not determine the rotation.
+    """
+    if len(A) < _MIN_MOTIONS:
+        raise GpvoError(f"only {len(A)} motions have truth at both ends, too few to align", cure="check the stamps")
+    X = _start(A, B)
+    free = 6 if lever_arm else 3
+    scale = np.array([1.0, 1.0])
+    for _ in range(_ITERATIONS):
+        r, J = _residuals(A, B, X)
+        scale = np.array([_spread(r[:, :3]), _spread(r[:, 3:])])
+        H, g = _normal_equations(r, J, scale, X)
+        H, g = (H, g) if lever_arm else (H[3:, 3:], g[3:])
+        step = np.zeros(6)
+        step[6 - free :] = -np.linalg.solve(H, g)
+        X = X @ se3.exp(step)
+        if not lever_arm:
+            X[:3, 3] = 0.0
+        if np.abs(step).max() < 1e-10:
+            break
+    return FixedTransform(se3.orthonormalise(X), float(scale[0]), float(scale[1]), len(A))
+
+
+def _start(A: Array, B: Array) -> Array:
+    """Rotation that takes the truth's rotation vectors and directions of travel to the log's (W. Kabsch, 1976)."""
+    pairs = []
+    for pick in (lambda T: se3.so3_log(T[:, :3, :3]), lambda T: T[:, :3, 3]):
+        a, b = pick(A), pick(B)
+        size = np.sqrt(np.median((b**2).sum(1)))
+        if size > 1e-9:
+            # One slip must not turn the start: lengths are limited to thrice the usual one.
+            limit = np.minimum(1.0, 3 * size / np.maximum(np.linalg.norm(a, axis=1), 1e-12))
+            pairs.append((a * limit[:, None] / size, b / size))
+    if not pairs:
+        raise GpvoError("the motions do not show how the frames are turned", cure="use a log that moves")
+    M = sum((a.T @ b for a, b in pairs), np.zeros((3, 3)))
+    U, S, Vt = np.linalg.svd(M)
+    if S[1] < 1e-4 * S[0]:
+        raise GpvoError("the motions do not show how the frames are turned", cure="use a log that turns as well")
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return se3.from_rt(R, np.zeros(3))
+
+
+def _residuals(A: Array, B: Array, X: Array) -> tuple[Array, Array]:
+    """``r = Log((X B)^-1 A X)`` (M, 6) and its derivative (M, 6, 6) by the right perturbation of X, to first order.
+
+    With X Exp(d) for X it is ``Log(Exp(-Ad(B^-1) d) (X B)^-1 A X Exp(d))``: ``r + d - Ad(B^-1) d`` for small r.
+    """
+    E = se3.inverse(X @ B) @ A @ X
+    return se3.log(E), np.eye(6) - se3.adjoint(se3.inverse(B))
+
+
+def _spread(r: Array) -> float:
+    """Robust standard deviation per axis, never zero."""
+    return max(1.4826 * float(np.median(np.abs(r))), 1e-9)
+
+
+def _normal_equations(r: Array, J: Array, scale: Array, X: Array) -> tuple[Array, Array]:
+    """Weighted by the spread of each kind, each motion by Cauchy's function, and the lever arm's prior."""
+    w = np.repeat(1.0 / scale**2, 3)
+    q = (r**2 * w).sum(1) / 6.0
+    weight = 1.0 / (1.0 + q / 4.0)
+    H = np.einsum("m,mki,k,mkj->ij", weight, J, w, J, optimize=True)
+    g = np.einsum("m,mki,k,mk->i", weight, J, w, r, optimize=True)
+    # The step moves the origin by R d: the prior is on the length of the lever arm.
+    R, t = X[:3, :3], X[:3, 3]
+    H[:3, :3] += np.eye(3) / PRIOR_LEVER_M**2
+    g[:3] += R.T @ t / PRIOR_LEVER_M**2
+    return H, g

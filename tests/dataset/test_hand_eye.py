@@ -1,0 +1,96 @@
+"""The fixed transform between a log and its truth, found again from their motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.types import Status, TruthLog, VoLog, VoRecord
+
+X = se3.exp(np.array([0.06, -0.03, 0.1, 1.2, -0.8, 0.4]))
+
+
+def _motions(n: int, noise: float, seed: int = 0, planar: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    xi = rng.normal(size=(n, 6)) * [0.3, 0.3, 1.0, 0.2, 0.4, 0.1]
+    if planar:
+        xi *= [0, 0, 1, 0, 1, 0]
+        xi[:, 2] += 5.0
+    B = se3.exp(xi)
+    A = X @ B @ se3.inverse(X) @ se3.exp(noise * rng.normal(size=(n, 6)) * [1, 1, 1, 0.3, 0.3, 0.3])
+    return A, B
+
+
+def test_exact_motions_give_the_exact_transform():
+    fit = fit_fixed_transform(*_motions(60, 0.0))
+    # The prior on the lever arm is all that holds it back.
+    np.testing.assert_allclose(fit.T_log_truth, X, atol=1e-6)
+    assert fit.lever_m == pytest.approx(np.linalg.norm(X[:3, 3]), abs=1e-6)
+
+
+def test_noise_and_slips():
+    A, B = _motions(300, 0.01)
+    A[::15] = A[::15] @ se3.exp(np.array([3.0, -2.0, 5.0, 0.5, 0.2, -0.3]))
+    fit = fit_fixed_transform(A, B)
+    error = se3.log(se3.inverse(X) @ fit.T_log_truth)
+    assert np.linalg.norm(error[3:]) < 2e-3
+    assert np.linalg.norm(error[:3]) < 2e-2
+    assert fit.residual_m < 0.03
+
+
+def test_planar_motion_leaves_the_height_near_zero():
+    fit = fit_fixed_transform(*_motions(200, 0.002, planar=True))
+    error = se3.log(se3.inverse(X) @ fit.T_log_truth)
+    assert np.linalg.norm(error[3:]) < 2e-3
+    # Turning about one axis says nothing on the offset along it: it must not run away.
+    assert fit.lever_m < 0.5
+
+
+def test_rotation_alone():
+    A, B = _motions(200, 0.001)
+    A = se3.inverse(X) @ A @ X
+    R = se3.exp(np.array([0, 0, 0, 0.5, -1.0, 2.0]))
+    fit = fit_fixed_transform(R @ A @ se3.inverse(R), B, lever_arm=False)
+    np.testing.assert_allclose(fit.T_log_truth[:3, :3], R[:3, :3], atol=2e-3)
+    assert fit.lever_m == 0.0
+
+
+def test_derivative_equals_the_numerical_one():
+    from gpvo.dataset.hand_eye import _residuals
+
+    A, B = _motions(20, 0.0)
+    _, J = _residuals(A, B, X)
+    h = 1e-6
+    for i in range(6):
+        d = np.eye(6)[i] * h
+        numeric = (_residuals(A, B, X @ se3.exp(d))[0] - _residuals(A, B, X @ se3.exp(-d))[0]) / (2 * h)
+        np.testing.assert_allclose(J[:, :, i], numeric, atol=1e-6)
+
+
+def test_windows_skip_lost_frames_and_gaps():
+    n = 100
+    t = np.arange(n) * 50_000_000
+    poses = se3.exp(np.outer(np.arange(n), [0.0, 0, 0.1, 0, 0.01, 0]))
+    motions = np.concatenate([np.eye(4)[None], se3.inverse(poses[:-1]) @ poses[1:]])
+    status = [Status.START, *[Status.OK] * (n - 1)]
+    status[50] = Status.LOST
+    records = [VoRecord(int(t[k]), int(t[max(k - 1, 0)]), status[k], motions[k]) for k in range(n)]
+    A, B = windowed_motions(VoLog(records), TruthLog(t, poses))
+    assert len(A) == 6
+    np.testing.assert_allclose(A, B, atol=1e-9)
+    late = TruthLog(t[40:], poses[40:])
+    assert len(windowed_motions(VoLog(records), late)[0]) == 3
+
+
+def test_what_cannot_be_aligned():
+    A, B = _motions(5, 0.0)
+    with pytest.raises(GpvoError, match="only 5 motions"):
+        fit_fixed_transform(A, B)
+    still = np.tile(np.eye(4), (30, 1, 1))
+    with pytest.raises(GpvoError, match="do not show"):
+        fit_fixed_transform(still, still)
+    straight = se3.exp(np.tile([0, 0, 1.0, 0, 0, 0], (30, 1)))
+    with pytest.raises(GpvoError, match="turns as well"):
+        fit_fixed_transform(straight, straight)
