@@ -1,0 +1,129 @@
+"""The predictor as one C header: arrays as constants, then plain C99 that needs ``math.h`` alone."""
+
+from __future__ import annotations
+
+import os
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gpvo.online.base import base_columns, positions
+from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.rowplan import StackedBasis, stack
+
+_PER_LINE = 8
+
+
+def to_c(
+    model: ErrorModelArrays,
+    path: str | os.PathLike[str],
+    *,
+    name: str = "gpvo",
+    units: tuple[str, ...] = (),
+    note: str = "",
+) -> None:
+    """Write the header. ``name`` prefixes every symbol, so that one program can hold several models.
+
+    ``units``: of the features, for the comment at the top; ``note``: one more line there. The numbers equal those of
+    ``ErrorModelArrays.estimate`` to about 1e-6: projections are kept in single precision. Raises ValueError where
+    ``name`` is no C identifier.
+    """
+    if not name.isidentifier() or not name.isascii():
+        raise ValueError(f"'{name}' is no C identifier")
+    template = files("gpvo.learning.export").joinpath("predictor.c").read_text(encoding="utf-8")
+    code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
+    code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_text(code, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _preamble(model: ErrorModelArrays, units: tuple[str, ...], note: str) -> list[str]:
+    units = units or ("",) * len(model.columns)
+    features = [
+        f" *  {i:3d}  {c} {f'[{u}]' if u else ''}".rstrip() for i, (c, u) in enumerate(zip(model.columns, units))
+    ]
+    return [
+        "/* Error model of stereo visual odometry, written by gpvo. No dependency but math.h; no heap; no state.",
+        *([f" * {note.replace('*/', '')}"] if note else []),
+        " *",
+        " * Features, in order:",
+        *features,
+        " */",
+        "#ifndef GPVO_MODEL_H",
+        "#define GPVO_MODEL_H",
+        "",
+        "#include <math.h>",
+        "",
+    ]
+
+
+def _constants(model: ErrorModelArrays) -> list[str]:
+    stacked, domain, d = stack(model.basis), model.domain, len(model.columns)
+    columns = positions(model.columns, base_columns(model.base.method))
+    sizes = {
+        "N_FEATURES": d,
+        "N_INPUTS": len(model.inputs),
+        "N_KERNELS": len(stacked.kernels),
+        "N_KERNEL": stacked.B.shape[2],
+        "N_DIRECTIONS": stacked.H.shape[2],
+        "N_BASE": len(columns),
+        "POINTS": "{" + ", ".join(str(len(gp.points)) for gp in stacked.kernels) + "}",
+        "DIRECTIONS": "{" + ", ".join(str(len(gp.flat_projection)) for gp in stacked.kernels) + "}",
+        "RADIUS": _number(domain.radius[0]),
+        "DT_S": _number(model.dt_s),
+        "GEOMETRY_WEIGHT": _number(model.geometry_weight[0]),
+        "TYPICAL_LN_DET": _number(model.typical_ln_det[0]),
+    }
+    return [
+        *(f"#define GPVO_{key} {value}" for key, value in sizes.items()),
+        "",
+        *_array("centre", domain.centre),
+        *_array("scale", domain.scale),
+        *_array("low", domain.low),
+        *_array("high_edge", domain.high),
+        *_array("whitening", domain.whitening),
+        *_array("may_miss", domain.may_miss, "int"),
+        *_array("input", model.inputs, "int"),
+        *_array("base_column", columns, "int"),
+        *_array("theta", model.base.theta),
+        *_array("factor", model.factor),
+        *_array("high", model.high),
+        *_array("correlation", model.correlation),
+        *_array("share", model.share),
+        *_basis_arrays(stacked),
+        "",
+    ]
+
+
+def _basis_arrays(stacked: StackedBasis) -> list[str]:
+    kernels = stacked.kernels
+    return [
+        *_array("kernel_centre", [gp.centre for gp in kernels]),
+        *_array("lengthscale", [gp.lengthscale for gp in kernels]),
+        *_array("point", np.concatenate([gp.points for gp in kernels])),
+        *_array("offset", stacked.offset),
+        *_array("mean_weight", stacked.B),
+        *_array("variance_weight", stacked.H, "float"),
+        *_array("projection", np.concatenate([gp.flat_projection.ravel() for gp in kernels]), "float"),
+    ]
+
+
+def _array(name: str, values: ArrayLike, kind: str = "double") -> list[str]:
+    """A constant array; ``kind`` double, float or int."""
+    flat = np.asarray(values).ravel()
+    text = [str(int(v)) for v in flat] if kind == "int" else [_number(v, kind == "float") for v in flat]
+    lines = ["    " + ", ".join(text[i : i + _PER_LINE]) + "," for i in range(0, len(text), _PER_LINE)]
+    return [f"static const {kind} gpvo_{name}[{len(text)}] = {{", *lines, "};"]
+
+
+def _number(value: float, single: bool = False) -> str:
+    """A C literal that reads back as the same number."""
+    if not np.isfinite(value):
+        return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
+    text = repr(float(value)) if not single else str(np.float32(value))
+    text = text if any(c in text for c in ".e") else f"{text}.0"
+    return f"{text}f" if single else text

@@ -1,0 +1,211 @@
+"""The predictor as an ONNX graph in double precision, any number of rows at a time."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gpvo.errors import MissingExtraError
+from gpvo.online.base import base_columns, positions
+from gpvo.online.estimate import PARTS, ErrorModelArrays
+from gpvo.online.rowplan import stack
+
+OPSET = 17
+_INT64 = 7  # TensorProto.INT64
+
+
+def to_onnx(model: ErrorModelArrays, path: str | os.PathLike[str], *, metadata: dict[str, str] | None = None) -> None:
+    """Write the graph.
+
+    Inputs, all double: ``features`` (N, d), NaN where missing; ``geometry`` (N, 6, 6), NaN where unknown; ``dt_s``
+    (N,). Outputs: ``mean`` (N, 6), ``covariance`` (N, 6, 6), its parts ``jitter``, ``white``, ``bias``, ``epistemic``
+    (N, 6), ``in_domain``, ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names. Raises
+    MissingExtraError without the package onnx.
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise MissingExtraError("onnx", "onnx") from None
+    graph = _Graph(onnx)
+    _predict(graph, model)
+    shapes: dict[str, list[Any]] = {"features": ["N", len(model.columns)], "geometry": ["N", 6, 6], "dt_s": ["N"]}
+    square: dict[str, list[Any]] = {name: ["N", 6, 6] for name in ("covariance", *PARTS)}
+    scalar: dict[str, list[Any]] = {name: ["N"] for name in ("in_domain", "confidence", "distance")}
+    outputs: dict[str, list[Any]] = {"mean": ["N", 6], **square, "epistemic": ["N", 6], **scalar}
+    names = {"features": ",".join(model.columns), **(metadata or {})}
+    blob = graph.serialise(shapes, outputs, names)
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_bytes(blob)
+    os.replace(temporary, path)
+
+
+class _Graph:
+    """Collects nodes and constants; every method returns the name of a value."""
+
+    def __init__(self, onnx: Any) -> None:
+        self._onnx = onnx
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+
+    def constant(self, value: ArrayLike, dtype: type = np.float64) -> str:
+        name = f"c{len(self._constants)}"
+        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(value, dtype=dtype), name))
+        return name
+
+    def __call__(self, op: str, *inputs: str | float, out: str | None = None, **attributes: Any) -> str:
+        """One node; numbers become constants."""
+        name = out or f"v{len(self._nodes)}"
+        named = [i if isinstance(i, str) else self.constant(i) for i in inputs]
+        self._nodes.append(self._onnx.helper.make_node(op, named, [name], **attributes))
+        return name
+
+    def add(self, *values: str | float, out: str | None = None) -> str:
+        total = values[0]
+        for i, value in enumerate(values[1:], 2):
+            total = self("Add", total, value, out=out if i == len(values) else None)
+        return str(total)
+
+    def sum(self, value: str, axis: int) -> str:
+        return self("ReduceSum", value, self.constant([axis], np.int64), keepdims=0)
+
+    def take(self, value: str, indices: ArrayLike, axis: int) -> str:
+        return self("Gather", value, self.constant(indices, np.int64), axis=axis)
+
+    def expand(self, value: str, axis: int) -> str:
+        return self("Unsqueeze", value, self.constant([axis], np.int64))
+
+    def finite(self, value: str) -> str:
+        """Where x - x is zero, x is neither NaN nor infinite."""
+        return self("Equal", self("Sub", value, value), 0.0)
+
+    def outer(self, value: str) -> str:
+        return self("Mul", self.expand(value, 2), self.expand(value, 1))
+
+    def serialise(self, inputs: dict[str, list[Any]], outputs: dict[str, list[Any]], metadata: dict[str, str]) -> bytes:
+        helper, double = self._onnx.helper, self._onnx.TensorProto.DOUBLE
+        graph = helper.make_graph(
+            self._nodes,
+            "gpvo",
+            [helper.make_tensor_value_info(name, double, shape) for name, shape in inputs.items()],
+            [helper.make_tensor_value_info(name, double, shape) for name, shape in outputs.items()],
+            self._constants,
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
+        model.producer_name = "gpvo"
+        helper.set_model_props(model, metadata)
+        self._onnx.checker.check_model(model)
+        return bytes(model.SerializeToString(deterministic=True))
+
+
+def _predict(g: _Graph, model: ErrorModelArrays) -> None:
+    """The whole graph; line by line ``ErrorModelArrays.estimate``."""
+    inside, distance, in_domain = _locate(g, model)
+    mean, mean_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
+    base = _base(g, model)
+    near = g.expand(in_domain, 1)
+    onward = g("Add", distance, 1.0)
+    growth = g.expand(g("Mul", onward, onward), 1)
+    known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
+    short = g("Max", g("Sub", g.constant(model.high), log_noise), 0.0)
+    cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
+    trusted = g("Mul", mean, near, out="mean")
+    lost = g("Sub", mean, trusted)
+    noise = g("Mul", base, g("Exp", cautious))
+    total = g("Mul", g.add(noise, mean_var, g("Mul", lost, lost)), growth)
+    factor = g.constant(model.factor)
+    variance = g("Mul", total, factor)
+    g("Sub", variance, g("Mul", known, factor), out="epistemic")
+    whole = g("Mul", g.outer(g("Sqrt", variance)), _correlations(g, model))
+    root = np.sqrt(model.share)
+    parts = [g("Mul", whole, g.constant(np.outer(root[i], root[i])), out=name) for i, name in enumerate(PARTS)]
+    covariance = g.add(*parts, out="covariance")
+    precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), _log_det(g, covariance)), 12.0))
+    g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
+
+
+def _locate(g: _Graph, model: ErrorModelArrays) -> tuple[str, str, str]:
+    domain = model.domain
+    u = g("Div", g("Sub", "features", g.constant(domain.centre)), g.constant(domain.scale))
+    present = g.finite(u)
+    u = g("Where", present, u, 0.0)
+    inside = g("Min", g("Max", u, g.constant(domain.low)), g.constant(domain.high))
+    away = g("Sub", u, inside)
+    charged = g("Where", present, 0.0, g.constant((~domain.may_miss).astype(np.float64)))
+    beyond = g.sum(g("Add", g("Mul", away, away), charged), 1)
+    white = g("MatMul", inside, g.constant(domain.whitening))
+    joint = g("Max", g("Sub", g("Sqrt", g.sum(g("Mul", white, white), 1)), float(domain.radius[0])), 0.0)
+    squared = g("Add", beyond, g("Mul", joint, joint))
+    distance = g("Sqrt", squared, out="distance")
+    return inside, distance, g("Exp", g("Mul", squared, -0.5), out="in_domain")
+
+
+def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, str, str]:
+    stacked = stack(model.basis)
+    kernels, squares = [], []
+    for gp in stacked.kernels:
+        u = g("Div", g("Sub", inputs, g.constant(gp.centre)), g.constant(gp.lengthscale))
+        cross = g("MatMul", u, g.constant(gp.points.T))
+        norms = g("Mul", g.expand(g.sum(g("Mul", u, u), 1), 1), 0.5)
+        e = g("Sub", g("Sub", cross, norms), g.constant(0.5 * (gp.points**2).sum(1)))
+        k = g("Exp", g("Min", e, 0.0))
+        z = g("MatMul", k, g.constant(gp.flat_projection.T))
+        kernels.append(k)
+        squares.append(g("Mul", z, z))
+    k, z2 = (g("Concat", *parts, axis=1) if len(parts) > 1 else parts[0] for parts in (kernels, squares))
+    mean, log_noise = (g("MatMul", k, g.constant(B.T)) for B in stacked.B)
+    mean_var, more, spread = (g("MatMul", z2, g.constant(H.T)) for H in stacked.H)
+    offset = [g.constant(row) for row in stacked.offset]
+    return (
+        g("Add", mean, offset[0]),
+        g("Max", g("Add", mean_var, offset[1]), 0.0),
+        g.add(log_noise, more, offset[2]),
+        g("Max", g("Add", spread, offset[3]), 0.0),
+    )
+
+
+def _base(g: _Graph, model: ErrorModelArrays) -> str:
+    domain, theta = model.domain, model.base.theta
+    at = positions(model.columns, base_columns(model.base.method))
+    columns = g.take("features", at, axis=1)
+    columns = g("Where", g.finite(columns), columns, g.constant(domain.centre[at]))
+    dt = g.expand("dt_s", 1)
+    moved = [g("Mul", g.take(columns, part, axis=1), dt) for part in ([0, 1, 2], [3, 4, 5])]
+    squared = [g.expand(g.sum(g("Mul", part, part), 1), 1) for part in moved]
+    terms = [g("Mul", squared[i], g.constant(theta[:, 2 + i])) for i in range(2)]
+    if len(at) >= 12:
+        least = (domain.centre + domain.scale * domain.low)[at][6:]
+        geometry = g("Exp", g("Max", g.take(columns, np.arange(6, 12), axis=1), g.constant(least[:6])))
+        terms.append(g("Mul", geometry, g.constant(theta[:, 0])))
+    return g.add(*terms, g.constant(theta[:, 1]))
+
+
+def _correlations(g: _Graph, model: ErrorModelArrays) -> str:
+    weight, typical = float(model.geometry_weight[0]), g.constant(model.correlation)
+    flat = g("Reshape", "geometry", g.constant([-1, 36], np.int64))
+    own = g("Div", "geometry", g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
+    finite = g.finite(own)
+    known = g("Equal", g("ReduceMin", g("Cast", finite, to=_INT64), axes=[1, 2]), g.constant(1, np.int64))
+    mixed = g("Add", g("Mul", g("Where", finite, own, 0.0), weight), g("Mul", typical, 1.0 - weight))
+    chosen = g("Where", known, mixed, typical) if weight > 0 else g("Where", known, typical, typical)
+    return g("Add", g("Mul", chosen, 1.0 - 1e-6), g.constant(1e-6 * np.eye(6)))
+
+
+def _log_det(g: _Graph, covariance: str) -> str:
+    """(N,) log-determinant of (N, 6, 6) positive definite matrices: pivots of successive Schur complements."""
+    logs, rest = [], covariance
+    for size in range(6, 0, -1):
+        column = g.take(rest, [0], axis=2)
+        pivot = g.take(column, [0], axis=1)
+        logs.append(g("Log", g("Reshape", pivot, g.constant([-1], np.int64))))
+        if size > 1:
+            others = np.arange(1, size)
+            below = g.take(column, others, axis=1)
+            right = g.take(g.take(rest, [0], axis=1), others, axis=2)
+            block = g.take(g.take(rest, others, axis=1), others, axis=2)
+            rest = g("Sub", block, g("Div", g("MatMul", below, right), pivot))
+    return g.add(*logs)

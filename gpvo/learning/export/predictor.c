@@ -1,0 +1,166 @@
+/* What the arithmetic below needs of a motion, and what it gives back. Tangent order: translation x y z [m], rotation
+ * x y z [rad], in the rectified left optical frame. Matrices are row-major. */
+typedef struct {
+    double mean[6];
+    double covariance[36]; /* total, about the mean */
+    double jitter[36];     /* the three parts it is the sum of */
+    double white[36];
+    double bias[36];
+    double epistemic[6]; /* share of each variance that comes from being away from the training data */
+    double in_domain;    /* 0..1 */
+    double confidence;   /* 0..1 */
+    double distance;     /* from the training domain, in training standard deviations */
+} gpvo_estimate;
+
+static double gpvo_clip(double v, double low, double high) { return v < low ? low : v > high ? high : v; }
+
+/* Draws the standardised features into the training domain; returns how far outside they were. */
+static double gpvo_locate(const double *features, double *inside) {
+    double beyond = 0.0, joint = 0.0;
+    int i, j;
+    for (i = 0; i < GPVO_N_FEATURES; ++i) {
+        double u = (features[i] - gpvo_centre[i]) / gpvo_scale[i];
+        int missing = !isfinite(u);
+        if (missing) {
+            u = 0.0;
+            beyond += gpvo_may_miss[i] ? 0.0 : 1.0;
+        }
+        inside[i] = gpvo_clip(u, gpvo_low[i], gpvo_high_edge[i]);
+        beyond += (u - inside[i]) * (u - inside[i]);
+    }
+    for (j = 0; j < GPVO_N_FEATURES; ++j) {
+        double w = 0.0;
+        for (i = 0; i < GPVO_N_FEATURES; ++i) w += inside[i] * gpvo_whitening[i * GPVO_N_FEATURES + j];
+        joint += w * w;
+    }
+    joint = sqrt(joint) - GPVO_RADIUS;
+    if (joint < 0.0) joint = 0.0;
+    return sqrt(beyond + joint * joint);
+}
+
+/* Mean, its variance, log noise variance and its spread, from inputs (standardised features the model sees). */
+static void gpvo_basis(const double *inputs, double out[4][6]) {
+    static const int points[] = GPVO_POINTS, directions[] = GPVO_DIRECTIONS;
+    double kernel[GPVO_N_KERNEL], square[GPVO_N_DIRECTIONS];
+    const double *point = gpvo_point;
+    const float *row = gpvo_projection;
+    double *k = kernel, *s = square;
+    int g, i, j, r;
+    for (g = 0; g < GPVO_N_KERNELS; ++g) {
+        for (i = 0; i < points[g]; ++i) {
+            double e = 0.0;
+            for (j = 0; j < GPVO_N_INPUTS; ++j) {
+                int at = g * GPVO_N_INPUTS + j;
+                double d = (inputs[j] - gpvo_kernel_centre[at]) / gpvo_lengthscale[at] - *point++;
+                e += d * d;
+            }
+            k[i] = exp(-0.5 * e);
+        }
+        for (r = 0; r < directions[g]; ++r) {
+            double z = 0.0;
+            for (i = 0; i < points[g]; ++i) z += (double)*row++ * k[i];
+            *s++ = z * z;
+        }
+        k += points[g];
+    }
+    for (j = 0; j < 6; ++j) {
+        for (g = 0; g < 4; ++g) out[g][j] = gpvo_offset[g * 6 + j];
+        for (i = 0; i < GPVO_N_KERNEL; ++i) {
+            out[0][j] += gpvo_mean_weight[j * GPVO_N_KERNEL + i] * kernel[i];
+            out[2][j] += gpvo_mean_weight[(6 + j) * GPVO_N_KERNEL + i] * kernel[i];
+        }
+        for (r = 0; r < GPVO_N_DIRECTIONS; ++r)
+            for (g = 0; g < 3; ++g)
+                out[g + 1][j] += (double)gpvo_variance_weight[(g * 6 + j) * GPVO_N_DIRECTIONS + r] * square[r];
+        if (out[1][j] < 0.0) out[1][j] = 0.0;
+        if (out[3][j] < 0.0) out[3][j] = 0.0;
+    }
+}
+
+/* Variance that is known before anything is learnt: geometry, floor, parts that grow with the motion. */
+static void gpvo_base(const double *features, double dt_s, double base[6]) {
+    double column[GPVO_N_BASE], translation = 0.0, rotation = 0.0;
+    int i, j;
+    for (i = 0; i < GPVO_N_BASE; ++i) {
+        int at = gpvo_base_column[i];
+        double least = gpvo_centre[at] + gpvo_scale[at] * gpvo_low[at];
+        column[i] = isfinite(features[at]) ? features[at] : gpvo_centre[at];
+        if (i >= 6 && column[i] < least) column[i] = least;
+    }
+    for (i = 0; i < 3; ++i) {
+        translation += column[i] * dt_s * column[i] * dt_s;
+        rotation += column[3 + i] * dt_s * column[3 + i] * dt_s;
+    }
+    for (j = 0; j < 6; ++j) {
+        const double *theta = gpvo_theta + 4 * j;
+        double geometry = GPVO_N_BASE >= 12 ? exp(column[(6 + j) % GPVO_N_BASE]) : 0.0;
+        base[j] = theta[0] * geometry + theta[1] + theta[2] * translation + theta[3] * rotation;
+    }
+}
+
+/* Correlations of the residuals, mixed with those of the geometric covariance where there is one. */
+static void gpvo_correlations(const double *geometry, double R[36]) {
+    int i, j, known = geometry != 0 && GPVO_GEOMETRY_WEIGHT > 0.0;
+    double own[36];
+    for (i = 0; i < 6 && known; ++i)
+        for (j = 0; j < 6; ++j) {
+            own[i * 6 + j] = geometry[i * 6 + j] / (sqrt(geometry[i * 7]) * sqrt(geometry[j * 7]));
+            if (!isfinite(own[i * 6 + j])) known = 0;
+        }
+    for (i = 0; i < 36; ++i) {
+        R[i] = gpvo_correlation[i];
+        if (known) R[i] = GPVO_GEOMETRY_WEIGHT * own[i] + (1.0 - GPVO_GEOMETRY_WEIGHT) * R[i];
+        R[i] = R[i] * (1.0 - 1e-6) + (i % 7 == 0 ? 1e-6 : 0.0);
+    }
+}
+
+/* Log-determinant of a symmetric positive definite 6x6 matrix, by Cholesky. */
+static double gpvo_log_det(const double C[36]) {
+    double L[36], sum = 0.0;
+    int i, j, k;
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j <= i; ++j) {
+            double v = C[i * 6 + j];
+            for (k = 0; k < j; ++k) v -= L[i * 6 + k] * L[j * 6 + k];
+            L[i * 6 + j] = i == j ? sqrt(v) : v / L[j * 7];
+            if (i == j) sum += 2.0 * log(L[i * 7]);
+        }
+    return sum;
+}
+
+/* The error of one motion. features: GPVO_N_FEATURES values in the order above, NAN where missing. geometry: 6x6
+ * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
+ * training's. Never fails; uses no heap and no state. */
+static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], R[36], sigma[6], distance, outside, growth;
+    int i, j;
+    distance = gpvo_locate(features, inside);
+    for (i = 0; i < GPVO_N_INPUTS; ++i) inputs[i] = inside[gpvo_input[i]];
+    gpvo_basis(inputs, said);
+    gpvo_base(features, dt_s > 0.0 ? dt_s : GPVO_DT_S, base);
+    gpvo_correlations(geometry, R);
+    out->distance = distance;
+    out->in_domain = exp(-0.5 * distance * distance);
+    outside = 1.0 - out->in_domain;
+    growth = (1.0 + distance) * (1.0 + distance);
+    for (j = 0; j < 6; ++j) {
+        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, variance;
+        double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
+        out->mean[j] = said[0][j] * out->in_domain;
+        lost = said[0][j] - out->mean[j];
+        variance = (base[j] * exp(cautious) * growth + (said[1][j] + lost * lost) * growth) * gpvo_factor[j];
+        out->epistemic[j] = variance - known * gpvo_factor[j];
+        sigma[j] = sqrt(variance);
+    }
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j < 6; ++j) {
+            double whole = sigma[i] * R[i * 6 + j] * sigma[j];
+            out->jitter[i * 6 + j] = whole * sqrt(gpvo_share[i]) * sqrt(gpvo_share[j]);
+            out->white[i * 6 + j] = whole * sqrt(gpvo_share[6 + i]) * sqrt(gpvo_share[6 + j]);
+            out->bias[i * 6 + j] = whole * sqrt(gpvo_share[12 + i]) * sqrt(gpvo_share[12 + j]);
+            out->covariance[i * 6 + j] = out->jitter[i * 6 + j] + out->white[i * 6 + j] + out->bias[i * 6 + j];
+        }
+    out->confidence = exp((GPVO_TYPICAL_LN_DET - gpvo_log_det(out->covariance)) / 12.0);
+    if (out->confidence > 1.0) out->confidence = 1.0;
+    out->confidence *= out->in_domain;
+}

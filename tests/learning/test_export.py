@@ -1,0 +1,193 @@
+"""Exports give the predictor's numbers: ONNX through onnxruntime, C through a compiler."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError
+from gpvo.learning.export import export_model, to_c, to_onnx
+from gpvo.online.base import BaseVariance, base_columns
+from gpvo.online.basis import ProjectedGP, SharedBasis
+from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate
+from gpvo.online.guard import Domain
+
+FIELDS = ("mean", "covariance", *PARTS, "epistemic", "in_domain", "confidence", "distance")
+
+
+def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> ProjectedGP:
+    points = rng.standard_normal((m, d))
+    K = np.exp(-0.5 * ((points[:, None] - points[None]) ** 2).sum(2))
+    eigenvalues, V = np.linalg.eigh(K)
+    gain = 1.0 / (eigenvalues + rng.uniform(0.1, 1.0, (6, 1)))
+    signal = scale**2 * rng.uniform(0.5, 2.0, 6)
+    return ProjectedGP(
+        0.1 * rng.standard_normal(d),
+        rng.uniform(0.8, 3.0, d),
+        points,
+        V.T,
+        scale * gain * (V.T @ rng.standard_normal((m, 6))).T,
+        gain * signal[:, None],
+        signal,
+        scale * rng.standard_normal(6),
+    )
+
+
+def some_model(*, method: str | None = "triangulation", noise: str = "own") -> ErrorModelArrays:
+    """A model of random but sensible numbers."""
+    rng = np.random.default_rng(0)
+    columns = (*base_columns(method), "inliers", "sharpness")
+    X = rng.standard_normal((400, len(columns)))
+    X[:, 6 : len(columns) - 2] -= 9.0
+    X[::7, -1] = np.nan
+    inputs = np.array([0, 2, 5, len(columns) - 2])
+    mean = random_gp(rng, 4, 30, 0.01)
+    second = random_gp(rng, 4, 20, 0.3)
+    if noise == "shared":
+        weights, offset = 30.0 * mean.weights[::-1], 30.0 * mean.offset
+        second = replace(
+            mean, weights=weights, reduction=900 * mean.reduction, signal_var=900 * mean.signal_var, offset=offset
+        )
+    A = rng.standard_normal((6, 30))
+    correlation = np.corrcoef(A)
+    share = rng.uniform(0.1, 1.0, (3, 6))
+    return ErrorModelArrays(
+        columns=columns,
+        inputs=inputs,
+        basis=SharedBasis(mean, None if noise == "constant" else second, rng.standard_normal(6)),
+        domain=Domain.learn(X),
+        base=BaseVariance(rng.uniform(1e-4, 1.0, (6, 4)) * [1.0 if method else 0.0, 1e-4, 1e-3, 1e-3], method),
+        factor=rng.uniform(0.5, 2.0, 6),
+        high=rng.uniform(0.0, 2.0, 6),
+        correlation=correlation,
+        geometry_weight=np.array([0.4 if method else 0.0]),
+        share=share / share.sum(0),
+        bias_tau_s=np.ones(6),
+        typical_ln_det=np.array([-60.0]),
+        dt_s=0.1,
+    )
+
+
+CASES = {
+    "own noise kernel": some_model(),
+    "shared kernel": some_model(noise="shared"),
+    "constant noise": some_model(noise="constant"),
+    "no geometry": some_model(method=None),
+}
+
+
+def some_inputs(model: ErrorModelArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows inside, at the edge, far outside and with missing values; geometry with some unknown; durations."""
+    rng = np.random.default_rng(1)
+    n, d = 60, len(model.columns)
+    X = model.domain.centre + model.domain.scale * rng.standard_normal((n, d))
+    X[20:30] += 4.0 * model.domain.scale
+    X[30:40, rng.integers(0, d, 10)] = np.nan
+    A = rng.standard_normal((n, 6, 9)) * 0.01
+    geometry = A @ A.transpose(0, 2, 1)
+    geometry[::5] = np.nan
+    return X, geometry, rng.uniform(0.05, 0.3, n)
+
+
+def assert_equal(got: dict[str, np.ndarray], wanted: Estimate) -> None:
+    for name in FIELDS:
+        expected = wanted.parts[name] if name in PARTS else getattr(wanted, name)
+        scale = np.sqrt(np.diagonal(wanted.covariance, axis1=1, axis2=2))
+        if name in ("covariance", *PARTS):
+            unit = scale[:, :, None] * scale[:, None, :]
+        elif name in ("mean", "epistemic"):
+            unit = scale if name == "mean" else scale**2
+        else:
+            unit = np.maximum(np.abs(expected), 1e-3)
+        assert got[name].shape == expected.shape, name
+        assert np.abs((got[name] - expected) / unit).max() < 1e-5, name
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_onnx_runs_to_the_same_numbers(case: str, tmp_path: Path) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    model = CASES[case]
+    path = tmp_path / "model.onnx"
+    to_onnx(model, path, metadata={"digest": "abc"})
+    X, geometry, dt_s = some_inputs(model)
+    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    assert session.get_modelmeta().custom_metadata_map == {"features": ",".join(model.columns), "digest": "abc"}
+    out = session.run(list(FIELDS), {"features": X, "geometry": geometry, "dt_s": dt_s})
+    assert_equal(dict(zip(FIELDS, out, strict=True)), model.estimate(X, geometry, dt_s))
+    again = tmp_path / "again.onnx"
+    to_onnx(model, again, metadata={"digest": "abc"})
+    assert again.read_bytes() == path.read_bytes()
+
+
+class CEstimate(ctypes.Structure):
+    _fields_ = [
+        ("mean", ctypes.c_double * 6),
+        ("covariance", ctypes.c_double * 36),
+        ("jitter", ctypes.c_double * 36),
+        ("white", ctypes.c_double * 36),
+        ("bias", ctypes.c_double * 36),
+        ("epistemic", ctypes.c_double * 6),
+        ("in_domain", ctypes.c_double),
+        ("confidence", ctypes.c_double),
+        ("distance", ctypes.c_double),
+    ]
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler 'cc' on this machine")
+@pytest.mark.parametrize("case", CASES)
+def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
+    model = CASES[case]
+    to_c(
+        model,
+        tmp_path / "model.h",
+        name="slam",
+        units=("m/s",) * len(model.columns),
+        note="a note */ that ends no comment",
+    )
+    source = tmp_path / "model.c"
+    source.write_text(
+        '#include "model.h"\nvoid run(const double *f, const double *g, double dt, slam_estimate *out)'
+        " { slam_predict(f, g, dt, out); }\n"
+    )
+    library = tmp_path / "model.so"
+    flags = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
+    subprocess.run(["cc", *flags, str(source), "-o", str(library), "-lm"], check=True)
+    run = ctypes.CDLL(str(library)).run
+    X, geometry, dt_s = some_inputs(model)
+    found = []
+    pointer = ctypes.POINTER(ctypes.c_double)
+    for x, G, dt in zip(X, geometry, dt_s, strict=True):
+        out, x, G = CEstimate(), np.ascontiguousarray(x), np.ascontiguousarray(G)
+        run(x.ctypes.data_as(pointer), G.ctypes.data_as(pointer), ctypes.c_double(dt), ctypes.byref(out))
+        found.append(out)
+    shaped = {
+        name: np.array(
+            [np.ctypeslib.as_array(getattr(o, name)) if name in _VECTORS else getattr(o, name) for o in found]
+        )
+        for name in FIELDS
+    }
+    for name in ("covariance", *PARTS):
+        shaped[name] = shaped[name].reshape(-1, 6, 6)
+    assert_equal(shaped, model.estimate(X, geometry, dt_s))
+    none = CEstimate()
+    run(np.ascontiguousarray(X[0]).ctypes.data_as(pointer), None, ctypes.c_double(0.0), ctypes.byref(none))
+    np.testing.assert_allclose(np.array(none.covariance).reshape(6, 6), model.estimate(X[:1]).covariance[0], rtol=1e-5)
+
+
+_VECTORS = ("mean", "covariance", *PARTS, "epistemic")
+
+
+def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="identifier"):
+        to_c(CASES["own noise kernel"], tmp_path / "model.h", name="1+1")
+
+
+def test_unknown_formats_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match="one of: onnx, c"):
+        export_model(tmp_path / "model", tmp_path / "out", "fortran")
