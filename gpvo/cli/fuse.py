@@ -1,9 +1,130 @@
-"""Commands of this group."""
+"""``gpvo fuse`` and ``gpvo publish``: what a filter gains, and messages for the filter that flies."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
 import typer
+
+from gpvo.errors import GpvoError
+
+
+def fuse(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders to filter.")],
+    model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the runs.")] = None,
+    train: Annotated[
+        list[Path] | None, typer.Option(help="Training run for the constants; repeatable. Default: the model's.")
+    ] = None,
+    policies: Annotated[str, typer.Option(help="Comma-separated; default all.")] = "",
+    init: Annotated[str, typer.Option(help="Start from truth, or from rest (static).")] = "truth",
+    gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
+    no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Filter VO with an IMU under constant, geometric and learned covariance, side by side.
+
+    Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs
+    from gpvo.filters.gate import Gate
+    from gpvo.filters.policies import LEARNED, POLICIES
+    from gpvo.filters.run import FuseOptions
+    from gpvo.filters.study import table
+
+    if init not in ("truth", "static"):
+        raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
+    if gate not in ("discard", "inflate"):
+        raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
+    wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
+    settings = FusionSettings(
+        policies=wanted,
+        model=model,
+        training=tuple(train or ()),
+        use_imu=not no_imu,
+        options=FuseOptions(
+            init="static" if init == "static" else "truth",
+            gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),
+        ),
+    )
+    report = fuse_runs(runs, settings, tell=_teller())
+    for warning in report.warnings:
+        print(f"gpvo: {warning}", file=sys.stderr)
+    if plot is not None:
+        from gpvo.evaluation.fusion_plot import plot_fusion
+
+        plot_fusion(report.traces, plot)
+    if json_:
+        print_json(document(report))
+        return
+    print(table(report.study))
+    if LEARNED in report.study.scores:
+        print()
+        for other in (p for p in report.study.scores if p != LEARNED):
+            compared = report.study.compare(LEARNED, other)
+            if compared.gain_percent == compared.gain_percent:
+                print(compared)
+
+
+def publish(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    to: Annotated[str | None, typer.Option(help="bag (default), mcap or mavlink.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="File or folder to write; a name that ends in .bag is a ROS 1 bag."),
+    ] = None,
+    link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the run.")] = None,
+    method: Annotated[str, typer.Option(help="Geometric covariance where there is no prediction.")] = (
+        "pointing_matching"
+    ),
+    correct_twist: Annotated[bool, typer.Option(help="Take the predicted mean error off the twist.")] = False,
+    topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry",
+    system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1,
+    consumer: Annotated[str | None, typer.Option(help="px4, ardupilot or robot_localization.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Say what the consumer will do; writes only with --to or -o.")
+    ] = False,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Write what robot_localization, PX4 and ArduPilot consume.
+
+    Example: gpvo publish runs/flight7 --to mavlink -o flight7.tlog --consumer px4 --check
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.publish.job import PublishSettings, publish_run
+
+    settings = PublishSettings(
+        to=to,
+        out=out,
+        link=link,
+        model=model,
+        method=method,
+        correct_twist=correct_twist,
+        topic=topic,
+        system=system,
+        consumer=consumer,
+        check=check,
+    )
+    result = publish_run(run, settings)
+    if json_:
+        print_json(result.document())
+    else:
+        print(result)
+
+
+def _teller() -> Callable[[str], None] | None:
+    """One line that says what is going on, on a terminal; silence in a pipe."""
+    if not sys.stderr.isatty():
+        return None
+    return lambda what: print(f"\r\033[K{what}", end="\r", file=sys.stderr, flush=True)
 
 
 def register(app: typer.Typer) -> None:
     """Add this file's commands to the application."""
+    app.command()(fuse)
+    app.command()(publish)

@@ -116,13 +116,12 @@ def from_rest(
 
 
 def _require_rest(gyro: Array, acc: Array, test: StaticTest) -> None:
-    moving = [
-        f"gyroscope spread {gyro.std(axis=0).max():.2g} rad/s" * (gyro.std(axis=0).max() > test.gyro_std_radps),
-        f"accelerometer spread {acc.std(axis=0).max():.2g} m/s^2" * (acc.std(axis=0).max() > test.acc_std_mps2),
-        f"mean turn rate {abs(gyro.mean(axis=0)).max():.2g} rad/s"
-        * (abs(gyro.mean(axis=0)).max() > test.gyro_mean_radps),
-    ]
-    reasons = ", ".join(filter(None, moving))
+    limits = (
+        ("gyroscope spread", gyro.std(axis=0).max(), test.gyro_std_radps, "rad/s"),
+        ("accelerometer spread", acc.std(axis=0).max(), test.acc_std_mps2, "m/s^2"),
+        ("mean turn rate", np.abs(gyro.mean(axis=0)).max(), test.gyro_mean_radps, "rad/s"),
+    )
+    reasons = ", ".join(f"{what} {value:.2g} {unit}" for what, value, limit, unit in limits if value > limit)
     if reasons:
         raise GpvoError(f"the vehicle is not at rest at the start: {reasons}", cure="use --init truth")
 

@@ -21,7 +21,7 @@ from gpvo.filters.policies import (
     LearnedPolicy,
     Policy,
 )
-from gpvo.filters.run import Flight, FuseOptions, fuse_flight
+from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 
 Array = NDArray[np.float64]
@@ -163,15 +163,21 @@ def study(
     *,
     constants: Constants | None = None,
     progress: Progress | None = None,
+    on_run: Callable[[Flight, FusedRun], None] | None = None,
 ) -> Study:
-    """Filter every run under every policy."""
+    """Filter every run under every policy; ``on_run`` sees each filtered run before it is reduced to scores."""
     scores: dict[str, list[Scores | None]] = {name: [] for name in policies}
     for flight in flights:
         if progress:
             progress(flight.name)
         for name, policy in policies.items():
-            usable = policy is not None and has_noise(flight, policy)
-            scores[name].append(fuse_flight(flight, policy, options)[0].scores if policy and usable else None)
+            if policy is None or not has_noise(flight, policy):
+                scores[name].append(None)
+                continue
+            fused = fuse_flight(flight, policy, options)[0]
+            scores[name].append(fused.scores)
+            if on_run:
+                on_run(flight, fused)
     return Study(tuple(f.name for f in flights), {k: tuple(v) for k, v in scores.items()}, constants)
 
 

@@ -23,7 +23,7 @@ class Odometry:
 
     ``T_odom_body`` (4, 4); ``pose_covariance`` (6, 6) in ``odom``'s fixed axes; ``twist_body`` (6,) linear then
     angular, expressed in the body; ``twist_covariance`` (6, 6) likewise. ``tracked`` is False for a lost frame: the
-    pose is held, twist and its covariance are None. ``confidence`` and ``in_domain`` are None without a model.
+    pose is VO's guess, twist and its covariance are None. ``confidence`` and ``in_domain`` are None without a model.
     """
 
     t_ns: int
@@ -111,7 +111,7 @@ class OdometryBuilder:
             self._resets += bool(self._chain)
             base = self._latest() or _Chain(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), record.t_prev_ns)
         if not record.usable:
-            return self._hold(record, base)
+            return self._lost(record, prediction, base)
         white, jitter, root, tau_s = self._parts(record, prediction)
         chain = _extend(base, record, white, root, tau_s)
         own = 0.5 * jitter
@@ -167,16 +167,18 @@ class OdometryBuilder:
         moved = self._Ad @ covariance @ self._Ad.T / dt**2
         return twist, lift(moved, self.floors.velocity_m2ps2, self.floors.rate_rad2ps2)
 
-    def _hold(self, record: VoRecord, base: _Chain) -> Odometry:
-        """A frame without a motion: the pose is held, as uncertain as the motion that may have happened."""
-        dt = (record.t_ns - base.t_ns) * 1e-9
-        missed = np.diag((np.abs(self._speed) * dt) ** 2)
-        held = _Chain(base.T_first_cam, base.walked + missed, base.cross, record.t_ns)
-        self._remember(record, held)
-        if record.is_reference and record.status is Status.LOST:
-            self._resets += 1
+    def _lost(self, record: VoRecord, prediction: Prediction | None, base: _Chain) -> Odometry:
+        """A frame without a measured motion: VO's guess stands in, as uncertain as what may have happened."""
+        stated = prediction.covariance if prediction is not None else record.covariances.get(self.method or "")
+        if stated is None or not is_positive_definite(stated):
+            dt = (record.t_ns - base.t_ns) * 1e-9
+            stated = np.diag((np.abs(self._speed) * dt) ** 2)
+        chain = _extend(base, record, stated, np.zeros((6, 6)), np.full(6, np.inf))
+        self._remember(record, chain)
+        # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone.
+        self._resets += record.is_reference and record.status is Status.LOST
         first = np.zeros((6, 6)) if self._first_jitter is None else self._first_jitter
-        return self._message(record, None, held, held.walked + first, None, None)
+        return self._message(record, prediction, chain, chain.walked + first, None, None)
 
     def _message(
         self,

@@ -1,0 +1,79 @@
+"""Cost of the filter: one IMU sample, one VO update, one published message. CPU time, median of repeats."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from gpvo.filters.eskf import ErrorStateFilter
+from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import MotionNoise
+from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
+from gpvo.filters.synthetic import synthetic_flight
+from gpvo.publish.odometry import OdometryBuilder
+
+
+def _microseconds(call: Callable[[], object], number: int, repeats: int = 7) -> float:
+    call()
+    costs = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        for _ in range(number):
+            call()
+        costs.append((time.process_time() - begin) / number)
+    return float(np.median(costs)) * 1e6
+
+
+def _row(value: float, unit: str, limit: float | None) -> dict:
+    return {
+        "value": value,
+        "unit": unit,
+        "peer": None if limit is None else "limit",
+        "peer_value": limit,
+        "ratio": None if limit is None else value / limit,
+    }
+
+
+def run() -> dict[str, dict]:
+    """Measure on this machine."""
+    flight = synthetic_flight(0, duration_s=4)
+    filter = _warm_filter(flight)
+    gyro, acc = np.array([[0.1, 0.2, 0.3]]), np.array([[0.1, 0.2, 9.8]])
+    sample = _microseconds(lambda: filter.propagate_imu(0.005, gyro, acc, gyro, acc), 500)
+
+    eye = np.eye(6)[None]
+    noise = MotionNoise(np.zeros((1, 6)), eye * 1e-4, eye * 1e-4, eye * 1e-2, np.ones(6))
+    gate = Gate(on_fail="accept")
+
+    def update() -> None:
+        filter.decay_bias(0.05, noise.bias_tau_s)
+        filter.update_motion(np.eye(4), noise, gate)
+        filter.clone(measured=True)
+
+    vo = _microseconds(update, 200)
+    builder = OdometryBuilder()
+    record = flight.records[5]
+    prediction = flight.predictions[record.t_ns]
+    message = _microseconds(lambda: builder.step(record, prediction), 200)
+
+    before = time.process_time()
+    fuse_flight(flight, LearnedPolicy())
+    whole = (time.process_time() - before) / 4.0
+    return {
+        "filter_imu_sample": _row(sample, "us", 150.0),
+        "filter_vo_update": _row(vo, "us", 500.0),
+        "filter_second_of_flight": _row(whole * 1e3, "ms of CPU per s (200 Hz IMU, 20 Hz VO)", None),
+        "publish_message": _row(message, "us", None),
+    }
+
+
+def _warm_filter(flight: Flight) -> ErrorStateFilter:
+    start, gravity = begin(flight, FuseOptions())
+    return make_filter(flight, start, gravity, 1, FuseOptions())
+
+
+if __name__ == "__main__":
+    for name, row in run().items():
+        print(f"{name:<28}{row['value']:>10.1f} {row['unit']}")

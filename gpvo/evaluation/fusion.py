@@ -1,0 +1,301 @@
+"""Run folders through the filters: load, predict, fuse under every policy, report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import motion_errors
+from gpvo.errors import GpvoError, ModelError
+from gpvo.filters.gate import chi2_quantile
+from gpvo.filters.metrics import Scores
+from gpvo.filters.policies import (
+    CONSTANT_BEST,
+    CONSTANT_HINDSIGHT,
+    LEARNED,
+    POLICIES,
+    constant_from_errors,
+)
+from gpvo.filters.run import Flight, FusedRun, FuseOptions
+from gpvo.filters.sanity import require_sane
+from gpvo.filters.start import StartSigmas
+from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
+from gpvo.io.run import Run, read_run
+from gpvo.online.predictor import Predictor
+from gpvo.types import Prediction
+
+Array = NDArray[np.float64]
+
+
+def predictions_of(predictor: Predictor, run: Run) -> dict[int, Prediction]:
+    """What the model predicts for every record of a run, in order."""
+    predictor.reset(run.log.camera)
+    stepped = ((r.t_ns, predictor.step(r)) for r in run.log)
+    return {t: p for t, p in stepped if p is not None}
+
+
+def load_predictor(path: str | Path) -> Predictor:
+    """A model that filters can use: one that predicts the error of single motions."""
+    predictor = Predictor.load(path)
+    if predictor.target != "frame":
+        raise ModelError(
+            f"predicts the error over {predictor.target}, a filter needs that of each motion",
+            where=path,
+            cure="train with --target frame",
+        )
+    return predictor
+
+
+def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
+    """A run as the filters take it, with the model's predictions, else those stored in the run.
+
+    Raises
+    ------
+    GpvoError
+        Where there is an IMU but nobody says how it sits to the camera, or the run is empty.
+    """
+    if len(run.log) < 2:
+        raise GpvoError(f"holds {len(run.log)} records: nothing to fuse", where=run.path)
+    imu = run.imu if use_imu else None
+    if imu is not None and run.mounting.T_imu_cam is None:
+        raise GpvoError("has an IMU but no T_imu_cam in rig.json", where=run.path, cure="add it, or use --no-imu")
+    poses = valid = None
+    if run.truth is not None:
+        poses, valid = interpolate_truth(run.truth, run.log.t_ns)
+        if not valid.any():
+            raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
+    predictions = predictions_of(predictor, run) if predictor else {p.t_ns: p for p in run.predictions}
+    return Flight(
+        name=run.name,
+        records=run.log.records,
+        imu=imu,
+        T_imu_cam=run.mounting.T_imu_cam if imu is not None else None,
+        T_world_cam=poses,
+        truth_valid=valid,
+        predictions=predictions,
+    )
+
+
+def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
+    """Initial covariance that is no smaller than the noise of the truth it starts from."""
+    base = StartSigmas()
+    position = max((r.truth.sigma_translation_m for r in runs if r.truth), default=0.0)
+    rotation = max((r.truth.sigma_rotation_rad for r in runs if r.truth), default=0.0)
+    return replace(
+        base,
+        position_m=max(base.position_m, position),
+        tilt_rad=max(base.tilt_rad, rotation),
+        yaw_rad=max(base.yaw_rad, rotation),
+    )
+
+
+def constants_of(runs: Sequence[Run]) -> Constants:
+    """Per-axis mean squares of the motions' errors over training runs, each run with equal weight."""
+    squares, dt = [], []
+    for run in runs:
+        if run.truth is None:
+            raise GpvoError("has no ground truth to train a constant on", where=run.path)
+        errors = motion_errors(run.log, run.truth)
+        if not len(errors.index):
+            raise GpvoError("has no motion with ground truth at both ends", where=run.path)
+        squares.append(constant_from_errors(errors.xi))
+        dt.append(float(np.median(errors.dt_s)))
+    return Constants(np.mean(squares, axis=0), float(np.median(dt)))
+
+
+def constants_in(header: Mapping[str, Any]) -> Constants | None:
+    """The constants that a model file carries, None where it has none."""
+    constant = header.get("constant")
+    if constant is None:
+        return None
+    mean_squares = constant.get("mean_squares") if isinstance(constant, Mapping) else constant
+    values = np.asarray(mean_squares, dtype=np.float64)
+    if values.shape != (6,) or not (np.isfinite(values).all() and (values > 0).all()):
+        return None
+    best = header.get("constant_best")
+    return Constants(values, float(header["dt_s"]), None if best is None else (float(best[0]), float(best[1])))
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """What ``gpvo fuse`` was asked for."""
+
+    policies: tuple[str, ...] = POLICIES
+    model: Path | None = None
+    training: tuple[Path, ...] = ()
+    use_imu: bool = True
+    options: FuseOptions = field(default_factory=FuseOptions)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a plot needs of one run under one policy; errors NaN without truth."""
+
+    run: str
+    policy: str
+    t_s: Array
+    position: Array
+    truth: Array | None
+    error_m: Array
+    sigma_m: Array
+    nis_dof: Array
+
+
+@dataclass(frozen=True)
+class FusionReport:
+    """The study with its traces and the warnings about the inputs."""
+
+    study: Study
+    traces: tuple[Trace, ...]
+    warnings: tuple[str, ...]
+
+
+def fuse_runs(
+    paths: Sequence[Path], settings: FusionSettings, *, tell: Callable[[str], None] | None = None
+) -> FusionReport:
+    """Fuse run folders under every policy that has what it needs."""
+    tell = tell or (lambda _: None)
+    unknown = [p for p in settings.policies if p not in POLICIES]
+    if unknown:
+        raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
+    predictor = None if settings.model is None else load_predictor(settings.model)
+    runs = [read_run(path) for path in paths]
+    options = replace(settings.options, sigmas=start_sigmas(runs))
+    flights, warnings = [], []
+    for run in runs:
+        flight = flight_of(run, predictor, use_imu=settings.use_imu)
+        warnings += [f"{flight.name}: {finding}" for finding in require_sane(flight)]
+        flights.append(flight)
+    constants = _constants(settings, predictor, flights, options, tell)
+    policies = make_policies(constants, names=settings.policies, learned=any(f.predictions for f in flights))
+    traces: list[Trace] = []
+    result = study(
+        flights,
+        policies,
+        options,
+        constants=constants,
+        progress=tell,
+        on_run=lambda flight, fused: traces.append(_trace(flight, fused)),
+    )
+    return FusionReport(result, tuple(traces), tuple(warnings))
+
+
+def _constants(
+    settings: FusionSettings,
+    predictor: Predictor | None,
+    flights: Sequence[Flight],
+    options: FuseOptions,
+    tell: Callable[[str], None],
+) -> Constants | None:
+    constants = constants_in(predictor.header) if predictor else None
+    if settings.training:
+        runs = [read_run(path) for path in settings.training]
+        constants = constants_of(runs)
+        if CONSTANT_BEST in settings.policies:
+            training = [flight_of(run, use_imu=settings.use_imu) for run in runs]
+            best = fit_scalars(training, constants, options, progress=lambda n: tell(f"constant_best on {n}"))
+            constants = replace(constants, best=best)
+    if constants and CONSTANT_HINDSIGHT in settings.policies and all(f.T_world_cam is not None for f in flights):
+        tuned = fit_scalars(flights, constants, options, progress=lambda n: tell(f"constant_hindsight on {n}"))
+        constants = replace(constants, hindsight=tuned)
+    return constants
+
+
+def _trace(flight: Flight, fused: FusedRun) -> Trace:
+    position = fused.T_world_cam[:, :3, 3]
+    truth = None
+    error = np.full(len(position), np.nan)
+    if flight.T_world_cam is not None:
+        index = {r.t_ns: i for i, r in enumerate(flight.records)}
+        truth = flight.T_world_cam[[index[int(t)] for t in fused.t_ns], :3, 3]
+        error = np.linalg.norm(position - truth, axis=1)
+    return Trace(
+        run=flight.name,
+        policy=fused.policy,
+        t_s=(fused.t_ns - fused.t_ns[0]) * 1e-9,
+        position=position,
+        truth=truth,
+        error_m=error,
+        sigma_m=np.sqrt(np.trace(fused.covariance[:, :3, :3], axis1=1, axis2=2)),
+        nis_dof=fused.nis / 6.0,
+    )
+
+
+def document(report: FusionReport) -> dict[str, Any]:
+    """The machine-readable result of ``gpvo fuse``; a policy that could not run is null."""
+    result = report.study
+    names = list(result.scores)
+    runs = [
+        {"run": run, "policies": {name: _score(result.scores[name][i]) for name in names}}
+        for i, run in enumerate(result.runs)
+    ]
+    others = [n for n in names if n != LEARNED] if LEARNED in names else []
+    return {
+        "schema": 1,
+        "runs": runs,
+        "mean": {name: _mean(result, name) for name in names},
+        "comparisons": [_comparison(result, LEARNED, other) for other in others],
+        "constants": _constants_document(result.constants),
+        "warnings": list(report.warnings),
+    }
+
+
+def _score(scores: Scores | None) -> dict[str, Any] | None:
+    if scores is None:
+        return None
+    return {
+        "ate_rmse_m": scores.ate_rmse_m,
+        "final_error_m": scores.final_error_m,
+        "drift_percent": scores.drift_percent,
+        "nees_dof": scores.nees_dof,
+        "nis_dof": scores.nis_dof,
+        "nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high],
+        "rejected": scores.rejected,
+        "diverged": scores.diverged,
+    }
+
+
+def _mean(result: Study, name: str) -> dict[str, Any] | None:
+    if all(s is None for s in result.scores[name]):
+        return None
+    keys = ("ate_rmse_m", "final_error_m", "drift_percent", "nis_dof", "rejected")
+    out: dict[str, Any] = {key: result.mean(name, key) for key in keys}
+    nees = {part: result.mean(name, f"nees_{part}") for part in ("position", "attitude")}
+    return {**out, "nees_dof": nees, "diverged": int(np.nansum(result.column(name, "diverged")))}
+
+
+def _comparison(result: Study, policy: str, against: str) -> dict[str, Any] | None:
+    compared = result.compare(policy, against)
+    if not np.isfinite(compared.gain_percent):
+        return None
+    d = compared.difference_m
+    return {
+        "policy": policy,
+        "against": against,
+        "gain_percent": compared.gain_percent,
+        "ate_difference_m": d.mean,
+        "interval_m": [d.low, d.high],
+    }
+
+
+def _constants_document(constants: Constants | None) -> dict[str, Any] | None:
+    if constants is None:
+        return None
+    return {
+        "mean_squares": constants.mean_squares,
+        "dt_s": constants.dt_s,
+        "best": constants.best,
+        "hindsight": constants.hindsight,
+    }
+
+
+def nis_band(runs: int, level: float = 0.95, dof: int = 6) -> tuple[float, float]:
+    """Where the mean NIS per degree of freedom over so many runs should lie at each time step."""
+    total = dof * runs
+    return chi2_quantile((1 - level) / 2, total) / total, chi2_quantile((1 + level) / 2, total) / total

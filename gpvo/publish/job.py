@@ -1,0 +1,151 @@
+"""One run published: messages made, checked against a consumer, and written."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.io.run import Run, read_run
+from gpvo.online.predictor import Predictor
+from gpvo.publish import consumers, mavlink, ros
+from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
+from gpvo.types import Prediction
+
+TARGETS = ("bag", "mcap", "mavlink")
+
+
+@dataclass(frozen=True)
+class PublishSettings:
+    """What ``gpvo publish`` was asked for."""
+
+    to: str | None = None
+    out: Path | None = None
+    link: str | None = None
+    model: Path | None = None
+    method: str = "pointing_matching"
+    correct_twist: bool = False
+    topic: str = ros.TOPIC
+    system: int = 1
+    consumer: str | None = None
+    check: bool = False
+
+
+@dataclass(frozen=True)
+class Published:
+    """What was written, and what the consumer will make of it."""
+
+    run: str
+    to: str | None
+    out: str | None
+    messages: int
+    lost: int
+    source: str
+    consumer: str | None
+    verdicts: Sequence[consumers.Verdict]
+
+    def document(self) -> dict[str, Any]:
+        """Machine-readable form."""
+        keys = ("run", "to", "out", "messages", "lost", "source", "consumer")
+        verdicts = [
+            {
+                "quantity": v.quantity,
+                "parameter": v.parameter,
+                "value": v.value,
+                "hidden_percent": v.hidden_percent,
+                "predicted_sigma": {"p5": v.predicted[0], "p50": v.predicted[1], "p95": v.predicted[2]},
+                "unit": v.unit,
+                "advice": v.advice or None,
+            }
+            for v in self.verdicts
+        ]
+        return {"schema": 1, **{k: getattr(self, k) for k in keys}, "checks": verdicts}
+
+    def __str__(self) -> str:
+        written = f"{self.out}: {self.messages} messages" if self.out else f"{self.run}: nothing written"
+        head = f"{written}, covariance from {self.source}, {self.lost} lost frames"
+        return "\n".join([head, *(f"{self.consumer} {v}" for v in self.verdicts)])
+
+
+def publish_run(path: Path, settings: PublishSettings) -> Published:
+    """Publish one run folder.
+
+    With ``check`` and neither ``to``, ``out`` nor ``link`` nothing is written.
+
+    Raises
+    ------
+    GpvoError
+        Where the run lacks a covariance, the target cannot be written, or an option is unknown.
+    """
+    _require(settings)
+    run = read_run(path)
+    odometry = odometry_of(run, settings)
+    consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
+    verdicts = consumers.check(odometry, consumer) if settings.check else []
+    only_check = settings.check and not (settings.to or settings.out or settings.link)
+    out, count = (None, 0) if only_check else _write(run, odometry, settings)
+    source = "the model" if settings.model or run.predictions else settings.method
+    lost = sum(not o.tracked for o in odometry)
+    return Published(run.name, settings.to, out, count, lost, source, consumer if settings.check else None, verdicts)
+
+
+def odometry_of(run: Run, settings: PublishSettings) -> list[Odometry]:
+    """All messages of a run; its ``odom`` starts at the body's first pose."""
+    predictions: dict[int, Prediction] = {p.t_ns: p for p in run.predictions}
+    if settings.model is not None:
+        predictor = Predictor.load(settings.model)
+        predictor.reset(run.log.camera)
+        stepped = ((r.t_ns, predictor.step(r)) for r in run.log)
+        predictions = {t: p for t, p in stepped if p is not None}
+    builder = OdometryBuilder(
+        T_body_cam=run.mounting.T_body_cam, method=settings.method, correct_twist=settings.correct_twist
+    )
+    try:
+        return list(messages(run.log, predictions, builder))
+    except GpvoError as error:
+        raise GpvoError(error.what, where=run.path, cure=error.cure) from None
+
+
+def _require(settings: PublishSettings) -> None:
+    if settings.to is not None and settings.to not in TARGETS:
+        raise GpvoError(f"--to is '{settings.to}'", cure=f"choose {', '.join(TARGETS)}")
+    if settings.consumer is not None and settings.consumer not in consumers.CONSUMERS:
+        raise GpvoError(f"--consumer is '{settings.consumer}'", cure=f"choose {', '.join(consumers.CONSUMERS)}")
+    if settings.link is not None and settings.to != "mavlink":
+        raise GpvoError("--link sends MAVLink", cure="add --to mavlink")
+    if settings.to == "mavlink":
+        mavlink.dialect()
+
+
+def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) -> tuple[str, int]:
+    if settings.link is not None:
+        return settings.link, _replay(odometry, mavlink.Link(settings.link, settings.system))
+    if settings.to == "mavlink":
+        out = settings.out or Path(f"{run.name}.tlog")
+        return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
+    kind = settings.to or "bag"
+    out = settings.out or Path(f"{run.name}_{kind}")
+    if kind == "bag" and out.suffix == ".bag":
+        count = ros.write_ros1(out, odometry, settings.topic)
+    else:
+        count = ros.write_ros2(out, odometry, settings.topic, mcap=kind == "mcap")
+    rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
+    parameters = out.with_name(f"{out.stem}_robot_localization.yaml")
+    parameters.write_text(ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz)), encoding="utf-8")
+    return str(out), count
+
+
+def _replay(odometry: Sequence[Odometry], link: mavlink.Link) -> int:
+    """Send at the pace of the recording."""
+    begin, first = time.monotonic(), odometry[0].t_ns
+    for item in odometry:
+        wait = (item.t_ns - first) * 1e-9 - (time.monotonic() - begin)
+        if wait > 0:
+            time.sleep(wait)
+        link.send(item)
+    return len(odometry)

@@ -1,0 +1,131 @@
+"""``gpvo fuse`` and ``gpvo publish`` from run folders to tables, JSON, pictures and bags."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.cli import app
+from gpvo.errors import GpvoError
+from gpvo.filters.policies import POLICIES
+from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
+from gpvo.geometry import se3
+from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.io.run import write_run
+from gpvo.types import ImuLog, Mounting, TruthLog, VoLog
+from typer.testing import CliRunner
+
+MOUNTING = Mounting(se3.from_rt(R_FLU_OPTICAL, np.array([0.3, 0.0, 0.1])), FORWARD_CAMERA)
+
+
+def _write(path: Path, seed: int, imu_scale: float = 1.0) -> Path:
+    flight = synthetic_flight(seed, duration_s=8, law=ErrorLaw(burst_factor=10.0))
+    flight = with_geometric(flight, np.diag([4e-4] * 3 + [4e-6] * 3), "pointing_matching")
+    assert flight.imu is not None
+    assert flight.T_world_cam is not None
+    t_ns = np.array([r.t_ns for r in flight.records])
+    write_run(
+        path,
+        VoLog(flight.records),
+        predictions=list(flight.predictions.values()),
+        mounting=MOUNTING,
+        truth=TruthLog(t_ns, flight.T_world_cam),
+        imu=replace(flight.imu, acc_mps2=flight.imu.acc_mps2 * imu_scale),
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("runs")
+    return [_write(folder / f"flight{seed}", seed) for seed in range(3)]
+
+
+def _run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_json_holds_every_policy(runs: list[Path], tmp_path: Path) -> None:
+    picture = tmp_path / "fuse.png"
+    out = json.loads(_run("fuse", *runs[:2], "--train", runs[2], "--plot", picture, "--json"))
+    assert out["schema"] == 1
+    assert picture.stat().st_size > 10_000
+    assert [r["run"] for r in out["runs"]] == ["flight0", "flight1"]
+    for row in out["runs"]:
+        assert set(row["policies"]) == set(POLICIES)
+        assert row["policies"]["triangulation"] is None
+        for name in ("constant", "constant_best", "constant_hindsight", "pointing_matching", "learned"):
+            scores = row["policies"][name]
+            assert scores["ate_rmse_m"] > 0
+            assert scores["drift_percent"] > 0
+            assert set(scores["nees_dof"]) == {"position", "attitude"}
+            assert scores["diverged"] is False
+    assert out["mean"]["triangulation"] is None
+    assert out["mean"]["learned"]["ate_rmse_m"] < out["mean"]["constant"]["ate_rmse_m"]
+
+
+def test_table_without_model_or_training(runs: list[Path]) -> None:
+    out = _run("fuse", runs[0], "--policies", "pointing_matching,learned")
+    assert "pointing_matching" in out
+    assert "learned less pointing_matching" in out
+
+
+def test_without_imu(runs: list[Path]) -> None:
+    out = json.loads(_run("fuse", runs[0], "--policies", "learned", "--no-imu", "--json"))
+    assert out["runs"][0]["policies"]["learned"]["ate_rmse_m"] < 2.0
+
+
+def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
+    wrong = _write(tmp_path / "in_g", 5, 1 / 9.80665)
+    with pytest.raises(GpvoError, match="it is in g") as error:
+        _run("fuse", wrong)
+    assert "multiply it by 9.80665" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("--init", "magic"), "truth or static"),
+        (("--init", "static"), "not at rest"),
+        (("--gate", "magic"), "discard or inflate"),
+        (("--policies", "best"), "unknown policy"),
+        (("--model", "nowhere.gpvo"), "nowhere.gpvo"),
+    ],
+)
+def test_bad_options_are_one_line(runs: list[Path], arguments: tuple[str, str], words: str) -> None:
+    with pytest.raises(GpvoError, match=words):
+        _run("fuse", runs[0], *arguments)
+
+
+@pytest.mark.parametrize("to, name", [("bag", "x.bag"), ("bag", "x"), ("mcap", "y"), ("mavlink", "z.tlog")])
+def test_publish_writes(runs: list[Path], tmp_path: Path, to: str, name: str) -> None:
+    if to == "mavlink":
+        pytest.importorskip("pymavlink")
+    out = json.loads(_run("publish", runs[0], "--to", to, "-o", tmp_path / name, "--json"))
+    assert out["messages"] == 161 - (to != "mavlink")
+    assert (tmp_path / name).exists()
+    if to != "mavlink":
+        assert (tmp_path / f"{Path(name).stem}_robot_localization.yaml").is_file()
+
+
+def test_publish_check_alone_writes_nothing(runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = _run("publish", runs[0].resolve(), "--consumer", "px4", "--check")
+    assert "EKF2_EVV_NOISE" in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_whose_imu_log_is_elsewhere_in_time(tmp_path: Path) -> None:
+    flight = synthetic_flight(1, duration_s=4)
+    assert flight.imu is not None
+    imu = ImuLog(flight.imu.t_ns + 10**13, flight.imu.gyro_radps, flight.imu.acc_mps2)
+    assert flight.T_world_cam is not None
+    truth = TruthLog(np.array([r.t_ns for r in flight.records]), flight.T_world_cam)
+    write_run(tmp_path / "late", VoLog(flight.records), mounting=MOUNTING, truth=truth, imu=imu)
+    with pytest.raises(GpvoError, match="do not overlap"):
+        _run("fuse", tmp_path / "late")

@@ -1,0 +1,115 @@
+"""The motion measurement against numerical derivatives, and the kernels against the general formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.filters import kernels
+from gpvo.filters import measurement as me
+from gpvo.filters.propagation import CORE, TH, Nominal, P, constant_velocity_step, imu_step
+from gpvo.filters.synthetic import FORWARD_CAMERA
+from gpvo.geometry import se3
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-5, 5e-3, 0.5, 1.5])
+@pytest.mark.parametrize("batch", [1, 5])
+def test_kernels_agree_with_the_general_formulas(size: float, batch: int) -> None:
+    phi = np.random.default_rng(0).standard_normal((batch, 3)) * size / 2
+    E, J = kernels.exp_and_right_jacobian(phi)
+    np.testing.assert_allclose(E, se3.so3_exp(phi), atol=1e-14)
+    np.testing.assert_allclose(J, se3.so3_right_jacobian(phi), atol=1e-12)
+    np.testing.assert_allclose(kernels.log(E), phi, atol=1e-12, rtol=1e-9)
+    xi = np.concatenate([np.random.default_rng(1).standard_normal((batch, 3)), phi], axis=1)
+    R, t = kernels.motion_exp(xi)
+    np.testing.assert_allclose(se3.from_rt(R, t), se3.exp(xi), atol=1e-12)
+    np.testing.assert_allclose(kernels.motion_log(R, t), xi, atol=1e-9)
+
+
+def _random_poses(rng: np.random.Generator) -> list[np.ndarray]:
+    out: list[np.ndarray] = []
+    for _ in range(2):
+        out += [se3.so3_exp(rng.standard_normal((1, 3)) * 0.5), rng.standard_normal((1, 3))]
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobian_of_the_motion(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    camera = me.CameraOnImu.of(FORWARD_CAMERA @ se3.exp(rng.standard_normal(6) * 0.3))
+    R0, p0, R1, p1 = _random_poses(rng)
+    bias_root = rng.standard_normal((1, 6, 6)) * 0.01
+
+    def motion(dx: np.ndarray) -> np.ndarray:
+        """``Exp(-n_ref) T Exp(n_cur + b)`` of the perturbed state, as the measurement's law has it."""
+        ref = camera.pose(p0 + dx[me.CLONE_P], R0 @ se3.so3_exp(dx[None, me.CLONE_TH]))
+        cur = camera.pose(p1 + dx[P], R1 @ se3.so3_exp(dx[None, TH]))
+        R, t = me.relative_motion(*ref, *cur)
+        late = se3.exp(dx[me.JITTER_CUR] + bias_root[0] @ dx[me.BIAS])
+        return se3.exp(-dx[me.JITTER_REF]) @ se3.from_rt(R[0], t[0]) @ late
+
+    T = motion(np.zeros(me.JOINT))
+    numeric = np.empty((6, me.JOINT))
+    for i in range(me.JOINT):
+        step = np.zeros(me.JOINT)
+        step[i] = 1e-6
+        ends = [se3.log(se3.inverse(T) @ motion(s)) for s in (step, -step)]
+        numeric[:, i] = (ends[0] - ends[1]) / 2e-6
+
+    H = np.zeros((1, 6, me.JOINT))
+    H[:, :, me.JITTER_CUR] = np.eye(6)
+    R_ref, p_ref = camera.pose(p0, R0)
+    R_cur, p_cur = camera.pose(p1, R1)
+    R, t = me.relative_motion(R_ref, p_ref, R_cur, p_cur)
+    me.jacobian(H, camera, R_ref, R_cur, R, t, bias_root)
+    np.testing.assert_allclose(H[0], numeric, atol=1e-8)
+
+    xi = rng.standard_normal(6) * 0.1
+    np.testing.assert_allclose(me.residual(R, t, T @ se3.exp(xi), np.zeros((1, 6)))[0], xi, atol=1e-12)
+    np.testing.assert_allclose(me.residual(R, t, T @ se3.exp(xi), xi[None])[0], np.zeros(6), atol=1e-12)
+
+
+def _perturbed(x: Nominal, dx: np.ndarray) -> Nominal:
+    return Nominal(
+        x.position + dx[0:3],
+        x.velocity + dx[3:6],
+        x.R_world_imu @ se3.so3_exp(dx[None, 6:9]),
+        x.acc_bias + dx[9:12],
+        x.gyro_bias + dx[12:15],
+    )
+
+
+def _difference(a: Nominal, b: Nominal) -> np.ndarray:
+    rotation = se3.so3_log(np.swapaxes(b.R_world_imu, 1, 2) @ a.R_world_imu)
+    parts = (
+        a.position - b.position,
+        a.velocity - b.velocity,
+        rotation,
+        a.acc_bias - b.acc_bias,
+        a.gyro_bias - b.gyro_bias,
+    )
+    return np.concatenate(parts, axis=1)[0]
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_transition_of_the_error_state(with_imu: bool) -> None:
+    rng = np.random.default_rng(4)
+    R, _, _, _ = _random_poses(rng)
+    x = Nominal(*rng.standard_normal((2, 1, 3)), R, *(0.3 * rng.standard_normal((2, 1, 3))))
+    samples = rng.standard_normal((4, 1, 3)) * np.array([1.0, 10.0, 1.0, 10.0])[:, None, None]
+
+    def moved(state: Nominal) -> tuple[Nominal, np.ndarray]:
+        state, F = state.copy(), np.eye(CORE)[None].copy()
+        if with_imu:
+            imu_step(state, F, 0.02, *samples, np.array([0.0, 0.0, -9.8]))
+        else:
+            constant_velocity_step(state, F, 0.1)
+        return state, F[0]
+
+    end, F = moved(x)
+    numeric = np.empty((CORE, CORE))
+    for i in range(CORE):
+        step = np.zeros(CORE)
+        step[i] = 1e-6
+        ends = [_difference(moved(_perturbed(x, s))[0], end) for s in (step, -step)]
+        numeric[:, i] = (ends[0] - ends[1]) / 2e-6
+    np.testing.assert_allclose(F, numeric, atol=2e-7)

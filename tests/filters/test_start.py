@@ -1,0 +1,83 @@
+"""Starts: from truth, from rest, in a world whose z is not up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError
+from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.propagation import BA, TH
+from gpvo.filters.run import FuseOptions, begin, fuse_flight
+from gpvo.filters.start import StartSigmas, StaticTest, from_rest, from_truth, heading
+from gpvo.filters.synthetic import synthetic_flight
+from gpvo.geometry import se3
+from gpvo.types import ImuLog
+
+
+def _rest(rng: np.random.Generator, R: np.ndarray, bias: np.ndarray, n: int = 100) -> ImuLog:
+    force = R.T @ np.array([0, 0, 9.80665]) + bias
+    t = np.arange(n, dtype=np.int64) * 5_000_000
+    gyro = np.array([0.01, -0.02, 0.005]) + 0.002 * rng.standard_normal((n, 3))
+    return ImuLog(t, gyro, force + 0.02 * rng.standard_normal((n, 3)))
+
+
+def test_static_start_knows_its_tilt_and_bias_together() -> None:
+    rng = np.random.default_rng(0)
+    sigma = StartSigmas().acc_bias_mps2
+    nees = []
+    for _ in range(300):
+        R = se3.so3_exp(rng.standard_normal(3) * [0.5, 0.5, 1.5])
+        bias = sigma * rng.standard_normal(3)
+        imu = _rest(rng, R, bias)
+        up = imu.acc_mps2.mean(axis=0)
+        start = from_rest(imu, 0, yaw_rad=heading(R, up / np.linalg.norm(up)))
+        error = np.concatenate([se3.so3_log(start.nominal.R_world_imu[0].T @ R), bias])
+        rows = np.r_[TH, BA]
+        C = start.covariance[np.ix_(rows, rows)]
+        # Yaw is given here and the vertical bias is not seen: what remains is four of the six.
+        nees.append(error @ np.linalg.solve(C, error))
+        np.testing.assert_allclose(start.nominal.gyro_bias[0], [0.01, -0.02, 0.005], atol=1e-3)
+        np.linalg.cholesky(start.covariance)
+    assert 2.0 < np.mean(nees) < 6.5
+
+
+def test_static_start_refuses_a_moving_vehicle() -> None:
+    imu = _rest(np.random.default_rng(1), np.eye(3), np.zeros(3))
+    with pytest.raises(GpvoError, match=r"not at rest.*turn rate"):
+        from_rest(replace(imu, gyro_radps=imu.gyro_radps + 0.5), 0)
+    with pytest.raises(GpvoError, match="10 IMU samples"):
+        from_rest(imu, 10**12, StaticTest())
+
+
+def test_truth_start_finds_velocity() -> None:
+    t = np.arange(5) * 50_000_000
+    s = t * 1e-9
+    poses = se3.from_rt(np.tile(np.eye(3), (5, 1, 1)), np.stack([2 * s + s**2, -s, 0 * s], axis=1))
+    start = from_truth(t, poses)
+    np.testing.assert_allclose(start.nominal.velocity[0], [2, -1, 0], atol=1e-9)
+    with pytest.raises(GpvoError, match="first two frames"):
+        from_truth(t[:1], poses[:1])
+
+
+def test_a_world_whose_z_is_not_up() -> None:
+    flight = synthetic_flight(3, duration_s=10)
+    tilted = se3.from_rt(se3.so3_exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
+    assert flight.T_world_cam is not None
+    turned = replace(flight, T_world_cam=tilted @ flight.T_world_cam)
+    start, gravity = begin(turned, FuseOptions())
+    assert gravity is not None
+    np.testing.assert_allclose(gravity, tilted[:3, :3] @ [0, 0, -9.80665], atol=0.2)
+    assert "gravity measured" in start.note
+    run = fuse_flight(turned, LearnedPolicy())[0]
+    assert run.scores is not None
+    assert run.scores.final_error_m < 1.0
+
+
+def test_missing_inputs_are_one_line() -> None:
+    flight = synthetic_flight(3, duration_s=2)
+    with pytest.raises(GpvoError, match="needs ground truth"):
+        begin(replace(flight, T_world_cam=None, truth_valid=None), FuseOptions())
+    with pytest.raises(GpvoError, match="needs an IMU"):
+        begin(replace(flight, imu=None), FuseOptions(init="static"))

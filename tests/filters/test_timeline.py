@@ -1,0 +1,206 @@
+"""Late, repeated and out-of-order inputs, lost frames, old references, gates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.filters.eskf import ErrorStateFilter
+from gpvo.filters.gate import THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
+from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
+from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, ErrorLaw, Events, synthetic_flight
+from gpvo.filters.timeline import Timeline
+from gpvo.geometry import se3
+from gpvo.types import ImuLog, Status, VoRecord
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return synthetic_flight(8, duration_s=6)
+
+
+def _timeline(flight: Flight, **options: object) -> Timeline:
+    start, gravity = begin(flight, FuseOptions())
+    filter = make_filter(flight, start, gravity, 1, FuseOptions())
+    return Timeline(filter, flight.records[0].t_ns, LearnedPolicy(), **options)
+
+
+def _feed_imu(timeline: Timeline, flight: Flight) -> None:
+    assert flight.imu is not None
+    for t, w, f in zip(flight.imu.t_ns, flight.imu.gyro_radps, flight.imu.acc_mps2, strict=True):
+        timeline.add_imu(int(t), w, f)
+
+
+def _feed(timeline: Timeline, flight: Flight, order: list[int]) -> None:
+    for i in order:
+        record = flight.records[i]
+        timeline.add_vo(record, flight.predictions.get(record.t_ns))
+
+
+def _same(a: ErrorStateFilter, b: ErrorStateFilter) -> None:
+    np.testing.assert_allclose(a.x.position, b.x.position, atol=1e-12)
+    np.testing.assert_allclose(a.P, b.P, atol=1e-14)
+
+
+@pytest.mark.parametrize("swap", [(60, 61), (60, 65), (100, 119)])
+def test_out_of_order_records_end_in_the_same_state(flight: Flight, swap: tuple[int, int]) -> None:
+    usual = _timeline(flight)
+    _feed_imu(usual, flight)
+    _feed(usual, flight, list(range(120)))
+    order = list(range(120))
+    i, j = swap
+    order.insert(j, order.pop(i))
+    shuffled = _timeline(flight)
+    _feed_imu(shuffled, flight)
+    _feed(shuffled, flight, order)
+    _same(usual.filter, shuffled.filter)
+    assert shuffled.counts["reordered"] == 1
+
+
+def test_repeated_and_too_late_records_are_counted_and_change_nothing(flight: Flight) -> None:
+    timeline = _timeline(flight, history_s=1.0)
+    _feed_imu(timeline, flight)
+    _feed(timeline, flight, [i for i in range(110) if i != 20])
+    before = timeline.filter.copy()
+    _feed(timeline, flight, [109, 105, 20])
+    assert timeline.counts["repeated"] == 2
+    assert timeline.counts["too_late"] == 1
+    _same(before, timeline.filter)
+
+
+def test_latency_costs_nothing(flight: Flight) -> None:
+    """Records that arrive long after the samples of their time give the same states."""
+    assert flight.imu is not None
+    prompt, late = _timeline(flight), _timeline(flight)
+    _feed_imu(prompt, flight)
+    _feed(prompt, flight, list(range(50)))
+    for k in range(600):
+        late.add_imu(int(flight.imu.t_ns[k]), flight.imu.gyro_radps[k], flight.imu.acc_mps2[k])
+        if k % 10 == 0 and 8 <= k // 10 < 58:
+            late.latest()
+            _feed(late, flight, [k // 10 - 8])
+    _same(prompt.filter, late.filter)
+
+
+def test_latest_carries_the_state_to_the_newest_sample(flight: Flight) -> None:
+    assert flight.imu is not None
+    timeline = _timeline(flight)
+    _feed_imu(timeline, flight)
+    _feed(timeline, flight, list(range(40)))
+    ahead = timeline.latest(flight.records[45].t_ns)
+    truth = flight.T_world_imu
+    assert np.linalg.norm(ahead.x.position[0] - truth[45, :3, 3]) < 0.1
+    assert np.trace(ahead.covariance[0, :3, :3]) > np.trace(timeline.filter.covariance[0, :3, :3])
+    assert timeline.t_ns == flight.records[39].t_ns
+
+
+def test_bad_imu_samples_are_dropped_and_counted(flight: Flight) -> None:
+    timeline = _timeline(flight)
+    _feed_imu(timeline, flight)
+    assert flight.imu is not None
+    last = int(flight.imu.t_ns[-1])
+    timeline.add_imu(last, np.zeros(3), np.zeros(3))
+    timeline.add_imu(last - 10**6, np.zeros(3), np.zeros(3))
+    timeline.add_imu(last + 10**6, np.full(3, np.nan), np.zeros(3))
+    assert (timeline.counts["imu_repeated"], timeline.counts["imu_out_of_order"]) == (1, 1)
+    assert timeline.counts["imu_not_finite"] == 1
+
+
+def test_a_gap_in_the_imu_widens_the_state(flight: Flight) -> None:
+    assert flight.imu is not None
+    keep = np.ones(len(flight.imu.t_ns), bool)
+    keep[500:600] = False
+    imu = flight.imu
+    gappy = ImuLog(imu.t_ns[keep], imu.gyro_radps[keep], imu.acc_mps2[keep], imu.noise)
+    whole = fuse_flight(flight, LearnedPolicy())[0]
+    broken = fuse_flight(replace(flight, imu=gappy), LearnedPolicy())[0]
+    assert broken.counts["imu_gaps"] > 0
+    assert broken.scores is not None
+    assert not broken.scores.diverged
+    assert np.trace(broken.covariance[55, 3:6, 3:6]) > 2 * np.trace(whole.covariance[55, 3:6, 3:6])
+
+
+def test_darkness_frozen_frames_and_bursts_do_not_diverge() -> None:
+    law = ErrorLaw(burst_factor=15.0)
+    for seed in range(3):
+        flight = synthetic_flight(seed, duration_s=12, law=law, events=Events(dark=(3.0, 5.0), frozen=(7.0, 8.0)))
+        run = fuse_flight(flight, LearnedPolicy())[0]
+        assert run.counts["lost"] == 40
+        assert run.counts.get("no_reference", 0) == 0
+        assert run.scores is not None
+        assert not run.scores.diverged
+        assert run.scores.final_error_m < 2.0
+
+
+def test_a_record_from_an_unknown_reference_is_skipped_and_counted(flight: Flight) -> None:
+    timeline = _timeline(flight)
+    _feed_imu(timeline, flight)
+    _feed(timeline, flight, [0, 1, 2])
+    stranger = replace(flight.records[5], t_prev_ns=flight.records[4].t_ns + 1)
+    (step,) = timeline.add_vo(stranger, flight.predictions[stranger.t_ns])
+    assert step.outcome == "no_reference"
+    # It becomes the reference of the next, which is used again.
+    (step,) = timeline.add_vo(flight.records[6], flight.predictions[flight.records[6].t_ns])
+    assert step.outcome == "used"
+
+
+def test_a_motion_that_is_not_finite_is_skipped(flight: Flight) -> None:
+    timeline = _timeline(flight)
+    _feed_imu(timeline, flight)
+    _feed(timeline, flight, [0, 1])
+    broken = replace(flight.records[2], T_prev_cur=np.full((4, 4), np.nan))
+    assert timeline.add_vo(broken, flight.predictions[broken.t_ns])[0].outcome == "not_finite"
+    assert np.isfinite(timeline.filter.P).all()
+
+
+@pytest.mark.parametrize("on_fail", ["discard", "inflate", "accept"])
+def test_gate(flight: Flight, on_fail: str) -> None:
+    timeline = _timeline(flight, gate=Gate(on_fail=on_fail))
+    _feed_imu(timeline, flight)
+    _feed(timeline, flight, list(range(40)))
+    before = timeline.filter.x.position.copy()
+    record = flight.records[40]
+    wrong = replace(record, T_prev_cur=record.T_prev_cur @ se3.exp(np.array([3.0, 0, 0, 0, 0, 0])))
+    (step,) = timeline.add_vo(wrong, flight.predictions[record.t_ns])
+    assert step.outcome == "rejected"
+    assert step.innovation is not None
+    assert step.innovation.nis[0] > Gate().threshold(6)
+    moved = np.linalg.norm(timeline.filter.x.position - before)
+    usual = np.linalg.norm(flight.T_world_imu[40, :3, 3] - flight.T_world_imu[39, :3, 3])
+    assert {"discard": moved < 1.2 * usual, "inflate": moved < 10 * usual, "accept": moved > usual}[on_fail]
+    np.linalg.cholesky(timeline.filter.covariance)
+
+
+def test_standing_still_against_one_reference_does_not_grow(flight: Flight) -> None:
+    """Frames that do not become the reference tie the state to the old one: no drift while at rest."""
+    n = 2000
+    rng = np.random.default_rng(0)
+    t_ns = np.arange(n + 1, dtype=np.int64) * 5_000_000
+    gyro = 2e-4 * np.sqrt(200) * rng.standard_normal((n + 1, 3))
+    acc = np.array([0, 0, 9.80665]) + 2e-3 * np.sqrt(200) * rng.standard_normal((n + 1, 3))
+    predictions, records = {}, [VoRecord(0, 0, Status.START, np.eye(4))]
+    template = next(iter(flight.predictions.values()))
+    for k in range(10, n + 1, 10):
+        t = int(t_ns[k])
+        error = rng.standard_normal(6) * np.sqrt(np.diagonal(template.covariance))
+        records.append(VoRecord(t, 0, Status.OK, se3.exp(error), is_reference=False))
+        parts = {"jitter": np.zeros((6, 6)), "white": template.covariance, "bias": np.zeros((6, 6))}
+        predictions[t] = replace(template, t_ns=t, parts=parts)
+    poses = np.tile(FORWARD_CAMERA, (len(records), 1, 1))
+    still = Flight("still", records, ImuLog(t_ns, gyro, acc, MEMS), FORWARD_CAMERA, poses, None, predictions)
+    run = fuse_flight(still, LearnedPolicy())[0]
+    sigma = np.sqrt(np.trace(run.covariance[:, :3, :3], axis1=1, axis2=2))
+    assert sigma[-1] < 1.5 * sigma[50]
+    assert np.linalg.norm(run.T_world_imu[-1, :3, 3]) < 0.01
+
+
+def test_chi_square_against_scipy() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    for dof in (1, 3, 6, 60, 300):
+        for p in (0.025, 0.5, 0.975, THREE_SIGMA):
+            assert chi2_quantile(p, dof) == pytest.approx(stats.chi2.ppf(p, dof), rel=1e-9)
+        assert chi2_cdf(dof * 1.3, dof) == pytest.approx(stats.chi2.cdf(dof * 1.3, dof), rel=1e-12)
+    with pytest.raises(ValueError, match="must lie"):
+        chi2_quantile(1.5, 6)
