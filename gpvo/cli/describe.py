@@ -10,8 +10,10 @@ import numpy as np
 from gpvo.errors import GpvoError, SourceError
 
 
-def describe(path: Path, kind: str | None = None) -> dict[str, Any]:
+def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
     """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known of it.
+
+    ``kind`` takes the path as a sequence of that format, ``options`` go to its source.
 
     Raises
     ------
@@ -34,16 +36,16 @@ def describe(path: Path, kind: str | None = None) -> dict[str, Any]:
         if path.suffix.lower() in (".txt", ".csv", ".tum"):
             return _trajectory(path)
         if is_bag(path):
-            return _bag(path)
+            return _bag(path, options or {})
         if path.is_file() and path.suffix.lower() != ".npz" and _is_safetensors(path):
             return _model(path)
-    return _sequence(path, kind or guess(path))
+    return _sequence(path, kind or guess(path), options or {})
 
 
-def _sequence(path: Path, kind: str) -> dict[str, Any]:
+def _sequence(path: Path, kind: str, options: dict[str, Any]) -> dict[str, Any]:
     from gpvo.io import open_source
 
-    source = open_source(path, kind)
+    source = open_source(path, kind, **options)
     camera, truth, imu = source.camera, source.truth, source.imu
     duration = (source.span_ns[1] - source.span_ns[0]) * 1e-9
     return {
@@ -138,7 +140,7 @@ def _is_safetensors(path: Path) -> bool:
     return len(head) == 9 and head[8:] == b"{" and int.from_bytes(head[:8], "little") < 100_000_000
 
 
-def _bag(path: Path) -> dict[str, Any]:
+def _bag(path: Path, options: dict[str, Any]) -> dict[str, Any]:
     from gpvo.io.bag_reader import open_bag
 
     with open_bag(path) as reader:
@@ -148,7 +150,7 @@ def _bag(path: Path) -> dict[str, Any]:
             "topics": {n: {"type": t.msgtype, "messages": t.msgcount} for n, t in sorted(reader.topics.items())},
         }
     try:
-        document["sequence"] = _sequence(path, "rosbag")
+        document["sequence"] = _sequence(path, "rosbag", options)
     except GpvoError as error:
         document["sequence"] = None
         document["notes"] = [str(error)]

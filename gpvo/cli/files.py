@@ -7,12 +7,16 @@ from typing import Annotated
 
 import typer
 
+from gpvo.cli import source_options as options
 from gpvo.errors import GpvoError
 
 
 def info(
     path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
-    kind: Annotated[str | None, typer.Option("--source", help="Take it as a sequence of this format.")] = None,
+    kind: options.Kind = None,
+    calibration: options.Calibration = None,
+    left_topic: options.LeftTopic = None,
+    right_topic: options.RightTopic = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the document as JSON.")] = False,
 ) -> None:
     """Say what a file or folder is.
@@ -22,7 +26,8 @@ def info(
     from gpvo.cli.describe import as_lines, describe
     from gpvo.cli.output import jsonable, print_json
 
-    document = jsonable(describe(path, kind))
+    given = options.source_options(calibration=calibration, left_topic=left_topic, right_topic=right_topic)
+    document = jsonable(describe(path, kind, given))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:

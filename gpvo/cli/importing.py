@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
@@ -129,7 +130,5 @@ def _shift(log: ForeignLog, truth: TruthLog | None, settings: ImportSettings) ->
     if offset is None:
         if truth is None:
             raise SourceError("a time offset is estimated against a truth", cure="give --truth")
-        from gpvo.dataset.align import estimate_time_offset
-
         offset = estimate_time_offset(VoLog(to_records(log)[0]), truth)
     return (log.shifted(offset), offset) if offset else (log, 0.0)

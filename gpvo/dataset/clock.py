@@ -1,0 +1,145 @@
+"""The offset between the clocks of a log and its truth, from how much both turn and travel.
+
+Angle and distance over a window do not depend on how the two frames sit to one another, so nothing need be aligned
+first. (P. Furgale, J. Rehder, R. Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", 2013,
+estimate both at once from raw measurements; logs of poses do not need it.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.align import interpolate_truth
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.types import TruthLog, VoLog
+
+# With clocks that overlap, offsets beyond this are a mistake of the search, not of the clocks.
+MAX_OFFSET_S = 5.0
+_WINDOW_S = 0.25
+_MIN_OVERLAP_S = 3.0
+_MIN_CORRELATION = 0.3
+_MAX_SAMPLES = 200_000
+
+
+def estimate_time_offset(log: VoLog, truth: TruthLog, max_offset_s: float = MAX_OFFSET_S) -> float:
+    """Seconds to add to the log's stamps so that they are of the truth's clock.
+
+    Clocks whose times do not overlap at all are searched over their whole length.
+
+    Raises
+    ------
+    GpvoError
+        Where either is too short, or the motions do not resemble one another at any offset.
+    """
+    if len(log) < 10 or len(truth.t_ns) < 10:
+        raise GpvoError("too few poses to estimate a time offset", cure="give --time-offset in seconds")
+    moving = TruthLog(log.t_ns, log.trajectory())
+    step_s = float(np.median(np.diff(moving.t_ns))) * 1e-9
+    window = max(1, round(_WINDOW_S / step_s))
+    coarse = _coarse(moving, truth, step_s, window * step_s, max_offset_s)
+    return _refine(moving, truth, coarse, window, 1.5 * step_s)
+
+
+def _amounts(T: Array, ok: NDArray[np.bool_], window: int) -> Array:
+    """(2, N - window) angle [rad] and distance [m] over each window; NaN where an end is unknown."""
+    motion = se3.inverse(T[:-window]) @ T[window:]
+    both = np.stack([np.linalg.norm(se3.so3_log(motion[:, :3, :3]), axis=1), np.linalg.norm(motion[:, :3, 3], axis=1)])
+    return np.where(ok[:-window] & ok[window:], both, np.nan)
+
+
+def _on_grid(poses: TruthLog, step_s: float, window: int) -> tuple[Array, int]:
+    """Amounts on an even grid of ``step_s``, and the grid's first stamp [ns]."""
+    first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
+    count = int((last - first) * 1e-9 / step_s)
+    if not 2 * window < count < _MAX_SAMPLES:
+        raise GpvoError(f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset")
+    grid = first + np.rint(np.arange(count) * step_s * 1e9).astype(np.int64)
+    return _amounts(*interpolate_truth(poses, grid), window), first
+
+
+def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float, max_offset_s: float) -> float:
+    """Offset [s] of the best normalised correlation, to one step."""
+    window = max(1, round(window_s / step_s))
+    a, a_first = _on_grid(log, step_s, window)
+    b, b_first = _on_grid(truth, step_s, window)
+    score = np.zeros(a.shape[1] + b.shape[1] - 1)
+    for x, y in zip(a, b, strict=True):
+        score = np.maximum(score, _correlation(x, y, round(_MIN_OVERLAP_S / step_s)))
+    # Lag k: sample i of the log meets sample i + k of the truth.
+    lag = np.arange(score.size) - (a.shape[1] - 1)
+    offset = (b_first - a_first) * 1e-9 + lag * step_s
+    overlapping = log.t_ns[0] <= truth.t_ns[-1] and truth.t_ns[0] <= log.t_ns[-1]
+    if overlapping:
+        score = np.where(np.abs(offset) <= max_offset_s, score, -1.0)
+    best = int(np.argmax(score))
+    if score[best] < _MIN_CORRELATION:
+        raise GpvoError(
+            f"the motions of log and truth do not resemble one another (correlation {score[best]:.2f})",
+            cure="is it the truth of this log? Else give --time-offset in seconds",
+        )
+    return float(offset[best])
+
+
+def _correlation(x: Array, y: Array, min_overlap: int) -> Array:
+    """Pearson's correlation of ``x[i]`` with ``y[i + k]`` for every lag k, -1 where too few samples overlap."""
+    n = x.size + y.size - 1
+    size = 1 << (n - 1).bit_length()
+    # A slip of the log must not outweigh everything: amounts are cut at thrice their upper decile.
+    parts = []
+    for v in (x, y):
+        known = np.isfinite(v)
+        cut = 3.0 * np.percentile(v[known], 90) if known.any() else 0.0
+        parts.append((known.astype(np.float64), np.where(known, np.minimum(v, cut), 0.0)))
+    (mx, vx), (my, vy) = parts
+
+    def sliding(p: Array, q: Array) -> Array:
+        spectrum = np.conj(np.fft.rfft(p, size)) * np.fft.rfft(q, size)
+        return np.roll(np.fft.irfft(spectrum, size), x.size - 1)[:n]
+
+    count = np.maximum(sliding(mx, my), 1.0)
+    sx, sy = sliding(vx, my), sliding(mx, vy)
+    var_x = sliding(vx**2, my) - sx**2 / count
+    var_y = sliding(mx, vy**2) - sy**2 / count
+    power = np.sqrt(np.maximum(var_x, 0) * np.maximum(var_y, 0))
+    covariance = sliding(vx, vy) - sx * sy / count
+    floor = 1e-9 * max(float(power.max(initial=0.0)), 1e-300)
+    enough = (count >= max(min_overlap, 0.2 * min(mx.sum(), my.sum()))) & (power > floor)
+    return np.where(enough, covariance / np.where(enough, power, 1.0), -1.0)
+
+
+def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius_s: float) -> float:
+    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: three nested grids and a parabola."""
+    T = log.T_world_cam
+    mine = _amounts(T, np.ones(len(T), dtype=bool), window)
+
+    def misfits(offsets: Array) -> Array:
+        differences = []
+        for offset in offsets:
+            moved = replace(log, t_ns=log.t_ns + round(float(offset) * 1e9))
+            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns), window))
+        d = np.stack(differences)
+        known = np.isfinite(d).all(axis=(0, 1))
+        if known.sum() < 10:
+            return np.zeros(len(offsets))
+        d = d[:, :, known]
+        spread = np.maximum(np.median(np.abs(d), axis=(0, 2)), 1e-9)[None, :, None]
+        misfit: Array = np.log1p((d / spread) ** 2).mean(axis=(1, 2))
+        return misfit
+
+    for _ in range(3):
+        offsets = np.linspace(offset_s - radius_s, offset_s + radius_s, 13)
+        cost = misfits(offsets)
+        best = int(np.argmin(cost))
+        offset_s = float(offsets[best])
+        if 0 < best < 12:
+            left, middle, right = cost[best - 1 : best + 2]
+            bend = left - 2 * middle + right
+            if bend > 0:
+                offset_s += 0.5 * (left - right) / bend * (offsets[1] - offsets[0])
+        radius_s /= 4.0
+    return offset_s
