@@ -13,22 +13,9 @@ from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.geometry.se3 import Array
+from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
 from gpvo.io.stamps import seconds_text_to_ns
 
-COUNT_FIELDS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
-FLOAT_FIELDS = (
-    "reproj_rms_px",
-    "disparity_p10_px",
-    "disparity_p50_px",
-    "disparity_p90_px",
-    "spread_u",
-    "spread_v",
-    "log10_condition",
-    "brightness",
-    "contrast",
-    "sharpness",
-    "noise_level",
-)
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
 _COV = tuple(f"cov_{i}{j}" for i in range(6) for j in range(6))
 # Everything that a column can be mapped to.

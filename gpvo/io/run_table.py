@@ -26,8 +26,9 @@ _POSITION = tuple(f"p_{a}_m" for a in _AXES)
 _QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 _ROTATION = tuple(f"R_{i}{j}" for i in range(3) for j in range(3))
 _TWIST = tuple(f"v_{a}_mps" for a in _AXES) + tuple(f"w_{a}_radps" for a in _AXES)
-_COUNTS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
-_FLOATS = (
+# Fields of a record that are counts, and those that are plain numbers.
+COUNT_FIELDS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
+FLOAT_FIELDS = (
     "reproj_rms_px",
     "residual_sigma_p_px",
     "residual_sigma_m_px",
@@ -86,10 +87,10 @@ def record_columns(records: Sequence[VoRecord]) -> Columns:
     dt = np.array([r.dt_s for r in records])
     twist = se3.log(T) / np.where(dt > 0, dt, np.nan)[:, None]
     out.update({name: _nulls(twist[:, i]) for i, name in enumerate(_TWIST)})
-    for name in _COUNTS:
+    for name in COUNT_FIELDS:
         out[name] = [v if v >= 0 else None for v in (getattr(r, name) for r in records)]
     out["inlier_ratio"] = _nulls([r.inlier_ratio for r in records])
-    for name in _FLOATS:
+    for name in FLOAT_FIELDS:
         out[name] = _nulls([getattr(r, name) for r in records])
     for name, pattern in _IMU.items():
         vectors = [getattr(r, name) for r in records]
@@ -112,8 +113,8 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
     """
     T = poses_from(columns)
     n = len(T)
-    counts = {c: np.where(np.isnan(f := _float(columns, c, n)), -1, f).astype(np.int64) for c in _COUNTS}
-    floats = {c: _float(columns, c, n) for c in _FLOATS}
+    counts = {c: np.where(np.isnan(f := _float(columns, c, n)), -1, f).astype(np.int64) for c in COUNT_FIELDS}
+    floats = {c: _float(columns, c, n) for c in FLOAT_FIELDS}
     imu = {c: np.stack([_float(columns, p.format(a), n) for a in _AXES], 1) for c, p in _IMU.items()}
     imu_known = {c: p.format("x") in columns for c, p in _IMU.items()}
     cov, v_t = _get_matrices(columns, "cov", _UPPER6, 6), _get_matrices(columns, "vt", _UPPER3, 3)
