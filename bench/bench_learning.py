@@ -1,0 +1,213 @@
+"""Speed and size of learning and prediction beside scikit-learn and gpytorch, every party on one thread."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+
+_TESTS = Path(__file__).resolve().parents[1] / "tests" / "learning"
+sys.path.insert(0, str(_TESTS))
+
+from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic  # noqa: E402
+from gpvo.learning.regressors import get_regressor  # noqa: E402
+from gpvo.online import modelfile  # noqa: E402
+from synthetic_errors import Problem, gaussian_nll, make_problem  # noqa: E402
+
+Results = dict[str, dict[str, Any]]
+
+N = 2000
+
+
+def entry(value: float, unit: str, peer: str | None = None, peer_value: float | None = None) -> dict[str, Any]:
+    """One line of bench.json; ``ratio`` is how many times better than the peer (smaller is better everywhere)."""
+    ratio = None if peer_value is None else peer_value / value
+    return {"value": value, "unit": unit, "peer": peer, "peer_value": peer_value, "ratio": ratio}
+
+
+def microseconds(call: Callable[[np.ndarray], Any], rows: np.ndarray, *, repeats: int, warm_up: int) -> float:
+    """Median time of one hot call."""
+    spent = []
+    for i in range(warm_up + repeats):
+        x = rows[i % len(rows)]
+        begin = time.perf_counter_ns()
+        call(x)
+        spent.append(time.perf_counter_ns() - begin)
+    return float(np.median(spent[warm_up:])) / 1e3
+
+
+def prediction(fit: HeteroscedasticFit, rows: np.ndarray) -> Results:
+    """One row: mean, aleatoric and epistemic variance of six outputs; mean and standard deviation by the peers."""
+    ours = microseconds(fit.basis.predict_one, rows, repeats=5000, warm_up=500)
+    few = make_problem(N, 1)
+    from_sklearn = microseconds(sklearn_predictor(few), rows, repeats=100, warm_up=5)
+    from_gpytorch = microseconds(gpytorch_predictor(few), rows, repeats=100, warm_up=20)
+    return {
+        "predict_one_us": entry(ours, "us", "scikit-learn GaussianProcessRegressor, n=2000", from_sklearn),
+        "predict_one_us_vs_gpytorch": entry(ours, "us", "gpytorch ExactGP, n=2000, fast_pred_var", from_gpytorch),
+    }
+
+
+def sklearn_predictor(few: Problem) -> Callable[[np.ndarray], Any]:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    kernel = ConstantKernel(0.5) * RBF(np.full(8, 2.5)) + WhiteKernel(0.7)
+    model = GaussianProcessRegressor(kernel, optimizer=None, normalize_y=True).fit(few.X, few.Y)
+    return lambda x: model.predict(x[None], return_std=True)
+
+
+def gpytorch_predictor(few: Problem) -> Callable[[np.ndarray], Any]:
+    import gpytorch
+
+    class Model(gpytorch.models.ExactGP):
+        """Six outputs as a batch that shares nothing but the inputs: what gpytorch's tutorial suggests."""
+
+        def __init__(self, X: torch.Tensor, Y: torch.Tensor, likelihood: Any) -> None:
+            super().__init__(X, Y, likelihood)
+            batch = torch.Size([6])
+            self.mean_module = gpytorch.means.ConstantMean(batch_shape=batch)
+            base = gpytorch.kernels.RBFKernel(ard_num_dims=8, batch_shape=batch)
+            self.covar_module = gpytorch.kernels.ScaleKernel(base, batch_shape=batch)
+
+        def forward(self, x: torch.Tensor) -> Any:
+            normal = gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+            return gpytorch.distributions.MultitaskMultivariateNormal.from_batch_mvn(normal)
+
+    likelihood = gpytorch.likelihoods.MultitaskGaussianLikelihood(num_tasks=6)
+    model = Model(torch.tensor(few.X).float(), torch.tensor(few.Y).float(), likelihood).eval()
+
+    def predict(x: np.ndarray) -> Any:
+        with torch.no_grad(), gpytorch.settings.fast_pred_var():
+            out = likelihood.eval()(model(torch.as_tensor(x, dtype=torch.float32)[None]))
+            return out.mean.numpy(), out.variance.numpy()
+
+    return predict
+
+
+def loading(fit: HeteroscedasticFit) -> Results:
+    """Import of everything that flies, the model file, and one prediction, in a fresh interpreter."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.gpvo"
+        modelfile.save(path, fit.basis.to_arrays(), {"features": []})
+        code = f"""
+import json, time
+def megabytes():
+    return int(next(l for l in open("/proc/self/status") if l.startswith("VmRSS")).split()[1]) / 1024
+before, begin = megabytes(), time.perf_counter()
+import numpy as np
+import gpvo.online.predictor
+from gpvo.online import modelfile
+from gpvo.online.basis import SharedBasis
+SharedBasis.from_arrays(modelfile.load({str(path)!r})[0]).predict_one(np.zeros(8))
+print(json.dumps([time.perf_counter() - begin, megabytes() - before]))
+"""
+        found = np.array([child(code) for _ in range(7)])
+    seconds, megabytes = np.median(found, axis=0)
+    return {"import_load_s": entry(float(seconds), "s"), "import_load_mb": entry(float(megabytes), "MB")}
+
+
+def training(test: Problem) -> Results:
+    """2,000 rows to hyperparameters and posterior; held-out NLL beside the time."""
+    few = make_problem(N, 1)
+    out: Results = {}
+    begin = time.perf_counter()
+    theirs, peer_nll = sklearn_fit(few, test)
+    peer_s = time.perf_counter() - begin - theirs
+    for name in ("sparse", "exact"):
+        begin = time.perf_counter()
+        fit = get_regressor(name).fit(few.X, few.Y)
+        seconds = time.perf_counter() - begin
+        mean, var = fit.predict(test.X)
+        nll = gaussian_nll(test.Y, mean, var + fit.hyper.noise_var)
+        out[f"train_2000_{name}_s"] = entry(seconds, "s", "scikit-learn GaussianProcessRegressor", peer_s)
+        out[f"train_2000_{name}_nll"] = entry(nll, "nats", "scikit-learn GaussianProcessRegressor", peer_nll)
+    return out
+
+
+def sklearn_fit(few: Problem, test: Problem) -> tuple[float, float]:
+    """Seconds spent on predicting the test rows (not to be counted), and their NLL."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    centre, scale = few.X.mean(0), few.X.std(0)
+    kernel = ConstantKernel(1.0) * RBF(np.ones(8), (1e-2, 1e3)) + WhiteKernel(1.0)
+    model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.fit((few.X - centre) / scale, few.Y)
+    begin = time.perf_counter()
+    mean, std = model.predict((test.X - centre) / scale, return_std=True)
+    return time.perf_counter() - begin, gaussian_nll(test.Y, mean, std**2)
+
+
+def scale(n_large: int = 100_000, n_huge: int = 1_000_000) -> Results:
+    """Mean and noise of six outputs: seconds at 100,000 rows, seconds and peak memory at 1,000,000."""
+    code = """
+import json, sys, time
+sys.path.insert(0, {tests!r})
+from synthetic_errors import make_problem
+from gpvo.learning.noise import fit_heteroscedastic
+problem = make_problem({n}, 1)
+begin = time.perf_counter()
+fit_heteroscedastic(problem.X, problem.Y, problem.run)
+seconds = time.perf_counter() - begin
+peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(json.dumps([seconds, int(peak.split()[1]) / 1024**2]))
+"""
+    large = child(code.format(tests=str(_TESTS), n=n_large))
+    huge = child(code.format(tests=str(_TESTS), n=n_huge))
+    return {
+        "train_100k_s": entry(large[0], "s"),
+        "train_100k_peak_gb": entry(large[1], "GB"),
+        "train_1m_s": entry(huge[0], "s"),
+        "train_1m_peak_gb": entry(huge[1], "GB"),
+    }
+
+
+def honesty(fit: HeteroscedasticFit, test: Problem, seconds: float) -> Results:
+    """20,000 rows of known truth: nats per output above the true density, and what one sigma covers."""
+    mean, var = fit.predict(test.X)
+    covered = float(np.mean(np.abs(test.Y - mean) < np.sqrt(var)))
+    return {
+        "known_truth_nll": entry(gaussian_nll(test.Y, mean, var), "nats", "the true density", test.true_nll()),
+        "known_truth_coverage_1_sigma": entry(covered, "share", "a Gaussian", 0.6827),
+        "train_20k_mean_and_noise_s": entry(seconds, "s"),
+    }
+
+
+def child(code: str) -> list[float]:
+    """What a fresh interpreter prints as JSON."""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return json.loads(out.stdout)
+
+
+def run() -> Results:
+    """All of it: about four minutes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            train, test = make_problem(20_000, 1), make_problem(20_000, 101)
+            begin = time.perf_counter()
+            fit = fit_heteroscedastic(train.X, train.Y, train.run, options=HeteroscedasticOptions(inducing=256))
+            seconds = time.perf_counter() - begin
+            rows = make_problem(500, 7).X
+            out = prediction(fit, rows) | loading(fit) | honesty(fit, test, seconds)
+            return out | training(make_problem(4000, 2)) | scale()
+    finally:
+        torch.set_num_threads(threads)
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(), indent=1))
