@@ -29,9 +29,7 @@ def main(sequence: str, model: str, address: str) -> None:
         message = builder.step(record, prediction)
         link.send(message)
         if prediction is not None:
-            print(
-                f"{record.t_ns}  {record.status.value:<9} sigma {prediction.sigma[:3]} m  {prediction.confidence:.2f}"
-            )
+            print(record.t_ns, record.status.value, prediction.sigma[:3], "m", round(prediction.confidence, 2))
 
 
 if __name__ == "__main__":

@@ -36,12 +36,9 @@ class GpvoNode(Node):
         self.odometry: StereoOdometry | None = None
         self.publisher = self.create_publisher(Odometry, "gpvo/odometry", 10)
         names = ("left/image_rect", "right/image_rect", "left/camera_info", "right/camera_info")
-        inputs = [
-            message_filters.Subscriber(
-                self, CameraInfo if "info" in n else Image, n, qos_profile=qos_profile_sensor_data
-            )
-            for n in names
-        ]
+        qos = qos_profile_sensor_data
+        types = [CameraInfo if "info" in name else Image for name in names]
+        inputs = [message_filters.Subscriber(self, t, n, qos_profile=qos) for t, n in zip(types, names)]
         self.sync = message_filters.TimeSynchronizer(inputs, 10)
         self.sync.registerCallback(self.on_pair)
 

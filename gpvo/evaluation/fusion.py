@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,9 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
     if imu is not None and run.mounting.T_imu_cam is None:
         raise GpvoError("has an IMU but no T_imu_cam in rig.json", where=run.path, cure="add it, or use --no-imu")
     poses = valid = None
+    truth_sigma = (0.0, 0.0)
     if run.truth is not None:
+        truth_sigma = (run.truth.sigma_translation_m, run.truth.sigma_rotation_rad)
         poses, valid = interpolate_truth(run.truth, run.log.t_ns)
         if not valid.any():
             raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
@@ -79,6 +81,7 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         T_world_cam=poses,
         truth_valid=valid,
         predictions=predictions,
+        truth_sigma=truth_sigma,
     )
 
 
@@ -109,17 +112,14 @@ def constants_of(runs: Sequence[Run]) -> Constants:
     return Constants(np.mean(squares, axis=0), float(np.median(dt)))
 
 
-def constants_in(header: Mapping[str, Any]) -> Constants | None:
+def constants_in(predictor: Predictor) -> Constants | None:
     """The constants that a model file carries, None where it has none."""
-    constant = header.get("constant")
-    if constant is None:
+    covariance = predictor.arrays.get("method.constant")
+    if covariance is None or covariance.shape != (6, 6):
         return None
-    mean_squares = constant.get("mean_squares") if isinstance(constant, Mapping) else constant
-    values = np.asarray(mean_squares, dtype=np.float64)
-    if values.shape != (6,) or not (np.isfinite(values).all() and (values > 0).all()):
-        return None
-    best = header.get("constant_best")
-    return Constants(values, float(header["dt_s"]), None if best is None else (float(best[0]), float(best[1])))
+    best = predictor.header.get("constant_best")
+    scalars = None if best is None else (float(best[0]), float(best[1]))
+    return Constants(np.diagonal(covariance).copy(), predictor.model.dt_s, scalars)
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def _constants(
     options: FuseOptions,
     tell: Callable[[str], None],
 ) -> Constants | None:
-    constants = constants_in(predictor.header) if predictor else None
+    constants = constants_in(predictor) if predictor else None
     if settings.training:
         runs = [read_run(path) for path in settings.training]
         constants = constants_of(runs)

@@ -31,7 +31,8 @@ class Flight:
     """One run as the filters take it.
 
     ``records`` in order of arrival; ``predictions`` by ``t_ns``; ``imu`` and ``T_imu_cam`` (4, 4) or None;
-    ``T_world_cam`` (N, 4, 4) true poses at the records' stamps where ``truth_valid`` (N,), None without truth.
+    ``T_world_cam`` (N, 4, 4) true poses at the records' stamps where ``truth_valid`` (N,), None without truth, whose
+    own noise is ``truth_sigma`` per axis [m, rad].
     """
 
     name: str
@@ -41,6 +42,7 @@ class Flight:
     T_world_cam: Array | None = None
     truth_valid: NDArray[np.bool_] | None = None
     predictions: Mapping[int, Prediction] = field(default_factory=dict)
+    truth_sigma: tuple[float, float] = (0.0, 0.0)
 
     @property
     def T_world_imu(self) -> Array:
@@ -239,8 +241,9 @@ def _score(
     path = metrics.path_length(truth_cam[:, :3, 3])
     counted = (t_ns[valid] - t_ns[0]) > score_gap_s * 1e9
     finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
-    position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3])
-    attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9])
+    own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
+    position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])
+    attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9] + own[1])
     measured = nis[np.isfinite(nis)] / 6.0
     return metrics.Scores(
         ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),

@@ -150,6 +150,8 @@ class OdometryBuilder:
         """
         t_last, T_last, noise_last = self._last or (record.t_prev_ns, se3.inverse(record.T_prev_cur), own)
         dt = (record.t_ns - t_last) * 1e-9
+        if dt <= 0:
+            raise GpvoError(f"the frame at t_ns {record.t_ns} does not follow the one at {t_last}")
         if t_last == record.t_prev_ns:
             xi, T_rel = se3.log(record.T_prev_cur), record.T_prev_cur
         else:

@@ -1,0 +1,91 @@
+"""Trajectory scores against evo, consistency scores against draws, paired comparisons."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.filters import metrics
+from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy, split_noise
+from gpvo.filters.study import Constants, fit_scalars, has_noise, make_policies, study, table
+from gpvo.filters.synthetic import ErrorLaw, synthetic_flight, with_geometric
+from gpvo.geometry import se3
+from gpvo.types import Status, VoRecord
+
+
+def test_ate_agrees_with_evo() -> None:
+    evo = pytest.importorskip("evo.core.metrics")
+    from evo.core.trajectory import PosePath3D
+
+    rng = np.random.default_rng(0)
+    truth = np.cumsum(rng.standard_normal((60, 3)), axis=0)
+    estimate = truth @ se3.so3_exp(np.array([0.3, -1.0, 2.0])).T + [4, 5, 6] + 0.1 * rng.standard_normal((60, 3))
+    eye = np.tile([1.0, 0, 0, 0], (60, 1))
+    a, b = PosePath3D(estimate, eye), PosePath3D(truth, eye)
+    a.align(b)
+    ape = evo.APE(evo.PoseRelation.translation_part)
+    ape.process_data((b, a))
+    assert metrics.ate_rmse(estimate, truth) == pytest.approx(ape.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
+
+
+def test_nees_of_honest_and_of_overconfident_states() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.standard_normal((3, 3))
+    C = np.tile(A @ A.T * 1e-4, (20000, 1, 1))
+    error = rng.standard_normal((20000, 3)) @ np.linalg.cholesky(C[0]).T
+    assert metrics.position_nees(np.zeros((20000, 3)), error, C).mean() == pytest.approx(1.0, abs=0.03)
+    R = se3.so3_exp(error)
+    assert metrics.attitude_nees(np.tile(np.eye(3), (20000, 1, 1)), R, C / 4).mean() == pytest.approx(4.0, abs=0.15)
+
+
+def test_divergence() -> None:
+    assert metrics.diverged(np.array([0.0, np.nan]), 10.0)
+    assert metrics.diverged(np.array([0.0, 3.0]), 10.0)
+    assert not metrics.diverged(np.array([0.0, 3.0]), 100.0)
+
+
+def test_parts_sum_to_the_total_and_a_bias_without_time_constant_is_white() -> None:
+    rng = np.random.default_rng(2)
+    J, W, B = (A @ A.T for A in rng.standard_normal((3, 6, 6)))
+    parts = {"jitter": J, "white": W, "bias": B}
+    noise = split_noise(np.zeros((1, 6)), J + W + B, parts, np.full(6, 3.0))
+    assert noise.jitter is not None
+    np.testing.assert_allclose(noise.white + noise.jitter + noise.bias_covariance, (J + W + B)[None], atol=1e-9)
+    noise = split_noise(np.zeros((1, 6)), J + W + B, parts, np.full(6, np.nan))
+    assert noise.bias_root is None
+    np.testing.assert_allclose(noise.white, (W + B)[None], atol=1e-9)
+
+
+def test_constant_widens_over_lost_frames_and_scales_by_block() -> None:
+    policy = ConstantPolicy(np.arange(1.0, 7.0), 0.05, np.array([[2.0, 0.5]]))
+    one = VoRecord(50_000_000, 0, Status.OK, np.eye(4))
+    np.testing.assert_allclose(np.diagonal(policy.noise(one, None).white[0]), [2, 4, 6, 2, 2.5, 3])
+    four = VoRecord(200_000_000, 0, Status.OK, np.eye(4))
+    np.testing.assert_allclose(policy.noise(four, None).white, 4 * policy.noise(one, None).white)
+
+
+def test_tuned_scalars_find_the_noise_they_were_made_with() -> None:
+    law = ErrorLaw(jitter=np.full(6, 1e-9), bias=np.full(6, 1e-9), white=np.array([8e-3] * 3 + [8e-4] * 3))
+    flights = [synthetic_flight(s, duration_s=6, imu_hz=50, law=law) for s in range(3)]
+    wrong = Constants(law.white**2 * 64.0, 0.05)
+    translation, _ = fit_scalars(flights, wrong)
+    # The optimum is broad: it must have moved towards 1/64, not have hit it.
+    assert translation < 0.3
+
+
+def test_study_tells_a_better_policy_and_leaves_out_what_cannot_run() -> None:
+    law = ErrorLaw(burst_factor=10.0)
+    flights = [synthetic_flight(s, duration_s=8, imu_hz=50, law=law) for s in range(6)]
+    square = np.mean([np.diagonal(p.covariance) for f in flights for p in f.predictions.values()], axis=0)
+    names = ("constant", "constant_best", "triangulation", "learned")
+    policies = make_policies(Constants(square, 0.05), names=names, learned=True)
+    assert policies["constant_best"] is None
+    result = study(flights, policies)
+    compared = result.compare("learned", "constant")
+    assert compared.gain_percent > 0
+    assert "learned less constant" in str(compared)
+    assert set(result.scores["triangulation"]) == {None}
+    text = table(result)
+    assert all(f.name in text for f in flights)
+    assert not has_noise(flights[0], GeometricPolicy("triangulation"))
+    assert has_noise(with_geometric(flights[0], np.eye(6)), GeometricPolicy("triangulation"))
+    assert has_noise(flights[0], LearnedPolicy())
