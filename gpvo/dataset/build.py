@@ -1,0 +1,173 @@
+"""VO log and ground truth to a training set, by replaying the online features over the log."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.targets import check_target, motion_targets, position_targets
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import Array
+from gpvo.io.run_read import Run
+from gpvo.online.features import resolve
+from gpvo.online.observer import Observer
+from gpvo.online.slip import REASON, SlipDetector
+from gpvo.types import Status, StereoCamera, TruthLog, VoLog, VoRecord
+
+MIN_ROWS = 30
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Features and targets of one sequence, n rows in time order.
+
+    ``X`` (n, d) features ``columns``, NaN where unknown. ``Y`` (n, 6) errors [m, rad], or (n, 3) residuals of a
+    position. ``covariances`` (n, 6, 6) and ``v_t`` (n, 3, 3) by method. ``counts``: frames, lost, slips (lost by
+    plausibility alone, also in ``lost``) and frames without truth. ``lost_xi`` (m, 6): errors of the slips that have
+    truth; ``lost_jump`` (m, 6): their distance from the motion expected.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    X: Array
+    Y: Array
+    t_ns: NDArray[np.int64]
+    dt_s: Array
+    covariances: Mapping[str, Array]
+    v_t: Mapping[str, Array]
+    counts: Mapping[str, int]
+    camera: StereoCamera | None = None
+    target: str = "frame"
+    lost_xi: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    lost_jump: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+    def __len__(self) -> int:
+        return len(self.X)
+
+    def select(self, names: Sequence[str]) -> Array:
+        """(n, len(names)) some of the columns."""
+        place = {c: i for i, c in enumerate(self.columns)}
+        return self.X[:, [place[n] for n in names]]
+
+    def rows(self, keep: NDArray) -> TrainingSet:
+        """A part of the rows."""
+        return replace(
+            self,
+            X=self.X[keep],
+            Y=self.Y[keep],
+            t_ns=self.t_ns[keep],
+            dt_s=self.dt_s[keep],
+            covariances={m: C[keep] for m, C in self.covariances.items()},
+            v_t={m: C[keep] for m, C in self.v_t.items()},
+        )
+
+    def supported(self) -> set[str]:
+        """Columns that the log knows in at least 95 of 100 rows."""
+        known = np.isfinite(self.X).mean(axis=0) >= 0.95
+        return {c for c, k in zip(self.columns, known) if k}
+
+    def digest(self) -> str:
+        """SHA-256 of the rows."""
+        sha = hashlib.sha256(repr((self.name, self.columns, self.target, self.X.shape)).encode())
+        for array in (self.X, self.Y, self.t_ns, self.dt_s, *(self.covariances[m] for m in sorted(self.covariances))):
+            sha.update(np.ascontiguousarray(array).tobytes())
+        return sha.hexdigest()
+
+
+def observe(log: VoLog, names: Sequence[str], target: str = "frame") -> tuple[list[VoRecord], Array]:
+    """Replay a log: the records as flight judges (or joins) them and their features (N, d)."""
+    observer = Observer(names, target, log.camera)
+    seen = [s for s in map(observer.step, log.records) if s is not None]
+    return [r for r, _ in seen], np.array([x for _, x in seen]).reshape(len(seen), len(names))
+
+
+def build(
+    log: VoLog,
+    truth: TruthLog | None,
+    *,
+    name: str,
+    columns: Sequence[str] | None = None,
+    target: str = "frame",
+) -> TrainingSet:
+    """The training set of one run. Frames that are lost or lack truth are left out and counted.
+
+    ``columns``: by default all of ``full``. Raises GpvoError where nothing is left to learn from.
+    """
+    check_target(target)
+    names = tuple(columns or resolve("full"))
+    if truth is None or len(truth.t_ns) < 2:
+        raise GpvoError("has no ground truth to learn from", where=name, cure="run a source that has it, or gpvo import --truth")
+    records, X = observe(log, names, target)
+    if target == "position":
+        usable = np.array([r.usable for r in records], dtype=bool)
+        Y, known = position_targets(log.trajectory(), log.t_ns, usable, truth)
+    else:
+        Y, known = motion_targets(records, truth)
+    if known.sum() < MIN_ROWS:
+        raise GpvoError(
+            f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed",
+            where=name,
+            cure="check that log and truth share one clock",
+        )
+    kept = [r for r, k in zip(records, known) if k]
+    lost = [r for r in records if r.status is Status.LOST]
+    slips, jumps = slips_of(log)
+    as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)
+    n_usable = sum(r.usable for r in records)
+    return TrainingSet(
+        name=name,
+        columns=names,
+        X=X[known],
+        Y=Y[known],
+        t_ns=np.array([r.t_ns for r in kept], dtype=np.int64),
+        dt_s=np.array([r.dt_s for r in kept]),
+        covariances={m: VoLog(kept).covariance(m) for m in VoLog(kept).methods},
+        v_t=_v_t(kept),
+        counts={"frames": len(log), "lost": len(lost), "slips": len(slips), "without_truth": int(n_usable - known.sum())},
+        camera=log.camera,
+        target=target,
+        lost_xi=as_if[has],
+        lost_jump=jumps[has],
+    )
+
+
+def slips_of(log: VoLog) -> tuple[list[VoRecord], Array]:
+    """The records that are lost for their motion alone, and the distance (m, 6) of each motion from the expected one."""
+    detector, slips, jumps = SlipDetector(), [], []
+    for record in log.records:
+        judged = detector.step(record)
+        if judged.status is Status.LOST and REASON in judged.reason and detector.expected is not None:
+            slips.append(judged)
+            jumps.append(se3.log(judged.T_prev_cur) - detector.expected * judged.dt_s)
+    return slips, np.array(jumps).reshape(-1, 6)
+
+
+def build_run(run: Run, *, columns: Sequence[str] | None = None, target: str = "frame", align: str = "none") -> TrainingSet:
+    """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
+    truth = run.truth
+    if align == "rotation" and truth is not None:
+        truth = align_rotation(run.log, truth)
+    elif align not in ("none", "rotation"):
+        raise GpvoError(f"there is no alignment '{align}'", cure="none or rotation")
+    return build(run.log, truth, name=run.name, columns=columns, target=target)
+
+
+def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:
+    """Truth turned by the fixed rotation between its camera and the log's, so that motions agree best."""
+    from gpvo.dataset.align import estimate_fixed_rotation
+
+    R_truthcam_cam = estimate_fixed_rotation(log, truth)
+    T = np.eye(4)
+    T[:3, :3] = R_truthcam_cam
+    return replace(truth, T_world_cam=truth.T_world_cam @ T)
+
+
+def _v_t(records: Sequence[VoRecord]) -> dict[str, Array]:
+    names = dict.fromkeys(m for r in records for m in r.v_t)
+    missing = np.full((3, 3), np.nan)
+    return {m: np.array([r.v_t.get(m, missing) for r in records]).reshape(-1, 3, 3) for m in names}

@@ -1,0 +1,58 @@
+"""Fitting the base variance: non-negative parts, by the likelihood of a heavy-tailed error."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from gpvo.online.base import BaseVariance, parts
+from gpvo.types import Array
+
+NU = 5.0
+"""Degrees of freedom of the Student-t that judges the fit: a few gross errors must not set the scale of all."""
+
+_SMALLEST = np.log(1e-6)
+_LARGEST = np.log(1e3)
+
+
+def t_negative_log_likelihood(square: Array, variance: Array, nu: float = NU) -> Array:
+    """Of a Student-t with second moment ``variance`` at the squared error, without its constant [nats]."""
+    scale = variance * (nu - 2.0) / nu
+    return 0.5 * np.log(scale) + 0.5 * (nu + 1.0) * np.log1p(square / (nu * scale))
+
+
+def fit_base(columns: Array, dt_s: Array, error: Array, method: str | None, weight: Array | None = None) -> BaseVariance:
+    """Coefficients of each axis from errors (n, 6); ``columns`` as :func:`gpvo.online.base.base_columns` says.
+
+    ``weight`` (n,): how much a row counts.
+    """
+    count = np.ones(len(error)) if weight is None else weight
+    terms = parts(columns, dt_s)
+    theta = np.stack([_fit_axis(terms[:, j], error[:, j] ** 2, count) for j in range(6)])
+    if method is None:
+        theta[:, 0] = 0.0
+    return BaseVariance(theta, method)
+
+
+def _fit_axis(terms: Array, square: Array, count: Array) -> Array:
+    """(4,) coefficients: minimises the t's negative log-likelihood over their logs, terms scaled to the mean square."""
+    typical = np.maximum(np.average(terms, axis=0, weights=count), 1e-300)
+    level = max(float(np.average(np.minimum(square, np.quantile(square, 0.99)), weights=count)), 1e-18)
+    scaled = terms / typical * level
+    weight = count / count.sum()
+
+    def objective(p: Array) -> tuple[float, Array]:
+        theta = np.exp(p)
+        v = scaled @ theta
+        s = v * (NU - 2.0) / NU
+        value = weight @ (0.5 * np.log(s) + 0.5 * (NU + 1.0) * np.log1p(square / (NU * s)))
+        # d/dv: half of (1 - (nu + 1) y^2 / (nu s + y^2)) / v.
+        slope = 0.5 * weight * (1.0 - (NU + 1.0) * square / (NU * s + square)) / v
+        return float(value), (slope @ scaled) * theta
+
+    free = terms.max(axis=0) > 0
+    bounds = [(_SMALLEST, _LARGEST) if f else (_SMALLEST, _SMALLEST) for f in free]
+    start = np.where(free, np.log(1.0 / max(free.sum(), 1)), _SMALLEST)
+    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    theta = np.where(free, np.exp(found.x), 0.0)
+    return theta / typical * level

@@ -1,0 +1,154 @@
+"""Calibration from residuals of sequences that the model has not seen: scale, correlation, conformal intervals.
+
+A new sequence is a new draw: the spread of the scale between sequences enters the stated variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from gpvo.learning.basefit import t_negative_log_likelihood
+from gpvo.stats.consistency import nees, nll_per_dim
+from gpvo.types import Array
+
+LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95)
+_NU_RANGE = (2.5, 200.0)
+_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+def robust_second_moment(square: Array) -> float:
+    """Second moment of one axis' normalised residuals (n,), given their squares, by the best Student-t.
+
+    The t's second moment is its squared scale times nu / (nu - 2); a few gross errors hardly move it.
+    """
+    square = np.maximum(square, 1e-300)
+    level = float(np.median(square)) / 0.4549  # Median of a squared standard normal.
+
+    def best_scale(nu: float) -> float:
+        v = max(level, 1e-300)
+        for _ in range(30):  # Fixed point of the likelihood equation (EM for the t).
+            w = (nu + 1.0) / (nu + square / v)
+            v_new = float((w * square).mean())
+            if abs(v_new - v) <= 1e-6 * v:
+                break
+            v = v_new
+        return v
+
+    def score(log_nu: float) -> float:
+        nu = float(np.exp(log_nu))
+        v = best_scale(nu)
+        from math import lgamma
+
+        constant = lgamma((nu + 1) / 2) - lgamma(nu / 2) - 0.5 * np.log(nu)
+        return float(t_negative_log_likelihood(square, np.asarray(v * nu / (nu - 2.0)), nu).mean() - constant)
+
+    found = minimize_scalar(score, bounds=np.log(_NU_RANGE).tolist(), method="bounded", options={"xatol": 1e-2})
+    nu = float(np.exp(found.x))
+    return best_scale(nu) * nu / (nu - 2.0)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """``factor`` (D,) on the variance; ``spread`` (D,): standard deviation of the log scale between groups.
+
+    ``by_group`` (G, D): robust mean square of the normalised residuals of each group.
+    """
+
+    factor: Array
+    spread: Array
+    by_group: Array
+
+
+def fit_scale(z: Array, group: NDArray, blocks: tuple[slice, ...] = (slice(0, 3), slice(3, 6))) -> Scale:
+    """Factor on the variance of normalised residuals z (n, D), with the spread between groups added.
+
+    The log scale of a group is taken as normal; the mean of its log-normal over a new group, whose centre is itself
+    known from G groups, is ``exp(m + s^2 (1 + 1/G) / 2)``. The spread is pooled over the axes of each block.
+    """
+    labels = np.unique(group)
+    by_group = np.array([[robust_second_moment(z[group == g, j] ** 2) for j in range(z.shape[1])] for g in labels])
+    logs = np.log(by_group)
+    G = len(labels)
+    spread = np.zeros(z.shape[1])
+    if G > 1:
+        for block in blocks:
+            if logs[:, block].size:
+                spread[block] = np.sqrt(logs[:, block].var(axis=0, ddof=1).mean())
+    return Scale(np.exp(logs.mean(axis=0) + 0.5 * spread**2 * (1.0 + 1.0 / G)), spread, by_group)
+
+
+def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
+    """One more factor, so that the NEES of all six axes together is right for a new group."""
+    squared = nees(error, covariance) / error.shape[1]
+    logs = np.log([robust_mean(squared[group == g]) for g in np.unique(group)])
+    spread2 = logs.var(ddof=1) if len(logs) > 1 else 0.0
+    return float(np.exp(logs.mean() + 0.5 * spread2 * (1.0 + 1.0 / len(logs))))
+
+
+def robust_mean(values: Array) -> float:
+    """Mean with the upper half per cent drawn in to the quantile there."""
+    return float(np.minimum(values, np.quantile(values, 0.995)).mean())
+
+
+def residual_correlation(z: Array, nu: float = 5.0) -> Array:
+    """(D, D) correlation of normalised residuals, by the scatter of a multivariate t (iterated weights)."""
+    d = z.shape[1]
+    C = np.eye(d)
+    for _ in range(20):
+        w = (nu + d) / (nu + (np.linalg.solve(C, z.T).T * z).sum(1))
+        C_new = (z * w[:, None]).T @ z / len(z) + 1e-9 * np.eye(d)
+        done = np.abs(C_new - C).max() < 1e-6
+        C = C_new
+        if done:
+            break
+    s = np.sqrt(np.diagonal(C))
+    return C / np.outer(s, s)
+
+
+def choose_geometry_weight(error: Array, sigma: Array, correlation: Array, geometry: Array | None, share: Array) -> float:
+    """How much of the geometry's correlation to believe: the weight with the best likelihood."""
+    if geometry is None:
+        return 0.0
+    s = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
+    R = geometry / (s[:, :, None] * s[:, None, :])
+    known = np.isfinite(R).all(axis=(1, 2))
+    if known.mean() < 0.5:
+        return 0.0
+    root = np.sqrt(share)
+    kept = sum(np.outer(r, r) for r in root)
+    outer = sigma[known][:, :, None] * sigma[known][:, None, :] * kept
+
+    def loss(w: float) -> float:
+        mixed = (w * R[known] + (1 - w) * correlation) * (1 - 1e-6) + 1e-6 * np.eye(6)
+        C = outer * mixed
+        # The scale is fitted afterwards: compare shapes at their own best scale.
+        scale = robust_mean(nees(error[known], C) / 6.0)
+        return float(np.mean(nll_per_dim(error[known], C * scale)))
+
+    return min(_WEIGHTS, key=loss)
+
+
+def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list[bool]]:
+    """Half widths, in sigma, that cover a new group's frame at each of ``LEVELS``, and whether that is guaranteed.
+
+    Each group counts alike and a new one counts too, as an unknown: Y. Lee, R. Barber, R. Willett, "Distribution-free
+    inference with hierarchical data" (2023), equation 5. Where G groups are too few for a level (level > G / (G + 1))
+    there is no finite guarantee: then the pooled quantile stands, marked so.
+    """
+    labels, inverse, counts = np.unique(group, return_inverse=True, return_counts=True)
+    order = np.argsort(score, kind="stable")
+    weight = (1.0 / counts[inverse])[order]
+    widths, sure = [], []
+    for level in LEVELS:
+        reached = np.cumsum(weight) / (len(labels) + 1)
+        guaranteed = bool(reached[-1] >= level - 1e-12)
+        if not guaranteed:
+            reached = np.cumsum(weight) / len(labels)
+        at = min(int(np.searchsorted(reached, level - 1e-12)), len(score) - 1)
+        widths.append(float(score[order][at]))
+        sure.append(guaranteed)
+    return widths, sure

@@ -1,0 +1,82 @@
+"""Settings of a training, and the sets of inputs that it chooses among by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gpvo.dataset.build import TrainingSet
+from gpvo.errors import GpvoError
+from gpvo.online.features import GEOMETRIC_METHODS, resolve
+
+FAMILIES: dict[str, tuple[str, ...]] = {
+    "motion": ("velocity", "rotation"),
+    "compact": (
+        "velocity",
+        "rotation",
+        "n_inliers",
+        "inlier_ratio",
+        "ln_disparity_p50",
+        "spread_u",
+        "spread_v",
+        "ln_reproj_rms",
+        "acceleration_mps2",
+        "angular_acceleration_radps2",
+        "sharpness",
+        "noise_level",
+    ),
+    "full": tuple(resolve("full")),
+}
+"""What ``features="auto"`` chooses among, beside no inputs at all: the base variance alone."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """``features``: ``auto`` (chosen by cross-validation over the training sequences), ``thesis``, ``full`` or a list.
+
+    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``: ``rotation``
+    first fits a fixed rotation between each log and its truth. ``inducing``, ``noise_inducing``: points of the GPs.
+    ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
+    """
+
+    features: str = "auto"
+    target: str = "frame"
+    regressor: str = "auto"
+    seed: int = 0
+    align: str = "none"
+    inducing: int = 256
+    noise_inducing: int = 64
+    jobs: int = 1
+    backend: str = "local"
+    scheduler: str | None = None
+
+
+def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tuple[str, ...]:
+    """Those of the wanted columns that every log knows and that are not constant."""
+    known = set.intersection(*(s.supported() for s in sets))
+    varied = set()
+    for i, name in enumerate(sets[0].columns):
+        values = [s.X[:, i] for s in sets]
+        if name in known and max(float(abs(v[v == v] - v[v == v][0]).max()) for v in values if (v == v).any()) > 1e-9:
+            varied.add(name)
+    return tuple(n for n in wanted if n in known and n in varied)
+
+
+def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tuple[str, ...]]:
+    """Named sets of inputs to try, each without what the logs lack. Raises GpvoError where nothing is left."""
+    names = FAMILIES if config.features == "auto" else {config.features: (config.features,)}
+    out: dict[str, tuple[str, ...]] = {}
+    for name, selection in names.items():
+        wanted = resolve(config.features) if name == config.features else resolve(selection)
+        columns = supported_columns(sets, wanted)
+        if columns and columns not in out.values():
+            out[name] = columns
+    if not out:
+        raise GpvoError(f"the logs hold none of the features '{config.features}'", cure="choose others with --features")
+    return out
+
+
+def geometric_method(sets: Sequence[TrainingSet]) -> list[str]:
+    """Geometric covariances that every log knows in 95 of 100 rows."""
+    known = set.intersection(*(s.supported() for s in sets))
+    return [m for m in GEOMETRIC_METHODS if f"ln_var_{m}_x" in known]

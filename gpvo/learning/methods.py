@@ -1,0 +1,115 @@
+"""The other ways of stating the uncertainty, fitted to the same training sequences: what ``learned`` is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.build import TrainingSet
+from gpvo.learning.config import supported_columns
+from gpvo.learning.regressors import get_regressor
+from gpvo.online.features import THESIS
+from gpvo.types import Array
+
+Statement = Callable[[TrainingSet], tuple[Array, Array] | None]
+"""Mean (n, 6) and covariance (n, 6, 6) of a sequence; None where it lacks what the method needs."""
+
+GEOMETRIC = ("triangulation", "pointing_matching")
+METHODS = (
+    "constant",
+    *GEOMETRIC,
+    *(f"{m}_scaled" for m in GEOMETRIC),
+    *(f"{m}_vt" for m in GEOMETRIC),
+    "gp_thesis",
+    "learned",
+)
+_THESIS_ROWS = 1500
+
+
+def constant_covariance(sets: Sequence[TrainingSet]) -> Array:
+    """(6, 6) mean square of the training errors."""
+    Y = np.concatenate([s.Y for s in sets])
+    return Y.T @ Y / len(Y) + 1e-15 * np.eye(6)
+
+
+def best_scale(sets: Sequence[TrainingSet], method: str) -> Array | None:
+    """(6,) factor per axis on the variance with the best likelihood: mean squared normalised error."""
+    ratio = [s.Y**2 / np.diagonal(s.covariances[method], axis1=1, axis2=2) for s in sets if method in s.covariances]
+    if not ratio:
+        return None
+    values = np.concatenate(ratio)
+    values = values[np.isfinite(values).all(axis=1)]
+    return values.mean(axis=0) if len(values) else None
+
+
+def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:
+    """What a model file keeps of the simple methods: ``method.constant`` (6, 6), ``method.<geometric>.scale`` (6,)."""
+    out: dict[str, NDArray[Any]] = {"method.constant": constant_covariance(sets)}
+    for method in GEOMETRIC:
+        scale = best_scale(sets, method)
+        if scale is not None:
+            out[f"method.{method}.scale"] = scale
+    return out
+
+
+def simple_statements(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Statement]:
+    """All rows but ``gp_thesis`` and ``learned``, from a model file's arrays."""
+    out: dict[str, Statement] = {"constant": _constant(arrays["method.constant"])}
+    for method in GEOMETRIC:
+        out[method] = _geometric(method, None)
+        scale = arrays.get(f"method.{method}.scale")
+        out[f"{method}_scaled"] = _nothing if scale is None else _geometric(method, scale)
+        out[f"{method}_vt"] = _translation_only(method)
+    return out
+
+
+def _nothing(_: TrainingSet) -> None:
+    return None
+
+
+def _constant(C: Array) -> Statement:
+    return lambda s: (np.zeros_like(s.Y), np.broadcast_to(C, (len(s), 6, 6)))
+
+
+def _geometric(method: str, scale: Array | None) -> Statement:
+    root = np.ones(6) if scale is None else np.sqrt(scale)
+
+    def state(s: TrainingSet) -> tuple[Array, Array] | None:
+        if method not in s.covariances:
+            return None
+        return np.zeros_like(s.Y), s.covariances[method] * np.outer(root, root)
+
+    return state
+
+
+def _translation_only(method: str) -> Statement:
+    return lambda s: (np.zeros_like(s.Y), s.v_t[method]) if method in s.v_t else None
+
+
+def thesis_gp(sets: Sequence[TrainingSet], *, seed: int = 0) -> Statement:
+    """The thesis' model: GP of each axis of the error on velocity and inlier count (velocity alone where the log has no
+    counts), one isotropic RBF kernel, constant noise."""
+    names = supported_columns(sets, THESIS) or THESIS[:3]
+    X = np.concatenate([s.select(names) for s in sets])
+    Y = np.concatenate([s.Y for s in sets])
+    keep = np.isfinite(X).all(axis=1)
+    X, Y = X[keep], Y[keep]
+    centre, spread = X.mean(axis=0), np.maximum(X.std(axis=0), 1e-9)
+    U, scale = (X - centre) / spread, np.maximum(Y.std(axis=0), 1e-12)
+    fits = []
+    for j in range(Y.shape[1]):
+        regressor = get_regressor("sparse", isotropic=True, inducing=128)
+        fits.append(regressor.fit(U, Y[:, [j]] / scale[j], seed=seed))
+
+    def state(s: TrainingSet) -> tuple[Array, Array]:
+        V = (np.nan_to_num(s.select(names), nan=0.0) - centre) / spread
+        mean, variance = np.zeros_like(s.Y), np.zeros_like(s.Y)
+        for j, fit in enumerate(fits):
+            m, v = fit.predict(V)
+            mean[:, j], variance[:, j] = m[:, 0] * scale[j], (v[:, 0] + fit.hyper.noise_var[0]) * scale[j] ** 2
+        return mean, variance[:, :, None] * np.eye(s.Y.shape[1])
+
+    return state

@@ -1,0 +1,45 @@
+"""The same jobs on this machine's cores or on a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from gpvo.errors import GpvoError, MissingExtraError
+
+
+def map_jobs(
+    function: Callable[..., Any],
+    jobs_arguments: Sequence[tuple[Any, ...]],
+    *,
+    jobs: int = 1,
+    backend: str = "local",
+    scheduler: str | None = None,
+) -> list[Any]:
+    """``[function(*arguments) for arguments in jobs_arguments]``, in order, in parallel.
+
+    ``backend`` "local": ``jobs`` processes (-1: all cores). "dask": the cluster at ``scheduler``, or one started here.
+    """
+    if backend == "dask":
+        return _on_dask(function, jobs_arguments, scheduler)
+    if backend != "local":
+        raise GpvoError(f"there is no backend '{backend}'", cure="local or dask")
+    if jobs == 1 or len(jobs_arguments) < 2:
+        return [function(*arguments) for arguments in jobs_arguments]
+    from joblib import Parallel, delayed
+
+    return list(Parallel(n_jobs=jobs)(delayed(function)(*arguments) for arguments in jobs_arguments))
+
+
+def _on_dask(function: Callable[..., Any], jobs_arguments: Sequence[tuple[Any, ...]], scheduler: str | None) -> list[Any]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise MissingExtraError("distributed", "dask") from None
+    try:
+        client = Client(scheduler, timeout="10s") if scheduler else Client(processes=True, dashboard_address=None)
+    except (OSError, TimeoutError, ValueError) as problem:
+        raise GpvoError(f"no Dask scheduler answers: {problem}", where=scheduler, cure="dask scheduler") from None
+    with client:
+        futures = [client.submit(function, *arguments, pure=False) for arguments in jobs_arguments]
+        return list(client.gather(futures))

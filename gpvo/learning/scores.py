@@ -1,0 +1,71 @@
+"""Scores of one statement of uncertainty on one sequence: the columns of the training table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gpvo.stats.consistency import coverage, crps_gaussian, nees, nll_per_dim
+from gpvo.types import Array
+
+_BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
+
+
+def score(error: Array, mean: Array, covariance: Array) -> dict[str, Any]:
+    """Of errors (n, 6), predicted means (n, 6) and covariances (n, 6, 6) about them.
+
+    A covariance that speaks of the translation alone is (n, 3, 3): fields that need the rotation are then None.
+    Rows whose covariance is not finite are left out; with none left every field is None.
+    """
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    d = covariance.shape[-1]
+    if known.sum() < 2:
+        return empty()
+    error, mean, covariance = error[known], mean[known], covariance[known]
+    residual = error - mean
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    per_block = {n: nees(residual[:, b], covariance[:, b, b]) / (b.stop - b.start) for n, b in _BLOCKS.items() if b.stop <= d}
+    crps = crps_gaussian(residual[:, :d], sigma)
+    level = coverage(residual[:, :d], sigma)
+    return {
+        "nees_dof": {n: _mean(per_block.get(n)) for n in _BLOCKS},
+        "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in _BLOCKS},
+        "coverage": {str(k + 1): float(c) for k, c in enumerate(level)},
+        "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if d == 6 else None,
+        "crps": {"translation_m": float(crps[:, :3].mean()), "rotation_rad": float(crps[:, 3:].mean()) if d == 6 else None},
+        "rmse_raw": _rmse(error, d),
+        "rmse_corrected": _rmse(residual, d),
+    }
+
+
+def empty() -> dict[str, Any]:
+    """The same document where nothing could be computed."""
+    return {
+        "nees_dof": dict.fromkeys(_BLOCKS),
+        "nees_dof_median": dict.fromkeys(_BLOCKS),
+        "coverage": dict.fromkeys("123"),
+        "nll_per_dim": None,
+        "crps": dict.fromkeys(("translation_m", "rotation_rad")),
+        "rmse_raw": dict.fromkeys(("translation_m", "rotation_rad")),
+        "rmse_corrected": dict.fromkeys(("translation_m", "rotation_rad")),
+    }
+
+
+def average(scores: list[dict[str, Any]]) -> dict[str, Any]:
+    """Field by field mean over sequences, of those that have the field; None where none has."""
+    out: dict[str, Any] = {}
+    for key in scores[0]:
+        values = [s[key] for s in scores]
+        out[key] = average(values) if isinstance(values[0], dict) else _mean([v for v in values if v is not None])
+    return out
+
+
+def _mean(values: Any) -> float | None:
+    return None if values is None or len(values) == 0 else float(np.mean(values))
+
+
+def _rmse(error: Array, d: int) -> dict[str, float | None]:
+    """Of the length of the translation and of the rotation."""
+    rotation = float(np.sqrt((error[:, 3:] ** 2).sum(1).mean())) if d == 6 else None
+    return {"translation_m": float(np.sqrt((error[:, :3] ** 2).sum(1).mean())), "rotation_rad": rotation}

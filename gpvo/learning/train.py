@@ -1,0 +1,195 @@
+"""Training: the model from all sequences, and the table of what it would have said on each one left out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo import __version__
+from gpvo.dataset.build import TrainingSet, build_run
+from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
+from gpvo.errors import GpvoError
+from gpvo.io.run_read import Run
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.fit import Learned, fit_model
+from gpvo.learning.methods import METHODS, method_arrays, simple_statements, thesis_gp
+from gpvo.learning.parallel import map_jobs
+from gpvo.learning.scores import average, empty, score
+from gpvo.online.estimate import Estimate
+from gpvo.online.features import units
+from gpvo.online.predictor import Predictor
+from gpvo.stats.bootstrap import Interval, sequence_bootstrap
+from gpvo.stats.consistency import nees
+from gpvo.types import Array
+
+GROSS_SIGMAS = 20.0
+"""An error beyond so many robust standard deviations of its sequence counts as a slip in the report."""
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """``arrays`` and ``header`` are the model file; ``table`` the document of the command (see :func:`train_table`)."""
+
+    arrays: Mapping[str, NDArray[Any]]
+    header: dict[str, Any]
+    table: dict[str, Any] = field(default_factory=dict)
+    sets: Sequence[TrainingSet] = ()
+
+    def predictor(self) -> Predictor:
+        """The predictor of this model, without a detour over a file."""
+        return Predictor(self.arrays, self.header)
+
+
+def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedModel:
+    """Learn from runs with ground truth, and judge by leaving each run out.
+
+    Raises GpvoError where a run has no truth, or runs do not belong together.
+    """
+    config = config or TrainConfig()
+    return train_sets([build_run(r, target=config.target, align=config.align) for r in runs], config)
+
+
+def train_sets(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
+    """The same from training sets. ``judge`` False leaves the table out."""
+    sets = _checked(sets)
+    table = train_table(sets, config) if judge else {}
+    learned = fit_model(sets, config)
+    arrays = {**learned.arrays, **method_arrays(sets)}
+    header = _header(sets, config, learned, table)
+    return TrainedModel(arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets)
+
+
+def _checked(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
+    if not sets:
+        raise GpvoError("there is no run to train on", cure="gpvo train RUN... -o MODEL")
+    names = [s.name for s in sets]
+    if len(set(names)) < len(names):
+        sets = [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]
+    steps = [float(np.median(s.dt_s)) for s in sets]
+    if max(steps) > 1.5 * min(steps):
+        raise GpvoError(
+            f"the runs differ in rate: {1 / max(steps):.3g} Hz ({names[int(np.argmax(steps))]}) and "
+            f"{1 / min(steps):.3g} Hz ({names[int(np.argmin(steps))]})",
+            cure="train one model per rate, or with --target window:1s",
+        )
+    return list(sets)
+
+
+def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
+    """``folds`` (one per sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
+
+    With a single sequence there is nothing to leave out: no folds.
+    """
+    jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(sets) if train_on]
+    folds = map_jobs(_fold, jobs, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler)
+    if not folds:
+        return {"folds": [], "mean": {m: empty() for m in METHODS}, "comparison": None}
+    mean = {m: average([f["methods"][m] for f in folds]) for m in METHODS}
+    return {"folds": folds, "mean": mean, "comparison": _compare(folds, mean)}
+
+
+def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
+    """All methods fitted without one sequence and scored on it."""
+    arrays = method_arrays(train_on)
+    statements = {**simple_statements(arrays), "gp_thesis": thesis_gp(train_on, seed=config.seed)}
+    said = {name: state(held_out) for name, state in statements.items()}
+    learned = fit_model(train_on, config)
+    estimate = estimate_set(learned, held_out)
+    said["learned"] = (estimate.mean, estimate.covariance)
+    methods = {name: empty() if (s := said[name]) is None else score(held_out.Y, *s) for name in METHODS}
+    return {
+        "held_out": held_out.name,
+        "rows": len(held_out),
+        "lost": held_out.counts["lost"],
+        "methods": methods,
+        "in_domain": float((estimate.in_domain > 0.5).mean()),
+        "slips": _slips(held_out, estimate, learned, arrays["method.constant"]),
+        "choices": learned.choices,
+    }
+
+
+def estimate_set(learned: Learned, s: TrainingSet) -> Estimate:
+    """The online predictor's own arithmetic over the rows of a sequence."""
+    model = learned.model
+    return model.estimate(s.select(model.columns), s.covariances.get(model.base.method or ""), s.dt_s)
+
+
+def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array) -> dict[str, Any]:
+    """Gross errors caught and missed, good motions flagged, and NEES/dof with the caught ones counted in."""
+    sigma = 1.4826 * np.median(np.abs(s.Y), axis=0)
+    gross = (np.abs(s.Y) > GROSS_SIGMAS * sigma).any(axis=1)
+    gross_lost = (np.abs(s.lost_xi) > GROSS_SIGMAS * sigma).any(axis=1)
+    usual = learned.arrays["lost_rate_var"] * learned.model.dt_s**2
+    jump2 = s.lost_jump**2
+    lost_var = np.maximum(usual, np.repeat(np.stack([jump2[:, :3].sum(1), jump2[:, 3:].sum(1)], 1), 3, axis=1))
+    learned_all = np.concatenate(
+        [nees(s.Y - estimate.mean, estimate.covariance), (s.lost_xi**2 / np.maximum(lost_var, 1e-12)).sum(1)]
+    )
+    constant_all = nees(np.concatenate([s.Y, s.lost_xi]), constant)
+    return {
+        "caught": int(gross_lost.sum()),
+        "missed": int(gross.sum()),
+        "falsely_flagged": int((~gross_lost).sum()),
+        "nees_dof_with_slips": {"learned": float(learned_all.mean() / 6), "constant": float(constant_all.mean() / 6)},
+    }
+
+
+def _compare(folds: Sequence[dict[str, Any]], mean: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Mean NLL of ``learned`` minus the best other row's, with a paired bootstrap interval over the sequences."""
+    rivals = {m: mean[m]["nll_per_dim"] for m in METHODS if m != "learned" and mean[m]["nll_per_dim"] is not None}
+    scaled = {m: v for m, v in rivals.items() if m.endswith("_scaled")} or rivals
+    best = min(scaled, key=scaled.__getitem__)
+    difference = paired_nll(folds, "learned", best)
+    return {
+        "rival": best,
+        "best_row": min({**rivals, "learned": mean["learned"]["nll_per_dim"]}.items(), key=lambda item: item[1])[0],
+        "nll_per_dim_difference": asdict(difference),
+    }
+
+
+def paired_nll(folds: Sequence[dict[str, Any]], method: str, rival: str) -> Interval:
+    """Bootstrap over sequences of the difference in NLL per dimension, ``method`` minus ``rival``."""
+    pairs = [(f["methods"][method]["nll_per_dim"], f["methods"][rival]["nll_per_dim"]) for f in folds]
+    return sequence_bootstrap(np.array([a - b for a, b in pairs if a is not None and b is not None]))
+
+
+def training_digest(sets: Sequence[TrainingSet]) -> str:
+    """SHA-256 over the rows of all sequences."""
+    return hashlib.sha256("".join(sorted(s.digest() for s in sets)).encode()).hexdigest()
+
+
+def _header(sets: Sequence[TrainingSet], config: TrainConfig, learned: Learned, table: Mapping[str, Any]) -> dict[str, Any]:
+    model = learned.model
+    domain = model.domain
+    low, high = domain.centre + domain.scale * domain.low, domain.centre + domain.scale * domain.high
+    cameras = [s.camera for s in sets if s.camera is not None]
+    step = model.dt_s
+    return {
+        "model_schema": 1,
+        "frame": "cam",
+        "tangent": "translation then rotation, right perturbation, m and rad",
+        "target": config.target,
+        "horizon": "one motion" if config.target == "frame" else config.target,
+        "features": list(model.columns),
+        "units": list(units(model.columns)),
+        "inputs": [model.columns[i] for i in model.inputs] if learned.choices["trust"] else [],
+        "base_method": model.base.method,
+        "training_domain": {n: [lo, hi] for n, lo, hi in zip(model.columns, low.tolist(), high.tolist())},
+        "dt_s": step,
+        "rate_hz": 1.0 / step,
+        "camera": asdict(cameras[0]) if cameras else None,
+        "choices": learned.choices,
+        "calibration": learned.calibration,
+        "by_few_sequences": len(sets) < MIN_SEQUENCES,
+        "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
+        "scores": {f["held_out"]: f["methods"] for f in table.get("folds", [])},
+        "comparison": table.get("comparison"),
+        "versions": {"gpvo": __version__, "numpy": np.__version__},
+        "training_digest": training_digest(sets),
+        "config": {k: v for k, v in asdict(config).items() if k not in ("jobs", "backend", "scheduler")},
+    }

@@ -1,0 +1,159 @@
+"""From features to the error's distribution: the arithmetic of the predictor, for one row and for many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import ModelError
+from gpvo.online.base import BaseVariance, base_columns, positions
+from gpvo.online.basis import SharedBasis
+from gpvo.online.guard import Domain, growth
+from gpvo.types import Array
+
+PARTS = ("jitter", "white", "bias")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The error's distribution for n rows; see ``gpvo.types.Prediction`` for the words.
+
+    ``mean`` (n, 6); ``covariance`` (n, 6, 6); ``parts``: name to (n, 6, 6); ``epistemic`` (n, 6); ``in_domain``,
+    ``confidence``, ``distance`` (n,). For a single row all without the first axis.
+    """
+
+    mean: Array
+    covariance: Array
+    parts: dict[str, Array]
+    epistemic: Array
+    in_domain: Array
+    confidence: Array
+    distance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """(n, 6) standard deviations."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def row(self, k: int) -> Estimate:
+        """One of the rows."""
+        parts = {name: C[k] for name, C in self.parts.items()}
+        return Estimate(
+            self.mean[k],
+            self.covariance[k],
+            parts,
+            self.epistemic[k],
+            self.in_domain[k],
+            self.confidence[k],
+            self.distance[k],
+        )
+
+
+@dataclass(frozen=True)
+class ErrorModelArrays:
+    """Everything the arithmetic needs; axes in the order of the tangent vector.
+
+    ``columns``: all features, in order; ``inputs``: positions of those the GP sees. ``factor`` (6,): calibration of the
+    variance. ``high`` (6,): log ratio to the base that few training rows exceeded. ``correlation`` (6, 6) of the
+    residuals, mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides into
+    jitter, white and bias; ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
+    """
+
+    columns: tuple[str, ...]
+    inputs: NDArray[np.int64]
+    basis: SharedBasis
+    domain: Domain
+    base: BaseVariance
+    factor: Array
+    high: Array
+    correlation: Array
+    geometry_weight: Array
+    share: Array
+    bias_tau_s: Array
+    typical_ln_det: Array
+    dt_s: float
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file."""
+        own = {name: np.asarray(getattr(self, name)) for name in _OWN}
+        return {**own, "theta": self.base.theta, **self.basis.to_arrays("basis."), **self.domain.to_arrays("domain.")}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], columns: tuple[str, ...], method: str | None, dt_s: float) -> ErrorModelArrays:
+        """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
+        try:
+            own = {name: arrays[name] for name in _OWN}
+            base = BaseVariance(arrays["theta"], method)
+        except KeyError as missing:
+            raise ModelError(f"the model file lacks the array {missing}") from None
+        shapes = {"factor": (6,), "high": (6,), "correlation": (6, 6), "share": (3, 6), "bias_tau_s": (6,), "geometry_weight": (1,)}
+        wrong = [n for n, s in shapes.items() if own[n].shape != s]
+        domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
+        if wrong or base.theta.shape != (6, 4) or len(domain.centre) != len(columns) or basis.n_inputs != len(own["inputs"]):
+            raise ModelError(f"the model file's arrays do not fit its features ({', '.join(wrong) or 'sizes differ'})")
+        return cls(columns=columns, basis=basis, domain=domain, base=base, dt_s=dt_s, **own)
+
+    def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Estimate:
+        """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown."""
+        place = self.domain.locate(X)
+        aleatoric, total, mean, mean_var = self.variances(X, place.inside, place, dt_s)
+        variance = (total + mean_var) * self.factor
+        correlation = self.correlations(len(X), geometry)
+        sigma = np.sqrt(variance)
+        whole = sigma[:, :, None] * correlation * sigma[:, None, :]
+        root = np.sqrt(self.share)
+        parts = {name: whole * np.outer(root[i], root[i]) for i, name in enumerate(PARTS)}
+        covariance = parts["jitter"] + parts["white"] + parts["bias"]
+        _, ln_det = np.linalg.slogdet(covariance)
+        # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
+        precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
+        return Estimate(
+            mean,
+            covariance,
+            parts,
+            variance - aleatoric * self.factor,
+            place.in_domain,
+            place.in_domain * precision,
+            place.distance,
+        )
+
+    def variances(self, X: Array, inside: Array, place: Any, dt_s: Array | None) -> tuple[Array, Array, Array, Array]:
+        """Aleatoric, aleatoric with ignorance, mean, and the mean's variance: each (n, 6), before calibration."""
+        said = self.basis.predict(inside[:, self.inputs])
+        base = self.base(self._base_columns(X), np.full(len(X), self.dt_s) if dt_s is None else dt_s)
+        outside = (1.0 - place.in_domain)[:, None]
+        known = said.log_noise_var - 0.5 * said.log_noise_spread
+        # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
+        cautious = said.log_noise_var + outside * np.maximum(self.high - said.log_noise_var, 0.0)
+        grown = growth(place.distance)[:, None]
+        mean = said.mean * place.in_domain[:, None]
+        mean_var = (said.epistemic_var + (said.mean - mean) ** 2) * grown
+        return base * np.exp(known), base * np.exp(cautious) * grown, mean, mean_var
+
+    def _base_columns(self, X: Array) -> Array:
+        """The base's columns, missing ones typical, geometric variances never below the training's smallest."""
+        at = positions(self.columns, base_columns(self.base.method))
+        d = self.domain
+        C = np.where(np.isfinite(X[:, at]), X[:, at], d.centre[at])
+        C[:, 6:] = np.maximum(C[:, 6:], (d.centre + d.scale * d.low)[at][6:])
+        return C
+
+    def correlations(self, n: int, geometry: Array | None) -> Array:
+        """(n, 6, 6) positive definite correlation matrices."""
+        out = np.broadcast_to(self.correlation, (n, 6, 6))
+        w = float(self.geometry_weight[0])
+        if geometry is not None and w > 0:
+            sigma = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
+            R = geometry / (sigma[:, :, None] * sigma[:, None, :])
+            known = np.isfinite(R).all(axis=(1, 2))
+            out = out.copy()
+            out[known] = w * R[known] + (1.0 - w) * self.correlation
+        # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
+        return out * (1.0 - 1e-6) + 1e-6 * np.eye(6)
+
+
+_OWN = ("inputs", "factor", "high", "correlation", "geometry_weight", "share", "bias_tau_s", "typical_ln_det")

@@ -1,0 +1,99 @@
+"""Does the model know this place? The training domain, and what to believe outside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import ModelError
+from gpvo.online.slip import SlipDetector, flag_slips
+from gpvo.types import Array
+
+__all__ = ["Domain", "SlipDetector", "Whereabouts", "flag_slips"]
+
+DEGRADED_BELOW = 0.5
+"""``in_domain`` under which a prediction is called ``degraded``."""
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Of n rows: ``inside`` (n, d) standardised features drawn into the domain; ``distance`` (n,) to it, in training
+    standard deviations; ``in_domain`` (n,) in [0, 1], 1 inside."""
+
+    inside: Array
+    distance: Array
+    in_domain: Array
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Where the training data lay, per feature and jointly.
+
+    ``centre``, ``scale`` (d,): robust, in the features' units. ``low``, ``high`` (d,): range of the standardised
+    features. ``whitening`` (d, d): ``|u W|`` is the Mahalanobis distance, with ``radius`` (1,) its training maximum.
+    ``may_miss`` (d,) bool: features that were absent from some training rows.
+    """
+
+    centre: Array
+    scale: Array
+    low: Array
+    high: Array
+    whitening: Array
+    radius: Array
+    may_miss: NDArray[np.bool_]
+
+    @classmethod
+    def learn(cls, X: Array, *, margin: float = 0.02) -> Domain:
+        """From training rows (n, d), NaN where a value is missing.
+
+        The range leaves out one row in a thousand at either end and adds ``margin`` of its width.
+        """
+        centre = np.nanmedian(X, axis=0)
+        q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
+        spread = np.nanstd(X, axis=0)
+        # A feature that mostly rests at one value has no quartiles to speak of.
+        scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
+        scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, 1.0)
+        U = (X - centre) / scale
+        low, high = np.nanquantile(U, [0.001, 0.999], axis=0)
+        pad = margin * (high - low)
+        U = np.clip(np.nan_to_num(U), low - pad, high + pad)
+        C = np.cov(U, rowvar=False).reshape(X.shape[1], -1)
+        # Shrunk towards its diagonal, so that collinear features do not make a razor-thin domain.
+        C = 0.9 * C + 0.1 * np.diag(np.diagonal(C)) + 1e-6 * np.eye(len(C))
+        whitening = np.linalg.inv(np.linalg.cholesky(C)).T
+        radius = np.quantile(np.linalg.norm((U - U.mean(0)) @ whitening, axis=1), 0.999, keepdims=True)
+        shift = np.linalg.norm(U.mean(0) @ whitening)
+        return cls(centre, scale, low - pad, high + pad, whitening, radius + shift, np.isnan(X).any(axis=0))
+
+    def locate(self, X: Array) -> Whereabouts:
+        """Rows (n, d) in the features' units. A missing value is taken as typical, and far if training never missed it."""
+        U = (X - self.centre) / self.scale
+        missing = ~np.isfinite(U)
+        U = np.where(missing, 0.0, U)
+        inside = np.clip(U, self.low, self.high)
+        beyond = ((U - inside) ** 2).sum(1) + (missing & ~self.may_miss).sum(1)
+        joint = np.maximum(np.linalg.norm(inside @ self.whitening, axis=1) - self.radius[0], 0.0)
+        distance = np.sqrt(beyond + joint**2)
+        return Whereabouts(inside, distance, np.exp(-0.5 * distance**2))
+
+    def to_arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
+        return {prefix + f.name: getattr(self, f.name) for f in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str) -> Domain:
+        """The domain from named arrays. Raises ModelError where one is missing."""
+        try:
+            return cls(**{f.name: arrays[prefix + f.name] for f in fields(cls)})
+        except KeyError as missing:
+            raise ModelError(f"the model file lacks the array {missing}") from None
+
+
+def growth(distance: Array) -> Array:
+    """Factor on the variance: the standard deviation grows linearly with the distance from the domain."""
+    return (1.0 + distance) ** 2

@@ -1,0 +1,194 @@
+"""The predictor that flies: features in, the error's distribution out. NumPy and safetensors alone."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpvo.errors import ModelError
+from gpvo.geometry import se3
+from gpvo.online import modelfile
+from gpvo.online.adapt import AdaptiveScale
+from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate
+from gpvo.online.features import resolve
+from gpvo.online.guard import DEGRADED_BELOW
+from gpvo.online.observer import Observer
+from gpvo.types import Array, Prediction, Status, StereoCamera, VoRecord
+
+_NO_MOTION_VAR = 1e-12
+_REMEMBERED = 512
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What one input did: the factor on sigma against its typical value, and how far outside training it lay."""
+
+    feature: str
+    value: float
+    unit: str
+    on_translation: float
+    on_rotation: float
+    outside: float
+
+    def __str__(self) -> str:
+        far = f", {self.outside:.1f} sigma outside the training data" if self.outside > 0 else ""
+        value = f"{self.feature} = {self.value:.4g} {self.unit}"
+        return f"{value}: sigma x{self.on_translation:.2f} translation, x{self.on_rotation:.2f} rotation{far}"
+
+
+class Predictor:
+    """Predicts the error of VO's motions. One instance per run: it remembers what its features need.
+
+    ``header``: the model file's. ``digest``: of the model file. ``features``: columns, in order.
+    """
+
+    def __init__(self, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any], digest: str = "") -> None:
+        self.header, self.digest, self.arrays = dict(header), digest, dict(arrays)
+        try:
+            self.features = tuple(header["features"])
+            method, target = header["base_method"], header["target"]
+            dt_s, camera = float(header["dt_s"]), header["camera"]
+        except (KeyError, TypeError, ValueError) as problem:
+            raise ModelError(f"the model's header is incomplete: {problem}") from None
+        if target == "position":
+            raise ModelError(
+                "this model predicts the residual of a position, not the error of a motion",
+                cure="use PositionPredictor, or train with --target frame",
+            )
+        resolve(self.features)
+        self.model = ErrorModelArrays.from_arrays(arrays, self.features, method, dt_s)
+        self.camera = None if camera is None else StereoCamera(**camera)
+        self.target = str(target)
+        self.reset()
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Predictor:
+        """From a model file. Raises ModelError, one line, where the file cannot be used."""
+        arrays, header = modelfile.load(path)
+        try:
+            return cls(arrays, header, hashlib.sha256(Path(path).read_bytes()).hexdigest())
+        except ModelError as problem:
+            raise ModelError(problem.what, where=Path(path), cure="train the model again") from None
+
+    def reset(self, camera: StereoCamera | None = None) -> None:
+        """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with."""
+        self._observer = Observer(self.features, self.target, camera or self.camera)
+        self._adaptive = AdaptiveScale()
+        self._last: tuple[VoRecord, Array] | None = None
+        self._stated: dict[int, tuple[Array, Array]] = {}
+
+    def predict(
+        self, features: ArrayLike, geometry: ArrayLike | None = None, dt_s: ArrayLike | None = None
+    ) -> Estimate:
+        """The error's distribution for one row of features (d,) or many (n, d), in the units of the header.
+
+        ``geometry`` (6, 6) or (n, 6, 6): covariance by the model's geometric method, for the correlations; without it
+        the training's typical ones. ``dt_s``: duration of the motion(s), by default the training's.
+        """
+        X = np.asarray(features, dtype=np.float64)
+        rows = np.atleast_2d(X)
+        if rows.ndim != 2 or rows.shape[1] != len(self.features):
+            raise ModelError(f"features have shape {X.shape}, the model takes {len(self.features)}: {', '.join(self.features)}")
+        G = None if geometry is None else np.asarray(geometry, dtype=np.float64).reshape(-1, 6, 6)
+        dt = None if dt_s is None else np.broadcast_to(np.asarray(dt_s, dtype=np.float64), (len(rows),))
+        out = self.model.estimate(rows, G, dt)
+        return out.row(0) if X.ndim == 1 else out
+
+    def step(self, record: VoRecord) -> Prediction | None:
+        """Prediction for the next record of a run, in time order; None while a window is not full yet."""
+        seen = self._observer.step(record)
+        if seen is None:
+            return None
+        record, x = self._last = seen
+        if record.status is Status.START:
+            return self._at_rest(record)
+        method = self.model.base.method
+        estimate = self.predict(x, record.covariances.get(method or ""), record.dt_s)
+        return self._publish(record, estimate)
+
+    def observe(self, xi_true: ArrayLike, t_ns: int | None = None) -> None:
+        """Late truth: the error (6,) that the motion ending at ``t_ns`` (default: the last) turned out to have.
+
+        Adapts the scale of later predictions; axes that are NaN are left alone.
+        """
+        if not self._stated:
+            return
+        stated = self._stated.get(next(reversed(self._stated)) if t_ns is None else t_ns)
+        if stated is not None:
+            self._adaptive.observe(np.asarray(xi_true, dtype=np.float64) - stated[0], stated[1])
+
+    def explain(self, record: VoRecord | None = None) -> list[Influence]:
+        """Which inputs drove the prediction of ``record`` (default: the last step), strongest first."""
+        if record is None or (self._last is not None and record.t_ns == self._last[0].t_ns):
+            if self._last is None:
+                raise ModelError("there is no prediction to explain yet", cure="call step first")
+            x, dt_s = self._last[1], self._last[0].dt_s
+        else:
+            seen = copy.deepcopy(self._observer).step(record)
+            if seen is None:
+                raise ModelError("the window of this record is not full", cure="call step with the records before it")
+            x, dt_s = seen[1], seen[0].dt_s
+        typical = np.tile(x, (len(x) + 1, 1))
+        typical[np.arange(1, len(x) + 1), np.arange(len(x))] = self.model.domain.centre
+        ln_sigma = np.log(self.predict(typical, dt_s=dt_s or self.model.dt_s).sigma)
+        gain = ln_sigma[0] - ln_sigma[1:]
+        u = (x - self.model.domain.centre) / self.model.domain.scale
+        outside = np.maximum(np.maximum(self.model.domain.low - u, u - self.model.domain.high), 0.0)
+        unit = self.header.get("units") or [""] * len(x)
+        factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1))
+        order = np.argsort(-np.abs(gain).sum(1), kind="stable")
+        return [Influence(self.features[i], float(x[i]), unit[i], *factors[i].tolist(), float(np.nan_to_num(outside[i]))) for i in order]
+
+    def _publish(self, record: VoRecord, estimate: Estimate) -> Prediction:
+        parts, status, confidence = dict(estimate.parts), record.status, float(estimate.confidence)
+        scale = self._adaptive.scale
+        parts = {name: C * np.outer(scale, scale) for name, C in parts.items()}
+        if estimate.in_domain < DEGRADED_BELOW and status is Status.OK:
+            status = Status.DEGRADED
+        if status is Status.DEGRADED:
+            confidence *= 0.5
+        if status is Status.LOST:
+            # No motion was measured: what stands in for it may be as wrong as the vehicle is fast, or the jump is long.
+            parts["white"] = parts["white"] + np.diag(self._lost_variance(record))
+            confidence = 0.0
+        covariance = parts["jitter"] + parts["white"] + parts["bias"]
+        sigma = np.sqrt(np.diagonal(covariance))
+        self._stated[record.t_ns] = (estimate.mean, sigma)
+        if len(self._stated) > _REMEMBERED:
+            del self._stated[next(iter(self._stated))]
+        return Prediction(
+            record.t_ns,
+            record.dt_s,
+            estimate.mean,
+            covariance,
+            parts,
+            self.model.bias_tau_s,
+            estimate.epistemic * scale**2,
+            confidence,
+            float(estimate.in_domain),
+            status,
+        )
+
+    def _lost_variance(self, record: VoRecord) -> Array:
+        """(6,) variance of a lost motion: the training's usual motion, and the distance from what was expected."""
+        usual = self.arrays["lost_rate_var"] * record.dt_s**2
+        expected = self._observer.slip.expected
+        if expected is None:
+            return usual
+        jump = se3.log(record.T_prev_cur) - expected * record.dt_s
+        return np.maximum(usual, np.repeat([(jump[:3] ** 2).sum(), (jump[3:] ** 2).sum()], 3))
+
+    def _at_rest(self, record: VoRecord) -> Prediction:
+        """The first frame has no motion and hence no error to speak of."""
+        white = np.eye(6) * _NO_MOTION_VAR
+        parts = {name: white if name == "white" else np.zeros((6, 6)) for name in PARTS}
+        zero = np.zeros(6)
+        return Prediction(record.t_ns, 0.0, zero, white, parts, self.model.bias_tau_s, zero, 1.0, 1.0, record.status)

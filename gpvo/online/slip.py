@@ -1,0 +1,135 @@
+"""Is this motion possible at all? Slips are caught from what is known at the time, before any truth is seen.
+
+The implied acceleration is compared with the motion so far: its far quantile is extrapolated from the history's upper tail
+(B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after I. Weissman,
+1978). Nothing has a unit that would favour a car or a drone, except that an acceleration of one g is always believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from gpvo.online.features import twist
+from gpvo.types import Array, Status, VoLog, VoRecord
+
+GRAVITY_MPS2 = 9.81
+FALSE_FLAG_RATE = 1e-6
+"""Wanted share of good motions that are called impossible."""
+
+_ARM_M = 0.5  # One g at this arm bounds the angular accelerations that are always believed.
+_GYRO_TRUST_RADPS = 0.05  # Disagreement with a gyro of ordinary bias and scale error that is always believed.
+_HISTORY = 1000
+_ENOUGH = 50  # Fewer motions do not show a tail: then tail index _PRIOR_TAIL and the median stand in.
+_PRIOR_TAIL = 3.0
+_TAIL_SHARE = 0.1
+_PATIENCE_S = 1.0
+REASON = "implausible motion"
+
+
+def tail_quantile(history: Array, rate: float = FALSE_FLAG_RATE) -> float:
+    """Value that a new draw exceeds with probability ``rate``, extrapolated from positive draws (n,). inf for n < 5."""
+    x = np.sort(np.asarray(history, dtype=np.float64))
+    n = len(x)
+    if n < 5:
+        return math.inf
+    if n < _ENOUGH:
+        return float(np.median(x) * (0.5 / rate) ** (1 / _PRIOR_TAIL))
+    k = int(n * _TAIL_SHARE)
+    edge = max(x[-k - 1], 1e-12)
+    tail_index = 1.0 / max(float(np.log(np.maximum(x[-k:], edge) / edge).mean()), 1e-3)
+    return float(edge * (_TAIL_SHARE / rate) ** (1 / min(max(tail_index, 2.0), 8.0)))
+
+
+class SlipDetector:
+    """Calls motions ``lost`` that the vehicle cannot have made.
+
+    A flagged velocity that the next motion confirms is believed: a true manoeuvre costs one frame.
+    """
+
+    def __init__(self) -> None:
+        self._linear: deque[float] = deque(maxlen=_HISTORY)
+        self._angular: deque[float] = deque(maxlen=_HISTORY)
+        self._gyro: deque[float] = deque(maxlen=_HISTORY)
+        self._anchor: tuple[float, Array] | None = None
+        self._suspect: tuple[float, Array] | None = None
+        self.expected: Array | None = None
+        """(6,) velocity expected of the latest motion, the last one believed; None before there is one."""
+
+    def step(self, record: VoRecord) -> VoRecord:
+        """The record, ``lost`` if its motion is impossible. Call once per record, in time order."""
+        record = _unflagged(record)
+        if not record.usable or record.dt_s <= 0:
+            return record
+        now = twist(record)
+        middle_s = (record.t_ns + record.t_prev_ns) * 0.5e-9
+        self.expected = None if self._anchor is None else self._anchor[1]
+        if self._anchor is None or middle_s - self._anchor[0] > _PATIENCE_S:
+            self._believe(middle_s, now)
+            return record
+        change = _rates(middle_s, now, self._anchor)
+        disagreement = self._gyro_disagreement(record, now)
+        problem = self._problem(record, change, disagreement)
+        if problem and self._suspect is not None and self._confirmed(record, middle_s, now):
+            problem = ""
+        if problem:
+            self._suspect = (middle_s, now)
+            return record.with_status(Status.LOST, f"{REASON}: {problem}")
+        self._linear.append(change[0])
+        self._angular.append(change[1])
+        if disagreement is not None:
+            self._gyro.append(disagreement)
+        self._believe(middle_s, now)
+        return record
+
+    def _believe(self, middle_s: float, now: Array) -> None:
+        self._anchor, self._suspect = (middle_s, now), None
+
+    def _confirmed(self, record: VoRecord, middle_s: float, now: Array) -> bool:
+        """Whether the motion before, flagged too, had this very velocity (a gyro's word is not outvoted)."""
+        assert self._suspect is not None
+        change = _rates(middle_s, now, self._suspect)
+        return not self._problem(record, change, self._gyro_disagreement(record, now))
+
+    def _problem(self, record: VoRecord, change: tuple[float, float], disagreement: float | None) -> str:
+        acc = record.imu_acc_mean_mps2
+        # Whatever the attitude, a camera accelerates by no more than specific force plus gravity.
+        believed = GRAVITY_MPS2 + (0.0 if acc is None else float(np.linalg.norm(acc)))
+        if change[0] > max(believed, tail_quantile(np.array(self._linear))):
+            return f"acceleration of {change[0]:.3g} m/s^2"
+        if disagreement is not None:
+            if disagreement > max(_GYRO_TRUST_RADPS, tail_quantile(np.array(self._gyro))):
+                return f"{disagreement:.3g} rad/s from the gyro"
+        elif change[1] > max(GRAVITY_MPS2 / _ARM_M, tail_quantile(np.array(self._angular))):
+            return f"angular acceleration of {change[1]:.3g} rad/s^2"
+        return ""
+
+    @staticmethod
+    def _gyro_disagreement(record: VoRecord, now: Array) -> float | None:
+        if record.imu_gyro_mean_radps is None or not np.isfinite(record.imu_gyro_mean_radps).all():
+            return None
+        return abs(float(np.linalg.norm(now[3:]) - np.linalg.norm(record.imu_gyro_mean_radps)))
+
+
+def _unflagged(record: VoRecord) -> VoRecord:
+    """A record that an earlier detector flagged, for judging it afresh: flagging twice must change nothing."""
+    before, found, _ = record.reason.partition(REASON)
+    if record.status is not Status.LOST or not found:
+        return record
+    return replace(record, status=Status.DEGRADED if before else Status.OK, reason=before.removesuffix("; "))
+
+
+def _rates(middle_s: float, now: Array, before: tuple[float, Array]) -> tuple[float, float]:
+    """Linear and angular acceleration implied by two velocities and the times they belong to."""
+    step_s = max(middle_s - before[0], 1e-6)
+    delta = (now - before[1]) / step_s
+    return float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
+
+
+def flag_slips(log: VoLog) -> VoLog:
+    """The log with impossible motions called ``lost``; causal, and the same when applied twice."""
+    detector = SlipDetector()
+    return VoLog([detector.step(r) for r in log.records], log.camera)
