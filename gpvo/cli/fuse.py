@@ -23,6 +23,7 @@ def fuse(
     gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Filter VO with an IMU under constant, geometric and learned covariance, side by side.
@@ -30,7 +31,8 @@ def fuse(
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
     from gpvo.cli.output import print_json
-    from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs
+    from gpvo.evaluation.fusion import FusionSettings, fuse_runs
+    from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
     from gpvo.filters.policies import LEARNED, POLICIES
     from gpvo.filters.run import FuseOptions
@@ -51,7 +53,12 @@ def fuse(
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),
         ),
     )
-    report = fuse_runs(runs, settings, tell=_teller())
+    report = fuse_runs(
+        runs,
+        settings,
+        tell=_teller(),
+        on_run=lambda fused: write_log(log / f"{fused.name}_{fused.policy}.csv", fused) if log else None,
+    )
     for warning in report.warnings:
         print(f"gpvo: {warning}", file=sys.stderr)
     if plot is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,9 @@ from numpy.typing import NDArray
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError, ModelError
-from gpvo.filters.gate import chi2_quantile
-from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
-    LEARNED,
     POLICIES,
     constant_from_errors,
 )
@@ -157,9 +153,13 @@ class FusionReport:
 
 
 def fuse_runs(
-    paths: Sequence[Path], settings: FusionSettings, *, tell: Callable[[str], None] | None = None
+    paths: Sequence[Path],
+    settings: FusionSettings,
+    *,
+    tell: Callable[[str], None] | None = None,
+    on_run: Callable[[FusedRun], None] | None = None,
 ) -> FusionReport:
-    """Fuse run folders under every policy that has what it needs."""
+    """Fuse run folders under every policy that has what it needs; ``on_run`` sees each filtered run whole."""
     tell = tell or (lambda _: None)
     unknown = [p for p in settings.policies if p not in POLICIES]
     if unknown:
@@ -175,13 +175,19 @@ def fuse_runs(
     constants = _constants(settings, predictor, flights, options, tell)
     policies = make_policies(constants, names=settings.policies, learned=any(f.predictions for f in flights))
     traces: list[Trace] = []
+
+    def keep(flight: Flight, fused: FusedRun) -> None:
+        traces.append(_trace(flight, fused))
+        if on_run:
+            on_run(fused)
+
     result = study(
         flights,
         policies,
         options,
         constants=constants,
         progress=tell,
-        on_run=lambda flight, fused: traces.append(_trace(flight, fused)),
+        on_run=keep,
     )
     return FusionReport(result, tuple(traces), tuple(warnings))
 
@@ -225,77 +231,3 @@ def _trace(flight: Flight, fused: FusedRun) -> Trace:
         sigma_m=np.sqrt(np.trace(fused.covariance[:, :3, :3], axis1=1, axis2=2)),
         nis_dof=fused.nis / 6.0,
     )
-
-
-def document(report: FusionReport) -> dict[str, Any]:
-    """The machine-readable result of ``gpvo fuse``; a policy that could not run is null."""
-    result = report.study
-    names = list(result.scores)
-    runs = [
-        {"run": run, "policies": {name: _score(result.scores[name][i]) for name in names}}
-        for i, run in enumerate(result.runs)
-    ]
-    others = [n for n in names if n != LEARNED] if LEARNED in names else []
-    return {
-        "schema": 1,
-        "runs": runs,
-        "mean": {name: _mean(result, name) for name in names},
-        "comparisons": [_comparison(result, LEARNED, other) for other in others],
-        "constants": _constants_document(result.constants),
-        "warnings": list(report.warnings),
-    }
-
-
-def _score(scores: Scores | None) -> dict[str, Any] | None:
-    if scores is None:
-        return None
-    return {
-        "ate_rmse_m": scores.ate_rmse_m,
-        "final_error_m": scores.final_error_m,
-        "drift_percent": scores.drift_percent,
-        "nees_dof": scores.nees_dof,
-        "nis_dof": scores.nis_dof,
-        "nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high],
-        "rejected": scores.rejected,
-        "diverged": scores.diverged,
-    }
-
-
-def _mean(result: Study, name: str) -> dict[str, Any] | None:
-    if all(s is None for s in result.scores[name]):
-        return None
-    keys = ("ate_rmse_m", "final_error_m", "drift_percent", "nis_dof", "rejected")
-    out: dict[str, Any] = {key: result.mean(name, key) for key in keys}
-    nees = {part: result.mean(name, f"nees_{part}") for part in ("position", "attitude")}
-    return {**out, "nees_dof": nees, "diverged": int(np.nansum(result.column(name, "diverged")))}
-
-
-def _comparison(result: Study, policy: str, against: str) -> dict[str, Any] | None:
-    compared = result.compare(policy, against)
-    if not np.isfinite(compared.gain_percent):
-        return None
-    d = compared.difference_m
-    return {
-        "policy": policy,
-        "against": against,
-        "gain_percent": compared.gain_percent,
-        "ate_difference_m": d.mean,
-        "interval_m": [d.low, d.high],
-    }
-
-
-def _constants_document(constants: Constants | None) -> dict[str, Any] | None:
-    if constants is None:
-        return None
-    return {
-        "mean_squares": constants.mean_squares,
-        "dt_s": constants.dt_s,
-        "best": constants.best,
-        "hindsight": constants.hindsight,
-    }
-
-
-def nis_band(runs: int, level: float = 0.95, dof: int = 6) -> tuple[float, float]:
-    """Where the mean NIS per degree of freedom over so many runs should lie at each time step."""
-    total = dof * runs
-    return chi2_quantile((1 - level) / 2, total) / total, chi2_quantile((1 + level) / 2, total) / total

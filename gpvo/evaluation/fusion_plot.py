@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gpvo.evaluation.fusion import Trace, nis_band
+from gpvo.evaluation.fusion import Trace
+from gpvo.evaluation.fusion_report import nis_band, nis_over_runs
 
 
 def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
@@ -59,11 +59,8 @@ def _innovations(axes: Axes, traces: Sequence[Trace]) -> None:
     runs = len({t.run for t in traces})
     for policy in dict.fromkeys(t.policy for t in traces):
         rows = [t for t in traces if t.policy == policy]
-        length = min(len(t.t_s) for t in rows)
-        nis = np.array([t.nis_dof[:length] for t in rows])
-        known = np.isfinite(nis).sum(axis=0)
-        mean = np.where(known > 0, np.nansum(nis, axis=0) / np.maximum(known, 1), np.nan)
-        axes.plot(rows[0].t_s[:length], mean, lw=0.8, label=policy)
+        mean, _ = nis_over_runs(rows)
+        axes.plot(rows[0].t_s[: len(mean)], mean, lw=0.8, label=policy)
     if runs:
         axes.axhspan(*nis_band(runs), color="grey", alpha=0.3)
     axes.set_yscale("log")

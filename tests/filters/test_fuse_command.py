@@ -52,7 +52,11 @@ def _run(*arguments: object) -> str:
 
 def test_json_holds_every_policy(runs: list[Path], tmp_path: Path) -> None:
     picture = tmp_path / "fuse.png"
-    out = json.loads(_run("fuse", *runs[:2], "--train", runs[2], "--plot", picture, "--json"))
+    out = json.loads(_run("fuse", *runs[:2], "--train", runs[2], "--plot", picture, "--log", tmp_path, "--json"))
+    lines = (tmp_path / "flight0_learned.csv").read_text().splitlines()
+    assert len(lines) == 162
+    assert lines[0].startswith("t_ns,outcome,nis,innovation_x_m")
+    assert out["mean"]["learned"]["nis_in_band_percent"] > 80
     assert out["schema"] == 1
     assert picture.stat().st_size > 10_000
     assert [r["run"] for r in out["runs"]] == ["flight0", "flight1"]
