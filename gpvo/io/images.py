@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import struct
 import threading
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _MAX_IMAGE_BYTES = 500_000_000
+_MAX_SIDE_PX = 16384
 
 Image8 = NDArray[np.uint8]
 T = TypeVar("T")
@@ -59,9 +61,11 @@ def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
 
 def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
     """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8, None where they are no image."""
+    if _claims_too_much(bytes(raw[:24])):
+        return None
     # A damaged image is counted and reported by us; OpenCV need not warn as well.
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         image = cv2.imdecode(raw, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
     except cv2.error:
@@ -71,6 +75,13 @@ def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
     return to_grey8(image, bits=bits)
+
+
+def _claims_too_much(head: bytes) -> bool:
+    """Whether a PNG's header states a size that would allocate more than any camera gives."""
+    if len(head) < 24 or not head.startswith(b"\x89PNG\r\n\x1a\n"):
+        return False
+    return max(struct.unpack(">II", head[16:24])) > _MAX_SIDE_PX
 
 
 def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:

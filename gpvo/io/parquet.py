@@ -68,13 +68,13 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
             if sum(shape.row_group(i).total_byte_size for i in range(shape.num_row_groups)) > MAX_BYTES:
                 raise SourceError("unpacks to more than 8 GB", where=path)
             table = file.read()
+            metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
+            return {name: _to_numpy(table[name]) for name in table.column_names}, metadata
     except FileNotFoundError:
         raise SourceError("is missing", where=path) from None
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SourceError(f"is damaged: {reason}", where=path, cure="run the sequence again") from None
-    metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
-    return {name: _to_numpy(table[name]) for name in table.column_names}, metadata
 
 
 def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:

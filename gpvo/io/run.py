@@ -8,6 +8,7 @@ its chunks.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 import shutil
@@ -146,6 +147,11 @@ class RunWriter:
         shutil.rmtree(self._chunks, ignore_errors=True)
         self._write_meta(complete=complete)
 
+    def _digests(self) -> dict[str, str]:
+        """SHA-256 of each table of the folder."""
+        files = ((name, self.path / name) for name in _FILES)
+        return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in files if f.is_file()}
+
     def _write_meta(self, *, complete: bool) -> None:
         state = self._state
         write_json(
@@ -160,6 +166,7 @@ class RunWriter:
                 "started": state.started,
                 "finished": datetime.now(timezone.utc).isoformat(timespec="seconds") if complete else None,
                 "wall_s": round(time.monotonic() - state.clock, 3),
+                "digests": self._digests() if complete else {},
                 "stage_ms_mean": {k: v / max(state.records_total, 1) for k, v in state.stage_ms.items()},
                 "versions": {"gpvo": __version__, "python": platform.python_version(), "numpy": np.__version__},
             },
