@@ -98,7 +98,8 @@ class ImuNoise:
 class ImuLog:
     """IMU samples in the IMU's own frame, already shifted to the camera's clock.
 
-    ``t_ns`` (N,) int64; ``gyro_radps`` (N, 3); ``acc_mps2`` (N, 3) specific force (+9.81 up at rest).
+    ``t_ns`` (N,) int64; ``gyro_radps`` (N, 3); ``acc_mps2`` (N, 3) specific force (+9.81 up at rest), NaN throughout
+    where there is a gyroscope alone.
     """
 
     t_ns: NDArray[np.int64]
