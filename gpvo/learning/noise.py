@@ -77,7 +77,7 @@ class HeteroscedasticOptions:
     heavy_tails: bool = True
     isotropic: bool = False
     inducing: int = 256
-    noise_inducing: int = 128
+    noise_inducing: int = 64
     profile: str = "common"
     max_folds: int = 8
     rounds: int = 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,62 +67,74 @@ def _place(block: Array, gp: ProjectedGP, values: Array, start: int) -> None:
 
 
 class RowPlan:
-    """Calls with x (d,) return (4, D): mean, its variance, log noise variance, its spread.
+    """Calls with x (d,) return four (D,): mean, its variance, log noise variance, its spread; fresh arrays.
 
-    With v = [u, 1, -|u|^2/2 of each kernel] all exponents are one product ``G v``. Projections are float32, as squares
-    forgive it; exponents and means cancel and stay float64.
+    With v = [y, y^2, 1], y = x - centre, all exponents are one product ``G v``; k and z^2 carry a last 1 that adds the
+    offsets. Projections are float32, as squares forgive it; exponents and means cancel and stay float64.
     """
 
     def __init__(self, stacked: StackedBasis) -> None:
         kernels, D = stacked.kernels, stacked.offset.shape[1]
-        self._centre, self._inverse = kernels[0].centre.copy(), 1.0 / kernels[0].lengthscale
-        self._exponents(kernels)
-        sizes = [len(gp.points) for gp in kernels]
-        flats = [np.ascontiguousarray(gp.flat_projection, dtype=np.float32) for gp in kernels]
+        d, sizes = kernels[0].n_inputs, [len(gp.points) for gp in kernels]
+        flats = [_aligned(gp.flat_projection, np.float32) for gp in kernels]
         lengths = [len(P) for P in flats]
-        self._k, self._k32 = np.empty(sum(sizes)), np.empty(sum(sizes), np.float32)
-        self._z = np.empty(sum(lengths), np.float32)
-        k_parts, z_parts = np.split(self._k32, np.cumsum(sizes)[:-1]), np.split(self._z, np.cumsum(lengths)[:-1])
-        self._products = list(zip(flats, k_parts, z_parts, strict=True))
-        self._B = np.ascontiguousarray(stacked.B.reshape(2 * D, -1))
-        self._H = np.ascontiguousarray(stacked.H.reshape(3 * D, -1), dtype=np.float32)
-        self._offset = stacked.offset.copy()
-        self._means, self._variances = np.empty(2 * D), np.empty(3 * D, np.float32)
-        self._out = (self._means.reshape(2, D), self._variances.reshape(3, D))
+        mean, mean_var, log_noise, spread = stacked.offset
+        B = _aligned(_with_offset(stacked.B, [mean, log_noise - 0.5 * spread]), np.float64)
+        H = _aligned(_with_offset(stacked.H[[1, 0, 2]], [0.5 * spread, mean_var, spread]), np.float32)
+        G = _aligned(np.vstack([_exponent_rows(gp, kernels[0].centre) for gp in kernels]), np.float64)
+        v, k = np.ones(2 * d + 1), _aligned(np.ones(B.shape[1]), np.float64)
+        k32, z = _aligned(np.ones(sum(sizes)), np.float32), _aligned(np.ones(H.shape[1]), np.float32)
+        means, narrow, wide = np.zeros((2, D)), np.zeros(3 * D, np.float32), np.zeros((3, D))
+        parts_k, parts_z = np.split(k32, np.cumsum(sizes)[:-1]), np.split(z[: sum(lengths)], np.cumsum(lengths)[:-1])
+        self._centre = kernels[0].centre.copy()
+        self._y, self._yy, self._v = v[:d], v[d : 2 * d], v
+        self._k, self._k_one, self._k32, self._z = k[: sum(sizes)], k, k32, z
+        self._exponents, self._means, self._variances = G.dot, B.dot, H.dot
+        self._projections = [(P.dot, part_k, part_z) for P, part_k, part_z in zip(flats, parts_k, parts_z, strict=True)]
+        self._flat_means, self._narrow, self._wide = means.reshape(-1), narrow, wide.reshape(-1)
+        self._log_noise, self._half_spread, self._vars, self._zeros = means[1], wide[0], wide[1:], np.zeros((2, D))
+        self._results = (means[0].copy, wide[1].copy, means[1].copy, wide[2].copy)
 
-    def _exponents(self, kernels: tuple[ProjectedGP, ...]) -> None:
-        """G, and the rows that give ``-|u|^2/2`` of each kernel from u*u, in the scaling of the first."""
-        first, rows, squares = kernels[0], [], []
-        d = first.n_inputs
-        for i, gp in enumerate(kernels):
-            ratio = first.lengthscale / gp.lengthscale
-            points = gp.points + (gp.centre - first.centre) / gp.lengthscale
-            one = np.zeros((len(points), len(kernels)))
-            one[:, i] = 1.0
-            rows.append(np.hstack([points * ratio, -0.5 * (points**2).sum(1)[:, None], one]))
-            squares.append(-0.5 * ratio**2)
-        self._G, self._Q = np.ascontiguousarray(np.vstack(rows)), np.array(squares)
-        self._v = np.zeros(d + 1 + len(kernels))
-        self._v[d] = 1.0
-        self._u, self._norms, self._uu = self._v[:d], self._v[d + 1 :], np.empty(d)
-
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Array) -> tuple[Array, Array, Array, Array]:
         """x (d,) float64, in the units of training."""
-        u, k = self._u, self._k
-        np.subtract(x, self._centre, out=u)
-        np.multiply(u, self._inverse, out=u)
-        np.multiply(u, u, out=self._uu)
-        np.dot(self._Q, self._uu, out=self._norms)
-        np.dot(self._G, self._v, out=k)
-        np.exp(k, out=k)
+        y, k, z = self._y, self._k, self._z
+        np.subtract(x, self._centre, y)
+        np.multiply(y, y, self._yy)
+        self._exponents(self._v, k)
+        np.exp(k, k)
         self._k32[:] = k
-        for P, k32, z in self._products:
-            np.dot(P, k32, out=z)
-        np.multiply(self._z, self._z, out=self._z)
-        np.dot(self._B, k, out=self._means)
-        np.dot(self._H, self._z, out=self._variances)
-        out = self._offset.copy()
-        out[::2] += self._out[0]
-        out[1:] += self._out[1]
-        np.maximum(out[1::2], 0.0, out=out[1::2])
-        return out
+        for project, part_k, part_z in self._projections:
+            project(part_k, part_z)
+        np.multiply(z, z, z)
+        self._means(self._k_one, self._flat_means)
+        self._variances(z, self._narrow)
+        self._wide[:] = self._narrow
+        np.add(self._log_noise, self._half_spread, self._log_noise)
+        np.maximum(self._vars, self._zeros, out=self._vars)
+        mean, var, log_noise, spread = self._results
+        return mean(), var(), log_noise(), spread()
+
+
+def _with_offset(weights: Array, offset: list[Array]) -> Array:
+    """(a D, N) from (a, D, n) and a rows (D,): weights, offset, and zeros that fill up to whole cache lines."""
+    a, D, n = weights.shape
+    joined = np.zeros((a, D, -(-(n + 1) // 16) * 16))
+    joined[:, :, :n], joined[:, :, n] = weights, np.stack(offset)
+    return joined.reshape(a * D, -1)
+
+
+def _aligned(values: Array, dtype: type) -> NDArray[Any]:
+    """A copy that starts on a cache line, as products of small matrices are a fifth faster there."""
+    size = int(values.size) * np.dtype(dtype).itemsize
+    raw = np.empty(size + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    out: NDArray[Any] = raw[start : start + size].view(dtype).reshape(values.shape)
+    out[...] = values
+    return out
+
+
+def _exponent_rows(gp: ProjectedGP, centre: Array) -> Array:
+    """(m, 2 d + 1): products with [y, y^2, 1], y = x - centre, are ``-|u - u_i|^2 / 2``."""
+    points = gp.points + (gp.centre - centre) / gp.lengthscale
+    square = np.broadcast_to(-0.5 / gp.lengthscale**2, points.shape)
+    return np.hstack([points / gp.lengthscale, square, -0.5 * (points**2).sum(1)[:, None]])
