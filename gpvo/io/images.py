@@ -18,6 +18,7 @@ from gpvo.cameras.masks import read_mask
 from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
+from gpvo.io.order import OrderCheck
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import in_order, usual_interval
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
@@ -203,9 +204,12 @@ class ImageSource:
         return replace(self.known, notes=list(self.known.notes))
 
     def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
-        for frame in in_order(self._readable(report), report, self.usual_interval_ns):
+        order = OrderCheck(self.path)
+        for raw in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
-            yield StereoFrame(frame.t_ns, *self.rectifier.apply(frame.left, frame.right))
+            frame = StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
+            order.see(frame)
+            yield frame
         if report.frames == 0:
             raise SourceError("not one readable image pair", where=self.path)
 

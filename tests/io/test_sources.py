@@ -279,6 +279,27 @@ def test_swapped_cameras(tmp_path):
     _one_line(caught)
 
 
+def _textured_pair(path, swap: bool) -> None:
+    """Noise on a wall whose disparity is 6 px, in place of the grey images."""
+    wall = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (240, 400), dtype=np.uint8), (0, 0), 1.5)
+    wall = cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX)
+    for k, t in enumerate(seq.stamps(4)):
+        views = (wall[:, k : k + 320], wall[:, k + 6 : k + 326])
+        for side, image in zip(("right", "left") if swap else ("left", "right"), views, strict=True):
+            seq.write_image(path / side / f"{t}.png", image)
+    text = seq.camchain_yaml().replace("[64, 48]", "[320, 240]").replace("31.5, 23.5", "159.5, 119.5")
+    (path / "camchain.yaml").write_text(text)
+
+
+def test_swapped_images(tmp_path):
+    _textured_pair(tmp_path / "right", swap=False)
+    assert len(list(open_source(tmp_path / "right"))) == 4
+    _textured_pair(tmp_path / "wrong", swap=True)
+    with pytest.raises(SourceError, match="images are swapped") as caught:
+        list(open_source(tmp_path / "wrong"))
+    assert str(tmp_path / "wrong") in _one_line(caught)
+
+
 def test_nan_in_truth_names_the_line(tmp_path):
     path = seq.write_euroc(tmp_path / "s")
     truth = path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
