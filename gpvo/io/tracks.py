@@ -3,7 +3,9 @@
 An ``.npz`` with one row per observation: ``frame`` (M,), ``track`` (M,), ``uv_left``, ``uv_right`` (M, 2) [px]; per
 frame ``t_s`` (N,); ``fx fy cx cy`` [px] and ``baseline_m``. Where present: ``T_world_cam`` (N, 4, 4) truth of the left
 camera, ``gyro_body_radps`` and ``acc_body_mps2`` (N, 3) in body axes with ``R_cam_body`` (3, 3) and
-``p_body_cam_in_body_m`` (3,), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``.
+``p_body_cam_in_body_m`` (3,), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``; an IMU at
+its own rate in body axes as ``imu_t_ns`` (K,), ``imu_gyro_radps``, ``imu_acc_mps2`` (K, 3) and ``imu_noise`` (4,),
+the fields of :class:`gpvo.types.ImuNoise`.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from gpvo.geometry.se3 import Array
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import in_order
 from gpvo.io.truth import GPS_INS, TruthNoise
-from gpvo.types import ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog
+from gpvo.types import ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
 
 _REQUIRED = ("t_s", "frame", "track", "uv_left", "uv_right", "fx", "fy", "cx", "cy", "baseline_m")
 _MAX_UNPACKED_BYTES = 4_000_000_000
@@ -117,6 +119,8 @@ class TracksSource:
 
     def _make_imu(self) -> ImuLog | None:
         n = len(self._t_ns)
+        if "imu_t_ns" in self._data:
+            return self._full_imu()
         if "gyro_body_radps" not in self._data:
             return None
         gyro = _shaped(self._data, "gyro_body_radps", (n, 3), self.path)
@@ -125,6 +129,19 @@ class TracksSource:
             acc = _shaped(self._data, "acc_body_mps2", (n, 3), self.path)
         keep = _growing(self._t_ns)
         return ImuLog(self._t_ns[keep], gyro[keep], acc[keep])
+
+    def _full_imu(self) -> ImuLog:
+        t_ns = self._data["imu_t_ns"]
+        if t_ns.ndim != 1 or t_ns.dtype.kind not in "iu":
+            raise SourceError(f"'imu_t_ns' is {t_ns.dtype} {t_ns.shape}, expected integers (N,)", where=self.path)
+        k = len(t_ns)
+        absent = [a for a in ("imu_gyro_radps", "imu_acc_mps2") if a not in self._data]
+        if absent:
+            raise SourceError(f"has 'imu_t_ns' but not {', '.join(absent)}", where=self.path)
+        gyro, acc = (_shaped(self._data, a, (k, 3), self.path) for a in ("imu_gyro_radps", "imu_acc_mps2"))
+        noise = ImuNoise(*_shaped(self._data, "imu_noise", (4,), self.path)) if "imu_noise" in self._data else None
+        keep = _growing(t_ns)
+        return ImuLog(t_ns[keep].astype(np.int64), gyro[keep], acc[keep], noise)
 
     def _make_truth(self, noise: TruthNoise | None) -> TruthLog | None:
         if "T_world_cam" not in self._data:

@@ -1,1 +1,1 @@
-"""gpvo.sim."""
+"""Worlds, vehicles, cameras, IMU and noise: sequences whose truth is exact."""

@@ -77,8 +77,9 @@ class TrackFrontend:
         uvd = np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), d], 1)
         self._detected = len(left)
         track, first = np.unique(frame.track[good], return_index=True)
-        self._current = (track, uvd[good][first])
-        return Observation(None, repeated=False)
+        before, self._current = self._current, (track, uvd[good][first])
+        repeated = before is not None and len(track) > 0 and np.array_equal(before[1], self._current[1])
+        return Observation(None, repeated)
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
         """Pair the points of equal identity."""

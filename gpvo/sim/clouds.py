@@ -1,0 +1,107 @@
+"""Landmarks without surfaces: points where a tunnel, a moon or a hall would have texture, and a path among them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.sim import paths
+from gpvo.sim.paths import Path3
+from gpvo.types import Array
+
+WORLDS = ("tunnel", "lunar", "room")
+
+
+def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator) -> tuple[Path3, Array]:
+    """A path and the landmarks (N, 3) [m] around it.
+
+    ``path``: ``along``, ``wander``, ``straight``, ``hover``, or a TUM file of a recorded flight.
+    """
+    if world not in WORLDS:
+        raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(WORLDS)}")
+    reach = duration_s * speed_mps + 25.0
+    centre = _tunnel_line(reach, rng, bend=0.0 if path == "straight" else 1.0)
+    low, high = {
+        "tunnel": (np.array([4.0, -0.6, -0.4]), np.array([6.0, 0.6, 0.5])),
+        "lunar": (np.array([-40.0, -20.0, 2.0]), np.array([40.0, 20.0, 4.0])),
+        "room": (np.array([-4.0, -4.0, 0.8]), np.array([4.0, 4.0, 3.2])),
+    }[world]
+    cloud = {"tunnel": _tunnel, "lunar": _lunar, "room": _room}[world](centre, rng)
+    return _path(world, path, centre, low, high, duration_s, speed_mps, rng), cloud
+
+
+def _path(
+    world: str, path: str, centre: Array, low: Array, high: Array, duration_s: float, speed_mps: float,
+    rng: np.random.Generator,
+) -> Path3:  # fmt: skip
+    if path == "hover":
+        return paths.hover((low + high) / 2, 0.0, duration_s)
+    if path == "straight":
+        height = 1.1 if world == "lunar" else 0.0
+        ground = ground_height if world == "lunar" else None
+        return paths.straight(np.array([0.0, 0.0, height]), np.array([1.0, 0, 0]), duration_s, speed_mps, ground)
+    if path == "wander" or (path == "along" and world == "room"):
+        return paths.wandering(low, high, duration_s, speed_mps, rng)
+    if path == "along":
+        if world == "lunar":
+            centre = centre * [1, 1, 0] + [0, 0, 1.5]
+        return paths.along_curve(centre, duration_s, speed_mps, rng, sway_m=0.35)
+    file = Path(path)
+    if not file.is_file():
+        raise GpvoError(f"'{path}' is neither a path kind nor a file", cure="along, wander, straight, hover or a file")
+    return paths.flown(file, low, high, duration_s, rng)
+
+
+def _tunnel_line(length_m: float, rng: np.random.Generator, bend: float) -> Array:
+    """A winding line (N, 3), half a metre between its points."""
+    s = np.arange(0.0, length_m, 0.5)
+    k, ph = rng.uniform(0.03, 0.12, 4), rng.uniform(0, 2 * np.pi, 4)
+    heading = bend * 0.5 * sum(np.sin(k[i] * s + ph[i]) - np.sin(ph[i]) for i in range(2))
+    climb = bend * 0.06 * (np.sin(k[2] * s + ph[2]) - np.sin(ph[2]))
+    step = 0.5 * np.stack([np.cos(heading), np.sin(heading), climb], 1)
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)[:-1]])
+
+
+def _tunnel(centre: Array, rng: np.random.Generator) -> Array:
+    """Points on the rough wall of a tunnel of 2 m radius with a flattened floor, about 70 per metre."""
+    n = int(len(centre) * 0.5 * 70)
+    i = rng.uniform(0, len(centre) - 1.001, n)
+    j = i.astype(int)
+    at = centre[j] + (i - j)[:, None] * (centre[j + 1] - centre[j])
+    along = centre[j + 1] - centre[j]
+    left = np.stack([-along[:, 1], along[:, 0], np.zeros(n)], 1)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    angle = rng.uniform(0, 2 * np.pi, n)
+    radius = 2.0 + 0.25 * rng.standard_normal(n)
+    wall = at + (radius * np.cos(angle))[:, None] * left
+    wall[:, 2] += np.maximum(radius * np.sin(angle), -1.3 + 0.05 * rng.standard_normal(n))
+    return wall
+
+
+def ground_height(xy: Array) -> Array:
+    """Height [m] of the rolling lunar plain at (N, 2) places: the same everywhere, so that wheels and points agree."""
+    x, y = np.asarray(xy).T
+    rolling = 0.25 * np.sin(0.11 * x + 0.7) * np.cos(0.09 * y)
+    return rolling + 0.05 * np.sin(0.6 * x + 0.3 * y) + 0.015 * np.sin(1.9 * x - 1.1 * y)
+
+
+def _lunar(centre: Array, rng: np.random.Generator) -> Array:
+    """Texture of the ground, denser near the track, and boulders that stand out of it."""
+    length = float(np.ptp(centre[:, 0])) + 30.0
+    n = int(60 * length)
+    x = rng.uniform(-5.0, length, n)
+    y = 12.0 * rng.standard_normal(n) * rng.uniform(0.1, 1.0, n)
+    up = np.where(rng.random(n) < 0.15, rng.exponential(0.25, n), 0.02 * np.abs(rng.standard_normal(n)))
+    return np.stack([x, y, ground_height(np.stack([x, y], 1)) + up], 1)
+
+
+def _room(centre: Array, rng: np.random.Generator) -> Array:
+    """Walls, floor and ceiling of a hall of 12 x 12 x 5 m; one wall is blank."""
+    n = 5200
+    p = rng.uniform([-6, -6, 0], [6, 6, 5], (n, 3))
+    face = rng.choice(6, n, p=[0.2, 0.2, 0.2, 0.03, 0.27, 0.1])
+    for f, (axis, value) in enumerate(((0, -6.0), (0, 6.0), (1, -6.0), (1, 6.0), (2, 0.0), (2, 5.0))):
+        p[face == f, axis] = value
+    return p

@@ -1,0 +1,205 @@
+"""Smooth paths to fly or drive: position as a C4 spline of time, attitude from how the vehicle moves.
+
+Every path begins with a rest, so that a filter can find its level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import gaussian_filter1d
+
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.sim.imu import GRAVITY_MPS2, Motion
+from gpvo.types import Array
+
+_KNOTS_PER_S = 25.0
+
+
+@dataclass(frozen=True)
+class Path3:
+    """``position`` is a quintic spline of time [s]; ``attitude(t)`` gives ``R_world_body`` (N, 3, 3), body FLU."""
+
+    position: BSpline
+    attitude: Callable[[Array], Array]
+    duration_s: float
+
+    def motion(self, rate_hz: float) -> Motion:
+        """Truth at equal steps over the whole duration."""
+        t = np.arange(round(self.duration_s * rate_hz) + 1) / rate_hz
+        R = self.attitude(t)
+        # Central difference of the exact attitude: good to 1e-8 rad/s at this step.
+        h = 5e-4
+        rate = se3.so3_log(np.swapaxes(self.attitude(t - h), -1, -2) @ self.attitude(t + h)) / (2 * h)
+        velocity, acceleration = self.position.derivative(1)(t), self.position.derivative(2)(t)
+        return Motion(t, self.position(t), R, velocity, acceleration, rate)
+
+
+def smooth_start(t_s: Array, rest_s: float, ramp_s: float = 2.0) -> Array:
+    """Time that stands still for ``rest_s`` and then takes ``ramp_s`` to run at full pace (C3)."""
+    x = np.clip((np.asarray(t_s) - rest_s) / ramp_s, 0.0, None)
+    y = np.minimum(x, 1.0)
+    # Integral of the smoothstep 35 y^4 - 84 y^5 + 70 y^6 - 20 y^7.
+    begun = 7 * y**5 - 14 * y**6 + 10 * y**7 - 2.5 * y**8
+    return ramp_s * (begun + np.maximum(x - 1.0, 0.0))
+
+
+def along_curve(
+    centre: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, *, sway_m: float, rest_s: float = 3.0
+) -> Path3:
+    """Flight along a polyline (N, 3) [m] with lateral and vertical sway, the nose along the curve.
+
+    The speed varies by a third around ``speed_mps``. Where the curve ends before the time does, the flight slows and
+    hovers there.
+    """
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    curve = make_interp_spline(arc, gaussian_filter1d(centre, 3.0, axis=0, mode="nearest"), k=5)
+    t = _knots(duration_s)
+    pace = smooth_start(t, rest_s)
+    w, ph = rng.uniform(0.15, 0.5, 5), rng.uniform(0, 2 * np.pi, 5)
+    s = speed_mps * (pace + 0.33 / w[0] * (np.sin(w[0] * pace + ph[0]) - np.sin(ph[0])))
+    room = arc[-1] - 1.0
+    s = room * np.tanh(s / room * 1.0) if s[-1] > 0.8 * room else s
+    start = np.clip(pace / 2.0, 0, 1) ** 3
+    tangent = curve.derivative(1)(s)
+    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], 1)
+    offset = sway_m * (np.sin(2 * w[1] * pace + ph[1]) - np.sin(ph[1])) * start
+    rise = 0.5 * sway_m * (np.sin(2 * w[2] * pace + ph[2]) - np.sin(ph[2])) * start
+    position = curve(s) + left * offset[:, None]
+    position[:, 2] += rise
+    yaw = heading + 0.25 * (np.sin(1.6 * w[3] * pace + ph[3]) - np.sin(ph[3])) * start
+    return _flat(t, position, yaw, duration_s)
+
+
+def wandering(
+    low: Array, high: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float = 3.0
+) -> Path3:
+    """A smooth random flight within a box [m]: sums of sines, the nose turning slowly."""
+    t = _knots(duration_s)
+    pace = smooth_start(t, rest_s)
+    half, middle = (np.asarray(high) - low) / 2, (np.asarray(high) + low) / 2
+    w = rng.uniform(0.5, 1.5, (3, 3))
+    amplitude = rng.uniform(0.3, 1.0, (3, 3))
+    amplitude *= half / amplitude.sum(0)
+    # Mean speed of the sum of sines is near its root mean square: scale the frequencies to the speed asked for.
+    rms = np.sqrt(0.5 * ((amplitude * w) ** 2).sum())
+    w = w * speed_mps / rms
+    ph = rng.uniform(0, 2 * np.pi, (3, 3))
+    angle = w[None] * pace[:, None, None] + ph[None]
+    position = middle + (amplitude * np.sin(angle)).sum(1)
+    yaw = rng.uniform(-np.pi, np.pi) + 1.2 * np.sin(0.25 * pace + ph[0, 0]) + 0.4 * np.sin(0.7 * pace + ph[1, 1])
+    return _flat(t, position, yaw, duration_s)
+
+
+def straight(
+    start: Array, direction: Array, duration_s: float, speed_mps: float, ground: Callable[[Array], Array] | None = None,
+    rest_s: float = 3.0,
+) -> Path3:  # fmt: skip
+    """A straight drive; ``ground(xy (N, 2)) -> z (N,)`` gives the height of the wheels' path, whose slope it
+    follows."""
+    t = _knots(duration_s)
+    s = speed_mps * smooth_start(t, rest_s)
+    unit = np.asarray(direction, float) / np.linalg.norm(direction)
+    position = np.asarray(start, float) + s[:, None] * unit
+    if ground is None:
+        return _flat(t, position, np.full(len(t), np.arctan2(unit[1], unit[0])), duration_s, lean=0.0)
+    position[:, 2] = start[2] + ground(position[:, :2])
+    side = 0.5 * np.array([-unit[1], unit[0], 0.0])
+    ahead = 0.6 * unit
+    pitch = np.arctan2(ground((position - ahead)[:, :2]) - ground((position + ahead)[:, :2]), 1.2)
+    roll = np.arctan2(ground((position + side)[:, :2]) - ground((position - side)[:, :2]), 1.0)
+    yaw = np.full(len(t), np.arctan2(unit[1], unit[0]))
+    angles = make_interp_spline(t, np.stack([roll, pitch, yaw], 1), k=5)
+    return Path3(make_interp_spline(t, position, k=5), lambda u: _from_rpy(angles(u)), duration_s)
+
+
+def hover(at: Array, yaw_rad: float, duration_s: float) -> Path3:
+    """Standing in the air."""
+    t = _knots(duration_s)
+    return _flat(t, np.tile(np.asarray(at, float), (len(t), 1)), np.full(len(t), yaw_rad), duration_s)
+
+
+def flown(
+    file: Path, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
+) -> Path3:
+    """A recorded path (TUM lines, z up) scaled down to fit a box [m], level at its start, looking in a random
+    direction.
+
+    Raises
+    ------
+    SourceError
+        Where the file is no trajectory, or is shorter than the flight.
+    """
+    from gpvo.io.trajectory import read_tum
+
+    recorded = read_tum(file)
+    clock = (recorded.t_ns - recorded.t_ns[0]) * 1e-9
+    needed = float(smooth_start(np.array([duration_s]), rest_s)[0])
+    if clock[-1] < needed:
+        raise SourceError(f"lasts {clock[-1]:.1f} s, the flight needs {needed:.1f} s", where=file)
+    # Laser and motion capture jitter by millimetres: smoothed over a tenth of a second before it is flown.
+    grid = np.arange(0.0, needed + 0.3, 0.02)
+    poses = _resample(clock, recorded.T_world_body, np.minimum(grid, clock[-1]))
+    p = gaussian_filter1d(poses[:, :3, 3], 5.0, axis=0, mode="nearest")
+    turned = _continuous(se3.rotation_to_quaternion_xyzw(poses[:, :3, :3] @ poses[0, :3, :3].T))
+    turned = gaussian_filter1d(turned, 5.0, axis=0, mode="nearest")
+    spin = se3.so3_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
+    p = p - p.mean(0)
+    scale = min(1.0, float(((np.asarray(high) - low) / np.maximum(np.ptp(p, axis=0), 1e-6)).min()))
+    middle = (np.asarray(high) + low) / 2
+    p = (p - (p.max(0) + p.min(0)) / 2) * scale + middle
+    place, pose = make_interp_spline(grid, p, k=5), make_interp_spline(grid, turned, k=5)
+    t = _knots(duration_s)
+    pace = smooth_start(t, rest_s)
+    return Path3(
+        make_interp_spline(t, place(pace), k=5),
+        lambda u: se3.from_quaternion(np.zeros((len(u), 3)), pose(smooth_start(u, rest_s)))[:, :3, :3] @ spin,
+        duration_s,
+    )
+
+
+def _knots(duration_s: float) -> Array:
+    # A margin, so that differences at the ends stay inside.
+    return np.arange(-0.2, duration_s + 0.24, 1.0 / _KNOTS_PER_S)
+
+
+def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float = 1.0) -> Path3:
+    """Attitude of a multirotor: its thrust points along acceleration plus gravity (D. Mellinger, V. Kumar, "Minimum
+    snap trajectory generation and control for quadrotors", 2011, section III). ``lean`` scales the tilt; 0 stays
+    level."""
+    place, turn = make_interp_spline(t, position, k=5), make_interp_spline(t, yaw, k=5)
+    pull = place.derivative(2)
+
+    def attitude(u: Array) -> Array:
+        z = lean * pull(u) + np.array([0, 0, GRAVITY_MPS2])
+        z = z / np.linalg.norm(z, axis=1, keepdims=True)
+        psi = turn(u)
+        x = np.stack([np.cos(psi), np.sin(psi), np.zeros_like(psi)], 1)
+        y = np.cross(z, x)
+        y = y / np.linalg.norm(y, axis=1, keepdims=True)
+        return np.stack([np.cross(y, z), y, z], axis=2)
+
+    return Path3(place, attitude, duration_s)
+
+
+def _from_rpy(rpy: Array) -> Array:
+    roll, pitch, yaw = (se3.so3_exp(rpy[:, i, None] * np.eye(3)[i]) for i in range(3))
+    return yaw @ pitch @ roll
+
+
+def _resample(clock: Array, T: Array, at: Array) -> Array:
+    j = np.clip(np.searchsorted(clock, at), 1, len(clock) - 1)
+    share = (at - clock[j - 1]) / np.maximum(clock[j] - clock[j - 1], 1e-9)
+    return se3.interpolate(T[j - 1], T[j], np.clip(share, 0, 1))
+
+
+def _continuous(q_xyzw: Array) -> Array:
+    """The same rotations with signs that do not jump: q and -q are equal."""
+    flips = np.where((q_xyzw[1:] * q_xyzw[:-1]).sum(1) < 0, -1.0, 1.0)
+    return q_xyzw * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
