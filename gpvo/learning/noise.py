@@ -59,9 +59,11 @@ class HeteroscedasticFit:
 class NoiseFit:
     """``gp``: of the log squared scale, given all rows. ``offset`` (D,): to the log of the variance. ``nu`` (D,).
 
-    Out of fold, (n, D): ``oof_log_var``; ``oof_scale``, the squared scale of the residual's t.
+    ``start``: GP of the log squared residuals, whose kernel ``gp`` keeps. Out of fold, (n, D): ``oof_log_var``;
+    ``oof_scale``, the squared scale of the residual's t.
     """
 
+    start: FittedGP
     gp: ProjectedGP
     offset: Array
     nu: Array
@@ -134,12 +136,12 @@ def _fit(
     for _ in range(max(options.rounds, 1) if use.any() else 1):
         if use.any():
             precision = _precision((np.log(robust) - log_var)[:, use], options.profile)
-            fitted = _regress(X, Y[:, use], precision, count, options)
+            fitted = _regress(X, Y[:, use], precision, count, fitted, options)
             mean = _spread(
                 fit_folded_mean(fitted, X, Y[:, use], precision, count, fold, options.inducing, options.seed), use
             )
         residuals = Residuals((Y - mean.oof_mean) ** 2, base, mean.oof_var, count)
-        noise = fit_noise(X, residuals, fold, options)
+        noise = fit_noise(X, residuals, fold, options, start=noise.start if noise else None)
         log_var = np.log(noise.oof_scale) + base
         robust = row_weight(residuals.square / (np.exp(log_var) + mean.oof_var), noise.nu)
     assert noise is not None
@@ -169,11 +171,16 @@ def _precision(log_precision: Array, profile: str) -> Array:
     return np.exp(np.clip(centred, -limit, limit))
 
 
-def _regress(X: Array, Y: Array, precision: Array, count: Array, options: HeteroscedasticOptions) -> FittedGP:
-    """Hyperparameters of the mean by the chosen regressor, under the outputs' average profile."""
+def _regress(
+    X: Array, Y: Array, precision: Array, count: Array, last: FittedGP | None, options: HeteroscedasticOptions
+) -> FittedGP:
+    """Hyperparameters of the mean by the chosen regressor, under the outputs' average profile, from those of
+    ``last``."""
     regressor = options.regressor
     if isinstance(regressor, str):
         more = dict(options.regressor_options)
+        if last is not None and last.regressor in ("exact", "sparse"):
+            more["guess"] = last.hyper
         regressor = get_regressor(
             regressor, n_rows=len(X), isotropic=options.isotropic, threads=options.threads, **more
         )
@@ -181,15 +188,24 @@ def _regress(X: Array, Y: Array, precision: Array, count: Array, options: Hetero
     return regressor.fit(X, Y, noise_weight=profile, sample_weight=count, seed=options.seed)
 
 
-def fit_noise(X: Array, residuals: Residuals, fold: NDArray[np.int64], options: HeteroscedasticOptions) -> NoiseFit:
-    """GP of the log squared scale of out-of-fold residuals, their tail, and both out of fold."""
+def fit_noise(
+    X: Array,
+    residuals: Residuals,
+    fold: NDArray[np.int64],
+    options: HeteroscedasticOptions,
+    start: FittedGP | None = None,
+) -> NoiseFit:
+    """GP of the log squared scale of out-of-fold residuals, their tail, and both out of fold.
+
+    ``start``: of an earlier round, whose kernel is kept; otherwise it is learnt from the log squared residuals.
+    """
     rows = np.arange(len(X))
     if len(X) > options.noise_rows:
         rows = np.sort(np.random.default_rng(options.seed).permutation(len(X))[: options.noise_rows])
     few, few_fold = residuals.subset(rows), fold[rows]
-    start = SparseRegressor(inducing=options.noise_inducing, isotropic=options.isotropic, threads=options.threads).fit(
-        X[rows], few.log_ratio(), sample_weight=few.count, seed=options.seed
-    )
+    if start is None:
+        sparse = SparseRegressor(options.noise_inducing, isotropic=options.isotropic, threads=options.threads)
+        start = sparse.fit(X[rows], few.log_ratio(), sample_weight=few.count, seed=options.seed)
     nu = np.full(residuals.square.shape[1], 6.0 if options.heavy_tails else np.inf)
     log_scale = np.zeros(len(nu))
     for _ in range(_TAIL_ROUNDS):
@@ -204,7 +220,7 @@ def fit_noise(X: Array, residuals: Residuals, fold: NDArray[np.int64], options: 
     offset = log_scale + log_second_moment(nu)
     g, spread = _out_of_fold(without, X, fold)
     log_squared_scale = g + 0.5 * spread + log_scale
-    return NoiseFit(gp, offset, nu, log_squared_scale + log_second_moment(nu), np.exp(log_squared_scale))
+    return NoiseFit(start, gp, offset, nu, log_squared_scale + log_second_moment(nu), np.exp(log_squared_scale))
 
 
 def _out_of_fold(without: dict[int, ProjectedGP], X: Array, fold: NDArray[np.int64]) -> tuple[Array, Array]:

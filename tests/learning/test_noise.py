@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.learning.folds import group_folds
@@ -9,7 +11,7 @@ from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_
 from gpvo.learning.tails import fit_tail, log_fisher, log_scale_score, log_second_moment
 from synthetic_errors import Problem, gaussian_nll, make_problem
 
-SMALL = HeteroscedasticOptions(inducing=64, noise_inducing=48, max_folds=4)
+SMALL = HeteroscedasticOptions(regressor="sparse", inducing=64, noise_inducing=48, max_folds=4)
 
 
 def gap_and_coverage(fit: HeteroscedasticFit, test: Problem) -> tuple[float, float]:
@@ -74,7 +76,7 @@ def test_gaussian_residuals_are_called_gaussian() -> None:
 
 
 def test_axes_without_mean_have_none() -> None:
-    problem = make_problem(800, 3)
+    problem = make_problem(450, 3)
     fit = fit_heteroscedastic(
         problem.X, problem.Y, problem.run, use_mean=np.array([1, 0, 0, 1, 0, 0], bool), options=SMALL
     )
@@ -97,9 +99,9 @@ def test_a_base_that_tells_all_leaves_a_constant_ratio() -> None:
 
 
 def test_one_profile_per_output_is_no_worse() -> None:
-    train, test = make_problem(1500, 5), make_problem(4000, 6)
+    train, test = make_problem(800, 5), make_problem(4000, 6)
     common, _ = gap_and_coverage(fit_heteroscedastic(train.X, train.Y, train.run, options=SMALL), test)
-    own_options = HeteroscedasticOptions(inducing=64, noise_inducing=48, max_folds=4, profile="output")
+    own_options = replace(SMALL, profile="output")
     own_fit = fit_heteroscedastic(train.X, train.Y, train.run, options=own_options)
     own, _ = gap_and_coverage(own_fit, test)
     assert own_fit.basis.mean.projection.ndim == 3
@@ -109,7 +111,7 @@ def test_one_profile_per_output_is_no_worse() -> None:
 def test_residuals_are_out_of_fold() -> None:
     """Shifting one fold's targets must not change what is predicted there."""
     problem = make_problem(2000, 7)
-    options = HeteroscedasticOptions(inducing=40, noise_inducing=32, rounds=1)
+    options = HeteroscedasticOptions(regressor="sparse", inducing=40, noise_inducing=32, rounds=1)
     before = fit_heteroscedastic(problem.X, problem.Y, problem.run, options=options)
     rows = before.fold == 0
     assert len(np.unique(problem.run[rows])) == 1
@@ -121,7 +123,7 @@ def test_residuals_are_out_of_fold() -> None:
 
 
 def test_the_same_data_and_seed_give_the_same_bits() -> None:
-    problem = make_problem(700, 8)
+    problem = make_problem(500, 8)
     fits = [fit_heteroscedastic(problem.X, problem.Y, problem.run, options=SMALL) for _ in range(2)]
     first, second = (fit.basis.to_arrays() for fit in fits)
     assert first.keys() == second.keys()

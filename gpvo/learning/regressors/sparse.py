@@ -28,12 +28,14 @@ class SparseRegressor:
     """For thousands to millions of rows: O(m^2) memory beside the rows, O(n m^2) time, m inducing points.
 
     Length scales are learnt on at most ``optimise_rows`` rows; signal and noise variances, and the posterior, on all.
-    ``isotropic``, ``hyper``, ``centre_outputs``: as in :class:`~gpvo.learning.regressors.exact.ExactRegressor`.
+    ``isotropic``, ``hyper``, ``guess``, ``centre_outputs``: as in
+    :class:`~gpvo.learning.regressors.exact.ExactRegressor`.
     """
 
     inducing: int = 256
     isotropic: bool = False
     hyper: Hyperparameters | None = None
+    guess: Hyperparameters | None = None
     centre_outputs: bool = True
     optimise_rows: int = 5000
     max_iterations: int = 25
@@ -66,15 +68,16 @@ class SparseRegressor:
             if self.hyper is not None:
                 hyper = scaling.scaled(self.hyper)
             else:
-                hyper = self._learn(sample, seed)
+                guess = None if self.guess is None else scaling.scaled(self.guess)
+                hyper = self._learn(sample, guess, seed)
             points = greedy_points(sample[0] / hyper.lengthscale, self.inducing, seed=seed)
             return close(rows, scaling, hyper, points, self.name, relearn=self.hyper is None)
 
-    def _learn(self, sample: Chunk, seed: int) -> Hyperparameters:
+    def _learn(self, sample: Chunk, guess: Hyperparameters | None, seed: int) -> Hyperparameters:
         """First guess from the exact likelihood of a few hundred rows, then the bound of ``optimise_rows`` rows."""
         some = np.sort(np.random.default_rng(seed).permutation(len(sample[0]))[: self.optimise_rows])
         Xs, Ys, w, count = (part[some] for part in sample)
-        hyper = start(Xs, Ys, w * count, isotropic=self.isotropic, seed=seed)
+        hyper = guess or start(Xs, Ys, w * count, isotropic=self.isotropic, seed=seed)
         bound, _ = tight_bound((Xs, Ys, w, count), hyper, self.inducing, seed=seed)
         return bound.maximise(hyper, isotropic=self.isotropic, iterations=self.max_iterations)
 
