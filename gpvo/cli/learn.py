@@ -1,9 +1,204 @@
-"""Commands of this group."""
+"""``gpvo train, predict, check, export``: error models."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
+
+from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from gpvo.learning.train import TrainedModel
+
+Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth.")]
+Model = Annotated[Path, typer.Argument(help="Model file.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def train(
+    runs: Runs,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Model file to write.")],
+    features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto",
+    target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame",
+    regressor: Annotated[str, typer.Option(help="auto, exact, sparse, svgp or sklearn.")] = "auto",
+    align: Annotated[
+        str, typer.Option(help="rotation: fit a fixed rotation between log and truth first; none.")
+    ] = "none",
+    update: Annotated[Path | None, typer.Option(help="Add the runs to this model's own.")] = None,
+    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    jobs: Annotated[int, typer.Option(help="Folds at a time; -1 for all cores.")] = 1,
+    backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
+    json_: Json = False,
+) -> None:
+    """Learn the odometry's error from runs with ground truth; judge by leaving each run out.
+
+    Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.learning.store import save_model
+
+    settings: dict[str, Any] = {
+        "features": features,
+        "target": target,
+        "regressor": regressor,
+        "align": align,
+        "seed": seed,
+    }
+    settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
+    trained = _train(runs, settings, update)
+    save_model(trained, out)
+    document = {**trained.table, "model": str(out)}
+    if json_:
+        print_json(document)
+    else:
+        _print_table(document)
+        print(f"{out}: {sum(len(s) for s in trained.sets)} rows of {len(trained.sets)} runs")
+
+
+def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> TrainedModel:
+    from gpvo.io.run import read_run
+    from gpvo.learning.config import TrainConfig
+
+    config = TrainConfig(**settings)
+    runs = [read_run(p) for p in paths]
+    if config.target == "position":
+        from gpvo.dataset.build import build_run
+        from gpvo.learning.position import train_position
+
+        return train_position([build_run(r, target="position", align=config.align) for r in runs], config)
+    if update is not None:
+        from gpvo.learning.update import update as update_model
+
+        return update_model(update, runs, config)
+    from gpvo.learning.train import train as train_model
+
+    return train_model(runs, config)
+
+
+def _print_table(document: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    if not document["folds"]:
+        print("one run alone: nothing could be left out, so there is no table")
+        return
+    table = Table("method", *(f["held_out"] for f in document["folds"]), "mean", "median", "1 sigma", "NLL per axis")
+    for method, mean in document["mean"].items():
+        per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
+        rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"], mean["nll_per_dim"]]
+        if any(v is not None for v in (*per_fold, *rest)):
+            table.add_row(method, *(_text(v) for v in (*per_fold, *rest)))
+    console = Console(width=max(Console().width, 120), highlight=False)
+    console.print("NEES per degree of freedom on each run left out (1 is right), then means over the runs")
+    console.print(table)
+    slips = [f["slips"] for f in document["folds"] if "slips" in f]
+    if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
+        total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
+        console.print(
+            f"slips: {total['caught']} caught, {total['missed']} missed, {total['falsely_flagged']} falsely flagged"
+        )
+    c = document["comparison"]
+    if c is not None:
+        d = c["nll_per_dim_difference"]
+        interval = f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
+        console.print(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {interval}")
+
+
+def _nees(block: dict[str, float | None]) -> float | None:
+    return block["joint"] if block["joint"] is not None else block["translation"]
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def predict(
+    model: Model,
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file of predictions to write.")],
+    json_: Json = False,
+) -> None:
+    """Predict the error of every motion of a run, as would have been done in flight.
+
+    Example: gpvo predict errors.gpvo runs/flight -o predictions.parquet
+    """
+    import numpy as np
+
+    from gpvo.cli.output import print_json
+    from gpvo.io.run import read_run, write_predictions
+    from gpvo.online.predictor import Predictor
+
+    predictor, log = Predictor.load(model), read_run(run).log
+    predictor.reset(log.camera)
+    predictions = [p for p in map(predictor.step, log) if p is not None]
+    write_predictions(out, predictions)
+    moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
+    sigma = np.median([p.sigma for p in moving], axis=0) if moving else np.full(6, np.nan)
+    inside = float(np.mean([p.in_domain > 0.5 for p in moving])) if moving else None
+    document = {
+        "schema": 1,
+        "predictions": len(predictions),
+        "in_domain": inside,
+        "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
+    }
+    if json_:
+        print_json(document)
+    else:
+        print(f"{out}: {len(predictions)} predictions, {100 * (inside or 0):.0f} % inside the training domain")
+        length, angle = (1e3 * np.linalg.norm(s) for s in (sigma[:3], sigma[3:]))
+        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad per motion")
+
+
+def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")], json_: Json = False) -> None:
+    """Before flight: does this model fit this camera, rate and domain? Exits with 1 if not.
+
+    Example: gpvo check errors.gpvo runs/hover
+    """
+    from dataclasses import asdict
+
+    from gpvo.cli.output import print_json
+    from gpvo.io.run import read_run
+    from gpvo.learning.check import check as check_model
+    from gpvo.online.predictor import Predictor
+
+    found = check_model(Predictor.load(model), read_run(run))
+    if json_:
+        print_json({"schema": 1, "fits": found.fits, **asdict(found)})
+    else:
+        print(
+            f"{found.usable} of {found.frames} frames usable, {100 * found.in_domain:.0f} % inside the training domain"
+        )
+        for name, beyond in found.farthest:
+            print(f"  {name}: {beyond:.2g} standard deviations outside on average")
+        for problem in found.problems:
+            print(f"problem: {problem}")
+        print("fits" if found.fits else "does not fit")
+    if not found.fits:
+        raise typer.Exit(1)
+
+
+def export(
+    model: Model,
+    to: Annotated[str, typer.Option(help="onnx or c.")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write; by default beside the model.")] = None,
+) -> None:
+    """Write a model for machines without Python: ONNX, or one C header.
+
+    Example: gpvo export errors.gpvo --to c
+    """
+    from gpvo.learning.export import FORMATS, export_model
+
+    if to not in FORMATS:
+        raise GpvoError(f"cannot export to '{to}'", cure=f"one of: {', '.join(FORMATS)}")
+    target = out or model.with_suffix({"onnx": ".onnx", "c": ".h"}[to])
+    export_model(model, target, to)
+    print(f"{target}: {target.stat().st_size} bytes")
 
 
 def register(app: typer.Typer) -> None:
     """Add this file's commands to the application."""
+    for command in (train, predict, check, export):
+        app.command()(command)

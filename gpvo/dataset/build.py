@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.dataset.targets import check_target, motion_targets, position_targets
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -16,7 +17,7 @@ from gpvo.geometry.se3 import Array
 from gpvo.io.run_read import Run
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer
-from gpvo.online.slip import REASON, SlipDetector
+from gpvo.online.slip import REASON, SlipDetector, flag_slips
 from gpvo.types import Status, StereoCamera, TruthLog, VoLog, VoRecord
 
 MIN_ROWS = 30
@@ -101,7 +102,9 @@ def build(
     check_target(target)
     names = tuple(columns or resolve("full"))
     if truth is None or len(truth.t_ns) < 2:
-        raise GpvoError("has no ground truth to learn from", where=name, cure="run a source that has it, or gpvo import --truth")
+        raise GpvoError(
+            "has no ground truth to learn from", where=name, cure="run a source that has it, or gpvo import --truth"
+        )
     records, X = observe(log, names, target)
     if target == "position":
         usable = np.array([r.usable for r in records], dtype=bool)
@@ -128,7 +131,12 @@ def build(
         dt_s=np.array([r.dt_s for r in kept]),
         covariances={m: VoLog(kept).covariance(m) for m in VoLog(kept).methods},
         v_t=_v_t(kept),
-        counts={"frames": len(log), "lost": len(lost), "slips": len(slips), "without_truth": int(n_usable - known.sum())},
+        counts={
+            "frames": len(log),
+            "lost": len(lost),
+            "slips": len(slips),
+            "without_truth": int(n_usable - known.sum()),
+        },
         camera=log.camera,
         target=target,
         lost_xi=as_if[has],
@@ -137,7 +145,7 @@ def build(
 
 
 def slips_of(log: VoLog) -> tuple[list[VoRecord], Array]:
-    """The records that are lost for their motion alone, and the distance (m, 6) of each motion from the expected one."""
+    """Records that are lost for their motion alone, and the distance (m, 6) of each motion from the expected one."""
     detector, slips, jumps = SlipDetector(), [], []
     for record in log.records:
         judged = detector.step(record)
@@ -147,7 +155,9 @@ def slips_of(log: VoLog) -> tuple[list[VoRecord], Array]:
     return slips, np.array(jumps).reshape(-1, 6)
 
 
-def build_run(run: Run, *, columns: Sequence[str] | None = None, target: str = "frame", align: str = "none") -> TrainingSet:
+def build_run(
+    run: Run, *, columns: Sequence[str] | None = None, target: str = "frame", align: str = "none"
+) -> TrainingSet:
     """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
     truth = run.truth
     if align == "rotation" and truth is not None:
@@ -158,13 +168,10 @@ def build_run(run: Run, *, columns: Sequence[str] | None = None, target: str = "
 
 
 def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:
-    """Truth turned by the fixed rotation between its camera and the log's, so that motions agree best."""
-    from gpvo.dataset.align import estimate_fixed_rotation
-
-    R_truthcam_cam = estimate_fixed_rotation(log, truth)
-    T = np.eye(4)
-    T[:3, :3] = R_truthcam_cam
-    return replace(truth, T_world_cam=truth.T_world_cam @ T)
+    """Truth turned by the fixed rotation between its camera and the log's, so that motions of a second agree best."""
+    motions = windowed_motions(flag_slips(log), truth)
+    fixed = fit_fixed_transform(*motions, lever_arm=False)
+    return replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))
 
 
 def _v_t(records: Sequence[VoRecord]) -> dict[str, Array]:

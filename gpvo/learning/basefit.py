@@ -21,7 +21,9 @@ def t_negative_log_likelihood(square: Array, variance: Array, nu: float = NU) ->
     return 0.5 * np.log(scale) + 0.5 * (nu + 1.0) * np.log1p(square / (nu * scale))
 
 
-def fit_base(columns: Array, dt_s: Array, error: Array, method: str | None, weight: Array | None = None) -> BaseVariance:
+def fit_base(
+    columns: Array, dt_s: Array, error: Array, method: str | None, weight: Array | None = None
+) -> BaseVariance:
     """Coefficients of each axis from errors (n, 6); ``columns`` as :func:`gpvo.online.base.base_columns` says.
 
     ``weight`` (n,): how much a row counts.

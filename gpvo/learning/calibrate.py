@@ -109,7 +109,9 @@ def residual_correlation(z: Array, nu: float = 5.0) -> Array:
     return C / np.outer(s, s)
 
 
-def choose_geometry_weight(error: Array, sigma: Array, correlation: Array, geometry: Array | None, share: Array) -> float:
+def choose_geometry_weight(
+    error: Array, sigma: Array, correlation: Array, geometry: Array | None, share: Array
+) -> float:
     """How much of the geometry's correlation to believe: the weight with the best likelihood."""
     if geometry is None:
         return 0.0

@@ -34,9 +34,9 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 class TrainConfig:
     """``features``: ``auto`` (chosen by cross-validation over the training sequences), ``thesis``, ``full`` or a list.
 
-    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``: ``rotation``
-    first fits a fixed rotation between each log and its truth. ``inducing``, ``noise_inducing``: points of the GPs.
-    ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
+    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``:
+    ``rotation`` first fits a fixed rotation between each log and its truth. ``inducing``, ``noise_inducing``: points of
+    the GPs. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
     """
 
     features: str = "auto"

@@ -1,7 +1,7 @@
 """From training sequences to one error model; every choice is made by leaving whole sequences out.
 
-The steps: base variance -> inputs -> log-variance GP -> mean, where it helps -> jitter, white and bias -> correlation ->
-calibration on residuals of sequences left out.
+The steps: base variance -> inputs -> log-variance GP -> mean, where it helps -> jitter, white and bias ->
+correlation -> calibration on residuals of sequences left out.
 """
 
 from __future__ import annotations
@@ -15,20 +15,11 @@ from numpy.typing import NDArray
 from scipy.stats import t as t_distribution
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.dataset.splits import group_labels
+from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_base, t_negative_log_likelihood
-from gpvo.learning.calibrate import (
-    LEVELS,
-    choose_geometry_weight,
-    conformal_quantiles,
-    fit_joint_factor,
-    fit_scale,
-    residual_correlation,
-)
 from gpvo.learning.config import TrainConfig, candidates, geometric_method
-from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
-from gpvo.learning.parts import Parts, fit_parts, stretches
+from gpvo.learning.rows import Rows
 from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
 from gpvo.online.estimate import ErrorModelArrays
@@ -40,36 +31,6 @@ TRUSTS = (0.25, 0.5, 0.75, 1.0)
 
 NONE = "none"
 """The choice of no inputs: the base variance alone."""
-
-
-@dataclass(frozen=True)
-class Rows:
-    """All training rows of several sequences below one another, with the groups that cross-validation leaves out."""
-
-    sets: Sequence[TrainingSet]
-    error: Array
-    dt_s: Array
-    group: NDArray[np.int64]
-    grouped_by: str
-    weight: Array
-
-    @classmethod
-    def stack(cls, sets: Sequence[TrainingSet]) -> Rows:
-        group, by = group_labels([len(s) for s in sets])
-        # Every sequence counts alike, however long: a new sequence is what the model will meet.
-        weight = np.concatenate([np.full(len(s), 1.0 / len(s)) for s in sets])
-        error, dt = np.concatenate([s.Y for s in sets]), np.concatenate([s.dt_s for s in sets])
-        return cls(sets, error, dt, group, by, weight / weight.mean())
-
-    def select(self, names: Sequence[str]) -> Array:
-        return np.concatenate([s.select(names) for s in self.sets])
-
-    def geometry(self, method: str | None) -> Array | None:
-        return None if method is None else np.concatenate([s.covariances[method] for s in self.sets])
-
-    def by_group(self, values: Array) -> Array:
-        """Means of (n, ...) over each group, (G, ...)."""
-        return np.array([values[self.group == g].mean(axis=0) for g in np.unique(self.group)])
 
 
 @dataclass(frozen=True)
@@ -91,7 +52,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     fitted, mean_gain = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
     fitted = None if fitted is None else shrink(fitted, trust)
     error, variance = _out_of_fold(rows, base_oof, fitted)
-    model, calibration = _assemble(rows, base, columns, inputs, fitted, error, variance)
+    model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance)
     lost = np.mean([(s.select(base_columns(None)) ** 2).mean(axis=0) for s in sets], axis=0)
     arrays = {**model.to_arrays(), "lost_rate_var": np.maximum(lost, 1e-6)}
     use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
@@ -108,14 +69,16 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
 
 
 def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
-    """The geometric method (or none) whose base variance predicts left-out groups best, and its out-of-fold variance."""
+    """The base variance, with geometry or without, that predicts left-out groups best; and that variance out of fold."""
     best: tuple[float, str | None, Array] | None = None
     for method in (*geometric_method(rows.sets), None):
         C = _base_inputs(rows, method)
         oof = np.empty_like(rows.error)
         for g in np.unique(rows.group):
             out = rows.group == g
-            oof[out] = fit_base(C[~out], rows.dt_s[~out], rows.error[~out], method, rows.weight[~out])(C[out], rows.dt_s[out])
+            oof[out] = fit_base(C[~out], rows.dt_s[~out], rows.error[~out], method, rows.weight[~out])(
+                C[out], rows.dt_s[out]
+            )
         loss = _loss(rows, rows.error**2, oof)
         if best is None or loss < best[0]:
             best = (loss, method, oof)
@@ -240,80 +203,3 @@ def _out_of_fold(rows: Rows, base_oof: Array, fitted: HeteroscedasticFit | None)
     if fitted is None:
         return rows.error, base_oof
     return rows.error - fitted.oof_mean, np.exp(fitted.oof_log_noise_var) * base_oof + fitted.oof_epistemic_var
-
-
-def _assemble(
-    rows: Rows,
-    base: BaseVariance,
-    columns: tuple[str, ...],
-    inputs: Sequence[str],
-    fitted: HeteroscedasticFit | None,
-    error: Array,
-    variance: Array,
-) -> tuple[ErrorModelArrays, dict[str, Any]]:
-    """Parts, correlation and calibration from the out-of-fold residuals; then everything in one place."""
-    scale = fit_scale(error / np.sqrt(variance), rows.group)
-    sigma = np.sqrt(variance * scale.factor)
-    z = error / sigma
-    split = fit_parts(_stretches(rows, z), float(np.median(rows.dt_s)))
-    correlation = residual_correlation(z)
-    geometry = rows.geometry(base.method)
-    weight = choose_geometry_weight(error, sigma, correlation, geometry, split.share)
-    X = rows.select(columns)
-    if fitted is None:
-        inputs, basis = (columns[0],), SharedBasis(no_mean(1, 6), None, np.zeros(6))
-        high = np.zeros(6)
-    else:
-        basis = fitted.basis
-        high = np.quantile(fitted.oof_log_noise_var, 0.95, axis=0)
-    at = np.array([columns.index(n) for n in inputs], dtype=np.int64)
-    model = ErrorModelArrays(
-        columns=columns,
-        inputs=at,
-        basis=basis,
-        domain=Domain.learn(X),
-        base=base,
-        factor=scale.factor,
-        high=high,
-        correlation=correlation,
-        geometry_weight=np.array([weight]),
-        share=split.share,
-        bias_tau_s=split.tau_s,
-        typical_ln_det=np.zeros(1),
-        dt_s=float(np.median(rows.dt_s)),
-    )
-    whole = _covariance(model, sigma, geometry)
-    joint = fit_joint_factor(error, whole, rows.group)
-    typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
-    model = replace(model, factor=scale.factor * joint, typical_ln_det=np.array([typical]))
-    return model, _calibration(rows, scale, joint, split, weight, np.abs(z) / np.sqrt(joint))
-
-
-def _covariance(model: ErrorModelArrays, sigma: Array, geometry: Array | None) -> Array:
-    root = np.sqrt(model.share)
-    kept = sum(np.outer(r, r) for r in root)
-    return sigma[:, :, None] * model.correlations(len(sigma), geometry) * sigma[:, None, :] * kept
-
-
-def _stretches(rows: Rows, z: Array) -> list[Array]:
-    out, start = [], 0
-    for s in rows.sets:
-        out += [z[start : start + len(s)][part] for part in stretches(s.t_ns, s.dt_s)]
-        start += len(s)
-    return out
-
-
-def _calibration(rows: Rows, scale: Any, joint: float, split: Parts, weight: float, score: Array) -> dict[str, Any]:
-    axes = [conformal_quantiles(score[:, j], rows.group) for j in range(6)]
-    return {
-        "by": rows.grouped_by,
-        "groups": len(np.unique(rows.group)),
-        "scale_of_groups": scale.by_group,
-        "log_scale_spread": scale.spread,
-        "joint_factor": joint,
-        "geometry_correlation_weight": weight,
-        "interval_levels": LEVELS,
-        "interval_sigmas": [widths for widths, _ in axes],
-        "interval_guaranteed": [sure for _, sure in axes],
-        "parts": {"spans_frames": split.spans, "measured": split.measured, "fitted": split.fitted},
-    }

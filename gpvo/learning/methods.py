@@ -1,4 +1,4 @@
-"""The other ways of stating the uncertainty, fitted to the same training sequences: what ``learned`` is compared with."""
+"""The other ways of stating the uncertainty, fitted to the same sequences: what ``learned`` is compared with."""
 
 from __future__ import annotations
 
@@ -36,13 +36,29 @@ def constant_covariance(sets: Sequence[TrainingSet]) -> Array:
 
 
 def best_scale(sets: Sequence[TrainingSet], method: str) -> Array | None:
-    """(6,) factor per axis on the variance with the best likelihood: mean squared normalised error."""
-    ratio = [s.Y**2 / np.diagonal(s.covariances[method], axis1=1, axis2=2) for s in sets if method in s.covariances]
-    if not ratio:
+    """(6,) factor per axis on the variance with the best joint likelihood on all rows.
+
+    With ``D = diag(1 / a)`` the negative log-likelihood of ``D C D`` is ``a^T M a / 2 - sum ln a`` up to a constant,
+    where M is the mean of ``e e^T * C^-1`` (element by element): convex, solved by damped Newton steps.
+    """
+    M, rows = np.zeros((6, 6)), 0
+    for s in sets:
+        if method in s.covariances:
+            known = np.isfinite(s.covariances[method]).all(axis=(1, 2))
+            e = s.Y[known]
+            M += (e[:, :, None] * e[:, None, :] * np.linalg.inv(s.covariances[method][known])).sum(axis=0)
+            rows += int(known.sum())
+    if rows == 0:
         return None
-    values = np.concatenate(ratio)
-    values = values[np.isfinite(values).all(axis=1)]
-    return values.mean(axis=0) if len(values) else None
+    M /= rows
+    a = 1.0 / np.sqrt(np.maximum(np.diagonal(M), 1e-300))
+    for _ in range(100):
+        slope = M @ a - 1.0 / a
+        step = np.linalg.solve(M + np.diag(1.0 / a**2), slope)
+        a = np.maximum(a - step, 0.1 * a)
+        if np.abs(step / a).max() < 1e-12:
+            break
+    return 1.0 / a**2
 
 
 def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:

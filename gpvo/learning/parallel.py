@@ -31,7 +31,9 @@ def map_jobs(
     return list(Parallel(n_jobs=jobs)(delayed(function)(*arguments) for arguments in jobs_arguments))
 
 
-def _on_dask(function: Callable[..., Any], jobs_arguments: Sequence[tuple[Any, ...]], scheduler: str | None) -> list[Any]:
+def _on_dask(
+    function: Callable[..., Any], jobs_arguments: Sequence[tuple[Any, ...]], scheduler: str | None
+) -> list[Any]:
     try:
         from distributed import Client
     except ImportError:

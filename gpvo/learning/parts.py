@@ -1,7 +1,7 @@
 """How errors add up over a distance: jitter, white and bias, from the variance of sums over 1, 2, 5, ... frames.
 
-With unit variance per frame, the variance of the sum over m frames is ``a`` for jitter (n_k - n_(k-1)), ``w m`` for white
-noise and ``b (m + 2 sum_i (m - i) rho^i)`` for a first-order Gauss-Markov bias with correlation rho per frame
+With unit variance per frame, the variance of the sum over m frames is ``a`` for jitter (n_k - n_(k-1)), ``w m`` for
+white noise and ``b (m + 2 sum_i (m - i) rho^i)`` for a first-order Gauss-Markov bias with correlation rho per frame
 (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8).
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Parts:
 
 
 def fit_parts(z: Sequence[Array], step_s: float) -> Parts:
-    """From normalised residuals, one array (n_i, D) per unbroken stretch of motions; ``step_s``: their usual duration."""
+    """From normalised residuals, one array (n_i, D) per unbroken stretch; ``step_s``: usual duration of a motion."""
     spans, measured, windows = span_variances(z)
     unit = measured[0]
     shares, taus, fitted = [], [], []
@@ -100,4 +101,4 @@ def stretches(t_ns: NDArray[np.int64], dt_s: Array) -> list[slice]:
     begins = t_ns[1:] - np.round(dt_s[1:] * 1e9).astype(np.int64)
     breaks = np.flatnonzero(np.abs(begins - t_ns[:-1]) > 1000) + 1
     edges = [0, *breaks.tolist(), len(t_ns)]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:])]
+    return [slice(a, b) for a, b in pairwise(edges)]

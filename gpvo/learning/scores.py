@@ -25,7 +25,9 @@ def score(error: Array, mean: Array, covariance: Array) -> dict[str, Any]:
     error, mean, covariance = error[known], mean[known], covariance[known]
     residual = error - mean
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    per_block = {n: nees(residual[:, b], covariance[:, b, b]) / (b.stop - b.start) for n, b in _BLOCKS.items() if b.stop <= d}
+    per_block = {
+        n: nees(residual[:, b], covariance[:, b, b]) / (b.stop - b.start) for n, b in _BLOCKS.items() if b.stop <= d
+    }
     crps = crps_gaussian(residual[:, :d], sigma)
     level = coverage(residual[:, :d], sigma)
     return {
@@ -33,7 +35,10 @@ def score(error: Array, mean: Array, covariance: Array) -> dict[str, Any]:
         "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in _BLOCKS},
         "coverage": {str(k + 1): float(c) for k, c in enumerate(level)},
         "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if d == 6 else None,
-        "crps": {"translation_m": float(crps[:, :3].mean()), "rotation_rad": float(crps[:, 3:].mean()) if d == 6 else None},
+        "crps": {
+            "translation_m": float(crps[:, :3].mean()),
+            "rotation_rad": float(crps[:, 3:].mean()) if d == 6 else None,
+        },
         "rmse_raw": _rmse(error, d),
         "rmse_corrected": _rmse(residual, d),
     }

@@ -27,8 +27,8 @@ from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
-GROSS_SIGMAS = 20.0
-"""An error beyond so many robust standard deviations of its sequence counts as a slip in the report."""
+SLIP_MEDIANS = 20.0
+"""A translation error longer than so many medians of its sequence counts as a slip in the report."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,9 @@ def train_sets(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool 
     learned = fit_model(sets, config)
     arrays = {**learned.arrays, **method_arrays(sets)}
     header = _header(sets, config, learned, table)
-    return TrainedModel(arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets)
+    return TrainedModel(
+        arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets
+    )
 
 
 def _checked(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
@@ -81,7 +83,7 @@ def _checked(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
 
 
 def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
-    """``folds`` (one per sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
+    """``folds`` (a sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
 
     With a single sequence there is nothing to leave out: no folds.
     """
@@ -121,9 +123,9 @@ def estimate_set(learned: Learned, s: TrainingSet) -> Estimate:
 
 def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array) -> dict[str, Any]:
     """Gross errors caught and missed, good motions flagged, and NEES/dof with the caught ones counted in."""
-    sigma = 1.4826 * np.median(np.abs(s.Y), axis=0)
-    gross = (np.abs(s.Y) > GROSS_SIGMAS * sigma).any(axis=1)
-    gross_lost = (np.abs(s.lost_xi) > GROSS_SIGMAS * sigma).any(axis=1)
+    length, lost_length = (np.linalg.norm(xi[:, :3], axis=1) for xi in (s.Y, s.lost_xi))
+    gross = length > SLIP_MEDIANS * np.median(length)
+    gross_lost = lost_length > SLIP_MEDIANS * np.median(length)
     usual = learned.arrays["lost_rate_var"] * learned.model.dt_s**2
     jump2 = s.lost_jump**2
     lost_var = np.maximum(usual, np.repeat(np.stack([jump2[:, :3].sum(1), jump2[:, 3:].sum(1)], 1), 3, axis=1))
@@ -163,7 +165,9 @@ def training_digest(sets: Sequence[TrainingSet]) -> str:
     return hashlib.sha256("".join(sorted(s.digest() for s in sets)).encode()).hexdigest()
 
 
-def _header(sets: Sequence[TrainingSet], config: TrainConfig, learned: Learned, table: Mapping[str, Any]) -> dict[str, Any]:
+def _header(
+    sets: Sequence[TrainingSet], config: TrainConfig, learned: Learned, table: Mapping[str, Any]
+) -> dict[str, Any]:
     model = learned.model
     domain = model.domain
     low, high = domain.centre + domain.scale * domain.low, domain.centre + domain.scale * domain.high

@@ -1,7 +1,8 @@
 """The variance that is known before anything is learnt, per axis: a sum of physical parts.
 
-``v_j = a_j g_j + b_j + c_j |t|^2 + d_j |phi|^2``: the geometric variance g (pixel noise carried through the geometry), a
-floor, and parts that grow with the motion (S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics" (2005), section 5.4).
+``v_j = a_j g_j + b_j + c_j |t|^2 + d_j |phi|^2``: the geometric variance g (pixel noise carried through the geometry),
+a floor, and parts that grow with the motion (S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics" (2005), section
+5.4).
 Coefficients are not negative, so it never shrinks when a part grows. The GP learns the log of the ratio to it.
 """
 

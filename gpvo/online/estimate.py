@@ -83,17 +83,31 @@ class ErrorModelArrays:
         return {**own, "theta": self.base.theta, **self.basis.to_arrays("basis."), **self.domain.to_arrays("domain.")}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], columns: tuple[str, ...], method: str | None, dt_s: float) -> ErrorModelArrays:
+    def from_arrays(
+        cls, arrays: Mapping[str, NDArray[Any]], columns: tuple[str, ...], method: str | None, dt_s: float
+    ) -> ErrorModelArrays:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
         try:
             own = {name: arrays[name] for name in _OWN}
             base = BaseVariance(arrays["theta"], method)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
-        shapes = {"factor": (6,), "high": (6,), "correlation": (6, 6), "share": (3, 6), "bias_tau_s": (6,), "geometry_weight": (1,)}
+        shapes = {
+            "factor": (6,),
+            "high": (6,),
+            "correlation": (6, 6),
+            "share": (3, 6),
+            "bias_tau_s": (6,),
+            "geometry_weight": (1,),
+        }
         wrong = [n for n, s in shapes.items() if own[n].shape != s]
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
-        if wrong or base.theta.shape != (6, 4) or len(domain.centre) != len(columns) or basis.n_inputs != len(own["inputs"]):
+        if (
+            wrong
+            or base.theta.shape != (6, 4)
+            or len(domain.centre) != len(columns)
+            or basis.n_inputs != len(own["inputs"])
+        ):
             raise ModelError(f"the model file's arrays do not fit its features ({', '.join(wrong) or 'sizes differ'})")
         return cls(columns=columns, basis=basis, domain=domain, base=base, dt_s=dt_s, **own)
 

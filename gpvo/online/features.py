@@ -1,7 +1,7 @@
 """What the error model looks at: the one causal, streaming definition, used in flight and replayed for training.
 
-A feature at frame k depends on the records up to k and on nothing later. Rates are per second and image lengths per focal
-length, so that a model survives another frame rate and another camera. Values a producer does not know are NaN.
+A feature at frame k depends on the records up to k and on nothing later. Rates are per second and image lengths per
+focal length, so that a model survives another frame rate and another camera. Values a producer does not know are NaN.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GEOMETRIC_METHODS = ("pointing_matching", "triangulation")
 TREND_S = 1.0
 """Time constant of the running means that the trends are measured against [s]."""
 
-Step = Callable[[VoRecord], Sequence[float]]
+Step = Callable[[VoRecord], Sequence[float] | Array]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _geometry(r: VoRecord, focal: float) -> Sequence[float]:
     out = [*disparities, r.spread_u, r.spread_v, _ln(r.reproj_rms_px / focal), r.log10_condition]
     for method in GEOMETRIC_METHODS:
         C = r.covariances.get(method)
-        if C is None:
+        if C is None or not np.isfinite(C).all():
             out += [math.nan] * 7
         else:
             sign, log_det = np.linalg.slogdet(C)
@@ -97,7 +97,9 @@ def _norm(v: Array | None) -> float:
 
 
 def _imu(r: VoRecord, _: float) -> Sequence[float]:
-    return tuple(_norm(v) for v in (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps, r.imu_acc_std_mps2, r.imu_gyro_std_radps))
+    return tuple(
+        _norm(v) for v in (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps, r.imu_acc_std_mps2, r.imu_gyro_std_radps)
+    )
 
 
 def _imu_axes(r: VoRecord, _: float) -> Sequence[float]:
@@ -148,9 +150,13 @@ def _variance_columns() -> list[str]:
 
 
 BUILT_IN = (
-    FeatureGroup("velocity", _columns("v_x_mps [m/s]", "v_y_mps [m/s]", "v_z_mps [m/s]"), lambda c: lambda r: twist(r)[:3]),
     FeatureGroup(
-        "rotation", _columns("w_x_radps [rad/s]", "w_y_radps [rad/s]", "w_z_radps [rad/s]"), lambda c: lambda r: twist(r)[3:]
+        "velocity", _columns("v_x_mps [m/s]", "v_y_mps [m/s]", "v_z_mps [m/s]"), lambda c: lambda r: twist(r)[:3]
+    ),
+    FeatureGroup(
+        "rotation",
+        _columns("w_x_radps [rad/s]", "w_y_radps [rad/s]", "w_z_radps [rad/s]"),
+        lambda c: lambda r: twist(r)[3:],
     ),
     FeatureGroup(
         "counts",
@@ -169,7 +175,11 @@ BUILT_IN = (
         ),
         _stateless(_geometry),
     ),
-    FeatureGroup("image", _columns("brightness [0..1]", "contrast [0..1]", "sharpness [log10]", "noise_level [0..1]"), _stateless(_image)),
+    FeatureGroup(
+        "image",
+        _columns("brightness [0..1]", "contrast [0..1]", "sharpness [log10]", "noise_level [0..1]"),
+        _stateless(_image),
+    ),
     FeatureGroup(
         "trend",
         _columns(
@@ -184,7 +194,9 @@ BUILT_IN = (
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.
     FeatureGroup(
         "imu",
-        _columns("imu_acc_mps2 [m/s^2]", "imu_gyro_radps [rad/s]", "imu_acc_std_mps2 [m/s^2]", "imu_gyro_std_radps [rad/s]"),
+        _columns(
+            "imu_acc_mps2 [m/s^2]", "imu_gyro_radps [rad/s]", "imu_acc_std_mps2 [m/s^2]", "imu_gyro_std_radps [rad/s]"
+        ),
         _stateless(_imu),
     ),
     FeatureGroup(
@@ -217,7 +229,7 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
     wanted = [w for w in groups() if w != "imu_axes"] if selection == "full" else selection
     if isinstance(wanted, str):
         wanted = [w.strip() for w in wanted.split(",") if w.strip()]
-    columns = {c.name for g in groups().values() for c in g.columns}
+    columns = known_columns()
     out: dict[str, None] = {}
     for name in wanted:
         if name in groups():
@@ -225,10 +237,18 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
         elif name in columns:
             out[name] = None
         else:
-            raise GpvoError(f"there is no feature '{name}'", cure=f"thesis, full, or any of: {', '.join(groups())}, or a column of them")
+            raise GpvoError(
+                f"there is no feature '{name}'",
+                cure=f"thesis, full, or any of: {', '.join(groups())}, or a column of them",
+            )
     if not out:
         raise GpvoError("the selection of features is empty", cure="thesis, full, or a comma-separated list")
     return tuple(out)
+
+
+def known_columns() -> frozenset[str]:
+    """Names of all columns, those of installed packages included."""
+    return frozenset(c.name for g in groups().values() for c in g.columns)
 
 
 def units(names: Sequence[str]) -> tuple[str, ...]:
@@ -240,8 +260,8 @@ def units(names: Sequence[str]) -> tuple[str, ...]:
 class FeatureStream:
     """Features of one run, frame by frame.
 
-    ``names``: columns, in the order of the output (see :func:`resolve`). ``camera`` makes image lengths independent of the
-    focal length; without it those columns are NaN.
+    ``names``: columns, in the order of the output (see :func:`resolve`). ``camera`` makes image lengths independent of
+    the focal length; without it those columns are NaN.
     """
 
     def __init__(self, names: Sequence[str], camera: StereoCamera | None = None) -> None:
@@ -252,9 +272,11 @@ class FeatureStream:
             picked = [(place[c.name], j) for j, c in enumerate(group.columns) if c.name in place]
             if picked:
                 self._pick.append((group.start(camera), picked))
-        unknown = set(self.names) - {c.name for g in groups().values() for c in g.columns}
+        unknown = set(self.names) - known_columns()
         if unknown:
-            raise GpvoError(f"unknown features: {', '.join(sorted(unknown))}", cure="install the package that defines them")
+            raise GpvoError(
+                f"unknown features: {', '.join(sorted(unknown))}", cure="install the package that defines them"
+            )
 
     def step(self, record: VoRecord) -> Array:
         """(d,) features of the record's motion. Call once per record, in time order."""

@@ -68,10 +68,10 @@ class Domain:
         whitening = np.linalg.inv(np.linalg.cholesky(C)).T
         radius = np.quantile(np.linalg.norm((U - U.mean(0)) @ whitening, axis=1), 0.999, keepdims=True)
         shift = np.linalg.norm(U.mean(0) @ whitening)
-        return cls(centre, scale, low - pad, high + pad, whitening, radius + shift, np.isnan(X).any(axis=0))
+        return cls(centre, scale, low - pad, high + pad, whitening, radius + shift, np.asarray(np.isnan(X).any(axis=0)))
 
     def locate(self, X: Array) -> Whereabouts:
-        """Rows (n, d) in the features' units. A missing value is taken as typical, and far if training never missed it."""
+        """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it."""
         U = (X - self.centre) / self.scale
         missing = ~np.isfinite(U)
         U = np.where(missing, 0.0, U)

@@ -18,7 +18,7 @@ from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate
-from gpvo.online.features import resolve
+from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoRecord
@@ -44,6 +44,14 @@ class Influence:
         return f"{value}: sigma x{self.on_translation:.2f} translation, x{self.on_rotation:.2f} rotation{far}"
 
 
+def _check_known(features: tuple[str, ...]) -> None:
+    """Refuse features that nobody here computes, such as those of a package that is not installed."""
+    unknown = [f for f in features if f not in known_columns()]
+    if unknown:
+        what = f"this model needs features that are not installed: {', '.join(unknown)}"
+        raise ModelError(what, cure="install the package that defines them, or update gpvo")
+
+
 class Predictor:
     """Predicts the error of VO's motions. One instance per run: it remembers what its features need.
 
@@ -63,7 +71,7 @@ class Predictor:
                 "this model predicts the residual of a position, not the error of a motion",
                 cure="use PositionPredictor, or train with --target frame",
             )
-        resolve(self.features)
+        _check_known(self.features)
         self.model = ErrorModelArrays.from_arrays(arrays, self.features, method, dt_s)
         self.camera = None if camera is None else StereoCamera(**camera)
         self.target = str(target)
@@ -76,7 +84,7 @@ class Predictor:
         try:
             return cls(arrays, header, hashlib.sha256(Path(path).read_bytes()).hexdigest())
         except ModelError as problem:
-            raise ModelError(problem.what, where=Path(path), cure="train the model again") from None
+            raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
 
     def reset(self, camera: StereoCamera | None = None) -> None:
         """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with."""
@@ -96,7 +104,9 @@ class Predictor:
         X = np.asarray(features, dtype=np.float64)
         rows = np.atleast_2d(X)
         if rows.ndim != 2 or rows.shape[1] != len(self.features):
-            raise ModelError(f"features have shape {X.shape}, the model takes {len(self.features)}: {', '.join(self.features)}")
+            raise ModelError(
+                f"features have shape {X.shape}, the model takes {len(self.features)}: {', '.join(self.features)}"
+            )
         G = None if geometry is None else np.asarray(geometry, dtype=np.float64).reshape(-1, 6, 6)
         dt = None if dt_s is None else np.broadcast_to(np.asarray(dt_s, dtype=np.float64), (len(rows),))
         out = self.model.estimate(rows, G, dt)
@@ -145,7 +155,17 @@ class Predictor:
         unit = self.header.get("units") or [""] * len(x)
         factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1))
         order = np.argsort(-np.abs(gain).sum(1), kind="stable")
-        return [Influence(self.features[i], float(x[i]), unit[i], *factors[i].tolist(), float(np.nan_to_num(outside[i]))) for i in order]
+        return [
+            Influence(
+                feature=self.features[i],
+                value=float(x[i]),
+                unit=unit[i],
+                on_translation=float(factors[i, 0]),
+                on_rotation=float(factors[i, 1]),
+                outside=float(np.nan_to_num(outside[i])),
+            )
+            for i in order
+        ]
 
     def _publish(self, record: VoRecord, estimate: Estimate) -> Prediction:
         parts, status, confidence = dict(estimate.parts), record.status, float(estimate.confidence)

@@ -1,8 +1,9 @@
 """Is this motion possible at all? Slips are caught from what is known at the time, before any truth is seen.
 
-The implied acceleration is compared with the motion so far: its far quantile is extrapolated from the history's upper tail
-(B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after I. Weissman,
-1978). Nothing has a unit that would favour a car or a drone, except that an acceleration of one g is always believed.
+The implied acceleration is compared with the motion so far: its far quantile is extrapolated from the history's upper
+tail (B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after I.
+Weissman, 1978). Nothing has a unit that would favour a car or a drone, except that an acceleration of one g is
+always believed.
 """
 
 from __future__ import annotations

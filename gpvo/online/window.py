@@ -1,10 +1,11 @@
-"""Motions over a window of time or length, as records of their own: features and targets then need no second definition."""
+"""Motions over a window of time or length, as records: features and targets then need no second definition."""
 
 from __future__ import annotations
 
 import re
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -79,12 +80,17 @@ def joined(motions: list[VoRecord]) -> VoRecord:
     for r in motions:
         T = T @ r.T_prev_cur
         covariances = {
-            m: transport.compound(r.T_prev_cur, C, r.covariances[m]) for m, C in covariances.items() if m in r.covariances
+            m: transport.compound(r.T_prev_cur, C, r.covariances[m])
+            for m, C in covariances.items()
+            if m in r.covariances
         }
     status = max((r.status for r in motions), key=lambda s: s.severity)
-    means = {name: float(np.mean([getattr(r, name) for r in motions])) for name in _MEANS}
-    counts = {name: int(np.mean([getattr(r, name) for r in motions])) for name in _COUNTS}
-    imu = {n: None if any(getattr(r, n) is None for r in motions) else np.mean([getattr(r, n) for r in motions], axis=0) for n in _IMU}
+    known: dict[str, Any] = {name: float(np.mean([getattr(r, name) for r in motions])) for name in _MEANS}
+    known |= {name: int(np.mean([getattr(r, name) for r in motions])) for name in _COUNTS}
+    known |= {
+        n: None if any(getattr(r, n) is None for r in motions) else np.mean([getattr(r, n) for r in motions], axis=0)
+        for n in _IMU
+    }
     return replace(
         last,
         t_prev_ns=motions[0].t_prev_ns,
@@ -92,7 +98,5 @@ def joined(motions: list[VoRecord]) -> VoRecord:
         status=Status(status),
         covariances=covariances,
         v_t={},
-        **means,
-        **counts,
-        **imu,
+        **known,
     )

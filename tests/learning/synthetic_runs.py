@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-
 from gpvo.geometry import se3
 from gpvo.types import Status, StereoCamera, TruthLog, VoLog, VoRecord
 
@@ -30,8 +29,8 @@ def make_run(
     geometry_scale: float = 0.1,
     geometry: bool = True,
 ) -> tuple[VoLog, TruthLog]:
-    """A log and its truth. The true variance goes with 100 / inliers and with the square of the turn rate; the geometric
-    covariance knows of the inliers alone and is ``geometry_scale`` of the variance."""
+    """A log and its truth. The true variance goes with 100 / inliers and with the square of the turn rate; the
+    geometric covariance knows of the inliers alone and is ``geometry_scale`` of the variance."""
     rng = np.random.default_rng(seed)
     dt = 1.0 / rate_hz
     twist = np.zeros((n, 6))
@@ -47,7 +46,11 @@ def make_run(
     bias[0] = rng.standard_normal(6)
     for k in range(1, n):
         bias[k] = rho * bias[k - 1] + np.sqrt(1 - rho**2) * rng.standard_normal(6)
-    z = np.sqrt(a / 2) * (noise[1:] - noise[:-1]) + np.sqrt(w) * rng.standard_normal((n, 6)) @ L.T + np.sqrt(b) * bias @ L.T
+    z = (
+        np.sqrt(a / 2) * (noise[1:] - noise[:-1])
+        + np.sqrt(w) * rng.standard_normal((n, 6)) @ L.T
+        + np.sqrt(b) * bias @ L.T
+    )
     T_true = se3.exp(twist * dt)
     T_est = T_true @ se3.exp(z * sigma)
     return _log(T_true, T_est, dt, inliers, geometry_scale if geometry else None)
@@ -68,7 +71,9 @@ def _log(T_true, T_est, dt, inliers, geometry_scale) -> tuple[VoLog, TruthLog]:
     poses = [np.eye(4)]
     base = np.outer(UNIT, UNIT) * correlation()
     for k in range(n):
-        covariances = {} if geometry_scale is None else {"pointing_matching": base * (100 / inliers[k]) * geometry_scale}
+        covariances = (
+            {} if geometry_scale is None else {"pointing_matching": base * (100 / inliers[k]) * geometry_scale}
+        )
         records.append(
             VoRecord(
                 int(t[k + 1]),

@@ -1,0 +1,134 @@
+"""The model card: what a person should know before flying a model, in Markdown beside the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gpvo.online.features import AXES
+
+
+def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -> str:
+    """Markdown from a model's header and its table of left-out sequences."""
+    if header["target"] == "position":
+        return "\n\n".join([_position(header, name), _sequences(header), _domain(header)]) + "\n"
+    sections = [
+        _intro(header, name),
+        _data(header),
+        _scores(table),
+        _calibration(header),
+        _domain(header),
+        _limits(header),
+    ]
+    return "\n\n".join(s for s in sections if s) + "\n"
+
+
+def _intro(h: Mapping[str, Any], name: str) -> str:
+    choices = h["choices"]
+    mean = [a for a, used in zip(AXES, choices["use_mean"]) if used]
+    inputs = (
+        ", ".join(f"`{i}`" for i in h["inputs"]) or "none: the base variance alone predicts left-out sequences best"
+    )
+    return "\n".join(
+        [
+            f"# {name}",
+            "",
+            "Predicts the error of stereo visual odometry, with covariance, in the rectified left camera's frame.",
+            "",
+            f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
+            f"* base variance: {choices['base']}",
+            f"* inputs of the Gaussian process (chosen set: {choices['inputs']}, trust {choices['trust']:g}): {inputs}",
+            f"* mean corrected on: {', '.join(mean) or 'no axis; no mean was proven to help on left-out sequences'}",
+        ]
+    )
+
+
+def _position(h: Mapping[str, Any], name: str) -> str:
+    what = "Predicts the residual of the accumulated position [m], as the thesis does. Not for filters."
+    return "\n".join([f"# {name}", "", what, "", f"* inputs: {', '.join(f'`{i}`' for i in h['features'])}"])
+
+
+def _data(h: Mapping[str, Any]) -> str:
+    return _sequences(h) + f"\n\nDigest of the rows: `{h['training_digest']}`"
+
+
+def _sequences(h: Mapping[str, Any]) -> str:
+    rows = [f"| {s['name']} | {s['rows']} | {s['lost']} | {s['without_truth']} |" for s in h["sequences"]]
+    camera = h["camera"]
+    seen = (
+        "no camera known"
+        if camera is None
+        else f"focal length {camera['fx_px']:.1f} px, baseline {camera['baseline_m']:.4f} m, "
+        f"{camera['width']}x{camera['height']}"
+    )
+    head = [
+        "## Training data",
+        "",
+        f"Camera: {seen}.",
+        "",
+        "| sequence | rows | lost | without truth |",
+        "| --- | --- | --- | --- |",
+    ]
+    return "\n".join([*head, *rows])
+
+
+def _number(value: float | None, digits: str = ".3g") -> str:
+    return "-" if value is None else format(value, digits)
+
+
+def _scores(table: Mapping[str, Any]) -> str:
+    if not table.get("folds"):
+        return "## Scores\n\nOne sequence: nothing could be left out, so nothing is known about another one."
+    lines = [
+        "## Scores on sequences left out",
+        "",
+        "| method | NEES/dof | median | within 1 sigma | NLL per axis |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for method, s in table["mean"].items():
+        numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"], s["nll_per_dim"]]
+        if any(v is not None for v in numbers):
+            lines.append(f"| {method} | " + " | ".join(_number(v) for v in numbers) + " |")
+    c = table["comparison"]
+    d = c["nll_per_dim_difference"]
+    lines += [
+        "",
+        f"Best row by NLL: `{c['best_row']}`. `learned` minus `{c['rival']}`: "
+        f"{d['mean']:+.3f} nats per axis [{d['low']:+.3f}, {d['high']:+.3f}].",
+    ]
+    return "\n".join(lines)
+
+
+def _calibration(h: Mapping[str, Any]) -> str:
+    c = h["calibration"]
+    marked = " With so few sequences the spread between sequences is a guess." if h["by_few_sequences"] else ""
+    widths = ", ".join(
+        f"{100 * level:.0f} %: {w:.2f}" for level, w in zip(c["interval_levels"], c["interval_sigmas"][0])
+    )
+    return "\n".join(
+        [
+            "## Calibration",
+            "",
+            f"By {c['by']} ({c['groups']} left out in turn).{marked}",
+            f"Half widths in sigma that covered left-out data on the first axis: {widths}.",
+        ]
+    )
+
+
+def _domain(h: Mapping[str, Any]) -> str:
+    rows = [
+        f"| `{n}` | {u} | {lo:.4g} | {hi:.4g} |" for (n, (lo, hi)), u in zip(h["training_domain"].items(), h["units"])
+    ]
+    return "\n".join(["## Where it has been", "", "| feature | unit | from | to |", "| --- | --- | --- | --- |", *rows])
+
+
+def _limits(h: Mapping[str, Any]) -> str:
+    return "\n".join(
+        [
+            "## Limits",
+            "",
+            "* Outside the ranges above the covariance grows, `in_domain` falls, and the numbers are a guess.",
+            "* The truth's own noise is part of the error learnt here.",
+            f"* Versions: gpvo {h['versions']['gpvo']}, NumPy {h['versions']['numpy']}.",
+        ]
+    )

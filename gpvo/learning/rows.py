@@ -1,0 +1,52 @@
+"""Training rows of several sequences below one another, with the groups that cross-validation leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.build import TrainingSet
+from gpvo.dataset.splits import group_labels
+from gpvo.learning.parts import stretches
+from gpvo.types import Array
+
+
+@dataclass(frozen=True)
+class Rows:
+    """All training rows of several sequences below one another, with the groups that cross-validation leaves out."""
+
+    sets: Sequence[TrainingSet]
+    error: Array
+    dt_s: Array
+    group: NDArray[np.int64]
+    grouped_by: str
+    weight: Array
+
+    @classmethod
+    def stack(cls, sets: Sequence[TrainingSet]) -> Rows:
+        group, by = group_labels([len(s) for s in sets])
+        # Every sequence counts alike, however long: a new sequence is what the model will meet.
+        weight = np.concatenate([np.full(len(s), 1.0 / len(s)) for s in sets])
+        error, dt = np.concatenate([s.Y for s in sets]), np.concatenate([s.dt_s for s in sets])
+        return cls(sets, error, dt, group, by, weight / weight.mean())
+
+    def select(self, names: Sequence[str]) -> Array:
+        return np.concatenate([s.select(names) for s in self.sets])
+
+    def geometry(self, method: str | None) -> Array | None:
+        return None if method is None else np.concatenate([s.covariances[method] for s in self.sets])
+
+    def by_group(self, values: Array) -> Array:
+        """Means of (n, ...) over each group, (G, ...)."""
+        return np.array([values[self.group == g].mean(axis=0) for g in np.unique(self.group)])
+
+    def stretches(self, values: Array) -> list[Array]:
+        """Rows of (n, ...) in unbroken stretches of motions."""
+        out, start = [], 0
+        for s in self.sets:
+            out += [values[start : start + len(s)][part] for part in stretches(s.t_ns, s.dt_s)]
+            start += len(s)
+        return out

@@ -1,0 +1,31 @@
+"""Adding one's own flights to a model: old and new rows together, everything fitted and judged anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+from gpvo.dataset.build import build_run
+from gpvo.errors import ModelError
+from gpvo.io.run_read import Run
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.store import training_rows
+from gpvo.learning.train import TrainedModel, train_sets
+from gpvo.online import modelfile
+
+
+def config_of(path: str | Path) -> TrainConfig:
+    """The settings a model was trained with."""
+    known = {f.name for f in fields(TrainConfig)}
+    return TrainConfig(**{k: v for k, v in modelfile.read_header(path).get("config", {}).items() if k in known})
+
+
+def update(path: str | Path, runs: Sequence[Run], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
+    """The model at ``path`` with more sequences. A run of a name it knows replaces that sequence."""
+    old = training_rows(path)
+    if old[0].target != config.target:
+        raise ModelError(f"learns the target '{old[0].target}', not '{config.target}'", where=path)
+    new = [build_run(r, target=config.target, align=config.align) for r in runs]
+    names = {s.name for s in new}
+    return train_sets([*(s for s in old if s.name not in names), *new], config, judge=judge)

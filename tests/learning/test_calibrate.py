@@ -1,0 +1,67 @@
+"""Calibration: second moments under heavy tails, new sequences, conformal intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.learning.basefit import fit_base
+from gpvo.learning.calibrate import conformal_quantiles, fit_scale, residual_correlation, robust_second_moment
+from gpvo.online.base import parts
+
+
+def test_second_moment_of_a_gaussian_and_of_a_t():
+    rng = np.random.default_rng(0)
+    assert robust_second_moment(4.0 * rng.standard_normal(4000) ** 2) == pytest.approx(4.0, rel=0.1)
+    heavy = [robust_second_moment(rng.standard_t(5, 4000) ** 2) for _ in range(10)]
+    assert np.mean(heavy) == pytest.approx(5 / 3, rel=0.12)
+
+
+def test_one_jump_does_not_set_the_scale():
+    square = np.random.default_rng(1).standard_normal(2000) ** 2
+    square[7] = 1e6
+    assert robust_second_moment(square) < 1.5
+
+
+def test_a_new_sequence_is_covered():
+    """Scales drawn per sequence: the mean NEES of new ones stays near one, where pooling would do no worse."""
+    rng = np.random.default_rng(2)
+    stated = []
+    for _ in range(200):
+        scale = np.exp(0.5 * rng.standard_normal(6))
+        z = np.concatenate([np.sqrt(c) * rng.standard_normal((200, 6)) for c in scale])
+        fitted = fit_scale(z, np.repeat(np.arange(6), 200))
+        stated.append(np.exp(0.125) / fitted.factor.mean())
+    assert 0.85 < np.mean(stated) < 1.15
+
+
+def test_conformal_intervals_cover_new_groups():
+    rng = np.random.default_rng(3)
+    inside = []
+    for _ in range(300):
+        scale = np.exp(0.4 * rng.standard_normal(11))
+        score = [np.abs(s * rng.standard_normal(100)) for s in scale]
+        widths, sure = conformal_quantiles(np.concatenate(score[:10]), np.repeat(np.arange(10), 100))
+        assert sure == [True, True, True, True, False]
+        inside.append([(score[10] <= w).mean() for w in widths])
+    assert (np.mean(inside, axis=0)[:4] >= np.array([0.5, 0.6827, 0.8, 0.9]) - 0.02).all()
+
+
+def test_correlation_of_heavy_tailed_residuals():
+    rng = np.random.default_rng(4)
+    R = np.array([[1, 0.8], [0.8, 1]])
+    z = rng.standard_normal((5000, 2)) @ np.linalg.cholesky(R).T / np.sqrt(rng.chisquare(4, (5000, 1)) / 4)
+    np.testing.assert_allclose(residual_correlation(z), R, atol=0.05)
+
+
+def test_base_variance_finds_its_parts():
+    rng = np.random.default_rng(5)
+    n = 6000
+    columns = np.concatenate([rng.normal(size=(n, 6)) * [1, 1, 5, 0.1, 0.3, 0.1], rng.normal(size=(n, 6))], axis=1)
+    dt = np.full(n, 0.1)
+    terms = parts(columns, dt)
+    theta = np.array([0.5, 0.0, 2.0, 0.0])
+    error = np.sqrt(terms @ theta) * rng.standard_normal((n, 6))
+    base = fit_base(columns, dt, error, "any")
+    ratio = np.log(base(columns, dt) / (terms @ theta))
+    # The heavy-tailed likelihood finds the shape; its scale is set later, by calibration.
+    assert np.abs(ratio - ratio.mean(axis=0)).mean() < 0.1

@@ -1,0 +1,203 @@
+"""Training: honest on flights it has not seen, over one motion and over many metres; repeatable to the byte."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError, ModelError
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.fit import surely_positive
+from gpvo.learning.methods import METHODS, best_scale
+from gpvo.learning.parts import fit_parts
+from gpvo.learning.scores import score
+from gpvo.learning.store import card_path, rows_path, save_model
+from gpvo.learning.train import train_sets
+from gpvo.learning.update import update
+from gpvo.online.predictor import Predictor
+from gpvo.stats.consistency import nees
+from small_model import small_model, training_sets
+from synthetic_runs import make_run
+
+QUICK = TrainConfig(features="velocity,rotation,n_inliers", noise_inducing=32)
+
+
+def _said(predictor, s):
+    return predictor.predict(s.select(predictor.features), s.covariances.get("pointing_matching"), s.dt_s)
+
+
+def test_consistent_on_unseen_flights():
+    predictor = small_model().predictor()
+    per_flight = []
+    for s in training_sets(range(100, 112), n=300):
+        e = _said(predictor, s)
+        per_flight.append(nees(s.Y - e.mean, e.covariance).mean() / 6)
+        assert 0.6 < np.mean(np.abs(s.Y - e.mean) < e.sigma) < 0.77
+    assert 0.8 <= np.mean(per_flight) <= 1.25
+
+
+def test_consistent_over_many_frames():
+    """Sums over 1, 10 and 100 frames against what jitter, white and bias say of them."""
+    predictor = small_model().predictor()
+    flights = [(s, _said(predictor, s)) for s in training_sets(range(100, 112), n=300)]
+    share, tau = predictor.model.share, predictor.model.bias_tau_s / predictor.model.dt_s
+    for m in (1, 10, 100):
+        ratio = []
+        for s, e in flights:
+            z = np.cumsum(np.vstack([np.zeros(6), (s.Y - e.mean) / e.sigma]), axis=0)
+            ratio.append(((z[m:] - z[:-m]) ** 2).mean(axis=0))
+        rho = np.exp(-1 / tau)
+        i = np.arange(1, m)[:, None]
+        stated = share[0] + share[1] * m + share[2] * (m + 2 * ((m - i) * rho**i).sum(axis=0))
+        assert 0.7 <= np.mean(np.mean(ratio, axis=0) / stated) <= 1.5, m
+
+
+def test_parts_of_a_known_mixture():
+    rng = np.random.default_rng(0)
+    out = []
+    for _ in range(20):
+        n = rng.standard_normal((1001, 3))
+        bias = np.zeros((1000, 3))
+        for k in range(1, 1000):
+            bias[k] = np.exp(-1 / 30) * bias[k - 1] + np.sqrt(1 - np.exp(-2 / 30)) * rng.standard_normal(3)
+        out.append(
+            np.sqrt(0.3) * (n[1:] - n[:-1]) + np.sqrt(0.3) * rng.standard_normal((1000, 3)) + np.sqrt(0.1) * bias
+        )
+    parts = fit_parts(out, 0.1)
+    np.testing.assert_allclose(parts.share.mean(axis=1), [0.6, 0.3, 0.1], atol=0.06)
+    assert 1.0 < parts.tau_s.mean() < 8.0
+
+
+def test_same_data_and_seed_give_the_same_bytes(tmp_path):
+    sets = training_sets(range(3), n=120)
+    for name in ("a", "b"):
+        save_model(train_sets(sets, QUICK, judge=False), tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_table_has_every_row_and_every_key(tmp_path):
+    sets = training_sets(range(3), n=120)
+    trained = train_sets(sets, QUICK)
+    folds = trained.table["folds"]
+    assert [f["held_out"] for f in folds] == [s.name for s in sets]
+    for fold in folds:
+        assert tuple(fold["methods"]) == METHODS
+        for method in METHODS:
+            assert set(fold["methods"][method]) == {
+                "nees_dof", "nees_dof_median", "coverage", "nll_per_dim", "crps", "rmse_raw", "rmse_corrected",
+            }  # fmt: skip
+        assert fold["methods"]["triangulation"]["nll_per_dim"] is None
+        assert fold["methods"]["learned"]["nll_per_dim"] < fold["methods"]["pointing_matching"]["nll_per_dim"]
+    save_model(trained, tmp_path / "m.gpvo")
+    card = card_path(tmp_path / "m.gpvo").read_text()
+    assert "pointing_matching_scaled" in card
+    assert "training data" in card.lower()
+
+
+def test_update_adds_flights(tmp_path):
+    path = tmp_path / "m.gpvo"
+    save_model(train_sets(training_sets(range(3), n=120), QUICK, judge=False), path)
+    run = _as_run(*make_run(9, n=120), "flight9")
+    more = update(path, [run], QUICK, judge=False)
+    assert [s.name for s in more.sets] == ["flight0", "flight1", "flight2", "flight9"]
+    rows_path(path).unlink()
+    with pytest.raises(ModelError, match="not beside"):
+        update(path, [run], QUICK)
+
+
+def _as_run(log, truth, name):
+    from types import SimpleNamespace
+
+    return SimpleNamespace(log=log, truth=truth, name=name)
+
+
+def test_few_sequences_are_calibrated_by_blocks_and_marked():
+    trained = train_sets(training_sets([0], n=200), QUICK)
+    assert trained.header["calibration"]["by"] == "time blocks"
+    assert trained.header["by_few_sequences"]
+    assert trained.table["folds"] == []
+
+
+def test_logs_of_poses_alone_train_on_what_they_have():
+    def bare(seed):
+        log, truth = make_run(seed, n=120, geometry=False)
+        records = [replace(r, n_inliers=-1, n_tracked=-1, n_detected=-1, n_stereo=-1) for r in log]
+        return type(log)(records, None), truth
+
+    from gpvo.dataset.build import build
+
+    trained = train_sets([build(*bare(k), name=str(k)) for k in range(3)], TrainConfig(noise_inducing=32))
+    assert trained.header["base_method"] is None
+    assert not any(f.startswith(("n_", "ln_", "inlier")) for f in trained.header["features"])
+    assert trained.table["mean"]["pointing_matching"]["nll_per_dim"] is None
+    assert trained.table["mean"]["gp_thesis"]["nll_per_dim"] is not None
+
+
+def test_window_target():
+    from gpvo.dataset.build import build
+
+    sets = [build(*make_run(k, n=160), name=str(k), target="window:0.5s") for k in range(3)]
+    trained = train_sets(sets, replace(QUICK, target="window:0.5s"), judge=False)
+    predictor = trained.predictor()
+    said = [predictor.step(r) for r in make_run(50, n=40)[0]]
+    assert said[5] is None
+    assert said[20].dt_s == pytest.approx(0.5)
+
+
+def test_position_target_has_its_own_type(tmp_path):
+    from gpvo.dataset.build import build
+    from gpvo.learning.position import train_position
+    from gpvo.online.position import PositionPredictor
+
+    sets = [build(*make_run(k, n=100), name=str(k), target="position") for k in range(3)]
+    trained = train_position(sets, TrainConfig(target="position"))
+    assert trained.table["mean"]["gp_thesis"]["rmse_raw"]["translation_m"] > 0
+    save_model(trained, tmp_path / "p.gpvo")
+    with pytest.raises(ModelError, match="position"):
+        Predictor.load(tmp_path / "p.gpvo")
+    said = [PositionPredictor.load(tmp_path / "p.gpvo").step(r) for r in make_run(50, n=5)[0]]
+    assert said[-1].mean.shape == (3,)
+
+
+def test_best_scale_is_best():
+    sets = training_sets(range(2), n=200)
+    scale = best_scale(sets, "pointing_matching")
+
+    def loss(c):
+        return np.mean(
+            [
+                score(s.Y, 0 * s.Y, s.covariances["pointing_matching"] * np.sqrt(np.outer(c, c)))["nll_per_dim"]
+                for s in sets
+            ]
+        )
+
+    for j in range(6):
+        for factor in (0.9, 1.1):
+            assert loss(scale * np.where(np.arange(6) == j, factor, 1.0)) > loss(scale)
+
+
+def test_a_gain_must_be_sure():
+    rng = np.random.default_rng(0)
+    chance = [surely_positive(rng.standard_normal((5, 6))).any() for _ in range(400)]
+    assert np.mean(chance) < 0.09
+    assert surely_positive(1.0 + 0.1 * rng.standard_normal((5, 6))).all()
+
+
+def test_runs_of_different_rate_are_refused():
+    sets = [*training_sets([0], n=100), *training_sets([1], n=100, rate_hz=60.0)]
+    with pytest.raises(GpvoError, match="rate"):
+        train_sets(sets, QUICK)
+
+
+@pytest.mark.slow
+def test_folds_on_a_dask_cluster_of_two_processes():
+    distributed = pytest.importorskip("distributed")
+    sets = training_sets(range(3), n=120)
+    here = train_sets(sets, QUICK).table["folds"]
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        config = replace(QUICK, backend="dask", scheduler=cluster.scheduler_address)
+        there = train_sets(sets, config).table["folds"]
+    assert [f["methods"]["learned"]["nll_per_dim"] for f in there] == pytest.approx(
+        [f["methods"]["learned"]["nll_per_dim"] for f in here], abs=1e-9
+    )

@@ -1,0 +1,203 @@
+"""The predictor: honest far away, the same for one and many, finite and positive definite whatever comes in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.dataset.build import build
+from gpvo.errors import ModelError
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import is_positive_definite
+from gpvo.online.adapt import AdaptiveScale
+from gpvo.online.predictor import Predictor
+from gpvo.types import Status
+from small_model import small_model
+from synthetic_runs import CAMERA, make_run
+
+
+@pytest.fixture
+def predictor() -> Predictor:
+    return small_model().predictor()
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return make_run(50, n=120)
+
+
+def test_step_is_what_training_would_have_seen(predictor, flight):
+    log, truth = flight
+    s = build(log, truth, name="x", columns=predictor.features)
+    said = {p.t_ns: p for p in map(predictor.step, log) if p is not None}
+    many = predictor.predict(s.X, s.covariances["pointing_matching"], s.dt_s)
+    for k, t in enumerate(s.t_ns):
+        np.testing.assert_allclose(said[int(t)].covariance, many.covariance[k], rtol=1e-9)
+        np.testing.assert_allclose(said[int(t)].mean, many.mean[k], atol=1e-12)
+    one = predictor.predict(s.X[7], s.covariances["pointing_matching"][7], s.dt_s[7])
+    np.testing.assert_allclose(one.covariance, many.covariance[7], rtol=1e-9)
+
+
+def test_parts_sum_to_the_covariance(predictor, flight):
+    for record in flight[0]:
+        p = predictor.step(record)
+        np.testing.assert_allclose(sum(p.parts.values()), p.covariance, rtol=1e-9)
+        assert is_positive_definite(p.covariance)
+        assert 0 <= p.confidence <= 1
+        assert 0 <= p.in_domain <= 1
+        assert (p.epistemic <= np.diagonal(p.covariance) * (1 + 1e-9)).all()
+
+
+def test_covariance_grows_with_the_distance_from_the_training_data(predictor, flight):
+    log, truth = flight
+    s = build(log, truth, name="x", columns=predictor.features)
+    domain = predictor.model.domain
+    for j in range(len(predictor.features)):
+        for side in (-1.0, 1.0):
+            edge = domain.centre[j] + domain.scale[j] * (domain.low if side < 0 else domain.high)[j]
+            rows = np.tile(s.X[10], (6, 1))
+            rows[:, j] = edge + side * domain.scale[j] * np.array([0.0, 0.5, 1, 2, 5, 50])
+            out = predictor.predict(rows)
+            assert (np.diff(np.log(out.sigma), axis=0) > 0).all(), predictor.features[j]
+            assert (np.diff(out.in_domain) <= 0).all()
+            assert (np.diff(out.epistemic, axis=0) > 0).all()
+            assert out.in_domain[-1] < 1e-6
+            assert out.confidence[-1] < 1e-6
+
+
+def test_never_a_small_covariance_outside(predictor, flight):
+    log, truth = flight
+    s = build(log, truth, name="x", columns=predictor.features)
+    usual = np.quantile(predictor.predict(s.X).sigma, 0.25, axis=0)
+    rng = np.random.default_rng(0)
+    domain = predictor.model.domain
+    far = domain.centre + domain.scale * rng.normal(size=(300, len(predictor.features))) * 30
+    assert (predictor.predict(far).sigma > usual).all()
+
+
+def test_what_is_missing_or_absurd_stays_finite(predictor, flight):
+    record = flight[0].records[5]
+    bad = [
+        replace(record, covariances={}),
+        replace(record, n_inliers=-1),
+        replace(record, T_prev_cur=se3.exp(np.full(6, 1e3))),
+        replace(record, status=Status.LOST, T_prev_cur=np.eye(4)),
+        replace(record, covariances={"pointing_matching": np.full((6, 6), np.nan)}),
+        replace(record, covariances={"pointing_matching": np.eye(6) * 1e-30}),
+    ]
+    for b in bad:
+        predictor.reset()
+        for before in flight[0].records[:5]:
+            predictor.step(before)
+        p = predictor.step(b)
+        assert is_positive_definite(p.covariance)
+        assert np.isfinite(p.mean).all()
+    assert p.status is not Status.OK or p.in_domain > 0.5
+
+
+def test_a_slip_is_lost_and_its_covariance_covers_the_jump(predictor, flight):
+    records = list(flight[0].records)
+    records[80] = replace(records[80], T_prev_cur=records[80].T_prev_cur @ se3.exp(np.array([0, 0, 10.0, 0, 0, 0])))
+    said = [predictor.step(r) for r in records]
+    assert said[80].status is Status.LOST
+    assert said[80].confidence == 0
+    assert said[80].sigma[2] > 5.0
+    assert said[81].status is not Status.LOST
+
+
+def test_explanation_names_the_input_that_changed(predictor, flight):
+    for record in flight[0].records[:30]:
+        predictor.step(record)
+    few = replace(flight[0].records[30], n_inliers=3, covariances={"pointing_matching": np.eye(6)})
+    predictor.step(few)
+    first = predictor.explain(few)[0]
+    assert first.feature.startswith(("ln_var", "n_inliers"))
+    assert "sigma" in str(first)
+
+
+def test_late_truth_restores_coverage():
+    rng = np.random.default_rng(0)
+    adaptive, hits = AdaptiveScale(), []
+    for k in range(4000):
+        actual = 3.0 if k > 1000 else 1.0
+        error = actual * rng.standard_normal(6)
+        sigma = adaptive.scale
+        hits.append(np.abs(error) <= 1.6449 * sigma)
+        adaptive.observe(error, sigma)
+    assert np.mean(hits[2000:], axis=0) == pytest.approx(0.9, abs=0.015)
+
+
+def test_observe_widens_the_next_prediction(predictor, flight):
+    for record in flight[0].records[:40]:
+        p = predictor.step(record)
+    before = predictor.step(flight[0].records[40])
+    for record in flight[0].records[41:90]:
+        p = predictor.step(record)
+        predictor.observe(p.mean + 6 * p.sigma)
+    after = predictor.step(flight[0].records[90])
+    assert (after.sigma > 2 * before.sigma).all()
+
+
+def test_load_refuses_what_does_not_fit(tmp_path: Path):
+    from gpvo.online import modelfile
+
+    model = small_model()
+    path = tmp_path / "m.gpvo"
+    modelfile.save(path, model.arrays, {**model.header, "target": "position"})
+    with pytest.raises(ModelError, match="position"):
+        Predictor.load(path)
+    modelfile.save(
+        path, model.arrays, {**model.header, "features": [*model.header["features"][:-1], "no_such_feature"]}
+    )
+    with pytest.raises(ModelError, match="no_such_feature"):
+        Predictor.load(path)
+    modelfile.save(path, {k: v for k, v in model.arrays.items() if k != "share"}, model.header)
+    with pytest.raises(ModelError, match="share"):
+        Predictor.load(path)
+
+
+def test_it_flies_with_numpy_and_safetensors_alone(tmp_path: Path):
+    """A fresh interpreter that can see the standard library, NumPy, safetensors and gpvo, and nothing else."""
+    import gpvo
+    import numpy
+    import safetensors
+    from gpvo.online import modelfile
+
+    model = small_model()
+    modelfile.save(tmp_path / "m.gpvo", model.arrays, model.header)
+    site = tmp_path / "site"
+    site.mkdir()
+    for package in (numpy, safetensors, gpvo):
+        folder = Path(package.__file__).parent
+        (site / folder.name).symlink_to(folder)
+        libraries = folder.parent / f"{folder.name}.libs"
+        if libraries.is_dir():
+            (site / libraries.name).symlink_to(libraries)
+    code = f"""
+import sys
+sys.path.insert(0, {str(site)!r})
+import numpy as np
+from gpvo.online.predictor import Predictor
+from gpvo.types import VoRecord, Status
+p = Predictor.load({str(tmp_path / "m.gpvo")!r})
+out = p.predict(np.zeros(len(p.features)))
+assert np.isfinite(out.covariance).all()
+T = np.eye(4); T[2, 3] = 0.05
+p.step(VoRecord(0, 0, Status.START, np.eye(4)))
+said = p.step(VoRecord(50_000_000, 0, Status.OK, T, n_inliers=90))
+assert np.isfinite(said.covariance).all()
+p.observe(np.zeros(6)); p.explain()
+heavy = {{"torch", "sklearn", "pandas", "scipy", "cv2", "pyarrow", "gpytorch", "matplotlib"}} & set(sys.modules)
+assert not heavy, heavy
+"""
+    done = subprocess.run([sys.executable, "-I", "-S", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_another_camera_is_told_by_reset(predictor, flight):
+    predictor.reset(replace(CAMERA, fx_px=800.0))
+    assert predictor.step(flight[0].records[0]).status is Status.START
