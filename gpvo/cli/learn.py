@@ -85,7 +85,12 @@ def _print_table(document: dict[str, Any]) -> None:
     if not document["folds"]:
         print("one run alone: nothing could be left out, so there is no table")
         return
-    table = Table("method", *(f["held_out"] for f in document["folds"]), "mean", "median", "1 sigma", "NLL per axis")
+    table = Table()
+    table.add_column("method", no_wrap=True)
+    for k in range(len(document["folds"])):
+        table.add_column(str(k + 1), justify="right")
+    for name in ("mean", "median", "1 sigma", "NLL/axis"):
+        table.add_column(name, justify="right")
     for method, mean in document["mean"].items():
         per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
         rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"], mean["nll_per_dim"]]
@@ -93,6 +98,7 @@ def _print_table(document: dict[str, Any]) -> None:
             table.add_row(method, *(_text(v) for v in (*per_fold, *rest)))
     console = Console(width=max(Console().width, 120), highlight=False)
     console.print("NEES per degree of freedom on each run left out (1 is right), then means over the runs")
+    console.print(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     console.print(table)
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):

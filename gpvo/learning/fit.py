@@ -69,7 +69,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
 
 
 def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
-    """The base variance, with geometry or without, that predicts left-out groups best; and that variance out of fold."""
+    """The base variance, with geometry or without, that predicts left-out groups best; and the same out of fold."""
     best: tuple[float, str | None, Array] | None = None
     for method in (*geometric_method(rows.sets), None):
         C = _base_inputs(rows, method)

@@ -48,9 +48,19 @@ class FeatureGroup:
 
 def twist(record: VoRecord) -> Array:
     """(6,) velocity of the camera over the motion [m/s, rad/s]; NaN where there is no motion."""
-    if not record.usable or record.dt_s <= 0:
-        return np.full(6, np.nan)
-    return se3.log(record.T_prev_cur) / record.dt_s
+    global _latest
+    latest = _latest
+    if latest is not None and latest[0] is record:
+        return latest[1]
+    moves = record.usable and record.dt_s > 0
+    out = se3.log(record.T_prev_cur) / record.dt_s if moves else np.full(6, np.nan)
+    out.setflags(write=False)
+    _latest = (record, out)
+    return out
+
+
+# Several groups and the slip detector ask for the twist of one record in turn.
+_latest: tuple[VoRecord, Array] | None = None
 
 
 def _ln(value: float) -> float:

@@ -99,12 +99,12 @@ class SlipDetector:
         acc = record.imu_acc_mean_mps2
         # Whatever the attitude, a camera accelerates by no more than specific force plus gravity.
         believed = GRAVITY_MPS2 + (0.0 if acc is None else float(np.linalg.norm(acc)))
-        if change[0] > max(believed, tail_quantile(np.array(self._linear))):
+        if change[0] > believed and change[0] > tail_quantile(np.array(self._linear)):
             return f"acceleration of {change[0]:.3g} m/s^2"
         if disagreement is not None:
-            if disagreement > max(_GYRO_TRUST_RADPS, tail_quantile(np.array(self._gyro))):
+            if disagreement > _GYRO_TRUST_RADPS and disagreement > tail_quantile(np.array(self._gyro)):
                 return f"{disagreement:.3g} rad/s from the gyro"
-        elif change[1] > max(GRAVITY_MPS2 / _ARM_M, tail_quantile(np.array(self._angular))):
+        elif change[1] > GRAVITY_MPS2 / _ARM_M and change[1] > tail_quantile(np.array(self._angular)):
             return f"angular acceleration of {change[1]:.3g} rad/s^2"
         return ""
 
