@@ -1,9 +1,164 @@
-"""Commands of this group."""
+"""``gpvo evaluate`` and ``gpvo report``: a run against its truth."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
+
+from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation
+
+Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
+Model = Annotated[Path | None, typer.Option(help="Error model: adds constant, scaled and learned.")]
+Truth = Annotated[Path | None, typer.Option(help="Ground truth (TUM lines, left camera), for a run without.")]
+Segments = Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")]
+TruthSigma = Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none.")]
+Align = Annotated[str, typer.Option(help="rotation: fit a fixed rotation between log and truth; none.")]
+TimeOffset = Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")]
+
+
+def evaluate(
+    runs: Runs,
+    model: Model = None,
+    truth: Truth = None,
+    segments: Segments = None,
+    truth_sigma: TruthSigma = None,
+    align: Align = "none",
+    time_offset: TimeOffset = "0",
+    plots: Annotated[Path | None, typer.Option(help="Folder for pictures, one set per run.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Trajectory errors, and whether each stated covariance is honest.
+
+    Example: gpvo evaluate runs/mh01 --plots pictures
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.evaluation.evaluate import document
+
+    found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
+    if plots is not None:
+        from gpvo.evaluation.plots import save_all
+
+        for evaluation in found:
+            save_all(evaluation, plots)
+    if json_:
+        print_json(document(found))
+    else:
+        for evaluation in found:
+            _print(evaluation)
+
+
+def report(
+    runs: Runs,
+    out: Annotated[Path, typer.Option("-o", "--out", help="HTML file to write.")] = Path("report.html"),
+    model: Model = None,
+    truth: Truth = None,
+    segments: Segments = None,
+    truth_sigma: TruthSigma = None,
+    align: Align = "none",
+    time_offset: TimeOffset = "0",
+) -> None:
+    """One self-contained page: trajectory, error against bounds, reliability, features, the table.
+
+    Example: gpvo report runs/mh01 -o report.html
+    """
+    from gpvo.evaluation.report import write_report
+
+    found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
+    write_report(found, out)
+    print(out)
+
+
+def options_of(segments: str | None, truth_sigma: str | None, align: str, time_offset: str) -> EvaluateOptions:
+    """The flags, parsed."""
+    from gpvo.evaluation.evaluate import EvaluateOptions
+
+    lengths = None if segments is None else tuple(_numbers("--segments", segments))
+    sigma = None
+    if truth_sigma is not None:
+        given = _numbers("--truth-sigma", truth_sigma)
+        if len(given) > 2 or min(given) < 0:
+            raise GpvoError(f"--truth-sigma is '{truth_sigma}'", cure="give metres, or metres,radians")
+        sigma = (given[0], given[1] if len(given) == 2 else 0.0)
+    offset = None if time_offset == "auto" else _numbers("--time-offset", time_offset)[0]
+    return EvaluateOptions(lengths, sigma, align, offset)
+
+
+def _numbers(option: str, text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise GpvoError(f"{option} is '{text}'", cure="give numbers, separated by commas") from None
+
+
+def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions) -> list[Evaluation]:
+    from dataclasses import replace
+
+    from gpvo.evaluation.evaluate import evaluate_run
+    from gpvo.io.run import read_run
+    from gpvo.io.trajectory import read_tum
+    from gpvo.online.predictor import Predictor
+    from gpvo.types import TruthLog
+
+    predictor = None if model is None else Predictor.load(model)
+    given = None
+    if truth is not None:
+        trajectory = read_tum(truth)
+        given = TruthLog(trajectory.t_ns, trajectory.T_world_body)
+    loaded = [read_run(path) for path in runs]
+    if given is not None:
+        loaded = [replace(run, truth=given) for run in loaded]
+    return [evaluate_run(run, predictor, options) for run in loaded]
+
+
+def _print(e: Evaluation) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from gpvo.evaluation.evaluate import document
+
+    d: dict[str, Any] = document([e])["runs"][0]
+    console = Console(width=max(Console().width, 130), highlight=False)
+    console.print(
+        f"{d['run']}: {d['frames']} frames, {d['lost']} lost, {d['path_length_m']:.1f} m; ATE {d['ate_rmse_m']:.3g} m,"
+        f" final error {d['final_error_m']:.3g} m"
+    )
+    for s in d["segments"]:
+        console.print(
+            f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"
+            f" ({s['count']})"
+        )
+    table = Table(
+        "method", "NEES/dof", "interval", "median", "with truth noise", "1, 2, 3 sigma [%]", "NLL", "final [m]"
+    )
+    for method, m in d["methods"].items():
+        block = "joint" if m["nees_dof"]["joint"] is not None else "translation"
+        if m["nees_dof"][block] is None:
+            continue
+        low, high = m["nees_dof_interval"][block]
+        table.add_row(
+            method + (" (translation)" if block == "translation" else ""),
+            _text(m["nees_dof"][block]),
+            f"{_text(low)} to {_text(high)}",
+            _text(m["nees_dof_median"][block]),
+            _text(m["nees_dof_truth_noise"][block]),
+            " ".join(f"{100 * c:.0f}" for c in m["coverage"].values()),
+            _text(m["nll_per_dim"]),
+            _text(m["predicted_final_error_m"]),
+        )
+    if table.row_count:
+        console.print(table)
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
 
 
 def register(app: typer.Typer) -> None:
     """Add this file's commands to the application."""
+    app.command()(evaluate)
+    app.command()(report)

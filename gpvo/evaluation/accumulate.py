@@ -1,0 +1,115 @@
+"""How the error of single motions adds up along a path.
+
+Two-frame VO shares each frame's pixel noise between two motions, with opposite signs; calibration and depth bias
+persist. So a motion's error is ``xi_k = w_k + b_k + n_k - n_(k-1)`` with white w, first-order Gauss-Markov b and the
+frame's own jitter n, and the error of the pose ``e_k = Ad(T_k)^-1 e_(k-1) + xi_k`` is carried with all three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import symmetrise
+from gpvo.types import Array, Prediction
+
+
+@dataclass(frozen=True)
+class Step:
+    """One motion: ``T_prev_cur``, its parts (6, 6) each, the bias' time constants (6,) [s] and its duration."""
+
+    T_prev_cur: Array
+    jitter: Array
+    white: Array
+    bias: Array
+    bias_tau_s: Array
+    dt_s: float
+
+    @classmethod
+    def independent(cls, T_prev_cur: Array, covariance: Array) -> Step:
+        """A motion whose error has nothing to do with any other's."""
+        zero = np.zeros((6, 6))
+        return cls(T_prev_cur, zero, covariance, zero, np.ones(6), 0.0)
+
+    @classmethod
+    def predicted(cls, T_prev_cur: Array, prediction: Prediction) -> Step:
+        """A motion with a model's prediction."""
+        parts: Mapping[str, Array] = prediction.parts
+        return cls(T_prev_cur, parts["jitter"], parts["white"], parts["bias"], prediction.bias_tau_s, prediction.dt_s)
+
+
+class PoseError:
+    """Covariance of the pose's error along a chain, right perturbation, in the axes of the last camera.
+
+    The joint state is (e, n, u): error, jitter of the last frame, and the bias in units of its own deviation, so that a
+    bias whose size changes stays correlated with what it was.
+    """
+
+    def __init__(self) -> None:
+        self._P = np.zeros((18, 18))
+        self._begun = False
+
+    def copy(self) -> PoseError:
+        """An independent copy, for a chain that branches."""
+        twin = PoseError()
+        twin._P, twin._begun = self._P.copy(), self._begun
+        return twin
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of the pose."""
+        return symmetrise(self._P[:6, :6])
+
+    def add(self, step: Step) -> Array:
+        """Append a motion; the pose's covariance after it."""
+        J = 0.5 * step.jitter
+        if not self._begun:
+            # The first frame's own jitter enters with the first motion; the bias starts in its steady state.
+            self._P[6:12, 6:12] = J
+            self._P[12:, 12:] = np.eye(6)
+            self._begun = True
+        phi = np.exp(-step.dt_s / np.maximum(step.bias_tau_s, 1e-6))
+        L = _root(step.bias)
+        A = np.zeros((18, 18))
+        A[:6, :6] = se3.adjoint(se3.inverse(step.T_prev_cur))
+        A[:6, 6:12] = -np.eye(6)
+        A[:6, 12:] = L * phi
+        A[12:, 12:] = np.diag(phi)
+        P = A @ self._P @ A.T
+        # What is new: n_k enters both the error and its own place, the bias' innovation likewise.
+        Q_u = np.diag(1.0 - phi**2)
+        P[:6, :6] += step.white + J + L @ Q_u @ L.T
+        P[:6, 6:12] += J
+        P[6:12, :6] += J
+        P[6:12, 6:12] += J
+        P[:6, 12:] += L @ Q_u
+        P[12:, :6] += Q_u @ L.T
+        P[12:, 12:] += Q_u
+        self._P = P
+        return self.covariance
+
+
+def _root(C: Array) -> Array:
+    """Symmetric square root (6, 6) of a positive semi-definite matrix."""
+    values, vectors = np.linalg.eigh(symmetrise(C))
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
+def along(steps: Sequence[Step], parent: Iterable[int]) -> Array:
+    """(N, 6, 6) covariance of every pose; ``parent`` gives the pose each motion starts from, -1 for the origin."""
+    states: dict[int, PoseError] = {}
+    out = np.zeros((len(steps), 6, 6))
+    for k, (step, p) in enumerate(zip(steps, parent, strict=True)):
+        if p < 0:
+            states[k] = PoseError()
+            continue
+        state = states[p].copy()
+        out[k] = state.add(step)
+        states[k] = state
+        # No motion starts before the reference of this one.
+        for old in [j for j in states if j < p]:
+            del states[old]
+    return out

@@ -1,0 +1,181 @@
+"""Is what a method says about the motions of a run true? Per motion, over a second, and over lengths of path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.errors import MotionErrors
+from gpvo.evaluation.accumulate import PoseError, Step, along
+from gpvo.evaluation.statements import Statement
+from gpvo.evaluation.trajectory import path_length_m
+from gpvo.geometry import se3
+from gpvo.stats.bootstrap import Interval, block_bootstrap
+from gpvo.stats.consistency import coverage, crps_gaussian, nees, nll_per_dim
+from gpvo.types import Array, VoLog
+
+BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
+HORIZONS_M = (1.0, 10.0, 100.0)
+_MAX_WINDOWS = 60
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """NEES per degree of freedom of the motion over a length of path, or over a time, from ``count`` windows."""
+
+    nees_dof: float
+    count: int
+    length_m: float | None = None
+    time_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Of one method on one run; None where it cannot be computed.
+
+    ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise``: the same with the
+    truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the axes.
+    """
+
+    method: str
+    count: int
+    nees_dof: dict[str, Interval | None]
+    nees_dof_median: dict[str, float | None]
+    nees_dof_truth_noise: dict[str, float | None]
+    coverage: tuple[float, float, float]
+    nll_per_dim: float | None
+    crps_translation_m: float
+    crps_rotation_rad: float | None
+    predicted_final_error_m: float | None
+    predicted_final_error_independent_m: float | None
+    horizons: tuple[Horizon, ...]
+
+
+def truth_noise(T_true: Array, sigma_m: float, sigma_rad: float) -> Array:
+    """(M, 6, 6) covariance that the truth's own noise adds to the error of motions (M, 4, 4).
+
+    Each motion holds the noise of two poses: ``S + Ad(T)^-1 S Ad(T)^-T``, the MA(1) shape of a differenced position.
+    """
+    S = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+    A = se3.adjoint(se3.inverse(T_true))
+    return S + A @ S @ np.swapaxes(A, -1, -2)
+
+
+def consistency(
+    statement: Statement, errors: MotionErrors, log: VoLog, T_true: Array, known: NDArray[np.bool_],
+    noise_sigma: tuple[float, float] = (0.0, 0.0),
+) -> Consistency | None:  # fmt: skip
+    """Scores of one method, None where it says nothing about any motion with truth.
+
+    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise_sigma``: of the truth's poses [m, rad].
+    """
+    C = statement.covariance[errors.index]
+    stated = np.isfinite(C).all(axis=(1, 2))
+    if stated.sum() < 2:
+        return None
+    index, d = errors.index[stated], statement.dof
+    e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
+    noise = truth_noise(errors.T_true[stated], *noise_sigma)[:, :d, :d]
+    per_block = {n: nees(e[:, b], C[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items() if b.stop <= d}
+    with_noise = {n: nees(e[:, b], (C + noise)[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items() if b.stop <= d}
+    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    crps = crps_gaussian(e, sigma)
+    covered = [float(c) for c in coverage(e, sigma)]
+    final, independent = _final_errors(statement, log)
+    return Consistency(
+        method=statement.method,
+        count=int(stated.sum()),
+        nees_dof={n: block_bootstrap(per_block[n]) if n in per_block else None for n in BLOCKS},
+        nees_dof_median={n: float(np.median(per_block[n])) if n in per_block else None for n in BLOCKS},
+        nees_dof_truth_noise={n: float(with_noise[n].mean()) if n in with_noise else None for n in BLOCKS},
+        coverage=(covered[0], covered[1], covered[2]),
+        nll_per_dim=float(nll_per_dim(e, C).mean()) if d == 6 else None,
+        crps_translation_m=float(crps[:, :3].mean()),
+        crps_rotation_rad=float(crps[:, 3:].mean()) if d == 6 else None,
+        predicted_final_error_m=final,
+        predicted_final_error_independent_m=independent,
+        horizons=horizons(statement, log, T_true, known, noise_sigma) if d == 6 else (),
+    )
+
+
+def _final_errors(statement: Statement, log: VoLog) -> tuple[float | None, float | None]:
+    """Stated standard deviation of the last position [m]: with the parts, and taking motions as independent."""
+    if statement.steps is None:
+        return None, None
+    independent = [Step.independent(s.T_prev_cur, s.jitter + s.white + s.bias) for s in statement.steps]
+    ends = [along(steps, log.parent)[-1] for steps in (statement.steps, independent)]
+    a, b = (float(np.sqrt(np.trace(C[:3, :3]))) for C in ends)
+    return a, b
+
+
+def horizons(
+    statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], noise_sigma: tuple[float, float]
+) -> tuple[Horizon, ...]:
+    """NEES over one second and over each length of path, of windows without lost frames, the truth's noise added."""
+    assert statement.steps is not None
+    out = []
+    for progress, span, name in _spans(log, T_true):
+        values = _window_nees(statement, log, T_true, known, progress, span, noise_sigma)
+        mean = float(np.mean(values)) if values else float("nan")
+        out.append(Horizon(mean, len(values), **{name: span}))
+    return tuple(out)
+
+
+def _spans(log: VoLog, T_true: Array) -> list[tuple[Array, float, str]]:
+    arc = path_length_m(T_true)
+    time = (log.t_ns - log.t_ns[0]) * 1e-9
+    return [(time, 1.0, "time_s"), *((arc, length, "length_m") for length in HORIZONS_M)]
+
+
+def _window_nees(
+    statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
+    noise_sigma: tuple[float, float],
+) -> list[float]:  # fmt: skip
+    """Joint NEES/dof of windows that begin where the one before has at least half passed, at most sixty of them."""
+    assert statement.steps is not None
+    total = float(progress[-1] - progress[0])
+    stride = max(0.5 * span, total / _MAX_WINDOWS)
+    values, t_next = [], float(progress[0])
+    parent, usable = log.parent, log.usable
+    for start in range(len(log)):
+        if progress[start] < t_next or not known[start]:
+            continue
+        window = _window(start, parent, usable, progress, span)
+        if not window or not known[window[-1]]:
+            continue
+        t_next = float(progress[start]) + stride
+        error, T_est = PoseError(), np.eye(4)
+        for k in window:
+            # The mean is taken off each motion, as a filter would.
+            T_est = T_est @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
+            C = error.add(statement.steps[k])
+        T = se3.inverse(T_true[start]) @ T_true[window[-1]]
+        e = se3.log(se3.inverse(T) @ T_est)
+        values.append(float(nees(e, C + truth_noise(T, *noise_sigma))) / 6)
+    return values
+
+
+def _window(
+    start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], progress: Array, span: float
+) -> Sequence[int]:
+    """The chain of motions from frame ``start`` over at least ``span``; empty where it is broken or too short."""
+    chain, here = [], start
+    for k in range(start + 1, len(parent)):
+        if parent[k] == here and usable[k]:
+            done = progress[k] - progress[start] >= span
+            if done or _leads_on(k, parent):
+                chain.append(k)
+                here = k
+            if done:
+                return chain
+        elif parent[k] == here and _leads_on(k, parent):
+            return []
+    return []
+
+
+def _leads_on(k: int, parent: NDArray[np.int64]) -> bool:
+    """Whether the next motion starts from frame k."""
+    return k + 1 < len(parent) and bool(parent[k + 1] == k)

@@ -1,0 +1,190 @@
+"""One run against its truth: trajectory errors, and the consistency of every method, in one object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.build import align_rotation
+from gpvo.dataset.clock import estimate_time_offset
+from gpvo.dataset.errors import MotionErrors, motion_errors
+from gpvo.errors import GpvoError, SourceError
+from gpvo.evaluation.consistency import Consistency, consistency
+from gpvo.evaluation.statements import Statement, statements
+from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
+from gpvo.io.run import Run
+from gpvo.online.predictor import Predictor
+from gpvo.types import Array, Prediction, Status, TruthLog
+
+METHODS = (
+    "constant",
+    "triangulation",
+    "triangulation_scaled",
+    "triangulation_vt",
+    "pointing_matching",
+    "pointing_matching_scaled",
+    "pointing_matching_vt",
+    "gp_thesis",
+    "learned",
+)
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """``truth_sigma`` (m, rad) per pose, None for what the source states; ``time_offset_s`` None to estimate it."""
+
+    segments_m: tuple[float, ...] | None = None
+    truth_sigma: tuple[float, float] | None = None
+    align: str = "none"
+    time_offset_s: float | None = 0.0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
+    poses made equal."""
+
+    run: Run
+    errors: MotionErrors
+    trajectory: TrajectoryErrors
+    statements: tuple[Statement, ...]
+    consistency: Mapping[str, Consistency]
+    covered: NDArray[np.bool_]
+    T_est: Array
+    T_true: Array
+    truth_sigma: tuple[float, float]
+    time_offset_s: float
+
+    def __str__(self) -> str:
+        t = self.trajectory
+        return f"{self.run.name}: ATE {t.ate_rmse_m:.3g} m over {t.path_length_m:.1f} m"
+
+
+def evaluate_run(run: Run, predictor: Predictor | None = None, options: EvaluateOptions | None = None) -> Evaluation:
+    """Evaluate a run against its truth; with a predictor, predictions are made as in flight, else those of the run
+    are used.
+
+    Raises
+    ------
+    SourceError
+        If the run has no truth, or none at the times of its frames.
+    """
+    options = options or EvaluateOptions()
+    truth, offset_s = _truth(run, options)
+    log = run.log
+    T_true, known = interpolate_truth(truth, log.t_ns)
+    if known.sum() < 3:
+        raise SourceError(
+            "ground truth and frames do not overlap in time",
+            where=run.path,
+            cure="use --time-offset auto, or its own truth",
+        )
+    sigma = options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad)
+    errors = motion_errors(log, truth)
+    T_est = log.trajectory()
+    made = statements(log, predictions_by_stamp(run, predictor), predictor)
+    found = {s.method: consistency(s, errors, log, T_true, known, sigma) for s in made}
+    first = int(np.flatnonzero(known)[0])
+    lift = T_true[first] @ np.linalg.inv(T_est[first])
+    return Evaluation(
+        run=run,
+        errors=errors,
+        trajectory=trajectory_errors(log.t_ns[known], T_est[known], T_true[known], options.segments_m),
+        statements=tuple(made),
+        consistency={m: c for m, c in found.items() if c is not None},
+        covered=known,
+        T_est=lift @ T_est,
+        T_true=T_true,
+        truth_sigma=sigma,
+        time_offset_s=offset_s,
+    )
+
+
+def predictions_by_stamp(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
+    """Predictions of a model over the run's log, or those stored with the run."""
+    if predictor is None:
+        return {p.t_ns: p for p in run.predictions}
+    predictor.reset(run.log.camera)
+    return {p.t_ns: p for p in map(predictor.step, run.log) if p is not None}
+
+
+def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
+    if run.truth is None:
+        raise SourceError("has no ground truth", where=run.path, cure="give one with --truth FILE (TUM lines)")
+    truth, offset_s = run.truth, options.time_offset_s
+    if offset_s is None:
+        offset_s = estimate_time_offset(run.log, truth)
+    if offset_s:
+        truth = replace(truth, t_ns=truth.t_ns - round(offset_s * 1e9))
+    if options.align == "rotation":
+        truth = align_rotation(run.log, truth)
+    elif options.align != "none":
+        raise GpvoError(f"there is no alignment '{options.align}'", cure="none or rotation")
+    return truth, float(offset_s)
+
+
+def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """The result as scripts read it; what could not be computed is None."""
+    return {"schema": 1, "runs": [_run_document(e) for e in evaluations]}
+
+
+def _run_document(e: Evaluation) -> dict[str, Any]:
+    t = e.trajectory
+    counts = {s.value: sum(r.status is s for r in e.run.log) for s in Status}
+    return {
+        "run": e.run.name,
+        "source": e.run.meta.get("source"),
+        "frames": len(e.run.log),
+        "lost": counts["lost"],
+        "degraded": counts["degraded"],
+        "path_length_m": t.path_length_m,
+        "ate_rmse_m": t.ate_rmse_m,
+        "rmse_origin_m": t.rmse_origin_m,
+        "final_error_m": t.final_error_m,
+        "time_offset_s": e.time_offset_s,
+        "truth_sigma": {"translation_m": e.truth_sigma[0], "rotation_rad": e.truth_sigma[1]},
+        "rpe": {
+            name: {"translation_m": _plain(getattr(t, key).translation_m), "rotation_rad": _plain(getattr(t,
+            key).rotation_rad)} for name, key in (("frame", "rpe_frame"), ("1s", "rpe_second"), ("10m", "rpe_10m"))
+        },
+        "segments": [_plain(s) for s in t.segments],
+        "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
+    }  # fmt: skip
+
+
+def _methods_of(e: Evaluation) -> list[str]:
+    return [*METHODS, *(m for m in e.consistency if m not in METHODS)]
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    return {name: getattr(value, name) for name in value.__dataclass_fields__}
+
+
+def _method_document(c: Consistency | None) -> dict[str, Any]:
+    blocks = ("translation", "rotation", "joint")
+    if c is None:
+        none = dict.fromkeys(blocks)
+        return {
+            "nees_dof": none, "nees_dof_interval": none, "nees_dof_median": none, "nees_dof_truth_noise": none,
+            "coverage": dict.fromkeys("123"), "nll_per_dim": None,
+            "crps": {"translation_m": None, "rotation_rad": None}, "predicted_final_error_m": None,
+            "predicted_final_error_independent_m": None, "horizons": [],
+        }  # fmt: skip
+    intervals = c.nees_dof
+    return {
+        "nees_dof": {b: i.mean if (i := intervals[b]) else None for b in blocks},
+        "nees_dof_interval": {b: [i.low, i.high] if (i := intervals[b]) else None for b in blocks},
+        "nees_dof_median": c.nees_dof_median,
+        "nees_dof_truth_noise": c.nees_dof_truth_noise,
+        "coverage": dict(zip("123", c.coverage, strict=True)),
+        "nll_per_dim": c.nll_per_dim,
+        "crps": {"translation_m": c.crps_translation_m, "rotation_rad": c.crps_rotation_rad},
+        "predicted_final_error_m": c.predicted_final_error_m,
+        "predicted_final_error_independent_m": c.predicted_final_error_independent_m,
+        "horizons": [_plain(h) for h in c.horizons],
+    }

@@ -1,0 +1,194 @@
+"""Pictures of one run: data in, matplotlib ``Figure`` out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from gpvo.evaluation.accumulate import along
+from gpvo.evaluation.evaluate import Evaluation
+from gpvo.evaluation.statements import Statement
+from gpvo.stats.consistency import nees
+from gpvo.stats.series import allan_deviation, autocorrelation
+from gpvo.types import Array
+
+AXES = ("x", "y", "z", "rot x", "rot y", "rot z")
+_COLOURS = {
+    "constant": "#888888", "triangulation": "#1f77b4", "pointing_matching": "#ff7f0e",
+    "triangulation_scaled": "#17becf", "pointing_matching_scaled": "#bcbd22", "learned": "#2ca02c",
+}  # fmt: skip
+
+
+def best_statement(e: Evaluation) -> Statement | None:
+    """The statement to draw bounds of: ``learned`` where there is one, else ``triangulation``, else any full one."""
+    full = {s.method: s for s in e.statements if s.steps is not None}
+    return full.get("learned") or full.get("triangulation") or next(iter(full.values()), None)
+
+
+def trajectory(e: Evaluation) -> Figure:
+    """Top and side view of estimate and truth, with 3-sigma ellipses of the best statement."""
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    top, side = figure.subplots(2, 1, height_ratios=(2, 1))
+    statement = best_statement(e)
+    bounds = None if statement is None or statement.steps is None else along(statement.steps, e.run.log.parent)
+    to_plane, names = _level(e)
+    p, q = e.T_est[:, :3, 3] @ to_plane.T, e.T_true[:, :3, 3] @ to_plane.T
+    for axes, (i, j) in ((top, (0, 1)), (side, (0, 2))):
+        axes.plot(q[e.covered, i], q[e.covered, j], color="black", lw=1.2, label="truth")
+        axes.plot(p[:, i], p[:, j], color="#d62728", lw=1.2, label="visual odometry")
+        if bounds is not None:
+            for k in np.unique(np.linspace(0, len(p) - 1, 12).astype(int)):
+                R = to_plane @ e.T_est[k, :3, :3]
+                C = (R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]
+                axes.add_patch(_ellipse(p[k, [i, j]], C))
+        axes.set_xlabel(f"{names[i]} [m]")
+        axes.set_ylabel(f"{names[j]} [m]")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(alpha=0.3)
+    top.legend(loc="best", frameon=False)
+    top.set_title(f"{e.run.name}: top and side view, 3-sigma ellipses: {statement.method if statement else 'none'}")
+    return figure
+
+
+def _level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
+    """Axes to draw in. Truth in a camera's world (y down, as KITTI's) is turned so that the third axis points up."""
+    spread = np.ptp(e.T_true[e.covered][:, :3, 3], axis=0)
+    down = e.T_true[e.covered][0, :3, :3] @ np.array([0.0, 1.0, 0.0])
+    if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
+        return np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]), ("forward z", "right x", "up -y")
+    return np.eye(3), ("x", "y", "z") if spread.any() else ("x", "y", "z")
+
+
+def _ellipse(centre: Array, C: Array) -> Ellipse:
+    values, vectors = np.linalg.eigh(C)
+    width, height = 2 * 3 * np.sqrt(np.maximum(values, 0))
+    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+    return Ellipse((centre[0], centre[1]), width, height, angle=angle, fill=False, ec="#2ca02c", lw=0.8)
+
+
+def error_bounds(e: Evaluation) -> Figure:
+    """Error of each motion against the 3-sigma bound, axis by axis."""
+    figure = Figure(figsize=(10, 7), layout="constrained")
+    axes = figure.subplots(3, 2, sharex=True)
+    statement = best_statement(e)
+    t = (e.run.log.t_ns[e.errors.index] - e.run.log.t_ns[0]) * 1e-9
+    for k in range(6):
+        ax = axes[k % 3, k // 3]
+        scale = 1e3
+        error = e.errors.xi[:, k]
+        if statement is not None:
+            mean = statement.mean[e.errors.index, k]
+            sigma = np.sqrt(statement.covariance[e.errors.index, k, k])
+            ax.fill_between(t, scale * (mean - 3 * sigma), scale * (mean + 3 * sigma), color="#2ca02c", alpha=0.2, lw=0)
+        ax.plot(t, scale * error, color="black", lw=0.7)
+        limit = scale * 1.3 * max(float(np.quantile(np.abs(error), 0.995)), 1e-9)
+        ax.set_ylim(-limit, limit)
+        ax.set_ylabel(f"{AXES[k]} [{'mm' if k < 3 else 'mrad'}]")
+        ax.grid(alpha=0.3)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+    figure.suptitle(f"{e.run.name}: error per motion and 3-sigma bound of {statement.method if statement else 'none'}")
+    return figure
+
+
+def reliability(e: Evaluation) -> Figure:
+    """Share of errors inside the stated interval against its level: the diagonal is right, below is overconfident."""
+    figure = Figure(figsize=(5.5, 5), layout="constrained")
+    ax = figure.subplots()
+    levels = np.linspace(0.02, 0.98, 49)
+    for s in e.statements:
+        if s.steps is None:
+            continue
+        C = s.covariance[e.errors.index]
+        known = np.isfinite(C).all(axis=(1, 2))
+        if known.sum() < 2:
+            continue
+        sigma = np.sqrt(np.diagonal(C[known], axis1=1, axis2=2))
+        z = np.abs(e.errors.xi[known] - s.mean[e.errors.index][known]) / sigma
+        inside = np.array([(z <= q).mean() for q in _half_width(levels)])
+        ax.plot(levels, inside, label=s.method, color=_COLOURS.get(s.method))
+    ax.plot([0, 1], [0, 1], color="black", lw=0.8, ls="--")
+    ax.set(xlabel="stated probability", ylabel="share of errors inside", title=f"{e.run.name}: reliability")
+    ax.legend(frameon=False, fontsize=8)
+    ax.grid(alpha=0.3)
+    return figure
+
+
+def _half_width(levels: Array) -> Array:
+    """Half-widths in sigmas of central normal intervals."""
+    from statistics import NormalDist
+
+    return np.array([NormalDist().inv_cdf(0.5 + p / 2) for p in levels])
+
+
+def memory(e: Evaluation) -> Figure:
+    """Autocorrelation and Allan deviation of the error: what is noise and what is bias."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    dt = float(np.median(e.errors.dt_s))
+    for k in range(6):
+        rho = autocorrelation(e.errors.xi[:, k], min(60, len(e.errors.xi) // 2))
+        left.plot(np.arange(len(rho)) * dt, rho, label=AXES[k], lw=1)
+        tau, deviation = allan_deviation(e.errors.xi[:, k] / dt, dt)
+        right.loglog(tau, deviation, label=AXES[k], lw=1)
+    left.axhline(0, color="black", lw=0.6)
+    left.set(xlabel="lag [s]", ylabel="autocorrelation", title="a dip at the first lag: shared pixel noise")
+    right.set(xlabel="averaging time [s]", ylabel="Allan deviation [m/s, rad/s]", title="flat or rising: bias")
+    right.legend(frameon=False, fontsize=8, ncols=2)
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    figure.suptitle(f"{e.run.name}: how the error remembers")
+    return figure
+
+
+def nees_over_time(e: Evaluation) -> Figure:
+    """Joint NEES per degree of freedom, averaged over half a second, of every full method."""
+    figure = Figure(figsize=(10, 3.5), layout="constrained")
+    ax = figure.subplots()
+    t = (e.run.log.t_ns[e.errors.index] - e.run.log.t_ns[0]) * 1e-9
+    for s in e.statements:
+        if s.steps is not None:
+            _nees_line(ax, e, s, t)
+    ax.axhline(1.0, color="black", lw=0.8, ls="--")
+    ax.set(
+        xlabel="time [s]", ylabel="NEES / dof", yscale="log", title=f"{e.run.name}: 1 is right, above is overconfident"
+    )
+    ax.legend(frameon=False, fontsize=8, ncols=3)
+    ax.grid(alpha=0.3)
+    return figure
+
+
+def _nees_line(ax: Axes, e: Evaluation, s: Statement, t: Array) -> None:
+    C = s.covariance[e.errors.index]
+    known = np.isfinite(C).all(axis=(1, 2))
+    if known.sum() < 2:
+        return
+    values = nees(e.errors.xi[known] - s.mean[e.errors.index][known], C[known]) / 6
+    width = max(1, round(0.5 / max(float(np.median(e.errors.dt_s)), 1e-3)))
+    smooth = np.convolve(values, np.ones(width) / width, mode="same")
+    ax.plot(t[known], np.maximum(smooth, 1e-3), label=s.method, color=_COLOURS.get(s.method), lw=1)
+
+
+FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
+    "trajectory": trajectory,
+    "errors": error_bounds,
+    "reliability": reliability,
+    "memory": memory,
+    "nees": nees_over_time,
+}
+
+
+def save_all(e: Evaluation, folder: Path) -> list[Path]:
+    """Every figure of a run as ``<run>_<figure>.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    out = []
+    for name, draw in FIGURES.items():
+        path = folder / f"{e.run.name}_{name}.png"
+        draw(e).savefig(path, dpi=110)
+        out.append(path)
+    return out

@@ -1,0 +1,88 @@
+"""What each method says about every motion of a run: one table of covariances per METHOD."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gpvo.evaluation.accumulate import Step
+from gpvo.types import Array, Prediction, Status, VoLog
+
+if TYPE_CHECKING:
+    from gpvo.online.predictor import Predictor
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One method over the N records of a log: ``mean`` (N, 6); ``covariance`` (N, d, d), d = 6, or 3 where the method
+    speaks of the translation alone; NaN where it says nothing. ``steps``: the same for accumulation, None for d = 3."""
+
+    method: str
+    mean: Array
+    covariance: Array
+    steps: Sequence[Step] | None
+
+    @property
+    def dof(self) -> int:
+        """3 or 6."""
+        return int(self.covariance.shape[-1])
+
+
+def statements(
+    log: VoLog, predictions: Mapping[int, Prediction] | None = None, predictor: Predictor | None = None
+) -> list[Statement]:
+    """All methods that can be stated of this log.
+
+    Geometric ones from its records, each with its translation-only ``_vt``; ``constant`` and ``_scaled`` from the model
+    file; ``learned`` from predictions by stamp.
+    """
+    out: list[Statement] = []
+    arrays = predictor.arrays if predictor is not None else {}
+    if "method.constant" in arrays and arrays["method.constant"].shape == (6, 6):
+        out.append(_plain(log, "constant", np.broadcast_to(arrays["method.constant"], (len(log), 6, 6))))
+    for method in log.methods:
+        covariance = log.covariance(method)
+        out.append(_plain(log, method, covariance))
+        scale = arrays.get(f"method.{method}.scale")
+        if scale is not None:
+            root = np.sqrt(scale)
+            out.append(_plain(log, f"{method}_scaled", covariance * np.outer(root, root)))
+        out.append(_translation_only(log, method))
+    if predictions:
+        out.append(_learned(log, predictions))
+    return out
+
+
+def _plain(log: VoLog, method: str, covariance: Array) -> Statement:
+    # A motion that nobody vouches for enters the sum with what was said of the one before.
+    filled, last = [], np.eye(6) * 1e-6
+    for C in covariance:
+        last = C if np.isfinite(C).all() else last
+        filled.append(last)
+    steps = [Step.independent(r.T_prev_cur, C) for r, C in zip(log, filled, strict=True)]
+    return Statement(method, np.zeros((len(log), 6)), np.asarray(covariance), steps)
+
+
+def _translation_only(log: VoLog, method: str) -> Statement:
+    missing = np.full((3, 3), np.nan)
+    # V_T is in the axes of the reference camera, the error in those of the current one.
+    turned = [r.T_prev_cur[:3, :3].T @ r.v_t.get(method, missing) @ r.T_prev_cur[:3, :3] for r in log]
+    return Statement(f"{method}_vt", np.zeros((len(log), 6)), np.array(turned).reshape(-1, 3, 3), None)
+
+
+def _learned(log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
+    mean, covariance = np.zeros((len(log), 6)), np.full((len(log), 6, 6), np.nan)
+    steps: list[Step] = []
+    last = Step.independent(np.eye(4), np.eye(6) * 1e-6)
+    for k, record in enumerate(log):
+        prediction = predictions.get(record.t_ns)
+        if prediction is not None and record.status is not Status.START:
+            mean[k], covariance[k] = prediction.mean, prediction.covariance
+            last = Step.predicted(record.T_prev_cur, prediction)
+        steps.append(
+            Step(record.T_prev_cur, last.jitter, last.white, last.bias, last.bias_tau_s, record.dt_s or last.dt_s)
+        )
+    return Statement("learned", mean, covariance, steps)

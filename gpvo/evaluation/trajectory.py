@@ -1,0 +1,157 @@
+"""Errors of a trajectory against truth: ATE, RPE and the segments of the KITTI benchmark.
+
+Poses are (N, 4, 4), estimate and truth of the same frame at the same times. Definitions: J. Sturm et al., "A
+benchmark for the evaluation of RGB-D SLAM systems" (2012), eqs. 1-5; A. Geiger, P. Lenz, R. Urtasun, "Are we ready
+for autonomous driving?" (2012), section 3.1; alignment by S. Umeyama (1991), without scale: a stereo rig knows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.filters.metrics import ate_rmse
+from gpvo.geometry import se3
+from gpvo.types import Array
+
+SHORT_M, LONG_M = (10.0, 20.0, 50.0, 100.0), tuple(100.0 * k for k in range(1, 9))
+_LONG_PATH_M = 800.0
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of a set of non-negative errors, in their unit."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Array) -> Statistics:
+        """All NaN for an empty set."""
+        if len(values) == 0:
+            nan = float("nan")
+            return cls(nan, nan, nan, nan, nan, nan, 0)
+        return cls(
+            rmse=float(np.sqrt((values**2).mean())),
+            mean=float(values.mean()),
+            median=float(np.median(values)),
+            std=float(values.std()),
+            min=float(values.min()),
+            max=float(values.max()),
+            count=len(values),
+        )
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Error of relative motions: translation [m] and rotation [rad]."""
+
+    translation_m: Statistics
+    rotation_rad: Statistics
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Mean error of all segments of one length, as a share of it."""
+
+    length_m: float
+    translation_percent: float
+    rotation_deg_per_m: float
+    count: int
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Every trajectory error of one run. ``rmse_origin_m`` and ``final_error_m`` have the first poses made equal and
+    nothing fitted; ``ate_rmse_m`` is after SE(3) alignment."""
+
+    path_length_m: float
+    ate_rmse_m: float
+    rmse_origin_m: float
+    final_error_m: float
+    rpe_frame: RelativeError
+    rpe_second: RelativeError
+    rpe_10m: RelativeError
+    segments: tuple[Segment, ...]
+
+
+def path_length_m(T: Array) -> Array:
+    """(N,) length of the path up to each pose."""
+    steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def relative_errors(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
+    """``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,): (M, 4, 4)."""
+    d_est = se3.inverse(T_est[start]) @ T_est[end]
+    d_true = se3.inverse(T_true[start]) @ T_true[end]
+    return se3.inverse(d_true) @ d_est
+
+
+def rpe(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> RelativeError:
+    """Relative pose error over given pairs of poses."""
+    E = relative_errors(T_est, T_true, start, end)
+    angle = np.linalg.norm(se3.so3_log(E[:, :3, :3]), axis=1)
+    return RelativeError(Statistics.of(np.linalg.norm(E[:, :3, 3], axis=1)), Statistics.of(angle))
+
+
+def pairs_ahead(progress: Array, step: float, every: int = 1) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of poses ``step`` apart in a growing quantity (N,): every n-th start, and the first pose at least that
+    far on."""
+    start = np.arange(0, len(progress), every)
+    # A hair of slack: times that are sums of a frame period must not miss the round number.
+    end = np.searchsorted(progress, progress[start] + step * (1 - 1e-9), side="left")
+    inside = end < len(progress)
+    return start[inside], end[inside]
+
+
+def segments(T_est: Array, T_true: Array, lengths_m: Sequence[float], every: int = 10) -> tuple[Segment, ...]:
+    """KITTI's segment errors for given lengths of the true path, a start at every tenth frame."""
+    arc = path_length_m(T_true)
+    out = []
+    for length in lengths_m:
+        start, end = pairs_ahead(arc, length, every)
+        if len(start) == 0:
+            continue
+        error = rpe(T_est, T_true, start, end)
+        out.append(
+            Segment(
+                length,
+                100 * error.translation_m.mean / length,
+                float(np.degrees(error.rotation_rad.mean)) / length,
+                len(start),
+            )
+        )
+    return tuple(out)
+
+
+def trajectory_errors(
+    t_ns: NDArray[np.int64], T_est: Array, T_true: Array, lengths_m: Sequence[float] | None = None
+) -> TrajectoryErrors:
+    """Every error of one run; ``lengths_m`` default to 10 to 100 m, for paths above 800 m to KITTI's 100 to 800 m."""
+    arc = path_length_m(T_true)
+    lengths = lengths_m or (LONG_M if arc[-1] > _LONG_PATH_M else SHORT_M)
+    from_start = se3.inverse(T_true[0]) @ T_true
+    drift = (T_est[0] @ from_start)[:, :3, 3] - T_est[:, :3, 3]
+    off = np.linalg.norm(drift, axis=1)
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    frames = np.arange(len(t_ns) - 1)
+    # A span, not an instant: a start at every frame, the end one second or ten metres on.
+    return TrajectoryErrors(
+        path_length_m=float(arc[-1]),
+        ate_rmse_m=ate_rmse(T_est[:, :3, 3], T_true[:, :3, 3]),
+        rmse_origin_m=float(np.sqrt((off**2).mean())),
+        final_error_m=float(off[-1]),
+        rpe_frame=rpe(T_est, T_true, frames, frames + 1),
+        rpe_second=rpe(T_est, T_true, *pairs_ahead(t_s, 1.0)),
+        rpe_10m=rpe(T_est, T_true, *pairs_ahead(arc, 10.0)),
+        segments=segments(T_est, T_true, lengths),
+    )

@@ -1,0 +1,38 @@
+"""How a series remembers: autocorrelation and Allan deviation.
+
+D. W. Allan, "Statistics of atomic frequency standards" (1966); overlapping estimator as in IEEE Std 952-1997, annex C.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def autocorrelation(values: Array, max_lag: int) -> Array:
+    """Autocorrelation (max_lag + 1,) of a series (n,), 1 at lag 0; zeros where the series is constant."""
+    x = np.asarray(values, dtype=np.float64) - np.mean(values)
+    power = float(x @ x)
+    if power == 0:
+        return np.concatenate([[1.0], np.zeros(max_lag)])
+    return np.array([1.0, *(float(x[:-k] @ x[k:]) / power for k in range(1, max_lag + 1))])
+
+
+def allan_deviation(rate: Array, dt_s: float) -> tuple[Array, Array]:
+    """Averaging times [s] and Allan deviations, in the rate's unit, of a rate (n,) sampled every ``dt_s``.
+
+    White noise falls with the root of time, a bias that wanders makes it flat and then rise.
+    """
+    total = np.concatenate([[0.0], np.cumsum(np.asarray(rate, dtype=np.float64))])
+    n = len(total) - 1
+    if n < 4:
+        return np.empty(0), np.empty(0)
+    sizes = np.unique(np.geomspace(1, n // 3 or 1, 25).astype(int))
+    deviations = []
+    for m in sizes:
+        means = (total[m:] - total[:-m]) / m
+        steps = means[m:] - means[:-m]
+        deviations.append(np.sqrt(0.5 * np.mean(steps**2)))
+    return sizes * dt_s, np.array(deviations)
