@@ -15,7 +15,7 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.statements import Statement
 from gpvo.stats.consistency import nees
 from gpvo.stats.series import allan_deviation, autocorrelation
-from gpvo.types import Array
+from gpvo.types import Array, Status
 
 AXES = ("x", "y", "z", "rot x", "rot y", "rot z")
 _COLOURS = {
@@ -36,7 +36,7 @@ def trajectory(e: Evaluation) -> Figure:
     top, side = figure.subplots(2, 1, height_ratios=(2, 1))
     statement = best_statement(e)
     bounds = None if statement is None or statement.steps is None else along(statement.steps, e.run.log.parent)
-    to_plane, names = _level(e)
+    to_plane, names = level(e)
     p, q = e.T_est[:, :3, 3] @ to_plane.T, e.T_true[:, :3, 3] @ to_plane.T
     for axes, (i, j) in ((top, (0, 1)), (side, (0, 2))):
         axes.plot(q[e.covered, i], q[e.covered, j], color="black", lw=1.2, label="truth")
@@ -55,13 +55,12 @@ def trajectory(e: Evaluation) -> Figure:
     return figure
 
 
-def _level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
+def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
     """Axes to draw in. Truth in a camera's world (y down, as KITTI's) is turned so that the third axis points up."""
-    spread = np.ptp(e.T_true[e.covered][:, :3, 3], axis=0)
     down = e.T_true[e.covered][0, :3, :3] @ np.array([0.0, 1.0, 0.0])
     if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
         return np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]), ("forward z", "right x", "up -y")
-    return np.eye(3), ("x", "y", "z") if spread.any() else ("x", "y", "z")
+    return np.eye(3), ("x", "y", "z")
 
 
 def _ellipse(centre: Array, C: Array) -> Ellipse:
@@ -174,12 +173,37 @@ def _nees_line(ax: Axes, e: Evaluation, s: Statement, t: Array) -> None:
     ax.plot(t[known], np.maximum(smooth, 1e-3), label=s.method, color=_COLOURS.get(s.method), lw=1)
 
 
+def inputs(e: Evaluation) -> Figure:
+    """What odometry saw: points, disparity, image, and where it was degraded or lost."""
+    figure = Figure(figsize=(10, 5.5), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
+    log = e.run.log
+    t = (log.t_ns - log.t_ns[0]) * 1e-9
+    for name in ("n_stereo", "n_tracked", "n_inliers"):
+        axes[0].plot(t, np.where(log.column(name) < 0, np.nan, log.column(name)), label=name, lw=1)
+    for name in ("disparity_p10_px", "disparity_p50_px", "disparity_p90_px"):
+        axes[1].plot(t, log.column(name), label=name, lw=1)
+    for name in ("brightness", "contrast", "noise_level"):
+        axes[2].plot(t, log.column(name), label=name, lw=1)
+    for ax, label in zip(axes, ("points", "disparity [px]", "image, 0 to 1"), strict=True):
+        for status, colour in ((Status.DEGRADED, "#ffbf00"), (Status.LOST, "#d62728")):
+            bad = np.array([r.status is status for r in log])
+            ax.fill_between(t, 0, 1, where=bad, transform=ax.get_xaxis_transform(), color=colour, alpha=0.25, lw=0)
+        ax.set_ylabel(label)
+        ax.legend(frameon=False, fontsize=8, ncols=3)
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]")
+    figure.suptitle(f"{e.run.name}: what odometry saw; amber is degraded, red is lost")
+    return figure
+
+
 FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
     "trajectory": trajectory,
     "errors": error_bounds,
     "reliability": reliability,
     "memory": memory,
     "nees": nees_over_time,
+    "inputs": inputs,
 }
 
 

@@ -1,0 +1,93 @@
+"""One self-contained HTML page: no network, readable on a phone and in print."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from gpvo import __version__
+from gpvo.evaluation import plots
+from gpvo.evaluation.accumulate import along
+from gpvo.evaluation.evaluate import Evaluation, document
+from gpvo.types import Array
+
+_MAX_POINTS = 600
+
+
+def write_report(evaluations: Sequence[Evaluation], path: Path) -> None:
+    """Write the page, by way of a temporary name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = render(evaluations)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def render(evaluations: Sequence[Evaluation]) -> str:
+    """The page as text. Its table shows the numbers of ``gpvo evaluate --json``."""
+    from jinja2 import Environment, PackageLoader, select_autoescape
+
+    environment = Environment(
+        loader=PackageLoader("gpvo.evaluation"), autoescape=select_autoescape(default=True), trim_blocks=True
+    )
+    environment.filters["number"] = _number
+    runs = []
+    for entry, evaluation in zip(document(evaluations)["runs"], evaluations, strict=True):
+        pictures = [(name, _svg(draw(evaluation))) for name, draw in plots.FIGURES.items()]
+        runs.append({"data": entry, "pictures": pictures, "scene": json.dumps(scene(evaluation))})
+    return environment.get_template("report.html").render(runs=runs, version=__version__)
+
+
+def scene(e: Evaluation) -> dict[str, Any]:
+    """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
+    to_plane, _ = plots.level(e)
+    keep = np.unique(np.linspace(0, len(e.T_est) - 1, _MAX_POINTS).astype(int))
+    est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[keep[e.covered[keep]], :3, 3] @ to_plane.T
+    centre = (true.max(0) + true.min(0)) / 2
+    statement = plots.best_statement(e)
+    ellipsoids: list[dict[str, Any]] = []
+    if statement is not None and statement.steps is not None:
+        bounds = along(statement.steps, e.run.log.parent)
+        for k in np.unique(np.linspace(0, len(e.T_est) - 1, 10).astype(int))[1:]:
+            R = to_plane @ e.T_est[k, :3, :3]
+            axes = _axes(R @ bounds[k, :3, :3] @ R.T)
+            ellipsoids.append({"at": _rounded(to_plane @ e.T_est[k, :3, 3] - centre), "axes": _rounded(axes)})
+    size = max(float(np.abs(true - centre).max()), 1e-6)
+    return {"est": _rounded(est - centre), "true": _rounded(true - centre), "ellipsoids": ellipsoids, "size": size}
+
+
+def _axes(C: Array) -> Array:
+    """(3, 3) rows: the half axes of the 3-sigma ellipsoid."""
+    values, vectors = np.linalg.eigh(C)
+    return 3 * (vectors * np.sqrt(np.maximum(values, 0.0))).T
+
+
+def _rounded(values: Array) -> Any:
+    return np.round(values, 5).tolist()
+
+
+def _svg(figure: Any) -> str:
+    # Text as text and a fixed salt: smaller, and the same input gives the same bytes.
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gpvo"}):
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    text = stream.getvalue()
+    return text[text.index("<svg") :]
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None or not np.isfinite(value) else f"{value:.3g}"
