@@ -1,0 +1,7 @@
+"""Stereo images of a world: exact geometry for any lens, in numba."""
+
+from __future__ import annotations
+
+from gpvo.sim.render.stereo import Effects, StereoRenderer
+
+__all__ = ["Effects", "StereoRenderer"]

@@ -1,0 +1,118 @@
+"""Built worlds on disk: one npz without pickle per kind, seed, parameters and version of the code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
+
+_LARGEST_BYTES = 2_000_000_000
+
+
+def cache_folder() -> Path:
+    """Where worlds are kept: ``$XDG_CACHE_HOME/gpvo/worlds``, by default under ``~/.cache``."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "gpvo" / "worlds"
+
+
+def cached(kind: str, seed: int, params: Mapping[str, object], build: Callable[[], World]) -> World:
+    """The world from its file, or built and written; a file that cannot be read or written is no hindrance."""
+    text = json.dumps([kind, int(seed), dict(params), code_digest()], sort_keys=True, default=str)
+    path = cache_folder() / f"{kind}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    try:
+        return load_world(path)
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        pass
+    world = build()
+    try:
+        save_world(world, path)
+    except OSError:
+        pass  # a full or read-only home costs time at the next run, nothing else
+    return world
+
+
+@cache
+def code_digest() -> str:
+    """Digest of the sources that worlds are built by, so that a change of theirs outdates the cache."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def save_world(world: World, path: Path) -> None:
+    """Write a world atomically.
+
+    Raises
+    ------
+    OSError
+        Where the folder cannot be written.
+    """
+    arrays: dict[str, np.ndarray] = {f"mesh_{f.name}": getattr(world.mesh, f.name) for f in fields(Mesh)}
+    arrays |= {f"texture_{k}": texture for k, texture in enumerate(world.textures)}
+    arrays |= {f"height_{k}": grid.z for k, grid in enumerate(world.heights)}
+    arrays |= {"centreline": world.centreline, "start_pose": world.start_pose, "bounds": world.bounds}
+    header: dict[str, object] = {
+        "kind": world.kind,
+        "seed": world.seed,
+        "params": dict(world.params),
+        "lighting": asdict(world.lighting),
+        "textures": len(world.textures),
+        "heights": [(grid.x0, grid.y0, grid.cell) for grid in world.heights],
+        "light_map": None,
+    }
+    if world.light_map is not None:
+        arrays["light_map"] = world.light_map.image
+        header["light_map"] = (world.light_map.origin, world.light_map.texel, world.light_map.material)
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load_world(path: Path) -> World:
+    """Read a world.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile
+        Where the file is absent or damaged.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if sum(info.file_size for info in archive.infolist()) > _LARGEST_BYTES:
+            raise ValueError(f"{path} is too large for a world")
+    with np.load(path, allow_pickle=False) as data:
+        header = json.loads(data["header"].tobytes())
+        light_map = None
+        if header["light_map"] is not None:
+            (u, v), texel, material = header["light_map"]
+            light_map = LightMap(data["light_map"], (u, v), texel, material)
+        return World(
+            kind=header["kind"],
+            seed=header["seed"],
+            params=header["params"],
+            mesh=Mesh(**{f.name: data[f"mesh_{f.name}"] for f in fields(Mesh)}),
+            textures=tuple(data[f"texture_{k}"] for k in range(header["textures"])),
+            lighting=Lighting(**header["lighting"]),
+            centreline=data["centreline"],
+            start_pose=data["start_pose"],
+            bounds=data["bounds"],
+            light_map=light_map,
+            heights=tuple(HeightGrid(data[f"height_{k}"], *g) for k, g in enumerate(header["heights"])),
+        )
