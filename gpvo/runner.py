@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gpvo.errors import SourceError
 from gpvo.io.run import RunWriter
-from gpvo.types import ImuLog, Prediction, Status, VoRecord
+from gpvo.types import ImuLog, Prediction, Status, TrackFrame, VoRecord
 from gpvo.vo.config import VoConfig
 from gpvo.vo.odometry import StereoOdometry
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from gpvo.io.source import Source
     from gpvo.online.predictor import Predictor
 
-# With fewer pairs of one kind the first frames say nothing about the order of the cameras.
-_FRAMES_BEFORE_DOUBT = 5
+# Frames in which the order of left and right is checked.
+_FRAMES_BEFORE_TRUST = 5
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ def run(
     meta = {"source": str(source.name), "source_format": source.format, "kind": source.kind}
     if predictor is not None:
         meta["model_digest"] = predictor.digest
+        predictor.reset(source.camera)
     status: Counter[str] = Counter()
     length_m = busy_s = 0.0
     with RunWriter(
@@ -74,10 +75,7 @@ def run(
         calibration=source.calibration,
     ) as writer:
         for record, seconds in records(source, config):
-            prediction = None
-            if predictor is not None:
-                prediction = predictor.step(record)
-                record = record.with_status(prediction.status, "prediction") if prediction else record
+            prediction = None if predictor is None else predictor.step(record)
             writer.append(record, prediction)
             status[record.status.value] += 1
             length_m += float(np.linalg.norm(record.T_prev_cur[:3, 3])) if record.is_reference else 0.0
@@ -96,16 +94,14 @@ def records(source: Source, config: VoConfig) -> Iterator[tuple[VoRecord, float]
     """The records of a source, one by one, with the seconds that each took."""
     odometry = StereoOdometry(source.camera, config, source.mask)
     t_last_ns: int | None = None
-    few = 0
     for k, frame in enumerate(source):
+        if k < _FRAMES_BEFORE_TRUST and isinstance(frame, TrackFrame):
+            _refuse_swapped(frame, source.path)
         samples = None if t_last_ns is None else imu_between(source.imu, t_last_ns, frame.t_ns)
         start = time.perf_counter()
         record = odometry.step(frame, samples)
         seconds = time.perf_counter() - start
         t_last_ns = frame.t_ns
-        few += record.n_stereo < config.min_inliers
-        if k + 1 == _FRAMES_BEFORE_DOUBT and few == _FRAMES_BEFORE_DOUBT:
-            _refuse_swapped(source, config)
         yield record, seconds
 
 
@@ -117,19 +113,13 @@ def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | No
     return replace(imu, t_ns=imu.t_ns[i:j], gyro_radps=imu.gyro_radps[i:j], acc_mps2=imu.acc_mps2[i:j])
 
 
-def _refuse_swapped(source: Source, config: VoConfig) -> None:
-    """Say so if the first pair matches only with its images exchanged; a dark or blank start passes."""
-    from gpvo.types import StereoFrame, TrackFrame
-
-    frame: Any = next(iter(source))
-    if isinstance(frame, StereoFrame):
-        frame = replace(frame, left=frame.right, right=frame.left)
-    elif isinstance(frame, TrackFrame):
-        frame = replace(frame, uv_left=frame.uv_right, uv_right=frame.uv_left)
-    swapped = StereoOdometry(source.camera, config).step(frame)
-    if swapped.n_stereo >= config.weak_inliers:
+def _refuse_swapped(frame: TrackFrame, where: object) -> None:
+    """Say so if most points of a frame of tracks lie behind the cameras; images are checked by their source."""
+    disparity = frame.uv_left[:, 0] - frame.uv_right[:, 0]
+    behind = int((disparity < -1.0).sum())
+    if behind >= 10 and behind > 0.8 * len(disparity):
         raise SourceError(
-            f"left and right look swapped: only exchanged does the first pair match ({swapped.n_stereo} points)",
-            where=source.path,
-            cure="exchange the two cameras, or the sign of the baseline",
+            f"left and right look swapped: {behind} of {len(disparity)} points have negative disparity",
+            where=where,
+            cure="exchange uv_left and uv_right",
         )

@@ -7,13 +7,12 @@ from typing import Annotated
 
 import typer
 
+from gpvo.cli import source_options as flags
 from gpvo.errors import GpvoError
 
 
 def run(
-    source: Annotated[
-        Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")
-    ],
+    source: Annotated[Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
     model: Annotated[Path | None, typer.Option(help="Error model: predict as it goes.")] = None,
     preset: Annotated[str, typer.Option(help="fast, or thesis.")] = "fast",
@@ -23,8 +22,19 @@ def run(
     sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto: from the residuals so far.")] = "0.1",
     sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
-    kind: Annotated[str | None, typer.Option("--source", help="Override the guessed format of the sequence.")] = None,
-    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair.")] = None,
+    kind: flags.Kind = None,
+    calibration: flags.Calibration = None,
+    hfov_deg: flags.HfovDeg = None,
+    size: flags.Size = None,
+    mask_left: flags.MaskLeft = None,
+    mask_right: flags.MaskRight = None,
+    bits: flags.Bits = None,
+    rate_hz: flags.RateHz = None,
+    left_topic: flags.LeftTopic = None,
+    right_topic: flags.RightTopic = None,
+    imu_topic: flags.ImuTopic = None,
+    truth_topic: flags.TruthTopic = None,
+    truth_frame: flags.TruthFrame = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Run stereo VO over a sequence: log, trajectory and covariances.
@@ -43,7 +53,20 @@ def run(
         sigma_p_px=_pixels("--sigma-p", sigma_p),
         sigma_m_px=_pixels("--sigma-m", sigma_m),
     )
-    options = {} if hfov_deg is None else {"hfov_deg": hfov_deg}
+    options = flags.source_options(
+        size,
+        calibration=calibration,
+        hfov_deg=hfov_deg,
+        mask_left=mask_left,
+        mask_right=mask_right,
+        bits=bits,
+        rate_hz=rate_hz,
+        left_topic=left_topic,
+        right_topic=right_topic,
+        imu_topic=imu_topic,
+        truth_topic=truth_topic,
+        truth_frame=truth_frame,
+    )
     sequence = open_source(source, kind=kind, **options)
     predictor = None
     if model is not None:
