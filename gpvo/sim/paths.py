@@ -65,7 +65,7 @@ def along_curve(
     s = speed_mps * (pace + 0.33 / w[0] * (np.sin(w[0] * pace + ph[0]) - np.sin(ph[0])))
     room = arc[-1] - 1.0
     s = room * np.tanh(s / room * 1.0) if s[-1] > 0.8 * room else s
-    start = np.clip(pace / 2.0, 0, 1) ** 3
+    start = _smoothstep(pace / 4.0)
     tangent = curve.derivative(1)(s)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
     left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], 1)
@@ -162,6 +162,12 @@ def flown(
         lambda u: se3.from_quaternion(np.zeros((len(u), 3)), pose(smooth_start(u, rest_s)))[:, :3, :3] @ spin,
         duration_s,
     )
+
+
+def _smoothstep(x: Array) -> Array:
+    """0 to 1 as x goes from 0 to 1, with three derivatives zero at both ends."""
+    y = np.clip(x, 0.0, 1.0)
+    return 35 * y**4 - 84 * y**5 + 70 * y**6 - 20 * y**7
 
 
 def _knots(duration_s: float) -> Array:
