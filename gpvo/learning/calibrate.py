@@ -17,6 +17,8 @@ from gpvo.types import Array
 
 LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95)
 _NU_RANGE = (2.5, 200.0)
+# Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
+_PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -74,18 +76,23 @@ def fit_scale(z: Array, group: NDArray, blocks: tuple[slice, ...] = (slice(0, 3)
     logs = np.log(by_group)
     G = len(labels)
     spread = np.zeros(z.shape[1])
-    if G > 1:
-        for block in blocks:
-            if logs[:, block].size:
-                spread[block] = np.sqrt(logs[:, block].var(axis=0, ddof=1).mean())
+    for block in blocks:
+        if logs[:, block].size:
+            seen = logs[:, block].var(axis=0, ddof=1).mean() if G > 1 else 0.0
+            spread[block] = np.sqrt(_with_prior(seen, G))
     return Scale(np.exp(logs.mean(axis=0) + 0.5 * spread**2 * (1.0 + 1.0 / G)), spread, by_group)
+
+
+def _with_prior(variance: float, groups: int) -> float:
+    """Variance between groups, drawn towards the prior: few groups cannot show how much groups differ."""
+    return (_PRIOR_GROUPS * _PRIOR_SPREAD**2 + (groups - 1) * variance) / (_PRIOR_GROUPS + groups - 1)
 
 
 def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
     """One more factor, so that the NEES of all six axes together is right for a new group."""
     squared = nees(error, covariance) / error.shape[1]
     logs = np.log([robust_mean(squared[group == g]) for g in np.unique(group)])
-    spread2 = logs.var(ddof=1) if len(logs) > 1 else 0.0
+    spread2 = _with_prior(logs.var(ddof=1) if len(logs) > 1 else 0.0, len(logs))
     return float(np.exp(logs.mean() + 0.5 * spread2 * (1.0 + 1.0 / len(logs))))
 
 

@@ -17,10 +17,11 @@ from scipy.optimize import nnls
 
 from gpvo.types import Array
 
-SPANS = (1, 2, 5, 10, 20, 50, 100)
+SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _TAU_FRAMES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0)
 _MIN_WINDOWS = 3.0
 _MIN_SHARE = 1e-6
+_REWEIGHTINGS = 8
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,21 @@ class Parts:
 
 
 def fit_parts(z: Sequence[Array], step_s: float) -> Parts:
-    """From normalised residuals, one array (n_i, D) per unbroken stretch; ``step_s``: usual duration of a motion."""
+    """From normalised residuals, one array (n_i, D) per unbroken stretch; ``step_s``: usual duration of a motion.
+
+    Translation and rotation (each three axes) have one time constant each; the shares are the axis' own.
+    """
     spans, measured, windows = span_variances(z)
-    unit = measured[0]
-    shares, taus, fitted = [], [], []
-    for j in range(measured.shape[1]):
-        share, tau, curve = _fit_axis(spans, measured[:, j] / unit[j], windows)
-        shares.append(share)
-        taus.append(tau * step_s)
-        fitted.append(curve)
-    return Parts(np.array(shares).T, np.array(taus), spans, measured / unit, np.array(fitted).T)
+    curve = measured / measured[0]
+    share, tau = np.empty((3, curve.shape[1])), np.empty(curve.shape[1])
+    for start in range(0, curve.shape[1], 3):
+        block = range(start, min(start + 3, curve.shape[1]))
+        fits = {t: [_fit_axis(spans, curve[:, j], windows, t) for j in block] for t in _TAU_FRAMES}
+        best = min(fits, key=lambda t: sum(loss for loss, _ in fits[t]))
+        for j, (_, found) in zip(block, fits[best]):
+            share[:, j], tau[j] = found, best
+    fitted = np.stack([curves(spans, tau[j]) @ share[:, j] for j in range(curve.shape[1])], axis=1)
+    return Parts(share, tau * step_s, spans, curve, fitted)
 
 
 def span_variances(z: Sequence[Array]) -> tuple[NDArray[np.int64], Array, Array]:
@@ -78,20 +84,20 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
     return np.stack([np.ones_like(m), m, bias], axis=1)
 
 
-def _fit_axis(spans: NDArray[np.int64], measured: Array, windows: Array) -> tuple[Array, float, Array]:
-    """Shares (3,), time constant in frames, and the fitted curve: relative least squares, weighted by the windows."""
-    weight = np.sqrt(windows / windows.sum())
-    best: tuple[float, Array, float, Array] | None = None
-    for tau in _TAU_FRAMES:
-        C = curves(spans, tau)
-        coefficients, residual = nnls(C / measured[:, None] * weight[:, None], weight)
-        if best is None or residual < best[0] - 1e-9:
-            best = (residual, coefficients, tau, C)
-    assert best is not None
-    _, coefficients, tau, C = best
-    share = np.maximum(coefficients / max(coefficients.sum(), 1e-300), _MIN_SHARE)
-    share = share / share.sum()
-    return share, tau, C @ share
+def _fit_axis(spans: NDArray[np.int64], measured: Array, windows: Array, tau_frames: float) -> tuple[float, Array]:
+    """Loss and shares (3,) for one time constant, by the likelihood of a chi-squared mean square.
+
+    Each mean square has a relative deviation of sqrt(2 / windows); the fit is reweighted by its own curve, because
+    weights by the measured values would favour curves that lie too low.
+    """
+    C, curve = curves(spans, tau_frames), measured
+    for _ in range(_REWEIGHTINGS):
+        weight = np.sqrt(windows) / curve
+        coefficients = nnls(C * weight[:, None], measured * weight)[0]
+        share = np.maximum(coefficients / max(coefficients.sum(), 1e-300), _MIN_SHARE)
+        share = share / share.sum()
+        curve = C @ share
+    return float(windows @ (np.log(curve) + measured / curve)), share
 
 
 def stretches(t_ns: NDArray[np.int64], dt_s: Array) -> list[slice]:

@@ -142,7 +142,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     out->distance = distance;
     out->in_domain = exp(-0.5 * distance * distance);
     outside = 1.0 - out->in_domain;
-    growth = (1.0 + distance) * (1.0 + distance);
+    growth = 1.0 + distance;
     for (j = 0; j < 6; ++j) {
         double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
