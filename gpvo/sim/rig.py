@@ -1,0 +1,88 @@
+"""Stereo rigs by name, and what separates the rig that draws the pictures from the calibration that is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
+from gpvo.cameras.rig import StereoRig
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.types import Array
+
+# The left camera looks forward from the nose, level. The IMU is the body's origin.
+T_BODY_LEFT = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
+
+
+@dataclass(frozen=True)
+class RigTolerance:
+    """Standard deviations of the calibration's error, drawn once per flight: fractions of baseline and focal length,
+    turn of the right camera per axis [rad], absolute change of the first distortion coefficient."""
+
+    baseline: float = 0.0
+    focal: float = 0.0
+    rotation_rad: float = 0.0
+    distortion: float = 0.0
+
+
+def _pinhole() -> StereoRig:
+    lens = PinholeRadtan(380.0, 380.0, 319.5, 239.5, 640, 480)
+    return _pair(lens, lens, 0.12, np.eye(3))
+
+
+def _euroc() -> StereoRig:
+    left = PinholeRadtan(458.0, 457.0, 367.0, 248.0, 752, 480, (-0.28, 0.074, 2e-4, 1e-5))
+    right = PinholeRadtan(457.5, 456.0, 380.0, 255.0, 752, 480, (-0.28, 0.074, -1e-4, -3e-5))
+    return _pair(left, right, 0.11, se3.so3_exp(np.array([0.014, -0.004, 0.002])))
+
+
+def _t265() -> StereoRig:
+    left = KannalaBrandt(286.0, 286.0, 421.0, 399.0, 848, 800, (-0.005, 0.04, -0.038, 0.006))
+    right = KannalaBrandt(285.5, 285.5, 419.0, 403.0, 848, 800, (-0.004, 0.039, -0.037, 0.006))
+    return _pair(left, right, 0.064, se3.so3_exp(np.array([0.001, 0.0046, -0.002])))
+
+
+_PRESETS: dict[str, Callable[[], StereoRig]] = {"pinhole": _pinhole, "euroc": _euroc, "t265": _t265}
+CAMERAS = tuple(_PRESETS)
+
+
+def camera_rig(name: str) -> StereoRig:
+    """The nominal rig of a preset: ``pinhole``, ``euroc`` or ``t265``.
+
+    Raises
+    ------
+    GpvoError
+        For any other name.
+    """
+    if name not in _PRESETS:
+        raise GpvoError(f"unknown camera '{name}'", cure=f"choose from {', '.join(CAMERAS)}")
+    return _PRESETS[name]()
+
+
+def draw_rig(written: StereoRig, tolerance: RigTolerance, rng: np.random.Generator) -> StereoRig:
+    """The rig that draws the pictures, given what its calibration says: baseline, focal length, the turn between the
+    cameras and distortion differ by what ``tolerance`` allows."""
+    e = rng.standard_normal(7)
+    T = written.T_right_left.copy()
+    T[:3, 3] *= 1 + tolerance.baseline * e[0]
+    T[:3] = se3.so3_exp(tolerance.rotation_rad * e[1:4]) @ T[:3]
+    left, right = (
+        _altered(lens, 1 + tolerance.focal * e[4], tolerance.distortion * e[k])
+        for lens, k in ((written.left, 5), (written.right, 6))
+    )
+    return replace(written, left=left, right=right, T_right_left=T)
+
+
+def _altered(lens: CameraModel, focal: float, k1: float) -> CameraModel:
+    first, *rest = lens.distortion
+    assert isinstance(lens, (PinholeRadtan, KannalaBrandt))
+    return replace(lens, fx_px=lens.fx_px * focal, fy_px=lens.fy_px * focal, distortion=(first + k1, *rest))
+
+
+def _pair(left: CameraModel, right: CameraModel, baseline_m: float, R_right_left: Array) -> StereoRig:
+    T_right_left = se3.from_rt(R_right_left, R_right_left @ np.array([-baseline_m, 0.0, 0.0]))
+    return StereoRig(left, right, T_right_left, T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)

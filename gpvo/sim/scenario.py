@@ -1,0 +1,178 @@
+"""Scenarios: what is flown, where, with which sensors and faults. One validated set of values, kept as small TOML."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gpvo.errors import GpvoError
+from gpvo.sim.points import SCENARIOS, PointsScenario, Tolerance
+from gpvo.sim.rig import RigTolerance
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
+
+_MAX_BYTES = 100_000
+Share = Field(0.0, ge=0.0, le=0.5)
+
+
+class Scenario(BaseModel):
+    """Everything that decides a sequence beside its seed. Times in s, lengths in m.
+
+    ``world_seed``: that of the flight where not given. ``path``: ``along`` the world's centre line, ``wander``,
+    ``straight``, ``hover``; ``trajectory``: a TUM file whose motion is flown instead. ``noise_sigma``: standard
+    deviation on a 0..1 scale, in every ``noise_every``-th frame. ``episodes_share``: share of the flight in which
+    seeing goes wrong. ``dark``: from, to. ``dropped, frozen, late, black``: shares of the frames.
+    ``calibration``: standard deviations of the written calibration's errors. ``points``: values for flights without
+    images alone.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    about: str = ""
+    world: Literal["tunnel", "lunar", "room"] = "tunnel"
+    world_seed: int | None = Field(None, ge=0)
+    world_params: dict[str, Any] = {}
+    vehicle: Literal["quadrotor", "rover", "path"] = "quadrotor"
+    path: Literal["along", "wander", "straight", "hover"] = "along"
+    trajectory: str | None = None
+    needs_trajectory: bool = False
+    duration_s: float = Field(60.0, ge=4.0, le=7200.0)
+    rate_hz: float = Field(20.0, ge=1.0, le=200.0)
+    speed_mps: float = Field(1.2, ge=0.05, le=10.0)
+    sway_m: float = Field(0.3, ge=0.0, le=2.0)
+    rest_s: float = Field(3.0, ge=0.0, le=60.0)
+    camera: Literal["pinhole", "euroc", "t265"] = "pinhole"
+    exposure_s: float = Field(0.0, ge=0.0, le=0.1)
+    sensor: dict[str, Any] = {}
+    noise_sigma: float = Field(0.0, ge=0.0, le=1.0)
+    noise_every: int = Field(1, ge=1)
+    episodes_share: float = Field(0.0, ge=0.0, le=0.5)
+    dark: tuple[float, float] | None = None
+    dropped: float = Share
+    frozen: float = Share
+    late: float = Share
+    late_s: float = Field(0.005, ge=0.0, le=0.5)
+    black: float = Share
+    imu: Literal["perfect", "euroc", "t265"] = "euroc"
+    imu_rate_hz: float = Field(200.0, ge=50.0, le=1000.0)
+    imu_offset_s: float = Field(0.0, ge=-0.1, le=0.1)
+    calibration: dict[Literal["baseline", "focal", "rotation_rad", "distortion"], float] = {}
+    points: dict[str, Any] = {}
+
+    @property
+    def tolerance(self) -> RigTolerance:
+        """Standard deviations of the calibration's error."""
+        return RigTolerance(**self.calibration)
+
+
+def names() -> tuple[str, ...]:
+    """Names of the scenarios that come with the package."""
+    folder = resources.files("gpvo.sim").joinpath("scenarios")
+    return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")))
+
+
+def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scenario:
+    """A scenario by its name or TOML file, with some values replaced; dots reach into tables (``points.sigma_px``).
+
+    Raises
+    ------
+    GpvoError
+        For an unknown name or value, with the nearest one that is known.
+    """
+    if name.endswith(".toml"):
+        table, where = _read_toml(Path(name)), name
+    elif name in names():
+        text = resources.files("gpvo.sim").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")
+        table, where = tomllib.loads(text), name
+    else:
+        raise GpvoError(f"unknown scenario '{name}'", cure=_nearest(name, names()))
+    table.setdefault("name", Path(name).stem if name.endswith(".toml") else name)
+    for key, value in (overrides or {}).items():
+        _put(table, key, value)
+    return _validated(table, where)
+
+
+def points_scenario(scenario: Scenario) -> PointsScenario:
+    """The same flight without images.
+
+    Raises
+    ------
+    GpvoError
+        For an unknown value in the scenario's ``points``.
+    """
+    from gpvo.cameras.rectify import rectify
+    from gpvo.sim.rig import camera_rig
+
+    base = SCENARIOS.get(scenario.name, PointsScenario())
+    known = {f.name for f in fields(PointsScenario)}
+    if unknown := sorted(set(scenario.points) - known):
+        raise GpvoError(f"unknown value 'points.{unknown[0]}'", cure=_nearest(unknown[0], known))
+    camera = base.camera if scenario.camera in ("pinhole", "t265") else rectify(camera_rig(scenario.camera)).camera
+    bias = scenario.calibration
+    values: dict[str, Any] = {
+        "world": scenario.world,
+        "path": scenario.trajectory or scenario.path,
+        "duration_s": scenario.duration_s,
+        "rate_hz": scenario.rate_hz,
+        "speed_mps": scenario.speed_mps,
+        "camera": camera,
+        "imu": scenario.imu,
+        "imu_rate_hz": scenario.imu_rate_hz,
+        "bursts": scenario.episodes_share > 0,
+        "dark": scenario.dark,
+        "tolerance": Tolerance(bias.get("baseline", 0.0), bias.get("focal", 0.0), bias.get("rotation_rad", 0.0)),
+    }
+    return replace(base, **{**values, **scenario.points})
+
+
+def _put(table: dict[str, Any], key: str, value: Any) -> None:
+    head, _, rest = key.partition(".")
+    if not rest:
+        table[head] = value
+        return
+    inner = table.setdefault(head, {})
+    if not isinstance(inner, dict):
+        raise GpvoError(f"'{head}' is no table", cure=f"set {head} itself")
+    _put(inner, rest, value)
+
+
+def _validated(table: dict[str, Any], where: object) -> Scenario:
+    if unknown := sorted(set(table) - set(Scenario.model_fields)):
+        raise GpvoError(
+            f"unknown parameter '{unknown[0]}'", where=where, cure=_nearest(unknown[0], Scenario.model_fields)
+        )
+    try:
+        scenario = Scenario(**table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"] if part != "[key]")
+        raise GpvoError(f"{key} = {first['input']!r}: {first['msg']}", where=where) from None
+    if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:
+        raise GpvoError("late_s is longer than the time between frames", where=where)
+    return scenario
+
+
+def _nearest(word: str, known: Any) -> str:
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
+    return f"nearest: {close[0]}" if close else f"known: {', '.join(sorted(known))}"
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise GpvoError("is larger than a scenario can be", where=path)
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise GpvoError(f"cannot be read: {error.strerror}", where=path) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise GpvoError(f"is no TOML: {error}", where=path) from None
