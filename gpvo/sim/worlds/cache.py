@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
+from gpvo.sim.worlds.world import HeightGrid, Lighting, Mesh, World
 
 _LARGEST_BYTES = 2_000_000_000
 
@@ -69,17 +69,13 @@ def save_world(world: World, path: Path) -> None:
         "lighting": asdict(world.lighting),
         "textures": len(world.textures),
         "heights": [(grid.x0, grid.y0, grid.cell) for grid in world.heights],
-        "light_map": None,
     }
-    if world.light_map is not None:
-        arrays["light_map"] = world.light_map.image
-        header["light_map"] = (world.light_map.origin, world.light_map.texel, world.light_map.material)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(file, **arrays)  # type: ignore[arg-type]
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
@@ -99,10 +95,6 @@ def load_world(path: Path) -> World:
             raise ValueError(f"{path} is too large for a world")
     with np.load(path, allow_pickle=False) as data:
         header = json.loads(data["header"].tobytes())
-        light_map = None
-        if header["light_map"] is not None:
-            (u, v), texel, material = header["light_map"]
-            light_map = LightMap(data["light_map"], (u, v), texel, material)
         return World(
             kind=header["kind"],
             seed=header["seed"],
@@ -113,6 +105,5 @@ def load_world(path: Path) -> World:
             centreline=data["centreline"],
             start_pose=data["start_pose"],
             bounds=data["bounds"],
-            light_map=light_map,
             heights=tuple(HeightGrid(data[f"height_{k}"], *g) for k, g in enumerate(header["heights"])),
         )

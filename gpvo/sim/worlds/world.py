@@ -38,25 +38,11 @@ class Mesh:
 @dataclass(frozen=True)
 class Lighting:
     """Light that is not baked. ``ambient``: irradiance from everywhere. ``head_lamp``: radiant intensity of a lamp at
-    the camera, 0 for none. ``dust_airlight``: radiance of a thick cloud of dust in this light.
+    the camera, 0 for none.
     """
 
     ambient: float = 0.01
     head_lamp: float = 0.0
-    dust_airlight: float = 0.1
-
-
-@dataclass(frozen=True)
-class LightMap:
-    """Fine shadows on one material: ``image`` (H, W) uint8, 255 in full light, over a rectangle of its texture plane.
-
-    Texel centres lie at ``uv = origin + (column + 0.5, row + 0.5) * texel``; outside, full light.
-    """
-
-    image: NDArray[np.uint8]
-    origin: tuple[float, float]
-    texel: float
-    material: int
 
 
 @dataclass(frozen=True)
@@ -77,8 +63,12 @@ class World:
     centreline: Array
     start_pose: Array
     bounds: Array
-    light_map: LightMap | None = None
     heights: tuple[HeightGrid, ...] = field(default=())
+
+    @property
+    def texture(self) -> NDArray[np.uint8]:
+        """The first material's texture."""
+        return self.textures[0]
 
     @cached_property
     def _distance(self) -> TriangleDistance:

@@ -1,0 +1,216 @@
+"""The light that reaches each pixel: numba kernels for texture, lamps and dust."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from gpvo.sim.render.groups import (
+    COLUMNS,
+    LIGHT,
+    SCRATCH,
+    SIZE,
+    START,
+    TAP_U,
+    TAP_V,
+    TAPS,
+    U0,
+    V0,
+    U,
+    V,
+    begin_group,
+    end_group,
+    tap_group,
+)
+from gpvo.sim.render.lanes import LANES
+from gpvo.sim.render.raster import INVERSE, OPTIONS, OWNER, RX, RY, RZ
+
+f4 = np.float32
+@njit(**OPTIONS)
+def _vertex_light(v, position, normal, light, albedo, P, axis, lights):
+    """Radiance factor of a vertex: ambient and baked light, and a lamp at the camera that shines forward."""
+    x, y, z = P[0] - position[0, v], P[1] - position[1, v], P[2] - position[2, v]
+    square = x * x + y * y + z * z
+    inverse = 1.0 / math.sqrt(max(square, 1e-12))
+    facing = max((normal[0, v] * x + normal[1, v] * y + normal[2, v] * z) * inverse, 0.0)
+    forward = -(axis[0] * x + axis[1] * y + axis[2] * z) * inverse
+    beam = min(max((forward - 0.30) / 0.65, 0.0), 1.0)
+    beam = beam * beam * (3.0 - 2.0 * beam)
+    return albedo[v] * (lights[0] + lights[1] * light[v] + lights[2] * beam * facing / (0.15 + square))
+
+
+@njit(**OPTIONS)
+def _prepare(t, rows, corner, vertices, R, P, lights, rays, width, plane, reach, texture, most_taps, table, integers):
+    """Fill the table of one triangle."""
+    position, normal, uv, light, albedo = vertices
+    i, j, k = corner[t, 0], corner[t, 1], corner[t, 2]
+    axis = R[2]
+    La = _vertex_light(i, position, normal, light, albedo, P, axis, lights)
+    Lb = _vertex_light(j, position, normal, light, albedo, P, axis, lights) - La
+    Lc = _vertex_light(k, position, normal, light, albedo, P, axis, lights) - La
+    ub, uc = uv[0, j] - uv[0, i], uv[0, k] - uv[0, i]
+    vb, vc = uv[1, j] - uv[1, i], uv[1, k] - uv[1, i]
+    for a in range(3):
+        s, b, c = rows[t, a], rows[t, 3 + a], rows[t, 6 + a]
+        table[t, U + a] = ub * b + uc * c
+        table[t, V + a] = vb * b + vc * c
+        table[t, LIGHT + a] = f4(La) * s + f4(Lb) * b + f4(Lc) * c
+    # Whole tiles are taken off for the sake of precision; a few are left so that no coordinate is negative.
+    table[t, U0] = uv[0, i] - f4(math.floor(uv[0, i])) + f4(2)
+    table[t, V0] = uv[1, i] - f4(math.floor(uv[1, i])) + f4(2)
+    size, level_start = texture
+    level, taps = _footprint(t, rows, position, i, j, k, R, P, rays, width, plane, reach, size, most_taps, table)
+    # The blend between levels happens in the middle half of each step: half of the pixels need one level only.
+    last = level_start.shape[1] - 2
+    level = min(max(level, f4(0)), f4(last + 1))
+    low = min(int(level), last)
+    blend = min(max((level - f4(low)) * f4(2) - f4(0.5), f4(0)), f4(1))
+    if blend == f4(1):
+        low, blend = low + 1, f4(0)
+    integers[t, START] = level_start[corner[t, 3], low]
+    table[t, SIZE] = f4(size >> low)
+    table[t, TAPS] = f4(taps) + f4(0.5) * blend
+
+
+@njit(**OPTIONS)
+def _footprint(t, rows, position, i, j, k, R, P, rays, width, plane, reach, size, most_taps, table):
+    """Level of detail and the taps along the longer axis of a pixel's shadow on the texture, at the centroid.
+
+    P. Heckbert, "Fundamentals of texture mapping and image warping" (1989), section 3.5.8, for the ellipse.
+    """
+    x = (np.float64(position[0, i]) + position[0, j] + position[0, k]) / 3.0 - P[0]
+    y = (np.float64(position[1, i]) + position[1, j] + position[1, k]) / 3.0 - P[1]
+    z = (np.float64(position[2, i]) + position[2, j] + position[2, k]) / 3.0 - P[2]
+    d = math.sqrt(x * x + y * y + z * z)
+    X = f4((R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / d)
+    Y = f4((R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / d)
+    Z = f4((R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / d)
+    grid = plane.shape[0] - 1
+    w = f4(1) / max(Z + f4(1), f4(1e-6))
+    gx = min(max(int(f4(0.5) * (X * w / reach[0] + f4(1)) * f4(grid) + f4(0.5)), 0), grid)
+    gy = min(max(int(f4(0.5) * (Y * w / reach[1] + f4(1)) * f4(grid) + f4(0.5)), 0), grid)
+    px = min(max(int(plane[gy, gx, 0]), 0), width - 2)
+    py = min(max(int(plane[gy, gx, 1]), 0), rays.shape[0] - 2)
+    table[t, TAP_U], table[t, TAP_V] = f4(0), f4(0)
+    s = rows[t, 0] * X + rows[t, 1] * Y + rows[t, 2] * Z
+    g, lane = px // LANES, px % LANES
+    g1, lane1 = (px + 1) // LANES, (px + 1) % LANES
+    norm = rays[py, g1, 2, lane1] * rays[py, g, 2, lane] * rays[py + 1, g, 2, lane]
+    if s <= 0 or norm == 0:
+        return f4(0), 1
+    turn = f4(1) / s
+    u = (table[t, U] * X + table[t, U + 1] * Y + table[t, U + 2] * Z) * turn
+    v = (table[t, V] * X + table[t, V + 1] * Y + table[t, V + 2] * Z) * turn
+    qa = qb = qc = f4(0)
+    for step in range(2):
+        if step == 0:
+            yn, gn, ln = py, g1, lane1
+        else:
+            yn, gn, ln = py + 1, g, lane
+        dx = rays[yn, gn, 0, ln] - rays[py, g, 0, lane]
+        dy = rays[yn, gn, 1, ln] - rays[py, g, 1, lane]
+        dz = rays[yn, gn, 2, ln] - rays[py, g, 2, lane]
+        ds = rows[t, 0] * dx + rows[t, 1] * dy + rows[t, 2] * dz
+        du = (table[t, U] * dx + table[t, U + 1] * dy + table[t, U + 2] * dz - ds * u) * turn
+        dv = (table[t, V] * dx + table[t, V + 1] * dy + table[t, V + 2] * dz - ds * v) * turn
+        qa += du * du
+        qb += du * dv
+        qc += dv * dv
+    mean, half = f4(0.5) * (qa + qc), f4(0.5) * (qa - qc)
+    root = f4(math.sqrt(half * half + qb * qb))
+    long, short = mean + root, max(mean - root, (mean + root) * f4(1e-4))
+    taps = min(max(int(f4(math.sqrt(long / short)) + f4(0.5)), 1), most_taps)
+    eu, ev = (long - qc, qb) if qa >= qc else (qb, long - qa)
+    length = f4(math.sqrt(eu * eu + ev * ev))
+    if taps > 1 and length > 0:
+        stretch = f4(math.sqrt(long)) / length
+        table[t, TAP_U], table[t, TAP_V] = eu * stretch, ev * stretch
+    else:
+        taps = 1
+    level = f4(0.5) * f4(math.log2(long * f4(size * size) / f4(taps * taps) + f4(1e-9)))
+    return level, taps
+
+
+@njit(**OPTIONS)
+def _shadow(image, u, v, origin_u, origin_v, per_texel):
+    """Light map value 0..1, 1 outside."""
+    x = (u - origin_u) * per_texel - f4(0.5)
+    y = (v - origin_v) * per_texel - f4(0.5)
+    if x < 0 or y < 0 or x >= f4(image.shape[1] - 1) or y >= f4(image.shape[0] - 1):
+        return f4(1)
+    i, j = int(y), int(x)
+    fx, fy = x - f4(j), y - f4(i)
+    a, b = f4(image[i, j]), f4(image[i, j + 1])
+    c, d = f4(image[i + 1, j]), f4(image[i + 1, j + 1])
+    upper = a + (b - a) * fx
+    lower = c + (d - c) * fx
+    return (upper + (lower - upper) * fy) * f4(1 / 255.0)
+
+
+@njit(**OPTIONS)
+def shade(
+    frame, rows, corner, vertices, texels, texture, R, P, lights, rays, width, plane, reach, most_taps,
+    table, integers, scratch, radiance, depth, y_first, y_last,
+):  # fmt: skip
+    """Radiance and depth of the rows ``y_first`` to ``y_last`` (exclusive) from the visibility buffer.
+
+    ``lights``: ambient, factor on baked light, head lamp. ``table`` (T, 16) float32, ``integers`` the same memory as
+    int32; a row whose TAPS are 0 is not filled yet.
+    """
+    pixels, out_radiance, out_depth = frame.reshape(frame.size), radiance.reshape(radiance.size), depth.reshape(depth.size)
+    tables = table.reshape(table.size)
+    groups = frame.shape[1]
+    for y in range(y_first, y_last):
+        for g in range(groups):
+            taps, blended, before = f4(0), False, np.int64(-1)
+            for k in range(LANES):
+                t = np.int64(frame[y, g, OWNER, k])
+                if t != before:
+                    before = t
+                    if table[t, TAPS] == 0:
+                        _prepare(
+                            t, rows, corner, vertices, R, P, lights, rays, width, plane, reach, texture, most_taps,
+                            table, integers,
+                        )  # fmt: skip
+                    taps = max(taps, table[t, TAPS])
+                    blended = blended or table[t, TAPS] != f4(int(table[t, TAPS]))
+            offset = (y * groups + g) * 5 * LANES
+            begin_group(pixels, offset, tables, scratch)
+            for k in range(int(taps)):
+                tap_group(scratch, texels, f4(k), 0)
+                if blended:
+                    tap_group(scratch, texels, f4(k), 1)
+            end_group(scratch, pixels, offset, out_radiance, out_depth, (y * groups + g) * LANES)
+
+
+@njit(**OPTIONS)
+def cast_shadows(frame, rows, corner, uv, table, light_map, radiance, y_first, y_last):
+    """Multiply the light map into the pixels of its material."""
+    image, material, origin_u, origin_v, scale = light_map
+    for y in range(y_first, y_last):
+        for x in range(radiance.shape[1]):
+            g, k = x >> 3, x & 7
+            t = np.int64(frame[y, g, OWNER, k])
+            if t == 0 or corner[t, 3] != material:
+                continue
+            rx, ry, rz = frame[y, g, RX, k], frame[y, g, RY, k], frame[y, g, RZ, k]
+            distance = f4(1) / frame[y, g, INVERSE, k]
+            i = corner[t, 0]
+            u = uv[0, i] + (table[t, U] * rx + table[t, U + 1] * ry + table[t, U + 2] * rz) * distance
+            v = uv[1, i] + (table[t, V] * rx + table[t, V + 1] * ry + table[t, V + 2] * rz) * distance
+            radiance[y, x] *= _shadow(image, u, v, origin_u, origin_v, scale)
+
+
+@njit(**OPTIONS)
+def veil(frame, extinction, airlight, radiance, y_first, y_last):
+    """Dust between camera and surface: takes light away and adds its own (Koschmieder, 1924)."""
+    for y in range(y_first, y_last):
+        for x in range(radiance.shape[1]):
+            inverse = frame[y, x >> 3, INVERSE, x & 7]
+            if inverse == 0:
+                radiance[y, x] = airlight
+            else:
+                clear = f4(math.exp(-extinction / inverse))
+                radiance[y, x] = radiance[y, x] * clear + airlight * (f4(1) - clear)

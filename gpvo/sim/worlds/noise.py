@@ -1,0 +1,61 @@
+"""Noise to make surfaces from: spectral and cellular on a torus, lattice noise in space."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gpvo.types import Array
+
+F32 = NDArray[np.float32]
+_LATTICE = 64
+
+
+def spectral(n: int, rng: np.random.Generator, beta: float, lowest: float = 1.0, highest: float | None = None) -> F32:
+    """Tileable (n, n) noise with amplitude spectrum ``f^-beta`` from ``lowest`` to about ``highest`` cycles per tile.
+
+    Mean 0, standard deviation 1.
+    """
+    wave = np.fft.rfft2(rng.standard_normal((n, n)).astype(np.float32))
+    f = np.hypot(np.fft.fftfreq(n)[:, None] * n, np.fft.rfftfreq(n)[None] * n)
+    gain = np.where(f >= lowest, np.maximum(f, 1.0) ** -beta, 0.0)
+    if highest is not None:
+        gain = gain * np.exp(-((f / highest) ** 2))
+    x = np.fft.irfft2(wave * gain, s=(n, n))
+    return ((x - x.mean()) / x.std()).astype(np.float32)
+
+
+def cellular(n: int, cells: int, rng: np.random.Generator, nearest: int = 2) -> tuple[F32, NDArray[np.int64]]:
+    """Distances (n, n, nearest) in tiles to the nearest of random points on the torus, and which points they are."""
+    tree = cKDTree(rng.random((cells, 2)), boxsize=1.0)
+    grid = (np.arange(n) + 0.5) / n
+    query = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    distance, index = tree.query(query, k=np.arange(1, nearest + 1))
+    return distance.reshape(n, n, nearest).astype(np.float32), index.reshape(n, n, nearest)
+
+
+def lattice(rng: np.random.Generator) -> F32:
+    """Random values for :func:`fractal`."""
+    return rng.standard_normal((_LATTICE,) * 3).astype(np.float32)
+
+
+def _value_noise(points: Array, values: F32) -> Array:
+    cell = np.floor(points).astype(np.int64)
+    f = points - cell
+    f = f**3 * (f * (f * 6 - 15) + 10)
+    out = np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.prod([f[:, k] if corner[k] else 1 - f[:, k] for k in range(3)], axis=0)
+        i, j, k = ((cell + corner) % _LATTICE).T
+        out += weight * values[i, j, k]
+    return out
+
+
+def fractal(points: Array, values: F32, octaves: int = 4, gain: float = 0.5) -> Array:
+    """Sum of octaves of smooth lattice noise at points (N, 3); the lowest has a wavelength of about 2 units."""
+    out, amplitude, p = np.zeros(len(points)), 1.0, np.asarray(points, dtype=np.float64)
+    for octave in range(octaves):
+        out += amplitude * _value_noise(p + 17.3 * octave, values)
+        p, amplitude = p * 2.03, amplitude * gain
+    return out

@@ -1,0 +1,174 @@
+"""A mine tunnel: rough rock, flattened floor, dim lamps; straight, curved or branching."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.sim.worlds.baking import Baker
+from gpvo.sim.worlds.noise import fractal, lattice
+from gpvo.sim.worlds.shapes import vertex_normals
+from gpvo.sim.worlds.textures import rock, shotcrete
+from gpvo.sim.worlds.tubes import Line, Tube, rough_tube
+from gpvo.sim.worlds.world import Lighting, Mesh, World
+from gpvo.types import Array
+
+_RADIUS_M = 2.6
+_TILE_M = 3.0
+_TEXTURE_PX = 2048
+_CURVES = {"straight": 0.0, "curved": 0.28, "branching": 0.2}
+_SMOOTH_M = 9.0  # length of one smooth stretch
+
+
+def build(
+    seed: int,
+    *,
+    length: float = 160.0,
+    curve: str = "curved",
+    roughness: float = 0.3,
+    smooth_stretches: int = 0,
+    lamps: float = 11.0,
+    step: float = 0.17,
+) -> World:
+    """A tunnel of ``length`` [m] with a lamp every ``lamps`` [m] (0: none) and ``smooth_stretches`` of bare concrete.
+
+    ``curve``: straight, curved or branching; ``roughness``: height of the rock's relief [m]; ``step``: edge of the
+    triangles [m].
+
+    Raises
+    ------
+    GpvoError
+        For values out of range.
+    """
+    if curve not in _CURVES:
+        raise GpvoError(f"unknown curve '{curve}' of a tunnel", cure=f"choose from {', '.join(_CURVES)}")
+    limits = (("length", length, 20, 2000), ("roughness", roughness, 0, 0.6), ("lamps", lamps, 0, 1000))
+    for name, value, low, high in (*limits, ("step", step, 0.05, 0.25), ("smooth_stretches", smooth_stretches, 0, 50)):
+        if not low <= value <= high:
+            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
+    rng = np.random.default_rng([seed, 1])
+    values = lattice(rng)
+    line = _line(length, step, _CURVES[curve], rng)
+    stretches = _stretches(length, smooth_stretches, rng)
+    tubes = [_tube(line, roughness, stretches, step, values, rng)]
+    if curve == "branching":
+        tubes += [_branch(line, at, side, roughness, step, values, rng) for at, side in ((0.35, 1), (0.68, -1))]
+    mesh = _mesh(tubes, stretches, lamps, values, rng)
+    start = int(6.0 / step)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([line.tangent[start], line.left[start], line.up[start]], axis=1)
+    pose[:3, 3] = line.points[start]
+    return World(
+        kind="tunnel",
+        seed=seed,
+        params={"length": length, "curve": curve, "roughness": roughness, "lamps": lamps, "step": step},
+        mesh=mesh,
+        textures=(rock(_TEXTURE_PX, rng), shotcrete(_TEXTURE_PX, rng)),
+        lighting=Lighting(ambient=0.015, head_lamp=1.6),
+        centreline=line.points[start:-start],
+        start_pose=pose,
+        bounds=np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]).astype(float),
+    )
+
+
+def _waves(s: Array, amplitude: float, shortest: float, longest: float, rng: np.random.Generator) -> Array:
+    """A smooth random function of the arc length, with standard deviation about ``amplitude`` / sqrt 2."""
+    wavelength, phase = rng.uniform(shortest, longest, 5), rng.uniform(0, 2 * np.pi, 5)
+    weight = rng.standard_normal(5) * amplitude / np.sqrt(5)
+    return (weight[:, None] * np.sin(2 * np.pi * s / wavelength[:, None] + phase[:, None])).sum(axis=0)
+
+
+def _line(length: float, step: float, curve: float, rng: np.random.Generator) -> Line:
+    s = np.linspace(0, length, int(length / step) + 1)
+    yaw = _waves(s, curve, 30, 90, rng)
+    pitch = _waves(s, 0.05 if curve else 0.0, 40, 100, rng)
+    return Line.through(s, yaw - yaw[0], pitch - pitch[0], np.zeros(3))
+
+
+def _stretches(length: float, count: int, rng: np.random.Generator) -> Array:
+    """Intervals of arc length (count, 2) in which walls are bare, one in each of ``count`` equal parts."""
+    part = (length - 20.0) / max(count, 1)
+    start = 12.0 + part * (np.arange(count) + rng.uniform(0.1, 0.6, count))
+    return np.stack([start, start + min(_SMOOTH_M, 0.4 * part)], axis=1)
+
+
+def _tube(
+    line: Line, roughness: float, bare: Array, step: float, values: np.ndarray, rng: np.random.Generator
+) -> Tube:
+    radius = _RADIUS_M * (1 + _waves(line.s, 0.09, 8, 25, rng))
+    rough = np.full(len(line.s), roughness)
+    for begin, end in bare:
+        rough *= 1 - 0.85 * np.clip(np.minimum(line.s - begin, end - line.s) / 0.8 + 1, 0, 1)
+    return rough_tube(line, radius, rough, int(2 * np.pi * _RADIUS_M / step), values)
+
+
+def _branch(
+    main: Line, at: float, side: int, roughness: float, step: float, values: np.ndarray, rng: np.random.Generator
+) -> Tube:
+    """A side drift of 18 m that leaves the main line at a share ``at`` of its length."""
+    k = int(at * (len(main.s) - 1))
+    s = np.linspace(0, 18.0, int(18.0 / step) + 1)
+    heading = np.arctan2(main.tangent[k, 1], main.tangent[k, 0]) + side * np.deg2rad(rng.uniform(50, 75))
+    yaw = heading - side * 0.03 * s
+    # It starts inside the main tunnel, so that the rounded end lies there and is cut away.
+    start = main.points[k] - 3.2 * np.array([np.cos(heading), np.sin(heading), 0.0])
+    line = Line.through(s + 0.0, yaw, np.zeros_like(s), start)
+    return _tube(line, roughness, np.zeros((0, 2)), step, values, rng)
+
+
+def _mesh(tubes: list[Tube], bare: Array, lamps: float, values: np.ndarray, rng: np.random.Generator) -> Mesh:
+    vertices, uv, faces, material, offset = [], [], [], [], 0
+    for k, tube in enumerate(tubes):
+        points, f = tube.vertices.reshape(-1, 3), tube.faces
+        inside = np.zeros(len(points), bool)
+        for j, other in enumerate(tubes):
+            if j != k:
+                inside |= other.contains(points)
+        f = f[~inside[f].all(axis=1)]
+        s = tube.line.s[f[:, 0] // tube.vertices.shape[1]]
+        is_bare = np.zeros(len(f), bool)
+        if k == 0:
+            for begin, end in bare:
+                is_bare |= (s >= begin) & (s <= end)
+        vertices.append(points)
+        uv.append(tube.uv(_TILE_M).reshape(-1, 2))
+        faces.append(f + offset)
+        material.append(is_bare.astype(np.uint8))
+        offset += len(points)
+    V, F = np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+    N = _seamless(vertex_normals(V, F), tubes)
+    baker = Baker(V, N, F)
+    positions, powers = _lamps(tubes[0].line, lamps, rng)
+    light = baker.lamps(positions, powers, reach_m=16.0)
+    patches = fractal(V * 0.35, values, 4)
+    albedo = (0.35 + 0.65 * baker.openness(12, 1.2, rng)) * np.clip(1 + 0.3 * patches, 0.4, 1.8)
+    return Mesh(
+        vertices=V.astype(np.float32),
+        normals=N.astype(np.float32),
+        uv=np.concatenate(uv).astype(np.float32),
+        light=light.astype(np.float32),
+        albedo=albedo.astype(np.float32),
+        faces=F,
+        material=np.concatenate(material),
+    )
+
+
+def _seamless(normals: Array, tubes: list[Tube]) -> Array:
+    """Give the first and the last column of each tube, which are the same points, the same normal."""
+    out, offset = normals.copy(), 0
+    for tube in tubes:
+        rows, columns = tube.vertices.shape[:2]
+        part = out[offset : offset + rows * columns].reshape(rows, columns, 3)
+        mean = part[:, 0] + part[:, -1]
+        part[:, 0] = part[:, -1] = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+        offset += rows * columns
+    return out
+
+
+def _lamps(line: Line, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    if spacing <= 0:
+        return np.zeros((0, 3)), np.zeros(0)
+    k = np.searchsorted(line.s, np.arange(4.0, line.s[-1] - 4.0, spacing))
+    side = rng.uniform(-0.8, 0.8, len(k))
+    positions = line.points[k] + 1.35 * line.up[k] + side[:, None] * line.left[k]
+    return positions, rng.uniform(0.6, 1.5, len(k))
