@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,21 +79,28 @@ def options_of(segments: str | None, truth_sigma: str | None, align: str, time_o
     from gpvo.evaluation.evaluate import EvaluateOptions
 
     lengths = None if segments is None else tuple(_numbers("--segments", segments))
+    if lengths is not None and min(lengths) <= 0:
+        raise GpvoError(f"--segments is '{segments}'", cure="give lengths above 0 in metres")
     sigma = None
     if truth_sigma is not None:
         given = _numbers("--truth-sigma", truth_sigma)
         if len(given) > 2 or min(given) < 0:
             raise GpvoError(f"--truth-sigma is '{truth_sigma}'", cure="give metres, or metres,radians")
         sigma = (given[0], given[1] if len(given) == 2 else 0.0)
-    offset = None if time_offset == "auto" else _numbers("--time-offset", time_offset)[0]
-    return EvaluateOptions(lengths, sigma, align, offset)
+    offsets = None if time_offset == "auto" else _numbers("--time-offset", time_offset)
+    if offsets is not None and len(offsets) != 1:
+        raise GpvoError(f"--time-offset is '{time_offset}'", cure="give seconds, or auto")
+    return EvaluateOptions(lengths, sigma, align, None if offsets is None else offsets[0])
 
 
 def _numbers(option: str, text: str) -> list[float]:
     try:
-        return [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise GpvoError(f"{option} is '{text}'", cure="give numbers, separated by commas") from None
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
+        raise GpvoError(f"{option} is '{text}'", cure="give numbers, separated by commas")
+    return numbers
 
 
 def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions) -> list[Evaluation]:

@@ -21,6 +21,8 @@ def interpolate_truth(
     (or one of them is the stamp itself).
     """
     t = np.asarray(t_ns, dtype=np.int64)
+    if len(truth.t_ns) == 0:
+        return np.broadcast_to(np.eye(4), (len(t), 4, 4)).copy(), np.zeros(len(t), dtype=bool)
     right = np.clip(np.searchsorted(truth.t_ns, t), 1, len(truth.t_ns) - 1)
     t_a, t_b = truth.t_ns[right - 1], truth.t_ns[right]
     fraction = np.clip((t - t_a) / np.maximum(t_b - t_a, 1), 0.0, 1.0)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.evaluation.accumulate import Step
+from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import Array, Prediction, Status, VoLog
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def statements(
     if "method.constant" in arrays and arrays["method.constant"].shape == (6, 6):
         out.append(_plain(log, "constant", np.broadcast_to(arrays["method.constant"], (len(log), 6, 6))))
     for method in log.methods:
-        covariance = log.covariance(method)
+        covariance = _where_stated(log.covariance(method))
         out.append(_plain(log, method, covariance))
         scale = arrays.get(f"method.{method}.scale")
         if scale is not None:
@@ -54,6 +55,12 @@ def statements(
     if predictions:
         out.append(_learned(log, predictions))
     return out
+
+
+def _where_stated(covariance: Array) -> Array:
+    """NaN in place of what is no covariance: zeros, say, with which other software marks what it does not know."""
+    stated = np.array([is_positive_definite(C) for C in covariance], dtype=bool)
+    return np.where(stated[:, None, None], covariance, np.nan)
 
 
 def _plain(log: VoLog, method: str, covariance: Array) -> Statement:
@@ -70,7 +77,8 @@ def _translation_only(log: VoLog, method: str) -> Statement:
     missing = np.full((3, 3), np.nan)
     # V_T is in the axes of the reference camera, the error in those of the current one.
     turned = [r.T_prev_cur[:3, :3].T @ r.v_t.get(method, missing) @ r.T_prev_cur[:3, :3] for r in log]
-    return Statement(f"{method}_vt", np.zeros((len(log), 6)), np.array(turned).reshape(-1, 3, 3), None)
+    covariance = _where_stated(np.array(turned).reshape(-1, 3, 3))
+    return Statement(f"{method}_vt", np.zeros((len(log), 6)), covariance, None)
 
 
 def _learned(log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
