@@ -20,6 +20,8 @@ from gpvo.types import Array, VoLog
 BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
 HORIZONS_M = (1.0, 10.0, 100.0)
 _MAX_WINDOWS = 60
+# Times that are sums of a frame period must not miss the round number.
+_HAIR = 1 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,8 @@ def _window_nees(
     stride = max(0.5 * span, total / _MAX_WINDOWS)
     values, t_next = [], float(progress[0])
     parent, usable = log.parent, log.usable
-    for start in range(len(log)):
+    # Nothing is long enough behind the last of these; without the cut a short run costs the square of its frames.
+    for start in np.flatnonzero(progress[-1] - progress >= span * _HAIR).tolist():
         if progress[start] < t_next or not known[start]:
             continue
         window = _window(start, parent, usable, progress, span)
@@ -165,7 +168,7 @@ def _window(
     chain, here = [], start
     for k in range(start + 1, len(parent)):
         if parent[k] == here and usable[k]:
-            done = progress[k] - progress[start] >= span
+            done = progress[k] - progress[start] >= span * _HAIR
             if done or _leads_on(k, parent):
                 chain.append(k)
                 here = k
