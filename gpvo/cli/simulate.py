@@ -1,9 +1,145 @@
-"""Commands of this group."""
+"""``gpvo simulate``: sequences with exact truth, from nothing but a name and a seed."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
+
+from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from gpvo.sim.campaign import Flight
+    from gpvo.sim.scenario import Scenario
+
+_SEED_LIMIT = 100_000
+
+
+def simulate(
+    scenario: Annotated[str | None, typer.Argument(help="A name of --list, or a TOML file.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to write; with --points a .npz.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 0,
+    seeds: Annotated[str | None, typer.Option(help="Many: 0..9 or 1,4,7. Each goes to OUT/seed_N.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Length of the flight [s].")] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
+    speed: Annotated[float | None, typer.Option(help="Speed [m/s].")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="Fly this recorded path (TUM lines, z up).")] = None,
+    camera: Annotated[str | None, typer.Option(help="pinhole, euroc or t265.")] = None,
+    points: Annotated[bool, typer.Option("--points", help="No images: landmark tracks, far faster.")] = False,
+    jobs: Annotated[int, typer.Option(help="Flights at a time.")] = 1,
+    backend: Annotated[str, typer.Option(help="joblib, or dask.")] = "joblib",
+    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
+    preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the pictures (PNG).")] = None,
+    list_: Annotated[bool, typer.Option("--list", help="Show the scenarios.")] = False,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="key=value; tables by dots. Repeatable.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")] = False,
+) -> None:
+    """Simulate stereo sequences with IMU and exact truth.
+
+    Example: gpvo simulate tunnel-clean -o seq/ --seed 1 --duration 30
+    """
+    if list_:
+        _show_list(json_)
+        return
+    if scenario is None or out is None:
+        raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
+    if points and preview:
+        raise GpvoError("--points draws no pictures to preview", cure="leave out one of --points, --preview")
+    from gpvo.sim.scenario import load_scenario
+
+    given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,
+             "trajectory": None if trajectory is None else str(trajectory)}  # fmt: skip
+    overrides = {k: v for k, v in given.items() if v is not None} | dict(map(_assignment, set_ or []))
+    chosen = load_scenario(scenario, overrides)
+    if seeds is None:
+        flights = [_one(chosen, seed, out, points)]
+    else:
+        from gpvo.sim.campaign import fly_campaign
+
+        flights = fly_campaign(
+            chosen, _seeds(seeds), out, points=points, jobs=jobs, backend=backend, scheduler=scheduler
+        )
+    _tell(chosen, flights, json_, preview)
+
+
+def _one(scenario: Scenario, seed: int, out: Path, points: bool) -> Flight:
+    from gpvo.cli.output import progress
+    from gpvo.sim.campaign import Flight, fly_points
+
+    if points:
+        return fly_points(scenario, seed, out if out.suffix == ".npz" else out.with_name(out.name + ".npz"))
+    from gpvo.sim.sequence import simulate as simulate_images
+
+    with progress("frames", int(scenario.duration_s * scenario.rate_hz) + 1) as advance:
+        info = simulate_images(scenario, seed, out, on_frame=advance)
+    return Flight(seed, out, info.frames, info.distance_m, info.redone)
+
+
+def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path | None) -> None:
+    good = [f for f in flights if not f.error]
+    if preview is not None and good:
+        from gpvo.sim.preview import contact_sheet
+
+        contact_sheet(good[0].path, preview)
+    if json_:
+        from gpvo.cli.output import print_json
+
+        print_json(
+            {"schema": 1, "scenario": scenario.name, "flights": [f.__dict__ | {"path": str(f.path)} for f in flights]}
+        )
+    else:
+        for f in flights:
+            what = f.error or f"{f.frames} frames, {f.distance_m:.1f} m" + ("" if f.redone else ", already there")
+            print(f"{f.path}: {what}")
+    if len(good) < len(flights):
+        raise GpvoError(f"{len(flights) - len(good)} of {len(flights)} flights failed", cure="see the lines above")
+
+
+def _show_list(json_: bool) -> None:
+    from gpvo.sim.scenario import load_scenario, names
+
+    known = {name: load_scenario(name).about for name in names()}
+    if json_:
+        from gpvo.cli.output import print_json
+
+        print_json({"schema": 1, "scenarios": known})
+        return
+    for name, about in known.items():
+        print(f"{name:16s}{about}")
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    """``key=value`` with a TOML value; what is no TOML is text."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
+
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise GpvoError(f"--set '{text}' is no key=value", cure="such as --set noise_sigma=0.05")
+    try:
+        return key.strip(), tomllib.loads(f"v = {value}")["v"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+def _seeds(text: str) -> list[int]:
+    """``0..9`` (both ends), ``3`` or ``1,4,7``."""
+    out: list[int] = []
+    try:
+        for part in text.split(","):
+            first, dots, last = part.partition("..")
+            a, b = int(first), int(last if dots else first)
+            if not 0 <= a <= b < a + _SEED_LIMIT:
+                raise ValueError
+            out += range(a, b + 1)
+    except ValueError:
+        raise GpvoError(f"--seeds '{text}' is no list of seeds", cure="such as 0..9 or 1,4,7") from None
+    return list(dict.fromkeys(out))
 
 
 def register(app: typer.Typer) -> None:
     """Add this file's commands to the application."""
+    app.command()(simulate)

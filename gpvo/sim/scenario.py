@@ -110,14 +110,14 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
     GpvoError
         For an unknown value in the scenario's ``points``.
     """
-    from gpvo.cameras.rectify import rectify
+    from gpvo.cameras.rectify import Rectifier
     from gpvo.sim.rig import camera_rig
 
     base = SCENARIOS.get(scenario.name, PointsScenario())
     known = {f.name for f in fields(PointsScenario)}
     if unknown := sorted(set(scenario.points) - known):
         raise GpvoError(f"unknown value 'points.{unknown[0]}'", cure=_nearest(unknown[0], known))
-    camera = base.camera if scenario.camera in ("pinhole", "t265") else rectify(camera_rig(scenario.camera)).camera
+    camera = base.camera if scenario.camera in ("pinhole", "t265") else Rectifier(camera_rig(scenario.camera)).camera
     bias = scenario.calibration
     values: dict[str, Any] = {
         "world": scenario.world,

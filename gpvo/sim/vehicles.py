@@ -140,9 +140,7 @@ class _Controller:
         ref, quad = self._reference, self._quad
         off = ref.position[k] - data.qpos[:3]
         if off @ off > 4.0:
-            raise GpvoError(
-                f"the quadrotor loses its path after {data.time:.1f} s", cure="a slower or smoother path"
-            )
+            raise GpvoError(f"the quadrotor loses its path after {data.time:.1f} s", cure="a slower or smoother path")
         pull = quad.position_gain * off + quad.velocity_gain * (ref.velocity[k] - data.qvel[:3])
         force = quad.mass * (pull + ref.acceleration[k] + [0, 0, GRAVITY_MPS2]) + quad.drag * ref.velocity[k]
         R = se3.from_quaternion(np.zeros((1, 3)), np.roll(data.qpos[3:7], -1)[None])[0, :3, :3]
