@@ -80,16 +80,16 @@ def clear(rays, valid, frame, y0, y1):
 
 
 @njit(**OPTIONS)
-def _to_pixels(position, start, count, R, P, plane, reach, camera, pixel):
+def _to_pixels(vertices, start, count, R, P, plane, reach, camera, pixel):
     """Vertices of a cluster to the camera frame and, for bounds, to pixels."""
     size = plane.shape[0]
     top = f4(size - 1.001)
     scale_x = f4(0.5 * (size - 1)) / reach[0]
     scale_y = f4(0.5 * (size - 1)) / reach[1]
     for k in range(count):
-        x = np.float64(position[0, start + k]) - P[0]
-        y = np.float64(position[1, start + k]) - P[1]
-        z = np.float64(position[2, start + k]) - P[2]
+        x = np.float64(vertices[start + k, 0]) - P[0]
+        y = np.float64(vertices[start + k, 1]) - P[1]
+        z = np.float64(vertices[start + k, 2]) - P[2]
         X = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
         Y = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
         Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
@@ -163,22 +163,23 @@ def _cover(pixels, groups, rows, t, x0, x1, y0, y1):
 
 
 @njit(**OPTIONS)
-def visibility(order, n, distance, scene, R, P, plane, reach, bend, width, frame, y_first, y_last, work, rows, corner):
+def visibility(
+    order, distance, scene, R, P, plane, reach, bend, width, frame, y_first, y_last, camera, pixel, rows, corner
+):  # fmt: skip
     """Fill the visibility buffer of rows ``y_first`` to ``y_last`` (exclusive). Returns one more than the number of triangles
     kept: they count from 1, and 0 is the blank that empty pixels see.
 
     ``corner`` (T, 4): indices of each kept triangle's three vertices and its material.
     """
-    position, triangles, vertex_start, triangle_start, material = scene
-    camera, pixel = work
+    vertices, triangles, vertex_start, triangle_start, material = scene
     groups = frame.shape[1]
     pixels = frame.reshape(frame.size)
     kept = 1
-    for q in range(n):
+    for q in range(len(order)):
         c = order[q]
         start = vertex_start[c]
         count = vertex_start[c + 1] - start
-        _to_pixels(position, start, count, R, P, plane, reach, camera, pixel)
+        _to_pixels(vertices, start, count, R, P, plane, reach, camera, pixel)
         left = right = pixel[0, 0]
         top = bottom = pixel[1, 0]
         for k in range(1, count):

@@ -1,4 +1,4 @@
-"""The ray of every pixel, which is all the renderer knows of a lens when it decides what a pixel sees."""
+"""Where each pixel looks, and the way back: tables made from a lens model's ``project`` and ``unproject``."""
 
 from __future__ import annotations
 
@@ -7,88 +7,91 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
-from gpvo.errors import CalibrationError
+from gpvo.cameras.models import CameraModel, PinholeRadtan
+from gpvo.types import Array
 
-_ALIGN = 16
-PINHOLE, FISHEYE = 0, 1
+LANES = 8  # pixels of a row that are worked on at once
+_GRID = 192
+_MARGIN = 1.12
+_PINHOLE_LIMIT_RAD = 1.45  # a pinhole's tangent runs away near 90 degrees; no image reaches that far
 
 
 @dataclass(frozen=True)
 class RayTable:
-    """Rays of a lens and the bounds that culling needs.
+    """Rays of all pixels, and pixels of all directions.
 
-    ``rays`` (3, H, P) float32 unit rays with rows padded to a multiple of 16; ``valid`` (H, W) whether a pixel has a
-    ray; ``lens`` is PINHOLE or FISHEYE, ``coefficients`` (10,): fx, fy, cx, cy, five of the distortion, largest valid
-    radius (tangent) or angle. ``max_angle`` [rad] from the axis over all rays; ``slope_x, slope_y``: largest |x/z|,
-    |y/z|, 0 where rays reach 90 degrees; ``px_per_rad``: finest resolution in the image.
+    ``rays`` (H, C, 3, 8) float32: unit rays of the pixels of a row in groups of eight, zero where there is none.
+    ``valid`` (H, W). ``plane`` (G, G, 2) float32: pixel (u, v) of directions given in the stereographic plane
+    ``p = (x, y) / (z + |xyz|)``, on an even grid over ``|p_x| <= reach[0], |p_y| <= reach[1]``; it only has to
+    bound triangles. ``bend`` [1/px]: straight edges of length L bulge by at most ``bend L^2`` pixels.
     """
 
-    width: int
-    height: int
     rays: NDArray[np.float32]
     valid: NDArray[np.bool_]
-    lens: int
-    coefficients: NDArray[np.float64]
-    max_angle: float
-    slope_x: float
-    slope_y: float
-    px_per_rad: float
+    plane: NDArray[np.float32]
+    reach: NDArray[np.float32]
+    max_angle_rad: float
+    bend: float
 
     @classmethod
     def of(cls, model: CameraModel, max_angle_rad: float) -> RayTable:
-        """Rays of a model up to ``max_angle_rad`` from the axis.
-
-        Raises
-        ------
-        CalibrationError
-            Where no pixel of the model has a ray, or the lens is of an unknown kind.
-        """
+        """Tables of a lens; pixels whose ray leaves the cone of ``max_angle_rad`` see nothing."""
         H, W = model.height, model.width
-        v, u = np.mgrid[:H, :W]
-        rays = model.unproject(np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)).reshape(H, W, 3)
-        valid = np.isfinite(rays).all(axis=2) & (np.nan_to_num(rays[..., 2], nan=-2.0) >= np.cos(max_angle_rad))
-        if not valid.any():
-            raise CalibrationError("no pixel of this lens sees anything", cure="check focal length and distortion")
-        rays = np.where(valid[..., None], rays, 0.0)
-        padded = np.zeros((3, H, -(-W // _ALIGN) * _ALIGN), dtype=np.float32)
-        padded[:, :, :W] = rays.transpose(2, 0, 1)
-        seen = rays[valid]
-        wide = seen[:, 2].min() < 0.1
-        slopes = (0.0, 0.0) if wide else np.abs(seen[:, :2] / seen[:, 2:]).max(axis=0)
-        lens, coefficients = _coefficients(model)
+        v, u = np.mgrid[0:H, 0:W].astype(np.float64)
+        rays = model.unproject(np.stack([u.ravel(), v.ravel()], axis=1))
+        with np.errstate(invalid="ignore"):
+            valid = np.isfinite(rays).all(axis=1) & (rays[:, 2] >= np.cos(max_angle_rad))
+        rays = np.where(valid[:, None], rays, 0.0)
+        angle = float(np.arccos(np.clip(rays[valid, 2].min(), -1, 1)))
+        p = np.abs(rays[valid, :2] / (1 + rays[valid, 2:])).max(axis=0)
+        reach = (p * _MARGIN + 0.02).astype(np.float32)
+        groups = -(-W // LANES)
+        packed = np.zeros((H, groups * LANES, 3), np.float32)
+        packed[:, :W] = rays.reshape(H, W, 3)
+        straight = isinstance(model, PinholeRadtan) and not any(model.distortion)
         return cls(
-            width=W,
-            height=H,
-            rays=padded,
-            valid=valid,
-            lens=lens,
-            coefficients=coefficients,
-            max_angle=float(np.arccos(np.clip(seen[:, 2].min(), -1, 1))),
-            slope_x=float(slopes[0]),
-            slope_y=float(slopes[1]),
-            px_per_rad=_finest_resolution(rays, valid),
+            rays=np.ascontiguousarray(packed.reshape(H, groups, LANES, 3).transpose(0, 1, 3, 2)),
+            valid=valid.reshape(H, W),
+            plane=_pixel_plane(model, reach),
+            reach=reach,
+            max_angle_rad=angle,
+            bend=0.0 if straight else 1.0 / (8.0 * min(model.fx_px, model.fy_px)),
         )
 
+    @property
+    def height(self) -> int:
+        """Rows of the image."""
+        return self.valid.shape[0]
 
-def _finest_resolution(rays: NDArray[np.float64], valid: NDArray[np.bool_]) -> float:
-    """Pixels per radian where neighbouring rays lie closest together."""
-    smallest = np.inf
-    for axis in (0, 1):
-        gap = np.linalg.norm(np.diff(rays, axis=axis), axis=2)
-        both = np.delete(valid, 0, axis=axis) & np.delete(valid, -1, axis=axis)
-        smallest = min(smallest, float(gap[both].min(initial=np.inf)))
-    return 1.0 / max(smallest, 1e-6)
+    @property
+    def width(self) -> int:
+        """Columns of the image."""
+        return self.valid.shape[1]
 
 
-def _coefficients(model: CameraModel) -> tuple[int, NDArray[np.float64]]:
-    k = np.zeros(10)
-    k[:4] = model.fx_px, model.fy_px, model.cx_px, model.cy_px
-    k[4 : 4 + len(model.distortion)] = model.distortion
-    if isinstance(model, PinholeRadtan):
-        k[9] = min(model.max_radius, 1e3)
-        return PINHOLE, k
-    if isinstance(model, KannalaBrandt):
-        k[9] = model.max_angle_rad
-        return FISHEYE, k
-    raise CalibrationError(f"the renderer does not know the lens '{model.kind}'")
+def _pixel_plane(model: CameraModel, reach: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pixels over the stereographic plane, continued outwards evenly where the lens model ends."""
+    px, py = np.meshgrid(*(np.linspace(-r, r, _GRID) for r in reach.astype(np.float64)))
+    radius = np.hypot(px, py).ravel()
+    theta = 2 * np.arctan(radius)
+    direction = np.stack([px.ravel(), py.ravel()], 1) / np.maximum(radius, 1e-12)[:, None]
+    limit = _largest_angle(model)
+    inside = np.minimum(theta, limit)
+    points = np.concatenate([direction * np.sin(inside)[:, None], np.cos(inside)[:, None]], axis=1)
+    uv, _ = model.project(points)
+    focal: Array = np.array([model.fx_px, model.fy_px])
+    uv = uv + np.maximum(theta - limit, 0.0)[:, None] * direction * focal
+    return np.ascontiguousarray(uv.reshape(_GRID, _GRID, 2).astype(np.float32))
+
+
+def _largest_angle(model: CameraModel) -> float:
+    """Angle up to which the model projects every direction."""
+    theta = np.linspace(0.0, np.pi * 0.95, 400)
+    azimuth = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    t, a = np.meshgrid(theta, azimuth, indexing="ij")
+    points = np.stack([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)], axis=-1).reshape(-1, 3)
+    uv, valid = model.project(points)
+    good = (valid & np.isfinite(uv).all(axis=1)).reshape(t.shape).all(axis=1)
+    last = len(theta) - 1 if good.all() else int(np.argmin(good)) - 1
+    limit = _PINHOLE_LIMIT_RAD if isinstance(model, PinholeRadtan) else np.pi
+    return min(float(theta[max(last - 1, 1)]), limit)

@@ -29,39 +29,38 @@ from gpvo.sim.render.raster import INVERSE, OPTIONS, OWNER, RX, RY, RZ
 
 f4 = np.float32
 @njit(**OPTIONS)
-def _vertex_light(v, position, normal, light, albedo, P, axis, lights):
+def _vertex_light(v, vertices, P, axis, lights):
     """Radiance factor of a vertex: ambient and baked light, and a lamp at the camera that shines forward."""
-    x, y, z = P[0] - position[0, v], P[1] - position[1, v], P[2] - position[2, v]
+    x, y, z = P[0] - vertices[v, 0], P[1] - vertices[v, 1], P[2] - vertices[v, 2]
     square = x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(max(square, 1e-12))
-    facing = max((normal[0, v] * x + normal[1, v] * y + normal[2, v] * z) * inverse, 0.0)
+    facing = max((vertices[v, 3] * x + vertices[v, 4] * y + vertices[v, 5] * z) * inverse, 0.0)
     forward = -(axis[0] * x + axis[1] * y + axis[2] * z) * inverse
     beam = min(max((forward - 0.30) / 0.65, 0.0), 1.0)
     beam = beam * beam * (3.0 - 2.0 * beam)
-    return albedo[v] * (lights[0] + lights[1] * light[v] + lights[2] * beam * facing / (0.15 + square))
+    return vertices[v, 9] * (lights[0] + lights[1] * vertices[v, 8] + lights[2] * beam * facing / (0.15 + square))
 
 
 @njit(**OPTIONS)
 def _prepare(t, rows, corner, vertices, R, P, lights, rays, width, plane, reach, texture, most_taps, table, integers):
     """Fill the table of one triangle."""
-    position, normal, uv, light, albedo = vertices
     i, j, k = corner[t, 0], corner[t, 1], corner[t, 2]
     axis = R[2]
-    La = _vertex_light(i, position, normal, light, albedo, P, axis, lights)
-    Lb = _vertex_light(j, position, normal, light, albedo, P, axis, lights) - La
-    Lc = _vertex_light(k, position, normal, light, albedo, P, axis, lights) - La
-    ub, uc = uv[0, j] - uv[0, i], uv[0, k] - uv[0, i]
-    vb, vc = uv[1, j] - uv[1, i], uv[1, k] - uv[1, i]
+    La = _vertex_light(i, vertices, P, axis, lights)
+    Lb = _vertex_light(j, vertices, P, axis, lights) - La
+    Lc = _vertex_light(k, vertices, P, axis, lights) - La
+    ub, uc = vertices[j, 6] - vertices[i, 6], vertices[k, 6] - vertices[i, 6]
+    vb, vc = vertices[j, 7] - vertices[i, 7], vertices[k, 7] - vertices[i, 7]
     for a in range(3):
         s, b, c = rows[t, a], rows[t, 3 + a], rows[t, 6 + a]
         table[t, U + a] = ub * b + uc * c
         table[t, V + a] = vb * b + vc * c
         table[t, LIGHT + a] = f4(La) * s + f4(Lb) * b + f4(Lc) * c
     # Whole tiles are taken off for the sake of precision; a few are left so that no coordinate is negative.
-    table[t, U0] = uv[0, i] - f4(math.floor(uv[0, i])) + f4(2)
-    table[t, V0] = uv[1, i] - f4(math.floor(uv[1, i])) + f4(2)
+    table[t, U0] = vertices[i, 6] - f4(math.floor(vertices[i, 6])) + f4(2)
+    table[t, V0] = vertices[i, 7] - f4(math.floor(vertices[i, 7])) + f4(2)
     size, level_start = texture
-    level, taps = _footprint(t, rows, position, i, j, k, R, P, rays, width, plane, reach, size, most_taps, table)
+    level, taps = _footprint(t, rows, vertices, i, j, k, R, P, rays, width, plane, reach, size, most_taps, table)
     # The blend between levels happens in the middle half of each step: half of the pixels need one level only.
     last = level_start.shape[1] - 2
     level = min(max(level, f4(0)), f4(last + 1))
@@ -75,14 +74,14 @@ def _prepare(t, rows, corner, vertices, R, P, lights, rays, width, plane, reach,
 
 
 @njit(**OPTIONS)
-def _footprint(t, rows, position, i, j, k, R, P, rays, width, plane, reach, size, most_taps, table):
+def _footprint(t, rows, vertices, i, j, k, R, P, rays, width, plane, reach, size, most_taps, table):
     """Level of detail and the taps along the longer axis of a pixel's shadow on the texture, at the centroid.
 
     P. Heckbert, "Fundamentals of texture mapping and image warping" (1989), section 3.5.8, for the ellipse.
     """
-    x = (np.float64(position[0, i]) + position[0, j] + position[0, k]) / 3.0 - P[0]
-    y = (np.float64(position[1, i]) + position[1, j] + position[1, k]) / 3.0 - P[1]
-    z = (np.float64(position[2, i]) + position[2, j] + position[2, k]) / 3.0 - P[2]
+    x = (np.float64(vertices[i, 0]) + vertices[j, 0] + vertices[k, 0]) / 3.0 - P[0]
+    y = (np.float64(vertices[i, 1]) + vertices[j, 1] + vertices[k, 1]) / 3.0 - P[1]
+    z = (np.float64(vertices[i, 2]) + vertices[j, 2] + vertices[k, 2]) / 3.0 - P[2]
     d = math.sqrt(x * x + y * y + z * z)
     X = f4((R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / d)
     Y = f4((R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / d)
@@ -186,7 +185,7 @@ def shade(
 
 
 @njit(**OPTIONS)
-def cast_shadows(frame, rows, corner, uv, table, light_map, radiance, y_first, y_last):
+def cast_shadows(frame, corner, vertices, table, light_map, radiance, y_first, y_last):
     """Multiply the light map into the pixels of its material."""
     image, material, origin_u, origin_v, scale = light_map
     for y in range(y_first, y_last):
@@ -198,8 +197,8 @@ def cast_shadows(frame, rows, corner, uv, table, light_map, radiance, y_first, y
             rx, ry, rz = frame[y, g, RX, k], frame[y, g, RY, k], frame[y, g, RZ, k]
             distance = f4(1) / frame[y, g, INVERSE, k]
             i = corner[t, 0]
-            u = uv[0, i] + (table[t, U] * rx + table[t, U + 1] * ry + table[t, U + 2] * rz) * distance
-            v = uv[1, i] + (table[t, V] * rx + table[t, V + 1] * ry + table[t, V + 2] * rz) * distance
+            u = vertices[i, 6] + (table[t, U] * rx + table[t, U + 1] * ry + table[t, U + 2] * rz) * distance
+            v = vertices[i, 7] + (table[t, V] * rx + table[t, V + 1] * ry + table[t, V + 2] * rz) * distance
             radiance[y, x] *= _shadow(image, u, v, origin_u, origin_v, scale)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,19 @@ from gpvo.types import Array
 Image = NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class Effects:
+    """What may happen to the light of one frame.
+
+    ``lamps`` and ``head_lamp`` scale the world's fixed light and the lamp at the camera (0: switched off).
+    ``dust_per_m``: extinction of the air [1/m]; its haze glows with the world's ``dust_airlight``.
+    """
+
+    lamps: float = 1.0
+    head_lamp: float = 1.0
+    dust_per_m: float = 0.0
+
+
 class StereoRenderer:
     """Draws stereo pairs of a world.
 
@@ -25,12 +39,12 @@ class StereoRenderer:
     ----------
     world
         As from ``build_world``.
-    left_model, right_model
+    left, right
         Lens models of the two cameras; they may differ.
     T_right_left
         (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
     threads
-        1 or 2; the pictures are the same to the bit.
+        Number of threads; the pictures are the same to the bit for any number.
     head_lamp
         Radiant intensity of a lamp at each camera; by default that of the world.
     max_angle_rad
@@ -47,13 +61,13 @@ class StereoRenderer:
     def __init__(
         self,
         world: World,
-        left_model: CameraModel,
-        right_model: CameraModel,
+        left: CameraModel,
+        right: CameraModel,
         T_right_left: Array,
         *,
         threads: int = 2,
         head_lamp: float | None = None,
-        max_angle_rad: float = np.deg2rad(81.5),
+        max_angle_rad: float = np.deg2rad(82.0),
         far_m: float = 500.0,
     ) -> None:
         try:
@@ -61,38 +75,64 @@ class StereoRenderer:
         except ImportError as error:
             raise MissingExtraError("numba", "sim") from error
         scene = Scene.of(world)
-        lamp = scene.head_lamp if head_lamp is None else head_lamp
-        tables = [RayTable.of(model, max_angle_rad) for model in (left_model, right_model)]
-        self._drawers = [Drawer(scene, table, far_m, lamp) for table in tables]
+        self._lighting = scene.lighting
+        self._head_lamp = scene.lighting.head_lamp if head_lamp is None else head_lamp
+        tables = [RayTable.of(model, max_angle_rad) for model in (left, right)]
+        bands = max(1, (threads + 1) // 2)
+        self._left, self._right = (Drawer(scene, table, far_m, bands) for table in tables)
         self._T_left_right = np.linalg.inv(np.asarray(T_right_left, dtype=np.float64))
-        self._pool = ThreadPoolExecutor(2) if threads > 1 else None
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self.mask_left, self.mask_right = (table.valid for table in tables)
-        self.depth_right: Image | None = None
 
     def render(
-        self, T_world_left: Array, *, motion: Array | Sequence[Array] | None = None
+        self, T_world_left: Array, *, motion: Array | Sequence[Array] | None = None, effects: Effects | None = None
     ) -> tuple[Image, Image, Image]:
-        """Linear radiance of both cameras and the depth of the left one, (H, W) float32 each.
+        """Linear radiance of both cameras and the depth of the left one, (H, W) float32 each, yours to keep.
 
         ``motion``: (k, 4, 4) poses ``T_world_left`` spread over the exposure, whose pictures are averaged; depth is
         always that of ``T_world_left``. Depth runs along the optical axis [m], NaN where there is nothing; that of the
         right camera is kept in ``depth_right`` until the next call.
         """
+        effects = effects or Effects()
         pose = np.asarray(T_world_left, dtype=np.float64)
-        exposure = [] if motion is None else [np.asarray(T, dtype=np.float64) for T in motion]
-        if self._pool is None:
-            views = [self._view(side, pose, exposure) for side in (0, 1)]
-        else:
-            views = list(self._pool.map(lambda side: self._view(side, pose, exposure), (0, 1)))
-        (left, depth), (right, self.depth_right) = views
-        return left, right, depth
+        left = right = None
+        if motion is not None and len(motion) > 1:
+            left, right = np.zeros_like(self._left.radiance), np.zeros_like(self._right.radiance)
+            for T in motion:
+                self._draw(np.asarray(T, dtype=np.float64), effects)
+                left += self._left.radiance
+                right += self._right.radiance
+            left /= np.float32(len(motion))
+            right /= np.float32(len(motion))
+        self._draw(pose, effects)
+        if left is None or right is None:
+            left, right = self._left.radiance.copy(), self._right.radiance.copy()
+        return left, right, self._left.depth.copy()
 
-    def _view(self, side: int, pose: Array, exposure: list[Array]) -> tuple[Image, Image]:
-        shift = np.eye(4) if side == 0 else self._T_left_right
-        radiance, depth = self._drawers[side].draw(pose @ shift)
-        if exposure:
-            radiance = np.zeros_like(radiance)
-            for T in exposure:
-                radiance += self._drawers[side].draw(T @ shift)[0]
-            radiance /= np.float32(len(exposure))
-        return radiance, depth
+    @property
+    def depth_right(self) -> Image:
+        """Depth of the right camera at the last pose (H, W) [m], NaN where there is nothing."""
+        return self._right.depth.copy()
+
+    def _draw(self, T_world_left: Array, effects: Effects) -> None:
+        base = self._lighting
+        brightest = max(effects.lamps, effects.head_lamp)
+        lights = np.array(
+            [
+                base.ambient * effects.lamps,
+                effects.lamps,
+                self._head_lamp * effects.head_lamp,
+                effects.dust_per_m,
+                base.dust_airlight * brightest,
+            ]
+        )
+        views = ((self._left, T_world_left), (self._right, T_world_left @ self._T_left_right))
+        aims = [(drawer.aim, (pose,)) for drawer, pose in views]
+        draws = [(drawer.draw, (band, lights)) for drawer, _ in views for band in range(len(drawer.bands))]
+        for jobs in (aims, draws):
+            if self._pool is None:
+                for function, arguments in jobs:
+                    function(*arguments)
+            else:
+                for future in [self._pool.submit(function, *arguments) for function, arguments in jobs]:
+                    future.result()

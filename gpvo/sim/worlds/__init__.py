@@ -7,9 +7,9 @@ from importlib import import_module
 
 from gpvo.errors import GpvoError
 from gpvo.sim.worlds.cache import cached
-from gpvo.sim.worlds.world import HeightGrid, Lighting, Mesh, World
+from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
 
-__all__ = ["KINDS", "HeightGrid", "Lighting", "Mesh", "World", "build_world", "world_parameters"]
+__all__ = ["KINDS", "HeightGrid", "LightMap", "Lighting", "Mesh", "World", "build_world", "world_parameters"]
 
 KINDS = ("tunnel", "lunar", "room")
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gpvo.sim.worlds.world import HeightGrid, Lighting, Mesh, World
+from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
 
 _LARGEST_BYTES = 2_000_000_000
 
@@ -69,7 +69,11 @@ def save_world(world: World, path: Path) -> None:
         "lighting": asdict(world.lighting),
         "textures": len(world.textures),
         "heights": [(grid.x0, grid.y0, grid.cell) for grid in world.heights],
+        "light_map": None,
     }
+    if world.light_map is not None:
+        arrays["light_map"] = world.light_map.image
+        header["light_map"] = (world.light_map.origin, world.light_map.texel, world.light_map.material)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
@@ -95,6 +99,10 @@ def load_world(path: Path) -> World:
             raise ValueError(f"{path} is too large for a world")
     with np.load(path, allow_pickle=False) as data:
         header = json.loads(data["header"].tobytes())
+        light_map = None
+        if header["light_map"] is not None:
+            (u, v), texel, material = header["light_map"]
+            light_map = LightMap(data["light_map"], (u, v), texel, material)
         return World(
             kind=header["kind"],
             seed=header["seed"],
@@ -106,4 +114,5 @@ def load_world(path: Path) -> World:
             start_pose=data["start_pose"],
             bounds=data["bounds"],
             heights=tuple(HeightGrid(data[f"height_{k}"], *g) for k, g in enumerate(header["heights"])),
+            light_map=light_map,
         )

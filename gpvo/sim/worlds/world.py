@@ -38,11 +38,25 @@ class Mesh:
 @dataclass(frozen=True)
 class Lighting:
     """Light that is not baked. ``ambient``: irradiance from everywhere. ``head_lamp``: radiant intensity of a lamp at
-    the camera, 0 for none.
+    the camera, 0 for none. ``dust_airlight``: radiance of a thick cloud of dust in this light.
     """
 
     ambient: float = 0.01
     head_lamp: float = 0.0
+    dust_airlight: float = 0.1
+
+
+@dataclass(frozen=True)
+class LightMap:
+    """Fine shadows on one material: ``image`` (H, W) uint8, 255 in full light, over a rectangle of its texture plane.
+
+    Texel centres lie at ``uv = origin + (column + 0.5, row + 0.5) * texel``; outside, full light.
+    """
+
+    image: NDArray[np.uint8]
+    origin: tuple[float, float]
+    texel: float
+    material: int
 
 
 @dataclass(frozen=True)
@@ -64,6 +78,7 @@ class World:
     start_pose: Array
     bounds: Array
     heights: tuple[HeightGrid, ...] = field(default=())
+    light_map: LightMap | None = None
 
     @property
     def texture(self) -> NDArray[np.uint8]:
