@@ -30,6 +30,12 @@ def best_statement(e: Evaluation) -> Statement | None:
     return full.get("learned") or full.get("triangulation") or next(iter(full.values()), None)
 
 
+def _legend(ax: Axes, columns: int = 1) -> None:
+    """A legend, where there is something to tell apart."""
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, fontsize=8, ncols=columns)
+
+
 def trajectory(e: Evaluation) -> Figure:
     """Top and side view of estimate and truth, with 3-sigma ellipses of the best statement."""
     figure = Figure(figsize=(9, 7), layout="constrained")
@@ -85,7 +91,7 @@ def error_bounds(e: Evaluation) -> Figure:
             sigma = np.sqrt(statement.covariance[e.errors.index, k, k])
             ax.fill_between(t, scale * (mean - 3 * sigma), scale * (mean + 3 * sigma), color="#2ca02c", alpha=0.2, lw=0)
         ax.plot(t, scale * error, color="black", lw=0.7)
-        limit = scale * 1.3 * max(float(np.quantile(np.abs(error), 0.995)), 1e-9)
+        limit = max(scale * 1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6) if len(error) else 1.0
         ax.set_ylim(-limit, limit)
         ax.set_ylabel(f"{AXES[k]} [{'mm' if k < 3 else 'mrad'}]")
         ax.grid(alpha=0.3)
@@ -113,7 +119,7 @@ def reliability(e: Evaluation) -> Figure:
         ax.plot(levels, inside, label=s.method, color=_COLOURS.get(s.method))
     ax.plot([0, 1], [0, 1], color="black", lw=0.8, ls="--")
     ax.set(xlabel="stated probability", ylabel="share of errors inside", title=f"{e.run.name}: reliability")
-    ax.legend(frameon=False, fontsize=8)
+    _legend(ax)
     ax.grid(alpha=0.3)
     return figure
 
@@ -129,8 +135,8 @@ def memory(e: Evaluation) -> Figure:
     """Autocorrelation and Allan deviation of the error: what is noise and what is bias."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    dt = float(np.median(e.errors.dt_s))
-    for k in range(6):
+    dt = float(np.median(e.errors.dt_s)) if len(e.errors.dt_s) else 1.0
+    for k in range(6 if len(e.errors.dt_s) else 0):
         rho = autocorrelation(e.errors.xi[:, k], min(60, len(e.errors.xi) // 2))
         left.plot(np.arange(len(rho)) * dt, rho, label=AXES[k], lw=1)
         tau, deviation = allan_deviation(e.errors.xi[:, k] / dt, dt)
@@ -138,7 +144,7 @@ def memory(e: Evaluation) -> Figure:
     left.axhline(0, color="black", lw=0.6)
     left.set(xlabel="lag [s]", ylabel="autocorrelation", title="a dip at the first lag: shared pixel noise")
     right.set(xlabel="averaging time [s]", ylabel="Allan deviation [m/s, rad/s]", title="flat or rising: bias")
-    right.legend(frameon=False, fontsize=8, ncols=2)
+    _legend(right, 2)
     for ax in (left, right):
         ax.grid(alpha=0.3)
     figure.suptitle(f"{e.run.name}: how the error remembers")
@@ -157,7 +163,7 @@ def nees_over_time(e: Evaluation) -> Figure:
     ax.set(
         xlabel="time [s]", ylabel="NEES / dof", yscale="log", title=f"{e.run.name}: 1 is right, above is overconfident"
     )
-    ax.legend(frameon=False, fontsize=8, ncols=3)
+    _legend(ax, 3)
     ax.grid(alpha=0.3)
     return figure
 
@@ -190,7 +196,7 @@ def inputs(e: Evaluation) -> Figure:
             bad = np.array([r.status is status for r in log])
             ax.fill_between(t, 0, 1, where=bad, transform=ax.get_xaxis_transform(), color=colour, alpha=0.25, lw=0)
         ax.set_ylabel(label)
-        ax.legend(frameon=False, fontsize=8, ncols=3)
+        _legend(ax, 3)
         ax.grid(alpha=0.3)
     axes[-1].set_xlabel("time [s]")
     figure.suptitle(f"{e.run.name}: what odometry saw; amber is degraded, red is lost")

@@ -56,7 +56,9 @@ def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
     to_plane, _ = plots.level(e)
     keep = np.unique(np.linspace(0, len(e.T_est) - 1, _MAX_POINTS).astype(int))
-    est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[keep[e.covered[keep]], :3, 3] @ to_plane.T
+    covered = np.flatnonzero(e.covered)
+    shown = covered[np.unique(np.linspace(0, len(covered) - 1, _MAX_POINTS).astype(int))]
+    est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T
     centre = (true.max(0) + true.min(0)) / 2
     statement = plots.best_statement(e)
     ellipsoids: list[dict[str, Any]] = []
