@@ -1,0 +1,143 @@
+"""Honest statements score 1, others by how far they are off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from evaluation_runs import make_run, stated_covariance
+from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import motion_errors
+from gpvo.evaluation.consistency import Consistency, consistency, truth_noise
+from gpvo.evaluation.statements import statements
+from gpvo.geometry import se3
+from gpvo.types import TruthLog, VoLog
+
+
+def _scores(log: VoLog, truth: TruthLog, sigma: tuple[float, float] = (0.0, 0.0)) -> dict[str, Consistency]:
+    T_true, known = interpolate_truth(truth, log.t_ns)
+    errors = motion_errors(log, truth)
+    found = {s.method: consistency(s, errors, log, T_true, known, sigma) for s in statements(log)}
+    return {m: c for m, c in found.items() if c is not None}
+
+
+@pytest.fixture(scope="module")
+def honest() -> dict[str, Consistency]:
+    return _scores(*make_run(3000, lost={500, 501, 1200}))
+
+
+def test_an_honest_covariance_scores_one(honest):
+    c = honest["triangulation"]
+    assert c.count == 2997
+    for block in ("translation", "rotation", "joint"):
+        interval = c.nees_dof[block]
+        assert interval is not None
+        assert 0.9 < interval.mean < 1.1
+        assert interval.contains(1.0)
+        assert interval.high - interval.low < 0.2
+        # The truth of a simulation has no noise of its own.
+        assert c.nees_dof_truth_noise[block] == pytest.approx(interval.mean)
+        assert 0.7 < c.nees_dof_median[block] < 1.0
+    np.testing.assert_allclose(c.coverage, [0.6827, 0.9545, 0.9973], atol=0.02)
+
+
+def test_an_honest_covariance_is_honest_over_every_horizon(honest):
+    found = {h.time_s or h.length_m: h for h in honest["triangulation"].horizons}
+    assert [(h.time_s, h.length_m) for h in honest["triangulation"].horizons] == [
+        (1.0, None), (None, 1.0), (None, 10.0), (None, 100.0),
+    ]  # fmt: skip
+    for span in (1.0, 10.0):
+        # Thirty to sixty windows that overlap by half: the mean of NEES/6 scatters by about 0.13.
+        assert 25 < found[span].count <= 61
+        assert 0.65 < found[span].nees_dof < 1.4
+
+
+def test_nll_and_crps_of_an_honest_covariance(honest):
+    c = honest["triangulation"]
+    C = stated_covariance()
+    entropy = 0.5 * (6 * np.log(2 * np.pi * np.e) + np.linalg.slogdet(C)[1]) / 6
+    assert c.nll_per_dim == pytest.approx(entropy, abs=0.03)
+    sigma = np.sqrt(np.diagonal(C))
+    # The mean CRPS of N(0, s^2) at its own draws is s / sqrt(pi).
+    assert c.crps_translation_m == pytest.approx(sigma[:3].mean() / np.sqrt(np.pi), rel=0.05)
+    assert c.crps_rotation_rad == pytest.approx(sigma[3:].mean() / np.sqrt(np.pi), rel=0.05)
+
+
+def test_translation_only_speaks_of_translation_alone(honest):
+    c = honest["triangulation_vt"]
+    assert 0.9 < c.nees_dof["translation"].mean < 1.1
+    assert c.nees_dof["rotation"] is None
+    assert c.nees_dof["joint"] is None
+    assert c.nll_per_dim is None
+    assert c.crps_rotation_rad is None
+    assert c.horizons == ()
+    assert c.predicted_final_error_m is None
+
+
+def test_translation_only_is_turned_from_the_reference_to_the_current_camera():
+    log, _ = make_run(5)
+    turn = se3.exp(np.array([0.0, 0, 0, 0, np.pi / 2, 0]))
+    V = np.diag([1.0, 4.0, 9.0])
+    log = VoLog([replace(r, T_prev_cur=turn, v_t={"triangulation": V}) for r in log])
+    said = next(s for s in statements(log) if s.method == "triangulation_vt")
+    # Turned by 90 degrees about y: x and z change places.
+    np.testing.assert_allclose(said.covariance[1], np.diag([9.0, 4.0, 1.0]), atol=1e-12)
+
+
+def test_an_overconfident_covariance_scores_by_its_factor():
+    log, truth = make_run(1000)
+    small = [replace(r, covariances={m: C / 9 for m, C in r.covariances.items()}) for r in log]
+    one, nine = _scores(log, truth)["triangulation"], _scores(VoLog(small), truth)["triangulation"]
+    assert nine.nees_dof["joint"].mean == pytest.approx(9 * one.nees_dof["joint"].mean)
+    assert nine.coverage[2] == pytest.approx(one.coverage[0])
+    assert nine.predicted_final_error_m == pytest.approx(one.predicted_final_error_m / 3)
+
+
+def test_predicted_final_error_is_that_of_drawn_runs():
+    errors = []
+    for seed in range(60):
+        log, truth = make_run(100, seed, v_t=False)
+        lift = truth.T_world_cam[0] @ log.trajectory()
+        errors.append(np.linalg.norm(lift[-1, :3, 3] - truth.T_world_cam[-1, :3, 3]))
+    c = _scores(log, truth)["triangulation"]
+    # The root mean square of 60 norms scatters by about 8 %.
+    assert c.predicted_final_error_m == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.25)
+    assert c.predicted_final_error_independent_m == pytest.approx(c.predicted_final_error_m)
+
+
+def test_truth_noise_is_that_of_two_noisy_poses():
+    sigma_m, sigma_rad = 0.003, 0.001
+    np.testing.assert_allclose(
+        truth_noise(np.eye(4)[None], sigma_m, sigma_rad)[0], np.diag([2 * sigma_m**2] * 3 + [2 * sigma_rad**2] * 3)
+    )
+    T = se3.exp(np.array([0.5, -0.2, 1.0, 0.3, -0.4, 0.2]))
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((2, 20_000, 6)) * ([sigma_m] * 3 + [sigma_rad] * 3)
+    measured = se3.inverse(se3.exp(noise[0])) @ T @ se3.exp(noise[1])
+    sample = np.cov(se3.log(se3.inverse(measured) @ T).T)
+    C = truth_noise(T[None], sigma_m, sigma_rad)[0]
+    scale = np.sqrt(np.outer(np.diagonal(C), np.diagonal(C)))
+    np.testing.assert_allclose(sample / scale, C / scale, atol=0.05)
+
+
+def test_noise_of_the_truth_is_taken_into_account():
+    log, truth = make_run(2000)
+    sigma = (0.002, 0.0005)
+    noise = np.random.default_rng(1).standard_normal((len(truth.t_ns), 6)) * ([sigma[0]] * 3 + [sigma[1]] * 3)
+    noisy = TruthLog(truth.t_ns, truth.T_world_cam @ se3.exp(noise))
+    c = _scores(log, noisy, sigma)["triangulation"]
+    assert c.nees_dof["joint"].mean > 2
+    for block in ("translation", "rotation", "joint"):
+        assert 0.9 < c.nees_dof_truth_noise[block] < 1.1
+    assert 0.6 < c.horizons[0].nees_dof < 1.5
+
+
+def test_covariances_that_are_none_say_nothing():
+    """Zeros are how other software says that it does not know."""
+    log, truth = make_run(50)
+    zeros = [replace(r, covariances={"imported": np.zeros((6, 6))}, v_t={}) for r in log]
+    assert _scores(VoLog(zeros), truth) == {}
+    C = stated_covariance()
+    half = [replace(r, covariances={"imported": 0 * C if k % 2 else C}, v_t={}) for k, r in enumerate(log)]
+    assert _scores(VoLog(half), truth)["imported"].count == 25

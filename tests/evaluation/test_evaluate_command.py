@@ -1,0 +1,176 @@
+"""``gpvo evaluate`` from a run folder to the numbers that scripts read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import make_run, stated_covariance
+from gpvo import cli
+from gpvo.evaluation.evaluate import METHODS, EvaluateOptions, document, evaluate_run
+from gpvo.geometry import se3
+from gpvo.io.run import read_run, write_run
+from gpvo.io.trajectory import write_tum
+from gpvo.types import Prediction, Status, TruthLog, VoLog
+
+RUN_KEYS = {"run", "source", "frames", "lost", "path_length_m", "ate_rmse_m", "rmse_origin_m", "final_error_m"}
+METHOD_KEYS = {"nees_dof", "nees_dof_median", "coverage", "nll_per_dim", "crps", "predicted_final_error_m", "horizons"}
+
+
+def predictions_of(log: VoLog) -> list[Prediction]:
+    C = stated_covariance()
+    parts = {"jitter": 0.3 * C, "white": 0.5 * C, "bias": 0.2 * C}
+    made = (r for r in log if r.status is not Status.START)
+    return [
+        Prediction(r.t_ns, r.dt_s, np.zeros(6), C, parts, np.ones(6), np.zeros(6), 0.9, 1.0, r.status) for r in made
+    ]
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """300 motions, one frame lost, with truth and predictions."""
+    log, truth = make_run(300, lost={40})
+    path = tmp_path_factory.mktemp("runs") / "hall"
+    write_run(path, log, predictions=predictions_of(log), truth=truth, meta={"source": "made"})
+    return path
+
+
+def _main(capsys, *args: object) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command, in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["gpvo", *map(str, args)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    out, err = capsys.readouterr()
+    return int(stop.value.code or 0), out, err
+
+
+def _assert_refused(capsys, *args: object, says: str) -> None:
+    code, out, err = _main(capsys, "evaluate", *args)
+    assert code == 2
+    assert out == ""
+    assert len(err.strip().splitlines()) == 1
+    assert says in err
+
+
+def test_json_has_every_name_of_the_interface(capsys, run_folder):
+    code, out, _ = _main(capsys, "evaluate", run_folder, "--json")
+    assert code == 0
+    found = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert found["schema"] == 1
+    (run,) = found["runs"]
+    assert set(run) >= RUN_KEYS
+    assert (run["run"], run["source"], run["frames"], run["lost"]) == ("hall", "made", 301, 1)
+    assert set(run["segments"][0]) == {"length_m", "translation_percent", "rotation_deg_per_m", "count"}
+    assert set(run["methods"]) >= set(METHODS)
+    for method in run["methods"].values():
+        assert set(method) >= METHOD_KEYS
+        assert set(method["nees_dof"]) == set(method["nees_dof_median"]) == {"translation", "rotation", "joint"}
+        assert set(method["coverage"]) == {"1", "2", "3"}
+        assert set(method["crps"]) == {"translation_m", "rotation_rad"}
+    absent, partial = run["methods"]["gp_thesis"], run["methods"]["triangulation_vt"]
+    assert absent["nees_dof"] == {"translation": None, "rotation": None, "joint": None}
+    assert absent["nll_per_dim"] is None
+    assert absent["horizons"] == []
+    assert partial["nees_dof"]["translation"] == pytest.approx(1.0, abs=0.15)
+    assert partial["nees_dof"]["joint"] is None
+    for method in ("triangulation", "learned"):
+        assert run["methods"][method]["nees_dof"]["joint"] == pytest.approx(1.0, abs=0.15)
+        # 15 m of path: there is no window of 100 m, so its figure is null.
+        last = run["methods"][method]["horizons"][-1]
+        assert (last["length_m"], last["nees_dof"], last["count"]) == (100.0, None, 0)
+
+
+def test_the_table_names_the_methods(capsys, run_folder):
+    code, out, _ = _main(capsys, "evaluate", run_folder, "--segments", "5,10")
+    assert code == 0
+    for word in ("hall: 301 frames, 1 lost", "5 m segments", "triangulation", "learned", "NEES/dof"):
+        assert word in out
+
+
+def test_parts_make_another_final_error_than_independence(run_folder):
+    c = evaluate_run(read_run(run_folder)).consistency["learned"]
+    # The jitter does not add up, the bias does.
+    assert c.predicted_final_error_m != pytest.approx(c.predicted_final_error_independent_m, rel=0.01)
+
+
+def test_several_runs_and_truth_from_a_file(capsys, run_folder, tmp_path):
+    run = read_run(run_folder)
+    write_run(tmp_path / "bare", run.log)
+    write_tum(tmp_path / "truth.tum", run.truth.t_ns, run.truth.T_world_cam)
+    code, out, _ = _main(capsys, "evaluate", tmp_path / "bare", run_folder, "--truth", tmp_path / "truth.tum", "--json")
+    assert code == 0
+    bare, full = json.loads(out)["runs"]
+    assert (bare["run"], full["run"]) == ("bare", "hall")
+    assert bare["ate_rmse_m"] == pytest.approx(full["ate_rmse_m"], abs=1e-6)
+
+
+def test_time_offset_is_found(tmp_path):
+    log, truth = make_run(1200)
+    shifted = TruthLog(truth.t_ns + 320_000_000, truth.T_world_cam)
+    write_run(tmp_path / "late", log, truth=shifted)
+    run = read_run(tmp_path / "late")
+    found = evaluate_run(run, options=EvaluateOptions(time_offset_s=None))
+    assert found.time_offset_s == pytest.approx(0.32, abs=0.02)
+    given = evaluate_run(run, options=EvaluateOptions(time_offset_s=0.32))
+    assert given.consistency["triangulation"].nees_dof["joint"].mean == pytest.approx(1.0, abs=0.1)
+    assert given.trajectory.ate_rmse_m < evaluate_run(run).trajectory.ate_rmse_m
+
+
+def test_truth_sigma_replaces_that_of_the_source(run_folder):
+    run = read_run(run_folder)
+    found = evaluate_run(run, options=EvaluateOptions(truth_sigma=(0.01, 0.01)))
+    c = found.consistency["triangulation"]
+    assert c.nees_dof_truth_noise["joint"] < 0.1 < c.nees_dof["joint"].mean
+    assert document([found])["runs"][0]["truth_sigma"] == {"translation_m": 0.01, "rotation_rad": 0.01}
+
+
+def test_first_poses_are_made_equal(run_folder):
+    e = evaluate_run(read_run(run_folder))
+    np.testing.assert_allclose(e.T_est[0], e.T_true[0], atol=1e-9)
+    np.testing.assert_allclose(se3.inverse(e.T_est[:-1]) @ e.T_est[1:], _motions(e.run.log), atol=1e-9)
+
+
+def _motions(log: VoLog) -> np.ndarray:
+    T = log.trajectory()
+    return se3.inverse(T[:-1]) @ T[1:]
+
+
+def test_bad_flags_are_one_line(capsys, run_folder):
+    for value in ("ten", "", "0", "-5", "nan", "10,,20", "inf"):
+        _assert_refused(capsys, run_folder, "--segments", value, says="--segments")
+    for value in ("x", "-1", "1,2,3", "nan"):
+        _assert_refused(capsys, run_folder, f"--truth-sigma={value}", says="--truth-sigma")
+    for value in ("soon", "nan", "1,2"):
+        _assert_refused(capsys, run_folder, "--time-offset", value, says="--time-offset")
+    _assert_refused(capsys, run_folder, "--align", "sideways", says="sideways")
+
+
+def test_a_run_without_truth_is_one_line(capsys, run_folder, tmp_path):
+    write_run(tmp_path / "blind", read_run(run_folder).log)
+    _assert_refused(capsys, tmp_path / "blind", says="blind: has no ground truth")
+
+
+def test_truth_of_another_day_is_one_line(capsys, run_folder, tmp_path):
+    run = read_run(run_folder)
+    write_run(tmp_path / "other", run.log, truth=replace(run.truth, t_ns=run.truth.t_ns + 10**15))
+    _assert_refused(capsys, tmp_path / "other", says="do not overlap")
+
+
+def test_what_is_no_run_is_one_line(capsys, tmp_path):
+    _assert_refused(capsys, tmp_path / "nowhere", says="nowhere")
+    (tmp_path / "empty").mkdir()
+    _assert_refused(capsys, tmp_path / "empty", says="empty")
+
+
+def test_a_run_that_was_lost_throughout_is_evaluated(capsys, tmp_path):
+    log, truth = make_run(30, lost=range(1, 31))
+    write_run(tmp_path / "dark", log, truth=truth)
+    code, out, _ = _main(capsys, "evaluate", tmp_path / "dark", "--json", "--plots", tmp_path / "pictures")
+    assert code == 0
+    (run,) = json.loads(out)["runs"]
+    assert run["lost"] == 30
+    assert run["methods"]["triangulation"]["nees_dof"]["joint"] is None

@@ -1,0 +1,172 @@
+"""Pictures have the axes they say, the report stands alone and shows the numbers of ``--json``."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from evaluation_runs import make_run
+from gpvo.evaluation import plots
+from gpvo.evaluation.evaluate import Evaluation, document, evaluate_run
+from gpvo.evaluation.report import render, scene, write_report
+from gpvo.io.run import read_run, write_run
+from matplotlib.figure import Figure
+
+AXES = {
+    "trajectory": [("[m]", "[m]")] * 2,
+    "errors": [
+        ("", "x [mm]"),
+        ("", "rot x [mrad]"),
+        ("", "y"),
+        ("", "rot y"),
+        ("time [s]", "z"),
+        ("time [s]", "rot z"),
+    ],
+    "reliability": [("stated probability", "share of errors inside")],
+    "memory": [("lag [s]", "autocorrelation"), ("averaging time [s]", "Allan deviation")],
+    "nees": [("time [s]", "NEES / dof")],
+    "inputs": [("", "points"), ("", "disparity [px]"), ("time [s]", "image")],
+}
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory) -> Evaluation:
+    log, truth = make_run(300, lost={40})
+    path = tmp_path_factory.mktemp("runs") / "a & b <i>"
+    write_run(path, log, truth=truth)
+    return evaluate_run(read_run(path))
+
+
+@pytest.fixture(scope="module")
+def page(evaluation) -> str:
+    return render([evaluation])
+
+
+@pytest.mark.parametrize("name", list(plots.FIGURES))
+def test_figures_have_their_axes(evaluation, name):
+    figure = plots.FIGURES[name](evaluation)
+    assert isinstance(figure, Figure)
+    labels = [(ax.get_xlabel(), ax.get_ylabel()) for ax in figure.axes]
+    assert len(labels) == len(AXES[name])
+    for (x, y), (in_x, in_y) in zip(labels, AXES[name], strict=True):
+        assert in_x in x
+        assert in_y in y
+
+
+def test_reliability_of_an_honest_method_is_the_diagonal(evaluation):
+    (ax,) = plots.reliability(evaluation).axes
+    line = next(entry for entry in ax.get_lines() if entry.get_label() == "triangulation")
+    np.testing.assert_allclose(line.get_ydata(), line.get_xdata(), atol=0.05)
+
+
+def test_pictures_are_saved(evaluation, tmp_path):
+    saved = plots.save_all(evaluation, tmp_path / "pictures")
+    assert len(saved) == len(plots.FIGURES)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in saved)
+
+
+def test_the_page_stands_alone(page):
+    # Names of XML vocabularies are not fetched; sources, links, styles and scripts would be.
+    assert not re.search(r"""(?:src|href|action)\s*=\s*["']?\s*(?:https?:|//|file:)""", page)
+    assert not re.search(r"url\(\s*['\"]?(?:https?:|//)|@import|fetch\(|XMLHttpRequest|import\(", page)
+    assert "a & b <i>" not in page
+    assert "a &amp; b &lt;i&gt;" in page
+
+
+class _Cells(HTMLParser):
+    """Rows of table cells, as text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self._inside = False
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "tr":
+            self.rows.append([])
+        if tag == "td":
+            self.rows[-1].append("")
+        self._inside = tag == "td"
+
+    def handle_endtag(self, tag):
+        self._inside = self._inside and tag != "td"
+
+    def handle_data(self, data):
+        if self._inside:
+            self.rows[-1][-1] += data.strip()
+
+
+def test_the_table_shows_the_numbers_of_json(evaluation, page):
+    parser = _Cells()
+    parser.feed(page)
+    rows = {row[0]: row for row in parser.rows if row}
+    (run,) = document([evaluation])["runs"]
+
+    def shown(value: float) -> str:
+        return f"{value:.3g}"
+
+    m = run["methods"]["triangulation"]
+    expected = [m["nees_dof"][b] for b in ("joint", "translation", "rotation")]
+    expected += [m["nees_dof_median"]["joint"], m["nees_dof_truth_noise"]["joint"]]
+    expected += [100 * m["coverage"][k] for k in "123"]
+    expected += [m["nll_per_dim"], 1000 * m["crps"]["translation_m"], m["predicted_final_error_m"]]
+    assert rows["triangulation"][1:] == [shown(v) for v in expected]
+    assert rows["triangulation_vt"][1] == "–"
+    for s in run["segments"]:
+        row = rows[f"{shown(s['length_m'])} m"]
+        assert row[1:] == [shown(s["translation_percent"]), shown(s["rotation_deg_per_m"]), str(s["count"])]
+    assert f"ATE {shown(run['ate_rmse_m'])} m" in page
+
+
+def test_the_scene_is_centred_and_has_ellipsoids(evaluation):
+    s = scene(evaluation)
+    assert len(s["est"]) == len(s["true"]) == 301
+    assert np.abs(s["true"]).max() == pytest.approx(s["size"], abs=1e-4)
+    assert len(s["ellipsoids"]) == 9
+    axes = np.array(s["ellipsoids"][-1]["axes"])
+    half = np.linalg.norm(axes, axis=1)
+    final = evaluation.consistency["triangulation"].predicted_final_error_m
+    assert np.sqrt((half**2).sum()) / 3 == pytest.approx(final, rel=1e-3)
+
+
+def test_the_same_input_gives_the_same_page(evaluation, page):
+    assert render([evaluation]) == page
+
+
+def test_the_file_is_whole_or_absent(evaluation, tmp_path, monkeypatch):
+    target = tmp_path / "deep" / "report.html"
+    write_report([evaluation], target)
+    assert target.read_text(encoding="utf-8").rstrip().endswith("</html>")
+    before = target.read_bytes()
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("gpvo.evaluation.report.os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_report([evaluation], target)
+    assert target.read_bytes() == before
+    assert [p.name for p in target.parent.iterdir()] == ["report.html"]
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_page_without_errors(page, tmp_path):
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here to open the report with")
+    # A mark at the end of the script tells that it ran to its end.
+    marked = page.replace("</body>", "<script>document.body.dataset.done = 'yes';</script></body>")
+    (tmp_path / "report.html").write_text(marked, encoding="utf-8")
+    command = [
+        browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
+        f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", (tmp_path / "report.html").as_uri(),
+    ]  # fmt: skip
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert 'data-done="yes"' in shown.stdout
+    # Drawing sets the size of the canvas.
+    assert re.search(r'<canvas[^>]* width="\d+"', shown.stdout)
+    assert "CONSOLE" not in shown.stderr, shown.stderr

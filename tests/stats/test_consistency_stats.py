@@ -1,0 +1,72 @@
+"""NEES, coverage, NLL and CRPS of statements that are known to be right, or wrong by a known factor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.stats.consistency import coverage, crps_gaussian, nees, nll_per_dim, whiten
+from scipy import stats
+from scipy.integrate import quad
+
+N = 20_000
+
+
+def _drawn(d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (N, d) drawn from as many different covariances (N, d, d)."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(N, d, d))
+    C = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(d)
+    return (np.linalg.cholesky(C) @ rng.standard_normal((N, d, 1)))[..., 0], C
+
+
+@pytest.mark.parametrize("d", [1, 3, 6])
+def test_nees_of_right_statements_has_mean_d_and_is_chi_squared(d):
+    values = nees(*_drawn(d))
+    # Standard deviation of the mean: sqrt(2 d / N); four of it.
+    assert abs(values.mean() - d) < 4 * np.sqrt(2 * d / N)
+    assert stats.kstest(values, stats.chi2(d).cdf).pvalue > 1e-3
+
+
+def test_nees_of_a_variance_too_small_by_four_is_four_times_larger():
+    e, C = _drawn(3)
+    np.testing.assert_allclose(nees(e, C / 4), 4 * nees(e, C))
+
+
+@pytest.mark.parametrize(
+    ("d", "shares"), [(1, (0.683, 0.954, 0.997)), (3, (0.20, 0.74, 0.97)), (6, (0.014, 0.32, 0.83))]
+)
+def test_joint_ellipsoid_coverage(d, shares):
+    values = nees(*_drawn(d))
+    for sigma, share in zip((1, 2, 3), shares, strict=True):
+        assert abs((values <= sigma**2).mean() - share) < 0.012
+
+
+def test_coverage_per_axis():
+    e, C = _drawn(6)
+    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    np.testing.assert_allclose(coverage(e, sigma), [0.6827, 0.9545, 0.9973], atol=0.005)
+    np.testing.assert_allclose(coverage(e, 10 * sigma, (1.0,)), [1.0], atol=1e-9)
+
+
+def test_whitened_errors_are_standard_normal():
+    z = whiten(*_drawn(4))
+    np.testing.assert_allclose(np.cov(z.T), np.eye(4), atol=0.04)
+
+
+def test_nll_is_scipys():
+    e, C = _drawn(6)
+    theirs = [-stats.multivariate_normal(np.zeros(6), C[k]).logpdf(e[k]) / 6 for k in range(50)]
+    np.testing.assert_allclose(nll_per_dim(e[:50], C[:50]), theirs, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("error", "sigma"), [(0.0, 1.0), (0.7, 0.5), (-2.0, 0.3), (1e-3, 2e-3)])
+def test_crps_is_its_integral(error, sigma):
+    cdf = stats.norm(0, sigma).cdf
+    low = quad(lambda x: cdf(x) ** 2, min(error, 0) - 12 * sigma, error, points=[0.0] if error > 0 else None)[0]
+    high = quad(lambda x: (1 - cdf(x)) ** 2, error, max(error, 0) + 12 * sigma, points=[0.0] if error < 0 else None)[0]
+    assert crps_gaussian(np.array([error]), np.array([sigma]))[0] == pytest.approx(low + high, rel=1e-6)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="last axes"):
+        nees(np.zeros((5, 6)), np.zeros((5, 3, 3)))
