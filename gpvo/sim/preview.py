@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 
@@ -20,7 +21,7 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
         raise GpvoError("holds no pictures", where=sequence)
     tiles = []
     for k in np.linspace(0, len(files[0]) - 1, rows * columns).astype(int):
-        pair = [cv2.imread(str(side[k]), cv2.IMREAD_GRAYSCALE) for side in files]
+        pair = [_read(side[k]) for side in files]
         small = [cv2.resize(p, (_WIDTH_PX, round(p.shape[0] * _WIDTH_PX / p.shape[1]))) for p in pair]
         tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
     sheet = np.vstack([np.hstack(tiles[r * columns : (r + 1) * columns]) for r in range(rows)])
@@ -29,3 +30,10 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
     return target
+
+
+def _read(file: Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise GpvoError("is no picture", where=file)
+    return np.asarray(image, np.uint8)

@@ -152,14 +152,16 @@ class _Eye:
             params = SensorParams(**scenario.sensor)
         except TypeError as error:
             raise GpvoError(f"unknown value of 'sensor': {error}") from None
-        self._sensor = SensorModel(params, seed)
+        self._sensor = SensorModel(params, seed, threads=threads)
         self._motion, self._T_body_left = motion, rig.T_body_left
 
     def see(self, index: int, plan: sequence_plan.FramePlan) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         pose, blur = sequence_plan.camera_poses(self._motion, plan.step, plan.exposure_s, self._T_body_left)
         left, right, depth = self._renderer.render(pose, motion=blur)
+        both = self._renderer.depth_right
+        depths = depth if both is None else [depth, both]
         a, b = self._sensor.expose(
-            left, right, index, depth=depth, darkness=plan.darkness, dust=plan.dust, noise_sigma=plan.noise_sigma
+            left, right, index, depth=depths, darkness=plan.light, dust=plan.dust, noise_sigma=plan.noise_sigma
         )
         if plan.fate == "black":
             return np.zeros_like(a), np.zeros_like(b)

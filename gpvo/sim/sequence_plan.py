@@ -25,12 +25,12 @@ _CHECK_HZ = 50
 @dataclass(frozen=True)
 class FramePlan:
     """``step``: index into the 1 kHz motion. ``fate``: shown, dropped, frozen, late or black. The rest goes to the
-    sensor: noise on a 0..1 scale, darkness and dust 0..1, exposure [s]."""
+    sensor: noise on a 0..1 scale, share of the light that is left, dust as extinction [1/m], exposure [s]."""
 
     step: int
     fate: str
     noise_sigma: float
-    darkness: float
+    light: float
     dust: float
     exposure_s: float
 
@@ -133,8 +133,8 @@ def plan_frames(scenario: Scenario, episodes: tuple[Episode, ...], rng: np.rando
                 step=round(t * vehicles.RATE_HZ),
                 fate=fate,
                 noise_sigma=float(np.hypot(base, extra)),
-                darkness={"darkness": 0.97, "blackout": 1.0}.get(cause, 0.0),
-                dust=0.85 if cause == "dust" else 0.0,
+                light={"darkness": 0.004, "blackout": 0.0}.get(cause, 1.0),
+                dust=0.6 if cause == "dust" else 0.0,
                 exposure_s=0.6 / scenario.rate_hz if cause == "motion_blur" else scenario.exposure_s,
             )
         )
