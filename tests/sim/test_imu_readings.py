@@ -1,0 +1,31 @@
+"""The IMU's readings: at rest, and what noise adds."""
+
+import numpy as np
+import pytest
+
+from gpvo.sim import imu, paths
+
+
+def test_rest_reads_gravity():
+    motion = paths.hover(np.zeros(3), 0.4, 2.0).motion(200.0)
+    gyro, force = imu.exact_imu(motion)
+    assert np.abs(gyro).max() < 1e-9
+    assert np.allclose(force, [0, 0, imu.GRAVITY_MPS2], atol=1e-9)
+
+
+def test_lunar_gravity():
+    motion = paths.hover(np.zeros(3), 0.0, 1.0).motion(100.0)
+    assert np.allclose(imu.exact_imu(motion, 1.62)[1], [0, 0, 1.62], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(imu.PRESETS))
+def test_white_noise_has_its_density(name):
+    model = imu.PRESETS[name]
+    motion = paths.hover(np.zeros(3), 0.0, 100.0).motion(200.0)
+    log, bias, _ = imu.measured_imu(motion, model, np.random.default_rng(5))
+    white = log.gyro_radps - bias
+    expected = model.noise.gyro_density_radps_sqrthz * np.sqrt(200.0)
+    assert white.std() == pytest.approx(expected, rel=0.03)
+    # A walk of density s has variance s^2 t.
+    steps = np.diff(bias, axis=0)
+    assert steps.std() == pytest.approx(model.noise.gyro_walk_radps2_sqrthz * np.sqrt(1 / 200.0), rel=0.03)

@@ -1,0 +1,63 @@
+"""Scenarios: all load, mistakes are named with their cure."""
+
+import pytest
+
+from gpvo.errors import GpvoError
+from gpvo.sim import scenario as sc
+from gpvo.sim.points import SCENARIOS, simulate_points
+
+
+def test_every_scenario_loads_and_explains_itself():
+    assert {"tunnel", "tunnel-clean", "tunnel-noise", "tunnel-bursts", "tunnel-dark"} <= set(sc.names())
+    assert {"lunar-straight", "room-t265", "room-flown"} <= set(sc.names())
+    assert set(SCENARIOS) <= set(sc.names())
+    assert all(sc.load_scenario(n).about for n in sc.names())
+
+
+@pytest.mark.parametrize("name", sorted(SCENARIOS))
+def test_points_scenario_is_the_known_one(name):
+    assert sc.points_scenario(sc.load_scenario(name)) == SCENARIOS[name]
+
+
+@pytest.mark.parametrize("name", ["tunnel", "tunnel-dark"])
+def test_the_others_fly_without_images_too(name):
+    flight = simulate_points(sc.points_scenario(sc.load_scenario(name, {"duration_s": 6.0})), 1)
+    assert len(flight.t_s) == 121
+
+
+@pytest.mark.parametrize(
+    "overrides, message",
+    [
+        ({"spede_mps": 1}, "nearest: speed_mps"),
+        ({"speed_mps": "quick"}, "speed_mps"),
+        ({"duration_s": -1}, "duration_s"),
+        ({"camera": "gopro"}, "camera"),
+        ({"calibration.focl": 0.1}, "calibration"),
+        ({"late": 0.1, "late_s": 0.2}, "late_s"),
+        ({"name.x": 1}, "no table"),
+    ],
+)
+def test_mistakes_are_named(overrides, message):
+    with pytest.raises(GpvoError, match=message) as caught:
+        sc.load_scenario("tunnel", overrides)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_names():
+    with pytest.raises(GpvoError, match="nearest: tunnel-clean"):
+        sc.load_scenario("tunel-clean")
+    with pytest.raises(GpvoError, match="nearest: sigma_px"):
+        sc.points_scenario(sc.load_scenario("tunnel", {"points.sigma_pix": 1.0}))
+
+
+def test_own_file(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('world = "room"\npath = "wander"\n[points]\nsigma_px = 0.3\n')
+    mine = sc.load_scenario(str(file), {"duration_s": 9.0})
+    assert (mine.name, mine.world, mine.duration_s) == ("mine", "room", 9.0)
+    assert sc.points_scenario(mine).sigma_px == 0.3
+    file.write_text("world = [")
+    with pytest.raises(GpvoError, match="no TOML"):
+        sc.load_scenario(str(file))
+    with pytest.raises(GpvoError, match="cannot be read"):
+        sc.load_scenario(str(tmp_path / "none.toml"))
