@@ -1,0 +1,151 @@
+"""The odometry on rendered pictures: precise where seeing is good, honest where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError, SourceError
+from gpvo.geometry import se3
+from gpvo.types import Status, StereoFrame, TrackFrame, VoLog, VoRecord
+from gpvo.vo.config import make_config
+from gpvo.vo.odometry import StereoOdometry
+
+pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+from gpvo.sim.clip import Clip, pinhole, render_clip, wander
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    return render_clip(pinhole(480, 360), wander(16, seed=2))
+
+
+def run(clip: Clip, frames: list[StereoFrame] | None = None, preset: str = "fast") -> list[VoRecord]:
+    odometry = StereoOdometry(clip.camera, make_config(preset))
+    return [odometry.step(f) for f in (clip.frames if frames is None else frames)]
+
+
+def errors_mm(clip: Clip, records: list[VoRecord]) -> np.ndarray:
+    T = VoLog(records, clip.camera).trajectory()
+    est, true = se3.inverse(T[:-1]) @ T[1:], se3.inverse(clip.T_world_cam[:-1]) @ clip.T_world_cam[1:]
+    return 1e3 * np.linalg.norm((se3.inverse(true) @ est)[:, :3, 3], axis=1)
+
+
+def blank(frame: StereoFrame) -> StereoFrame:
+    return replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.right))
+
+
+def test_fast_is_precise_and_says_ok(clip: Clip) -> None:
+    records = run(clip)
+    assert records[0].status is Status.START
+    assert all(r.status is Status.OK for r in records[1:])
+    step_mm = 1e3 * np.median(np.linalg.norm(np.diff(clip.T_world_cam[:, :3, 3], axis=0), axis=1))
+    assert np.median(errors_mm(clip, records)) < 0.06 * step_mm
+    for r in records[1:]:
+        assert set(r.covariances) == {"triangulation", "pointing_matching"}
+        assert all(np.linalg.eigvalsh(C)[0] > 0 for C in r.covariances.values())
+        assert 0 < r.n_inliers <= r.n_tracked <= 450
+
+
+def test_thesis_runs_and_is_coarser(clip: Clip) -> None:
+    thesis = run(clip, preset="thesis")
+    assert all(r.usable for r in thesis[1:])
+    assert all(r.is_reference for r in thesis)
+    assert np.median(errors_mm(clip, thesis)) > np.median(errors_mm(clip, run(clip)))
+
+
+def test_same_input_same_output(clip: Clip) -> None:
+    for a, b in zip(run(clip), run(clip), strict=True):
+        np.testing.assert_array_equal(a.T_prev_cur, b.T_prev_cur)
+
+
+@pytest.mark.parametrize("preset", ["fast", "thesis"])
+def test_black_frames_are_lost_and_then_it_recovers(clip: Clip, preset: str) -> None:
+    frames = [blank(f) if k in (6, 7) else f for k, f in enumerate(clip.frames)]
+    records = run(clip, frames, preset)
+    assert [r.status for r in records[6:8]] == [Status.LOST] * 2
+    assert "point" in records[6].reason
+    assert not records[6].is_reference
+    after = records[8]
+    assert after.usable
+    assert after.t_prev_ns == clip.frames[5].t_ns
+    T_true = se3.inverse(clip.T_world_cam[5]) @ clip.T_world_cam[8]
+    assert np.linalg.norm((se3.inverse(T_true) @ after.T_prev_cur)[:3, 3]) < (
+        0.05 if preset == "fast" else 0.3
+    ) * np.linalg.norm(T_true[:3, 3])
+    sigma_lost, sigma_ok = (np.sqrt(np.trace(records[k].covariances["triangulation"][:3, :3])) for k in (6, 5))
+    assert sigma_lost > 3 * sigma_ok
+
+
+def test_a_frozen_picture_is_no_standstill(clip: Clip) -> None:
+    frames = [replace(clip.frames[5], t_ns=f.t_ns) if k in (6, 7) else f for k, f in enumerate(clip.frames)]
+    records = run(clip, frames)
+    assert [r.status for r in records[6:8]] == [Status.LOST] * 2
+    assert "frozen" in records[6].reason
+    assert records[8].usable
+    assert records[8].t_prev_ns == clip.frames[5].t_ns
+
+
+def test_standing_still_does_not_drift(clip: Clip) -> None:
+    """Sixty noisy pictures from one place: pose and stated sigma stay where they were."""
+    still = render_clip(clip.camera, np.repeat(clip.T_world_cam[:1], 60, axis=0), noise_sigma=0.01)
+    records = run(still)
+    assert all(r.status is Status.OK for r in records[1:])
+    assert sum(r.is_reference for r in records) <= 2
+    assert np.linalg.norm(VoLog(records, still.camera).trajectory()[-1, :3, 3]) < 2e-3
+
+
+def test_a_cut_starts_anew_and_is_lost(clip: Clip) -> None:
+    """A jump to the other side of the hall fits nothing: lost once, then odometry goes on from there."""
+    far = render_clip(clip.camera, wander(4, seed=5))
+    frames = clip.frames[:6] + [replace(f, t_ns=clip.frames[6 + k].t_ns) for k, f in enumerate(far.frames)]
+    records = run(clip, frames)
+    assert records[6].status is not Status.OK
+    assert records[9].status is Status.OK
+
+
+def test_few_points_and_far_points_are_doubted(clip: Clip) -> None:
+    rng = np.random.default_rng(0)
+
+    def tracks(t_ns: int, count: int, disparity: float, spread: float) -> TrackFrame:
+        uv = clip.camera.K[:2, 2] + spread * grid[:count]
+        uv = uv + 0.1 * rng.standard_normal(uv.shape)
+        right = uv - [disparity, 0] + 0.1 * rng.standard_normal(uv.shape)
+        return TrackFrame(t_ns, np.arange(count), uv, right)
+
+    grid = rng.uniform(-100, 100, (200, 2))
+    for count, disparity, spread, word in ((12, 20.0, 1.0, "points agree"), (100, 20.0, 0.08, "small part")):
+        odometry = StereoOdometry(clip.camera)
+        odometry.step(tracks(0, count, disparity, spread))
+        record = odometry.step(tracks(10**8, count, disparity, spread))
+        assert record.status is Status.DEGRADED
+        assert word in record.reason
+    odometry = StereoOdometry(clip.camera)
+    odometry.step(tracks(0, 9, 1.2, 0.3))
+    record = odometry.step(tracks(10**8, 9, 1.2, 0.3))
+    assert record.status is not Status.OK
+
+
+def test_refuses_what_it_cannot_mean(clip: Clip) -> None:
+    odometry = StereoOdometry(clip.camera)
+    odometry.step(clip.frames[0])
+    with pytest.raises(SourceError, match="not later"):
+        odometry.step(clip.frames[0])
+    small = replace(clip.frames[1], left=clip.frames[1].left[:100])
+    with pytest.raises(SourceError, match="the camera is"):
+        odometry.step(small)
+    for wrong in ({"preset": "best"}, {"nonsense": 1}, {"methods": ("magic",)}, {"sigma_px": -1.0}):
+        with pytest.raises(GpvoError):
+            make_config(**wrong)  # type: ignore[arg-type]
+
+
+def test_sigmas_follow_the_residuals(clip: Clip) -> None:
+    """With sigma_p and sigma_m left open, the stated covariance follows the pictures' noise."""
+    noisy = render_clip(clip.camera, clip.T_world_cam, noise_sigma=0.05)
+    sizes = []
+    for source in (clip, noisy):
+        odometry = StereoOdometry(clip.camera, make_config(sigma_p_px=None, sigma_m_px=None))
+        records = [odometry.step(f) for f in source.frames]
+        sizes.append(np.trace(records[-1].covariances["pointing_matching"]))
+    assert sizes[1] > 2 * sizes[0]
