@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from gpvo.errors import SourceError
 from gpvo.sim import paths
 

@@ -1,7 +1,6 @@
 """Scenarios: all load, mistakes are named with their cure."""
 
 import pytest
-
 from gpvo.errors import GpvoError
 from gpvo.sim import scenario as sc
 from gpvo.sim.points import SCENARIOS, simulate_points

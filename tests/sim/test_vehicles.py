@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.sim import paths, vehicles

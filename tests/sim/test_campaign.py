@@ -1,0 +1,70 @@
+"""Campaigns and the command."""
+
+import json
+
+import pytest
+from gpvo.cli import simulate as command
+from gpvo.errors import GpvoError
+from gpvo.sim import campaign
+from gpvo.sim.scenario import load_scenario
+from typer.testing import CliRunner
+
+
+def test_points_campaign_is_the_same_on_two_jobs(tmp_path):
+    scenario = load_scenario("tunnel-clean", {"duration_s": 5.0})
+    one = campaign.fly_campaign(scenario, [0, 2], tmp_path / "one", points=True)
+    two = campaign.fly_campaign(scenario, [0, 2], tmp_path / "two", points=True, jobs=2)
+    assert [f.seed for f in one] == [0, 2]
+    assert not any(f.error for f in one + two)
+    for a, b in zip(one, two):
+        assert a.path.read_bytes() == b.path.read_bytes()
+
+
+def test_one_failure_does_not_stop_the_others(tmp_path, monkeypatch):
+    def flaky(scenario, seed, out):
+        if seed == 1:
+            raise GpvoError("the quadrotor crashes")
+        return campaign.Flight(seed, out, 10)
+
+    monkeypatch.setattr(campaign, "fly_points", flaky)
+    flights = campaign.fly_campaign(load_scenario("tunnel"), [0, 1, 2], tmp_path, points=True)
+    assert [bool(f.error) for f in flights] == [False, True, False]
+
+
+def test_unknown_backend(tmp_path):
+    with pytest.raises(GpvoError, match="joblib or dask"):
+        campaign.fly_campaign(load_scenario("tunnel"), [0], tmp_path, backend="slurm")
+
+
+@pytest.mark.parametrize("text, seeds", [("0..3", [0, 1, 2, 3]), ("1,4,7", [1, 4, 7]), ("5", [5]), ("1..2,2", [1, 2])])
+def test_seeds(text, seeds):
+    assert command._seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "a", "3..1", "-1", "0..999999999"])
+def test_seeds_that_are_none(text):
+    with pytest.raises(GpvoError, match="no list of seeds"):
+        command._seeds(text)
+
+
+def test_assignments():
+    assert command._assignment("noise_sigma=0.05") == ("noise_sigma", 0.05)
+    assert command._assignment("world=room") == ("world", "room")
+    assert command._assignment("dark=[3, 5]") == ("dark", [3, 5])
+    with pytest.raises(GpvoError, match="key=value"):
+        command._assignment("noise")
+
+
+def test_command(tmp_path):
+    import typer
+
+    app = typer.Typer()
+    app.callback()(lambda: None)
+    command.register(app)
+    run = CliRunner().invoke
+    listed = run(app, ["simulate", "--list"])
+    assert "lunar-straight" in listed.output
+    out = tmp_path / "a.npz"
+    made = run(app, ["simulate", "room-t265", "--points", "-o", str(out), "--duration", "5", "--json"])
+    assert json.loads(made.output)["flights"][0]["frames"] == 101
+    assert out.is_file()
