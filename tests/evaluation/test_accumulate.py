@@ -14,11 +14,11 @@ PATH = curved_path(N, step_m=0.1)
 CHAIN = np.arange(N) - 1
 
 
-def _steps(jitter: float, white: float, bias: float, growth: float = 0.0) -> list[Step]:
+def _steps(jitter: float, white: float, bias: float, growth: float = 0.0, path: np.ndarray = PATH) -> list[Step]:
     """Shares of the covariance, which grows linearly along the path by ``growth`` in all."""
     tau = np.full(6, TAU_S)
     sizes = 1 + growth * np.arange(N) / N
-    return [Step(T, s * jitter * C, s * white * C, s * bias * C, tau, DT_S) for T, s in zip(PATH, sizes, strict=True)]
+    return [Step(T, s * jitter * C, s * white * C, s * bias * C, tau, DT_S) for T, s in zip(path, sizes, strict=True)]
 
 
 def _drawn(steps: list[Step], seed: int = 0) -> np.ndarray:
@@ -32,7 +32,8 @@ def _drawn(steps: list[Step], seed: int = 0) -> np.ndarray:
 
     phi = np.exp(-DT_S / TAU_S)
     unit = rng.standard_normal((DRAWS, 6))
-    last = draw(0.5 * steps[1].jitter)
+    # A frame's jitter is as if its own pose were off, so it is carried over the motion that it begins.
+    last = draw(0.5 * steps[1].jitter) @ se3.adjoint(steps[1].T_prev_cur).T
     T_true, T_est = np.eye(4), np.broadcast_to(np.eye(4), (DRAWS, 4, 4))
     for step in steps[1:]:
         unit = phi * unit + np.sqrt(1 - phi**2) * rng.standard_normal((DRAWS, 6))
@@ -40,7 +41,7 @@ def _drawn(steps: list[Step], seed: int = 0) -> np.ndarray:
         bias = unit @ ((vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T)
         now = draw(0.5 * step.jitter)
         T_true = T_true @ step.T_prev_cur
-        T_est = T_est @ step.T_prev_cur @ se3.exp(draw(step.white) + bias + now - last)
+        T_est = T_est @ se3.exp(-last) @ step.T_prev_cur @ se3.exp(draw(step.white) + bias + now)
         last = now
     return se3.log(se3.inverse(T_true) @ T_est)
 
@@ -58,6 +59,14 @@ def test_final_covariance_is_that_of_drawn_trajectories(parts):
     np.testing.assert_allclose(np.diagonal(predicted) / np.diagonal(sample), 1.0, atol=0.1)
     sigma = np.sqrt(np.diagonal(predicted))
     np.testing.assert_allclose(sample / np.outer(sigma, sigma), predicted / np.outer(sigma, sigma), atol=0.1)
+
+
+@pytest.mark.parametrize("parts", [(1, 0, 0), (0.5, 0.3, 0.2)], ids=str)
+def test_long_steps_turn_jitter_into_position_only_as_far_as_it_does(parts):
+    """Two metres a frame: the lever makes a frame's jitter of rotation as large as that of translation."""
+    steps = _steps(*parts, path=curved_path(N, step_m=2.0))
+    predicted, sample = along(steps, CHAIN)[-1], np.cov(_drawn(steps).T)
+    np.testing.assert_allclose(np.diagonal(predicted) / np.diagonal(sample), 1.0, atol=0.1)
 
 
 def test_independent_motions_are_plain_compounding():

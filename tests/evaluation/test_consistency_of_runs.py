@@ -43,14 +43,14 @@ def test_an_honest_covariance_scores_one(honest):
 
 
 def test_an_honest_covariance_is_honest_over_every_horizon(honest):
-    found = {h.time_s or h.length_m: h for h in honest["triangulation"].horizons}
-    assert [(h.time_s, h.length_m) for h in honest["triangulation"].horizons] == [
-        (1.0, None), (None, 1.0), (None, 10.0), (None, 100.0),
-    ]  # fmt: skip
-    for span in (1.0, 10.0):
+    c = honest["triangulation"]
+    assert c.one_second.span == 1.0
+    assert [h.span for h in c.horizons] == [1.0, 10.0, 100.0]
+    for h in (c.one_second, c.horizons[1]):
         # Thirty to sixty windows that overlap by half: the mean of NEES/6 scatters by about 0.13.
-        assert 25 < found[span].count <= 61
-        assert 0.65 < found[span].nees_dof < 1.4
+        assert 25 < h.count <= 61
+        assert 0.65 < h.nees_dof < 1.4
+        assert h.nees_dof_truth_noise == pytest.approx(h.nees_dof)
 
 
 def test_nll_and_crps_of_an_honest_covariance(honest):
@@ -71,6 +71,7 @@ def test_translation_only_speaks_of_translation_alone(honest):
     assert c.nees_dof["joint"] is None
     assert c.nll_per_dim is None
     assert c.crps_rotation_rad is None
+    assert c.one_second is None
     assert c.horizons == ()
     assert c.predicted_final_error_m is None
 
@@ -130,7 +131,7 @@ def test_noise_of_the_truth_is_taken_into_account():
     assert c.nees_dof["joint"].mean > 2
     for block in ("translation", "rotation", "joint"):
         assert 0.9 < c.nees_dof_truth_noise[block] < 1.1
-    assert 0.6 < c.horizons[0].nees_dof < 1.5
+    assert 0.6 < c.one_second.nees_dof_truth_noise < 1.5
 
 
 def test_covariances_that_are_none_say_nothing():

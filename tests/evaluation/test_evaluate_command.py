@@ -65,6 +65,10 @@ def test_json_has_every_name_of_the_interface(capsys, run_folder):
     assert set(run) >= RUN_KEYS
     assert (run["run"], run["source"], run["frames"], run["lost"]) == ("hall", "made", 301, 1)
     assert set(run["segments"][0]) == {"length_m", "translation_percent", "rotation_deg_per_m", "count"}
+    # 15 m of path: longer segments have no figure.
+    assert [(s["length_m"], s["translation_percent"]) for s in run["segments"][1:]] == [
+        (20.0, None), (50.0, None), (100.0, None),
+    ]  # fmt: skip
     assert set(run["methods"]) >= set(METHODS)
     for method in run["methods"].values():
         assert set(method) >= METHOD_KEYS
@@ -74,7 +78,7 @@ def test_json_has_every_name_of_the_interface(capsys, run_folder):
     absent, partial = run["methods"]["gp_thesis"], run["methods"]["triangulation_vt"]
     assert absent["nees_dof"] == {"translation": None, "rotation": None, "joint": None}
     assert absent["nll_per_dim"] is None
-    assert absent["horizons"] == []
+    assert [(h["length_m"], h["nees_dof"]) for h in absent["horizons"]] == [(1.0, None), (10.0, None), (100.0, None)]
     assert partial["nees_dof"]["translation"] == pytest.approx(1.0, abs=0.15)
     assert partial["nees_dof"]["joint"] is None
     for method in ("triangulation", "learned"):

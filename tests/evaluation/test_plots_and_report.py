@@ -116,7 +116,9 @@ def test_the_table_shows_the_numbers_of_json(evaluation, page):
     expected += [m["nll_per_dim"], 1000 * m["crps"]["translation_m"], m["predicted_final_error_m"]]
     assert rows["triangulation"][1:] == [shown(v) for v in expected]
     assert rows["triangulation_vt"][1] == "–"
-    for s in run["segments"]:
+    reached = [s for s in run["segments"] if s["count"]]
+    assert [s["length_m"] for s in reached] == [10.0]
+    for s in reached:
         row = rows[f"{shown(s['length_m'])} m"]
         assert row[1:] == [shown(s["translation_percent"]), shown(s["rotation_deg_per_m"]), str(s["count"])]
     assert f"ATE {shown(run['ate_rmse_m'])} m" in page

@@ -78,7 +78,9 @@ def test_kitti_segments_by_hand():
     # 0-10 misses nothing, 10-20 misses 0.5 m of 10, 20-30 misses nothing.
     assert found.count == 3
     assert found.translation_percent == pytest.approx(5.0 / 3)
-    assert segments(estimate, T, (100.0,)) == ()
+    (longer,) = segments(estimate, T, (100.0,))
+    assert longer.count == 0
+    assert np.isnan(longer.translation_percent)
 
 
 def test_long_paths_have_kittis_lengths_and_given_ones_win():
