@@ -135,7 +135,7 @@ def _print(e: Evaluation) -> None:
         f"{d['run']}: {d['frames']} frames, {d['lost']} lost, {d['path_length_m']:.1f} m; ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )
-    for s in d["segments"]:
+    for s in (s for s in d["segments"] if s["count"]):
         console.print(
             f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"
             f" ({s['count']})"

@@ -1,8 +1,10 @@
 """How the error of single motions adds up along a path.
 
 Two-frame VO shares each frame's pixel noise between two motions, with opposite signs; calibration and depth bias
-persist. So a motion's error is ``xi_k = w_k + b_k + n_k - n_(k-1)`` with white w, first-order Gauss-Markov b and the
-frame's own jitter n, and the error of the pose ``e_k = Ad(T_k)^-1 e_(k-1) + xi_k`` is carried with all three.
+persist. So a motion's error is ``xi_k = w_k + b_k + n_k - Ad(T_k)^-1 n_(k-1)`` with white w, first-order Gauss-Markov
+b and the frame's own jitter n, as if that frame's pose were off by n; and the error of the pose
+``e_k = Ad(T_k)^-1 e_(k-1) + xi_k`` is carried with all three. The jitter then never adds up: of it the pose holds only
+the last frame's and, from afar, the first one's.
 """
 
 from __future__ import annotations
@@ -66,16 +68,18 @@ class PoseError:
     def add(self, step: Step) -> Array:
         """Append a motion; the pose's covariance after it."""
         J = 0.5 * step.jitter
+        moved = se3.adjoint(se3.inverse(step.T_prev_cur))
         if not self._begun:
-            # The first frame's own jitter enters with the first motion; the bias starts in its steady state.
-            self._P[6:12, 6:12] = J
+            # The first frame's jitter is the other half of the first motion's; the bias starts in its steady state.
+            back = se3.adjoint(step.T_prev_cur)
+            self._P[6:12, 6:12] = back @ J @ back.T
             self._P[12:, 12:] = np.eye(6)
             self._begun = True
         phi = np.exp(-step.dt_s / np.maximum(step.bias_tau_s, 1e-6))
         L = _root(step.bias)
         A = np.zeros((18, 18))
-        A[:6, :6] = se3.adjoint(se3.inverse(step.T_prev_cur))
-        A[:6, 6:12] = -np.eye(6)
+        A[:6, :6] = moved
+        A[:6, 6:12] = -moved
         A[:6, 12:] = L * phi
         A[12:, 12:] = np.diag(phi)
         P = A @ self._P @ A.T

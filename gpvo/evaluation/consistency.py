@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.errors import MotionErrors
-from gpvo.evaluation.accumulate import PoseError, Step, along
+from gpvo.evaluation.accumulate import PoseError, Step
 from gpvo.evaluation.statements import Statement
 from gpvo.evaluation.trajectory import path_length_m
 from gpvo.geometry import se3
@@ -26,12 +26,15 @@ _HAIR = 1 - 1e-9
 
 @dataclass(frozen=True)
 class Horizon:
-    """NEES per degree of freedom of the motion over a length of path, or over a time, from ``count`` windows."""
+    """Joint NEES per degree of freedom of the motion over a stretch, from ``count`` windows; NaN where none fits.
 
+    ``span``: metres of path, or seconds. ``nees_dof_truth_noise``: with the truth's own noise added to what is stated.
+    """
+
+    span: float
     nees_dof: float
+    nees_dof_truth_noise: float
     count: int
-    length_m: float | None = None
-    time_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Consistency:
 
     ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise``: the same with the
     truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the axes.
+    ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames.
     """
 
     method: str
@@ -53,6 +57,7 @@ class Consistency:
     crps_rotation_rad: float | None
     predicted_final_error_m: float | None
     predicted_final_error_independent_m: float | None
+    one_second: Horizon | None
     horizons: tuple[Horizon, ...]
 
 
@@ -86,7 +91,8 @@ def consistency(
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     crps = crps_gaussian(e, sigma)
     covered = [float(c) for c in coverage(e, sigma)]
-    final, independent = _final_errors(statement, log)
+    final, independent = _final_errors(statement, log, known)
+    progress = path_length_m(T_true), (log.t_ns - log.t_ns[0]) * 1e-9
     return Consistency(
         method=statement.method,
         count=int(stated.sum()),
@@ -99,47 +105,55 @@ def consistency(
         crps_rotation_rad=float(crps[:, 3:].mean()) if d == 6 else None,
         predicted_final_error_m=final,
         predicted_final_error_independent_m=independent,
-        horizons=horizons(statement, log, T_true, known, noise_sigma) if d == 6 else (),
+        one_second=horizon(statement, log, T_true, known, progress[1], 1.0, noise_sigma) if d == 6 else None,
+        horizons=tuple(
+            horizon(statement, log, T_true, known, progress[0], m, noise_sigma) for m in HORIZONS_M if d == 6
+        ),
     )
 
 
-def _final_errors(statement: Statement, log: VoLog) -> tuple[float | None, float | None]:
-    """Stated standard deviation of the last position [m]: with the parts, and taking motions as independent."""
+def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) -> tuple[float | None, float | None]:
+    """Stated standard deviation of the last position with truth [m], as seen from the first pose with truth.
+
+    With the parts, and taking motions as independent.
+    """
     if statement.steps is None:
         return None, None
-    independent = [Step.independent(s.T_prev_cur, s.jitter + s.white + s.bias) for s in statement.steps]
-    ends = [along(steps, log.parent)[-1] for steps in (statement.steps, independent)]
-    a, b = (float(np.sqrt(np.trace(C[:3, :3]))) for C in ends)
+    covered = np.flatnonzero(known)
+    chain = _ancestors(int(covered[-1]), int(covered[0]), log.parent)
+    parts = [statement.steps[k] for k in chain]
+    independent = [Step.independent(s.T_prev_cur, s.jitter + s.white + s.bias) for s in parts]
+    a, b = (float(np.sqrt(np.trace(_sum_of(steps)[:3, :3]))) for steps in (parts, independent))
     return a, b
 
 
-def horizons(
-    statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], noise_sigma: tuple[float, float]
-) -> tuple[Horizon, ...]:
-    """NEES over one second and over each length of path, of windows without lost frames, the truth's noise added."""
-    assert statement.steps is not None
-    out = []
-    for progress, span, name in _spans(log, T_true):
-        values = _window_nees(statement, log, T_true, known, progress, span, noise_sigma)
-        mean = float(np.mean(values)) if values else float("nan")
-        out.append(Horizon(mean, len(values), **{name: span}))
-    return tuple(out)
+def _ancestors(frame: int, root: int, parent: NDArray[np.int64]) -> list[int]:
+    """The motions that lead to ``frame``, in order, from ``root`` or the first frame after it on the way."""
+    chain = []
+    while frame > root and parent[frame] >= root:
+        chain.append(frame)
+        frame = int(parent[frame])
+    return chain[::-1]
 
 
-def _spans(log: VoLog, T_true: Array) -> list[tuple[Array, float, str]]:
-    arc = path_length_m(T_true)
-    time = (log.t_ns - log.t_ns[0]) * 1e-9
-    return [(time, 1.0, "time_s"), *((arc, length, "length_m") for length in HORIZONS_M)]
+def _sum_of(steps: Sequence[Step]) -> Array:
+    """(6, 6) covariance after a chain of motions."""
+    error = PoseError()
+    for step in steps:
+        error.add(step)
+    return error.covariance
 
 
-def _window_nees(
+def horizon(
     statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
     noise_sigma: tuple[float, float],
-) -> list[float]:  # fmt: skip
-    """Joint NEES/dof of windows that begin where the one before has at least half passed, at most sixty of them."""
+) -> Horizon:  # fmt: skip
+    """NEES over windows of ``span`` of a growing ``progress`` (N,), at most sixty, without lost frames.
+
+    Each begins where the one before has at least half passed.
+    """
     assert statement.steps is not None
-    total = float(progress[-1] - progress[0])
-    stride = max(0.5 * span, total / _MAX_WINDOWS)
+    stride = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS)
     values, t_next = [], float(progress[0])
     parent, usable = log.parent, log.usable
     # Nothing is long enough behind the last of these; without the cut a short run costs the square of its frames.
@@ -150,15 +164,15 @@ def _window_nees(
         if not window or not known[window[-1]]:
             continue
         t_next = float(progress[start]) + stride
-        error, T_est = PoseError(), np.eye(4)
-        for k in window:
-            # The mean is taken off each motion, as a filter would.
-            T_est = T_est @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
-            C = error.add(statement.steps[k])
         T = se3.inverse(T_true[start]) @ T_true[window[-1]]
-        e = se3.log(se3.inverse(T) @ T_est)
-        values.append(float(nees(e, C + truth_noise(T, *noise_sigma))) / 6)
-    return values
+        # The mean is taken off each motion, as a filter would.
+        T_est = np.eye(4)
+        for k in window:
+            T_est = T_est @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
+        e, C = se3.log(se3.inverse(T) @ T_est), _sum_of([statement.steps[k] for k in window])
+        values.append([float(nees(e, S)) / 6 for S in (C, C + truth_noise(T, *noise_sigma))])
+    plain, noisy = np.mean(values, axis=0).tolist() if values else (float("nan"), float("nan"))
+    return Horizon(span, plain, noisy, len(values))
 
 
 def _window(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,13 +14,13 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import align_rotation
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
-from gpvo.errors import GpvoError, SourceError
-from gpvo.evaluation.consistency import Consistency, consistency
+from gpvo.errors import GpvoError, ModelError, SourceError
+from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
-from gpvo.types import Array, Prediction, Status, TruthLog
+from gpvo.types import Array, Prediction, Status, TruthLog, VoLog
 
 METHODS = (
     "constant",
@@ -67,15 +68,19 @@ class Evaluation:
 
 def evaluate_run(run: Run, predictor: Predictor | None = None, options: EvaluateOptions | None = None) -> Evaluation:
     """Evaluate a run against its truth; with a predictor, predictions are made as in flight, else those of the run
-    are used.
+    are used. A motion that either says is lost counts as lost for every method.
 
     Raises
     ------
     SourceError
         If the run has no truth, or none at the times of its frames.
+    ModelError
+        If the model predicts something else than the error of a motion.
     """
     options = options or EvaluateOptions()
     truth, offset_s = _truth(run, options)
+    predictions = predictions_by_stamp(run, predictor)
+    run = replace(run, log=judged(run.log, predictions))
     log = run.log
     T_true, known = interpolate_truth(truth, log.t_ns)
     if known.sum() < 3:
@@ -87,7 +92,7 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
     sigma = options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad)
     errors = motion_errors(log, truth)
     T_est = log.trajectory()
-    made = statements(log, predictions_by_stamp(run, predictor), predictor)
+    made = statements(log, predictions, predictor)
     found = {s.method: consistency(s, errors, log, T_true, known, sigma) for s in made}
     first = int(np.flatnonzero(known)[0])
     lift = T_true[first] @ np.linalg.inv(T_est[first])
@@ -109,8 +114,22 @@ def predictions_by_stamp(run: Run, predictor: Predictor | None) -> dict[int, Pre
     """Predictions of a model over the run's log, or those stored with the run."""
     if predictor is None:
         return {p.t_ns: p for p in run.predictions}
+    if predictor.target != "frame":
+        raise ModelError(
+            f"this model predicts the error over {predictor.target}, not that of each motion",
+            cure="train with --target frame; gpvo train itself scores the others",
+        )
     predictor.reset(run.log.camera)
     return {p.t_ns: p for p in map(predictor.step, run.log) if p is not None}
+
+
+def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
+    """The log as a flight with the model would write it: each status the worse of odometry's and the model's."""
+    records = []
+    for r in log:
+        p = predictions.get(r.t_ns)
+        records.append(r if p is None or r.status is Status.START else r.with_status(p.status, "prediction"))
+    return VoLog(records, log.camera)
 
 
 def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
@@ -165,6 +184,12 @@ def _plain(value: Any) -> dict[str, Any]:
     return {name: getattr(value, name) for name in value.__dataclass_fields__}
 
 
+def _horizon(h: Horizon | None) -> dict[str, Any]:
+    if h is None:
+        return {"nees_dof": None, "nees_dof_truth_noise": None, "count": 0}
+    return {"nees_dof": h.nees_dof, "nees_dof_truth_noise": h.nees_dof_truth_noise, "count": h.count}
+
+
 def _method_document(c: Consistency | None) -> dict[str, Any]:
     blocks = ("translation", "rotation", "joint")
     if c is None:
@@ -173,7 +198,8 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
             "nees_dof": none, "nees_dof_interval": none, "nees_dof_median": none, "nees_dof_truth_noise": none,
             "coverage": dict.fromkeys("123"), "nll_per_dim": None,
             "crps": {"translation_m": None, "rotation_rad": None}, "predicted_final_error_m": None,
-            "predicted_final_error_independent_m": None, "horizons": [],
+            "predicted_final_error_independent_m": None, "one_second": _horizon(None),
+            "horizons": [{"length_m": m, **_horizon(None)} for m in HORIZONS_M],
         }  # fmt: skip
     intervals = c.nees_dof
     return {
@@ -186,5 +212,6 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
         "crps": {"translation_m": c.crps_translation_m, "rotation_rad": c.crps_rotation_rad},
         "predicted_final_error_m": c.predicted_final_error_m,
         "predicted_final_error_independent_m": c.predicted_final_error_independent_m,
-        "horizons": [_plain(h) for h in c.horizons],
+        "one_second": _horizon(c.one_second),
+        "horizons": [{"length_m": m, **_horizon(h)} for m, h in itertools.zip_longest(HORIZONS_M, c.horizons)],
     }

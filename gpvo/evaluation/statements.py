@@ -49,8 +49,7 @@ def statements(
         out.append(_plain(log, method, covariance))
         scale = arrays.get(f"method.{method}.scale")
         if scale is not None:
-            root = np.sqrt(scale)
-            out.append(_plain(log, f"{method}_scaled", covariance * np.outer(root, root)))
+            out.append(_plain(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
         out.append(_translation_only(log, method))
     if predictions:
         out.append(_learned(log, predictions))
@@ -61,6 +60,11 @@ def _where_stated(covariance: Array) -> Array:
     """NaN in place of what is no covariance: zeros, say, with which other software marks what it does not know."""
     stated = np.array([is_positive_definite(C) for C in covariance], dtype=bool)
     return np.where(stated[:, None, None], covariance, np.nan)
+
+
+def _scaled(log: VoLog, covariance: Array, root: Array) -> Array:
+    """The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands."""
+    return np.where(log.usable[:, None, None], covariance * np.outer(root, root), covariance)
 
 
 def _plain(log: VoLog, method: str, covariance: Array) -> Statement:
@@ -87,7 +91,9 @@ def _learned(log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
     last = Step.independent(np.eye(4), np.eye(6) * 1e-6)
     for k, record in enumerate(log):
         prediction = predictions.get(record.t_ns)
-        if prediction is not None and record.status is not Status.START:
+        # A prediction over a window of motions is not one of this motion.
+        fits = prediction is not None and abs(prediction.dt_s - record.dt_s) < 1e-6
+        if prediction is not None and fits and record.status is not Status.START:
             mean[k], covariance[k] = prediction.mean, prediction.covariance
             last = Step.predicted(record.T_prev_cur, prediction)
         steps.append(

@@ -60,7 +60,7 @@ class RelativeError:
 
 @dataclass(frozen=True)
 class Segment:
-    """Mean error of all segments of one length, as a share of it."""
+    """Mean error of all segments of one length, as a share of it; NaN where there is none."""
 
     length_m: float
     translation_percent: float
@@ -114,13 +114,14 @@ def pairs_ahead(progress: Array, step: float, every: int = 1) -> tuple[NDArray[n
 
 
 def segments(T_est: Array, T_true: Array, lengths_m: Sequence[float], every: int = 10) -> tuple[Segment, ...]:
-    """KITTI's segment errors for given lengths of the true path, a start at every tenth frame."""
+    """KITTI's segment errors for given lengths of the true path, a start at every tenth frame.
+
+    NaN, and a count of 0, for a length that the path does not reach.
+    """
     arc = path_length_m(T_true)
     out = []
     for length in lengths_m:
         start, end = pairs_ahead(arc, length, every)
-        if len(start) == 0:
-            continue
         error = rpe(T_est, T_true, start, end)
         out.append(
             Segment(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,3 +143,23 @@ def test_covariances_that_are_none_say_nothing():
     C = stated_covariance()
     half = [replace(r, covariances={"imported": 0 * C if k % 2 else C}, v_t={}) for k, r in enumerate(log)]
     assert _scores(VoLog(half), truth)["imported"].count == 25
+
+
+def test_the_scale_of_pixel_noise_leaves_lost_motions_alone():
+    log, _ = make_run(5, lost={3})
+    log = VoLog([replace(r, covariances={"triangulation": np.eye(6)}) for r in log])
+    predictor = SimpleNamespace(arrays={"method.triangulation.scale": np.full(6, 100.0)})
+    said = {s.method: s.covariance for s in statements(log, None, predictor)}["triangulation_scaled"]
+    assert said[2, 0, 0] == pytest.approx(100.0)
+    assert said[3, 0, 0] == 1.0
+
+
+def test_final_error_is_stated_between_the_first_and_the_last_frame_with_truth():
+    log, truth = make_run(100)
+    whole = _scores(log, truth)["triangulation"].predicted_final_error_m
+    middle = slice(20, 81)
+    inner = TruthLog(truth.t_ns[middle], truth.T_world_cam[middle])
+    part = _scores(log, inner)["triangulation"].predicted_final_error_m
+    cut = VoLog([replace(log.records[20], t_prev_ns=log.records[20].t_ns, T_prev_cur=np.eye(4)), *log.records[21:81]])
+    assert part == pytest.approx(_scores(cut, inner)["triangulation"].predicted_final_error_m)
+    assert part < 0.8 * whole

@@ -95,6 +95,22 @@ def test_the_table_names_the_methods(capsys, run_folder):
         assert word in out
 
 
+def test_what_the_model_calls_lost_is_lost_for_every_method(run_folder):
+    run = read_run(run_folder)
+    plain = evaluate_run(run)
+    lost = [replace(p, status=Status.LOST) if k == 100 else p for k, p in enumerate(run.predictions)]
+    found = evaluate_run(replace(run, predictions=lost))
+    assert document([found])["runs"][0]["lost"] == 2
+    for method in ("triangulation", "learned"):
+        assert found.consistency[method].count == plain.consistency[method].count - 1
+
+
+def test_predictions_over_windows_say_nothing_of_single_motions(run_folder):
+    run = read_run(run_folder)
+    windows = [replace(p, dt_s=1.0) for p in run.predictions]
+    assert "learned" not in evaluate_run(replace(run, predictions=windows)).consistency
+
+
 def test_parts_make_another_final_error_than_independence(run_folder):
     c = evaluate_run(read_run(run_folder)).consistency["learned"]
     # The jitter does not add up, the bias does.
