@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from gpvo.types import Array
 _MARGIN_M = 0.7
 _ROVER_HEIGHT_M = 0.9
 _CHECK_HZ = 50
+_DRAWS = 40
+_SLACK_M = 0.15
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,13 @@ def gravity_mps2(scenario: Scenario) -> float:
 def plan_path(scenario: Scenario, world: World, rng: np.random.Generator) -> Path3:
     """The path that the vehicle is asked to follow."""
     duration, speed, rest = scenario.duration_s, scenario.speed_mps, scenario.rest_s
-    low, high = world.bounds[0] + _MARGIN_M, world.bounds[1] - _MARGIN_M
     if scenario.needs_trajectory and not scenario.trajectory:
         raise GpvoError(f"'{scenario.name}' flies a recorded path", cure="give --trajectory FILE (TUM lines, z up)")
     if scenario.trajectory:
         file = Path(scenario.trajectory)
         if not file.is_file():
             raise GpvoError("no such trajectory", where=file)
-        return paths.flown(file, low, high, duration, rng, rest_s=rest)
+        return _clear_of_walls(scenario, world, lambda a, b: paths.flown(file, a, b, duration, rng, rest_s=rest))
     start, ahead = world.start_pose[:3, 3], world.start_pose[:3, 0]
     if scenario.vehicle == "rover":
         if not world.heights:
@@ -64,8 +66,20 @@ def plan_path(scenario: Scenario, world: World, rng: np.random.Generator) -> Pat
     if scenario.path == "straight":
         return paths.straight(start, ahead * [1, 1, 0], duration, speed, rest_s=rest)
     if scenario.path == "wander":
-        return paths.wandering(low, high, duration, speed, rng, rest_s=rest)
+        return _clear_of_walls(scenario, world, lambda a, b: paths.wandering(a, b, duration, speed, rng, rest_s=rest))
     return paths.along_curve(world.centreline, duration, speed, rng, sway_m=scenario.sway_m, rest_s=rest)
+
+
+def _clear_of_walls(scenario: Scenario, world: World, draw: Callable[[Array, Array], Path3]) -> Path3:
+    """The first drawn path that keeps away from all surfaces; the box it is drawn in shrinks towards the start."""
+    low, high = world.bounds[0] + _MARGIN_M, world.bounds[1] - _MARGIN_M
+    home = np.clip(world.start_pose[:3, 3], low, high)
+    for size in np.linspace(1.0, 0.25, _DRAWS):
+        path = draw(home + size * (low - home), home + size * (high - home))
+        places = path.position(np.arange(0.0, scenario.duration_s, 1.0 / _CHECK_HZ))
+        if world.clearance(places).min() > vehicles.RADIUS_M[scenario.vehicle] + _SLACK_M:
+            return path
+    raise GpvoError(f"no path of {_DRAWS} drawn keeps clear of the walls", cure="another seed, or a shorter duration")
 
 
 def move(scenario: Scenario, path: Path3) -> Motion:
@@ -134,7 +148,7 @@ def plan_frames(scenario: Scenario, episodes: tuple[Episode, ...], rng: np.rando
                 fate=fate,
                 noise_sigma=float(np.hypot(base, extra)),
                 light={"darkness": 0.004, "blackout": 0.0}.get(cause, 1.0),
-                dust=0.6 if cause == "dust" else 0.0,
+                dust=0.8 if cause == "dust" else 0.0,
                 exposure_s=0.6 / scenario.rate_hz if cause == "motion_blur" else scenario.exposure_s,
             )
         )
