@@ -147,7 +147,7 @@ def plan_frames(scenario: Scenario, episodes: tuple[Episode, ...], rng: np.rando
                 step=round(t * vehicles.RATE_HZ),
                 fate=fate,
                 noise_sigma=float(np.hypot(base, extra)),
-                light={"darkness": 0.004, "blackout": 0.0}.get(cause, 1.0),
+                light={"darkness": 0.015, "blackout": 0.0}.get(cause, 1.0),
                 dust=0.8 if cause == "dust" else 0.0,
                 exposure_s=0.6 / scenario.rate_hz if cause == "motion_blur" else scenario.exposure_s,
             )
