@@ -158,8 +158,13 @@ class ErrorStateFilter:
 
     # -- measurements ---------------------------------------------------------------------------------------------
 
-    def update_motion(self, T_est: Array, noise: MotionNoise, gate: Gate | None = None) -> Innovation:
-        """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame."""
+    def update_motion(
+        self, T_est: Array, noise: MotionNoise, gate: Gate | None = None, recover: NDArray[np.bool_] | None = None
+    ) -> Innovation:
+        """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame.
+
+        ``recover`` (B,): members for which a failing measurement is inflated, whatever the gate's policy.
+        """
         gate = gate or Gate()
         if noise.jitter is not None:
             half = 0.5 * noise.jitter
@@ -174,12 +179,19 @@ class ErrorStateFilter:
         me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise.bias_root)
         r = me.residual(R_rel, t_rel, T_est, noise.mean)
         expected = H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None] + H[:, :, BIAS] @ self.bias_mean[:, :, None]
-        innovation = self.correct(H, r - expected[:, :, 0], noise.white, gate)
+        innovation = self.correct(H, r - expected[:, :, 0], noise.white, gate, recover)
         if innovation.used.any():
             self.inject()
         return innovation
 
-    def correct(self, H: Array, residual: Array, R: Array, gate: Gate | None = None) -> Innovation:
+    def correct(
+        self,
+        H: Array,
+        residual: Array,
+        R: Array,
+        gate: Gate | None = None,
+        recover: NDArray[np.bool_] | None = None,
+    ) -> Innovation:
         """Linear update of the error's mean and covariance, Joseph form; :meth:`inject` moves it into the estimate.
 
         ``H`` (B, m, 39), ``residual`` (B, m) at the estimate, ``R`` (b, m, m).
@@ -191,27 +203,28 @@ class ErrorStateFilter:
         whitened: Array = np.linalg.solve(L, np.concatenate([kernels.transpose(PHt), r[:, :, None]], axis=2))
         z = whitened[:, :, -1]
         nis = (z * z).sum(1)
-        passed = nis <= gate.threshold(H.shape[1]) if gate else np.ones(self.batch, dtype=bool)
+        limit = gate.threshold(H.shape[1]) if gate else np.inf
+        passed = nis <= limit
         used = passed
+        alpha = np.ones(self.batch)
         if gate and not passed.all():
-            if gate.on_fail == "inflate":
-                alpha = np.maximum(nis / gate.threshold(H.shape[1]), 1.0)
-                # S becomes alpha S, so the same factor divides the gain and the whitened innovation's square.
-                R = R + (alpha - 1.0)[:, None, None] * S
-                L = np.asarray(np.sqrt(alpha)[:, None, None] * L, dtype=np.float64)
-                whitened = np.asarray(whitened / np.sqrt(alpha)[:, None, None], dtype=np.float64)
-            if gate.on_fail != "discard":
-                used = np.ones_like(passed)
-        if not used.any():
-            return Innovation(r, S, nis, passed, used)
-        K = np.asarray(np.linalg.solve(kernels.transpose(L), whitened[:, :, :-1]), dtype=np.float64).transpose(0, 2, 1)
-        if not used.all():
-            K = K * used[:, None, None]
+            everyone = np.full(self.batch, gate.on_fail == "inflate")
+            inflated = everyone if recover is None else everyone | recover
+            used = passed | inflated | (gate.on_fail == "accept")
+            alpha = np.where(inflated, np.maximum(nis / limit, 1.0), 1.0)
+        if used.any():
+            whitened_H = np.asarray(whitened[:, :, :-1], dtype=np.float64)
+            K = np.asarray(np.linalg.solve(kernels.transpose(L), whitened_H), dtype=np.float64).transpose(0, 2, 1)
+            # A wider R turns S into alpha S, and the gain into a 1/alpha of itself.
+            R = R + (alpha - 1.0)[:, None, None] * S
+            self._joseph(K * (used / alpha)[:, None, None], H, R)
+            self.dx += (K @ r[:, :, None])[:, :, 0] * (used / alpha)[:, None]
+        return Innovation(r, S, nis, passed, used)
+
+    def _joseph(self, K: Array, H: Array, R: Array) -> None:
         A = _EYE - K @ H
         new = A @ self.P @ kernels.transpose(A) + K @ R @ kernels.transpose(K)
         self.P = 0.5 * (new + kernels.transpose(new))
-        self.dx += (K @ r[:, :, None])[:, :, 0]
-        return Innovation(r, S, nis, passed, used)
 
     def inject(self) -> None:
         """Move the error's mean into the estimate and carry the covariance to the new attitudes."""

@@ -45,10 +45,14 @@ class Gate:
 
     ``on_fail``: ``discard`` drops what fails; ``inflate`` widens its covariance until it just passes;
     ``accept`` uses it as it is (the gate then only counts).
+
+    A filter that discards cannot tell whether it or the measurement is wrong. So after ``recover_after_s`` without
+    one that passed, what fails is inflated instead until one passes again; 5 s is PX4's EKF2_NOAID_TOUT.
     """
 
     probability: float = THREE_SIGMA
     on_fail: Literal["discard", "inflate", "accept"] = "discard"
+    recover_after_s: float = 5.0
 
     def threshold(self, dof: int) -> float:
         """Largest NIS that passes."""

@@ -26,7 +26,7 @@ class StartSigmas:
     tilt_rad: float = 5e-4
     yaw_rad: float = 5e-4
     acc_bias_mps2: float = 0.05
-    gyro_bias_radps: float = 3e-3
+    gyro_bias_radps: float = 5e-3
     turn_rate_radps: float = 0.5  # constant-velocity model: nothing is known about the turn rate
 
 

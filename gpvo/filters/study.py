@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 # Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
-_COARSE: Array = np.power(4.0, np.arange(-4, 3))
+_COARSE: Array = np.power(4.0, np.arange(-6, 2))
 _FINE: Array = np.power(4.0, [-0.67, -0.33, 0.0, 0.33, 0.67])
 
 

@@ -46,6 +46,7 @@ class _Entry:
     filter: ErrorStateFilter
     t_ns: int
     reference_ns: int | None
+    passed_ns: NDArray[np.int64]
 
 
 class Timeline:
@@ -76,6 +77,8 @@ class Timeline:
         self._history_ns = round(history_s * 1e9)
         self._history: deque[_Entry] = deque()
         self._reference_ns: int | None = self.t_ns
+        # When each member last had a measurement that passed the gate, or none to judge.
+        self._passed_ns = np.full(filter.batch, self.t_ns, dtype=np.int64)
         self._newest_ns: int | None = None
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
@@ -133,6 +136,8 @@ class Timeline:
         if noise is not None and noise.bias_tau_s is not None:
             self.filter.decay_bias(elapsed, noise.bias_tau_s)
         step = self._measure(record, noise)
+        passed = True if step.innovation is None else step.innovation.passed
+        self._passed_ns = np.where(passed, record.t_ns, self._passed_ns)
         self.counts[step.outcome] += 1
         if record.is_reference:
             self.filter.clone(measured=step.innovation is not None)
@@ -150,14 +155,17 @@ class Timeline:
             return Step(record.t_ns, "not_finite")
         if noise is None:
             return Step(record.t_ns, "no_covariance")
-        innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate)
+        recover = record.t_ns - self._passed_ns > self.gate.recover_after_s * 1e9
+        innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate, recover)
+        self.counts["recovered"] += int((recover & ~innovation.passed).any())
         return Step(record.t_ns, "used" if innovation.passed.all() else "rejected", innovation)
 
     def _remember(self, record: VoRecord, noise: MotionNoise | None) -> None:
         if self._history_ns <= 0:
             self._drop_imu_before(self.t_ns)
             return
-        self._history.append(_Entry(record, noise, self.filter.copy(), self.t_ns, self._reference_ns))
+        state = (self.filter.copy(), self.t_ns, self._reference_ns, self._passed_ns)
+        self._history.append(_Entry(record, noise, *state))
         while self._history[0].record.t_ns < record.t_ns - self._history_ns:
             self._history.popleft()
         self._drop_imu_before(self._history[0].t_ns)
@@ -168,7 +176,8 @@ class Timeline:
         if not later or later[0].t_ns > t_ns:
             return None
         first = later[0]
-        self.filter, self.t_ns, self._reference_ns = first.filter, first.t_ns, first.reference_ns
+        self.filter, self.t_ns = first.filter, first.t_ns
+        self._reference_ns, self._passed_ns = first.reference_ns, first.passed_ns
         for entry in later:
             self._history.remove(entry)
         return later

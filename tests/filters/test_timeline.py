@@ -173,6 +173,23 @@ def test_gate(flight: Flight, on_fail: str) -> None:
     np.linalg.cholesky(timeline.filter.covariance)
 
 
+def test_a_filter_that_is_wrong_recovers(flight: Flight) -> None:
+    """A wrong velocity shuts good measurements out; after five seconds of that they are let in again."""
+    long = synthetic_flight(9, duration_s=20)
+    timeline = _timeline(long)
+    _feed_imu(timeline, long)
+    _feed(timeline, long, list(range(60)))
+    timeline.filter.x.velocity = timeline.filter.x.velocity + 3.0
+    _feed(timeline, long, list(range(60, 155)))
+    assert timeline.counts["rejected"] == 95
+    assert timeline.counts["recovered"] == 0
+    _feed(timeline, long, list(range(155, 400)))
+    assert 0 < timeline.counts["recovered"] < 200
+    speed = np.linalg.norm(np.diff(long.T_world_imu[-2:, :3, 3], axis=0)) * 20
+    assert abs(np.linalg.norm(timeline.filter.x.velocity) - speed) < 0.2
+    np.linalg.cholesky(timeline.filter.covariance)
+
+
 def test_standing_still_against_one_reference_does_not_grow(flight: Flight) -> None:
     """Frames that do not become the reference tie the state to the old one: no drift while at rest."""
     n = 2000
