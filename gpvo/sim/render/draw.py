@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +27,7 @@ class Drawer:
         self._scene, self._table, self._far = scene, table, float(far_m)
         H, W, groups = table.height, table.width, table.rays.shape[1]
         edges = np.linspace(0, H, bands + 1).astype(int)
-        self.bands = list(zip(edges[:-1], edges[1:], strict=True))
+        self.bands = list(pairwise(edges.tolist()))
         self._frame = np.zeros((H, groups, 5, LANES), np.float32)
         self._radiance, self._depth = (np.zeros((H, groups * LANES), np.float32) for _ in range(2))
         self.radiance, self.depth = self._radiance[:, :W], self._depth[:, :W]

@@ -134,7 +134,9 @@ def tap_group(typingctx, scratch, texels, number, next_level):  # type: ignore[n
             whole = size.truncated()
             start = start + whole * whole
             size = size * 0.5
-        value = _bilinear(builder, texture, start, size, get(S_U) + along * get(S_TAP_U), get(S_V) + along * get(S_TAP_V))
+        value = _bilinear(
+            builder, texture, start, size, get(S_U) + along * get(S_TAP_U), get(S_V) + along * get(S_TAP_V)
+        )
         weight = step * blend if coarse else step * (blend * -1.0 + 1.0)
         weight = weight.choose(along.compare("<", 0.5), 0.0)
         store(builder, get(S_SUM) + value * weight, memory, zero, S_SUM * LANES)

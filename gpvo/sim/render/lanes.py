@@ -1,7 +1,7 @@
 """Eight floats or integers at once, for numba: vector instructions spelled out.
 
-Loops over eight pixels are not vectorised reliably, so the innermost operations are written in LLVM's own portable vector
-instructions; a processor without wide registers runs them in pieces. ``Lanes`` makes them read as formulas.
+Loops over eight pixels are not vectorised reliably, so the innermost operations are written in LLVM's own portable
+vector instructions; a processor without wide registers runs them in pieces. ``Lanes`` makes them read as formulas.
 """
 
 from __future__ import annotations

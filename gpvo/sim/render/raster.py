@@ -166,8 +166,9 @@ def _cover(pixels, groups, rows, t, x0, x1, y0, y1):
 def visibility(
     order, distance, scene, R, P, plane, reach, bend, width, frame, y_first, y_last, camera, pixel, rows, corner
 ):  # fmt: skip
-    """Fill the visibility buffer of rows ``y_first`` to ``y_last`` (exclusive). Returns one more than the number of triangles
-    kept: they count from 1, and 0 is the blank that empty pixels see.
+    """Fill the visibility buffer of rows ``y_first`` to ``y_last`` (exclusive).
+
+    Returns one more than the number of triangles kept: they count from 1, and 0 is the blank that empty pixels see.
 
     ``corner`` (T, 4): indices of each kept triangle's three vertices and its material.
     """
@@ -186,10 +187,10 @@ def visibility(
             left, right = min(left, pixel[0, k]), max(right, pixel[0, k])
             top, bottom = min(top, pixel[1, k]), max(bottom, pixel[1, k])
         grow = f4(0.6) + bend * ((right - left) * (right - left) + (bottom - top) * (bottom - top))
-        x0 = max(int(math.ceil(left - grow)), 0)
-        x1 = min(int(math.floor(right + grow)), width - 1)
-        y0 = max(int(math.ceil(top - grow)), y_first)
-        y1 = min(int(math.floor(bottom + grow)), y_last - 1)
+        x0 = max(math.ceil(left - grow), 0)
+        x1 = min(math.floor(right + grow), width - 1)
+        y0 = max(math.ceil(top - grow), y_first)
+        y1 = min(math.floor(bottom + grow), y_last - 1)
         if x1 < x0 or y1 < y0:
             continue
         near = distance[q]
@@ -202,10 +203,10 @@ def visibility(
             top = min(min(pixel[1, i], pixel[1, j]), pixel[1, k])
             bottom = max(max(pixel[1, i], pixel[1, j]), pixel[1, k])
             grow = f4(0.03) + bend * ((right - left) * (right - left) + (bottom - top) * (bottom - top))
-            x0 = max(int(math.ceil(left - grow)), 0)
-            x1 = min(int(math.floor(right + grow)), width - 1)
-            y0 = max(int(math.ceil(top - grow)), y_first)
-            y1 = min(int(math.floor(bottom + grow)), y_last - 1)
+            x0 = max(math.ceil(left - grow), 0)
+            x1 = min(math.floor(right + grow), width - 1)
+            y0 = max(math.ceil(top - grow), y_first)
+            y1 = min(math.floor(bottom + grow), y_last - 1)
             if x1 < x0 or y1 < y0 or not _solve(camera, i, j, k, rows, kept):
                 continue
             _cover(pixels, groups, rows, kept, x0, x1, y0, y1)

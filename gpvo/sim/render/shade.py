@@ -8,9 +8,7 @@ import numpy as np
 from numba import njit
 
 from gpvo.sim.render.groups import (
-    COLUMNS,
     LIGHT,
-    SCRATCH,
     SIZE,
     START,
     TAP_U,
@@ -28,6 +26,8 @@ from gpvo.sim.render.lanes import LANES
 from gpvo.sim.render.raster import INVERSE, OPTIONS, OWNER, RX, RY, RZ
 
 f4 = np.float32
+
+
 @njit(**OPTIONS)
 def _vertex_light(v, vertices, P, axis, lights):
     """Radiance factor of a vertex: ambient and baked light, and a lamp at the camera that shines forward."""
@@ -158,7 +158,11 @@ def shade(
     ``lights``: ambient, factor on baked light, head lamp. ``table`` (T, 16) float32, ``integers`` the same memory as
     int32; a row whose TAPS are 0 is not filled yet.
     """
-    pixels, out_radiance, out_depth = frame.reshape(frame.size), radiance.reshape(radiance.size), depth.reshape(depth.size)
+    pixels, out_radiance, out_depth = (
+        frame.reshape(frame.size),
+        radiance.reshape(radiance.size),
+        depth.reshape(depth.size),
+    )
     tables = table.reshape(table.size)
     groups = frame.shape[1]
     for y in range(y_first, y_last):

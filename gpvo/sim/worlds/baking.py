@@ -41,6 +41,12 @@ class Baker:
         rays = np.ascontiguousarray(directions, dtype=np.float32)
         return np.asarray(self._scene.run(origins, rays, query="DISTANCE"), dtype=np.float64)
 
+    def reaches(self, origins: Array, direction: Array) -> NDArray[np.bool_]:
+        """Whether light from a unit direction (3,) far away reaches points (N, 3)."""
+        rays = np.broadcast_to(direction.astype(np.float32), (len(origins), 3))
+        points = np.ascontiguousarray(origins, dtype=np.float32)
+        return np.asarray(self._scene.run(points, np.ascontiguousarray(rays), query="DISTANCE")) > 1e6
+
     def lamps(self, positions: Array, powers: Array, reach_m: float, size_m: float = 0.8) -> Array:
         """Irradiance (V,) of lamps at (L, 3); ``size_m`` softens the peak beside a lamp."""
         out = np.zeros(len(self._origins))

@@ -8,6 +8,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import cache
 from pathlib import Path
@@ -34,10 +35,8 @@ def cached(kind: str, seed: int, params: Mapping[str, object], build: Callable[[
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         pass
     world = build()
-    try:
+    with suppress(OSError):  # a full or read-only home costs time at the next run, nothing else
         save_world(world, path)
-    except OSError:
-        pass  # a full or read-only home costs time at the next run, nothing else
     return world
 
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from gpvo.errors import GpvoError
 from gpvo.sim.worlds.baking import Baker
+from gpvo.sim.worlds.fittings import Parts, add_stone
 from gpvo.sim.worlds.noise import fractal, lattice, spectral
-from gpvo.sim.worlds.shapes import Faces, grid_faces, icosphere, vertex_normals
-from gpvo.sim.worlds.textures import regolith
-from gpvo.sim.worlds.world import HeightGrid, Lighting, Mesh, World
+from gpvo.sim.worlds.shapes import grid_faces, icosphere, vertex_normals
+from gpvo.sim.worlds.soil import regolith
+from gpvo.sim.worlds.stone import rock
+from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
 from gpvo.types import Array
 
 _TILE_M = 2.5
@@ -20,13 +27,17 @@ _LANE_M = 6.0  # half the width of the finely meshed lane
 _EDGE_M = 180.0  # how far the ground goes on beside it
 _BEHIND_M = 10.0
 _SUN = 2.2
+_AMBIENT = 0.02
+_SHADOW_TEXEL_M = 0.04
+_SHADOW_WIDTH_M = 9.0  # half the width of the strip with sharp shadows
+_GROUND, _ROCK = range(2)
 
 
 def build(
     seed: int,
     *,
     length: float = 260.0,
-    boulders: int = 900,
+    boulders: int = 1200,
     craters: int = 1600,
     sun_elevation_deg: float = 18.0,
     sun_azimuth_deg: float = 70.0,
@@ -48,28 +59,34 @@ def build(
     x = _spaced(-_BEHIND_M, length + _BEHIND_M, 20.0, _EDGE_M)
     y = _spaced(-_LANE_M, _LANE_M, _EDGE_M, _EDGE_M)
     z = _heights(x, y, length, craters, rng)
-    mesh = _mesh(x, y, z, length, boulders, np.deg2rad([sun_elevation_deg, sun_azimuth_deg]), rng)
+    elevation, azimuth = np.deg2rad([sun_elevation_deg, sun_azimuth_deg])
+    sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    with ThreadPoolExecutor(2) as pool:
+        soil = pool.submit(regolith, _TEXTURE_PX, np.random.default_rng([seed, 2, 1]), sun, _TILE_M)
+        stone = pool.submit(rock, _TEXTURE_PX, np.random.default_rng([seed, 2, 2]))
+        mesh, light_map = _mesh(x, y, z, length, boulders, sun, rng)
     fine_x = (x >= -_BEHIND_M - 1e-6) & (x <= length + _BEHIND_M + 1e-6)
     fine_y = np.abs(y) <= _LANE_M + 1e-6
-    grid = HeightGrid(
-        z[np.ix_(fine_y, fine_x)].astype(np.float32), float(x[fine_x][0]), float(y[fine_y][0]), _CELL_M
-    )
+    grid = HeightGrid(z[np.ix_(fine_y, fine_x)].astype(np.float32), float(x[fine_x][0]), float(y[fine_y][0]), _CELL_M)
     line_x = np.arange(0.0, length + 1e-9, 0.5)
     line = np.stack([line_x, np.zeros_like(line_x), grid(line_x, np.zeros_like(line_x)) + 0.8], axis=1)
     pose = np.eye(4)
     pose[:3, 3] = line[4]
-    low, high = float(grid.z.min()), float(grid.z.max())
+    deepest, highest = float(grid.z.min()), float(grid.z.max())
     return World(
         kind="lunar",
         seed=seed,
         params={"length": length, "sun_elevation_deg": sun_elevation_deg, "sun_azimuth_deg": sun_azimuth_deg},
         mesh=mesh,
-        textures=(regolith(_TEXTURE_PX, rng),),
-        lighting=Lighting(ambient=0.02, head_lamp=0.0),
+        textures=(soil.result(), stone.result()),
+        lighting=Lighting(ambient=_AMBIENT, head_lamp=0.0),
         centreline=line,
         start_pose=pose,
-        bounds=np.array([[-_BEHIND_M + 1, -_LANE_M + 0.5, low], [length + _BEHIND_M - 1, _LANE_M - 0.5, high + 6]]),
+        bounds=np.array(
+            [[-_BEHIND_M + 1, -_LANE_M + 0.5, deepest], [length + _BEHIND_M - 1, _LANE_M - 0.5, highest + 6]]
+        ),
         heights=(grid,),
+        light_map=light_map,
     )
 
 
@@ -117,44 +134,60 @@ def _crater(z: Array, x: Array, y: Array, cx: float, cy: float, radius: float, f
     z[i0:i1, j0:j1] += profile * np.clip((2.2 - q) / 0.8, 0, 1)
 
 
-def _boulders(
-    x: Array, y: Array, z: Array, length: float, count: int, rng: np.random.Generator
-) -> list[tuple[Array, Faces]]:
+def _boulders(parts: Parts, x: Array, y: Array, z: Array, length: float, count: int, rng: np.random.Generator) -> None:
     """Rough stones half sunk in the ground, none on the lane."""
     values = lattice(rng)
-    out = []
     for _ in range(count):
         radius = min(0.05 * (rng.pareto(2.0) + 1), 0.9)
-        cx, cy = rng.uniform(-5, length + 40), rng.normal(0, 14)
+        cx, cy = rng.uniform(-5, length + 40), rng.normal(0, rng.choice([5, 16]))
         if abs(cy) < 1.4 + radius:
             continue
         ball, faces = icosphere(1 if radius < 0.09 else 2 if radius < 0.3 else 3)
         bumps = 1 + 0.3 * fractal(ball * 1.3 + rng.uniform(0, 50, 3), values, 4)
         ground = z[np.abs(y - cy).argmin(), np.abs(x - cx).argmin()]
         stone = ball * np.clip(bumps, 0.4, 1.8)[:, None] * rng.uniform(0.65, 1.1, 3) * radius
-        out.append((stone + [cx, cy, ground + 0.25 * radius], faces))
-    return out
+        add_stone(parts, stone, faces, np.array([cx, cy, ground + 0.25 * radius]), _ROCK, _TILE_M)
 
 
 def _mesh(
     x: Array, y: Array, z: Array, length: float, boulders: int, sun: Array, rng: np.random.Generator
-) -> Mesh:
+) -> tuple[Mesh, LightMap]:
     X, Y = np.meshgrid(x, y)
     ground = np.stack([X.ravel(), Y.ravel(), z.ravel()], axis=1)
-    vertices, faces, uv = [ground], [grid_faces(len(y), len(x))], [ground[:, :2] / _TILE_M]
-    count = len(ground)
-    for stone, stone_faces in _boulders(x, y, z, length, boulders, rng):
-        vertices.append(stone)
-        faces.append(stone_faces + count)
-        uv.append((stone[:, :2] + 0.7 * stone[:, 2:]) / _TILE_M)
-        count += len(stone)
-    V, F = np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+    parts = Parts()
+    parts.add(ground, ground[:, :2] / _TILE_M, grid_faces(len(y), len(x)), _GROUND)
+    _boulders(parts, x, y, z, length, boulders, rng)
+    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces)
     N = vertex_normals(V, F)
-    elevation, azimuth = sun
-    direction = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
-    light = _SUN * Baker(V, N, F).sun(direction, 4, 0.006, rng)
+    baker = Baker(V, N, F)
+    light = _SUN * baker.sun(sun, 4, 0.006, rng)
+    shadows, strip = _shadows(baker, x, y, z, length, sun)
+    # Where the fine map holds the shadows, vertices only say how steeply the light falls.
+    inside = (np.arange(len(V)) < len(ground)) & (np.abs(V[:, 1]) < _SHADOW_WIDTH_M) & strip(V[:, 0])
+    light = np.where(inside, _SUN * np.maximum(N @ sun, 0), light)
     albedo = np.clip(1 + 0.18 * fractal(V * 0.5, lattice(rng), 4), 0.5, 1.5)
-    f32 = [a.astype(np.float32) for a in (V, N, np.concatenate(uv), light, albedo)]
-    return Mesh(*f32, F, np.zeros(len(F), np.uint8))
+    mesh = Mesh.of(V, N, np.concatenate(parts.uv), light, albedo, F, np.concatenate(parts.material))
+    return mesh, shadows
+
+
+def _shadows(
+    baker: Baker, x: Array, y: Array, z: Array, length: float, sun: Array
+) -> tuple[LightMap, Callable[[Array], NDArray[np.bool_]]]:
+    """Sharp shadows on the ground of the lane, and whether an x coordinate lies in their strip."""
+    low, high = -_BEHIND_M, length + _BEHIND_M
+    columns, rows = (round(d / _SHADOW_TEXEL_M) for d in (high - low, 2 * _SHADOW_WIDTH_M))
+    px = low + (np.arange(columns) + 0.5) * _SHADOW_TEXEL_M
+    py = -_SHADOW_WIDTH_M + (np.arange(rows) + 0.5) * _SHADOW_TEXEL_M
+    row, column = np.interp(py, y, np.arange(len(y))), np.interp(px, x, np.arange(len(x)))
+    image = np.zeros((rows, columns), np.float32)
+    for k in range(rows):
+        height = map_coordinates(z, [np.full(columns, row[k]), column], order=1, mode="nearest")
+        origins = np.stack([px, np.full(columns, py[k]), height + 0.015], axis=1)
+        image[k] = baker.reaches(origins, sun)
+    # The light that comes from everywhere else stays.
+    floor = _AMBIENT / (_AMBIENT + _SUN * max(float(sun[2]), 0.1))
+    image = np.clip(floor + (1 - floor) * cv2.GaussianBlur(image, (0, 0), 0.6), 0, 1)
+    texel = _SHADOW_TEXEL_M / _TILE_M
+    origin = (low / _TILE_M, -_SHADOW_WIDTH_M / _TILE_M)
+    light_map = LightMap((image * 255 + 0.5).astype(np.uint8), origin, texel, _GROUND)
+    return light_map, lambda at: (at > low) & (at < high)

@@ -1,10 +1,9 @@
-"""Noise to make surfaces from: spectral and cellular on a torus, lattice noise in space."""
+"""Noise to make surfaces from: spectral on a torus, lattice noise in space."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from gpvo.types import Array
 
@@ -24,15 +23,6 @@ def spectral(n: int, rng: np.random.Generator, beta: float, lowest: float = 1.0,
         gain = gain * np.exp(-((f / highest) ** 2))
     x = np.fft.irfft2(wave * gain, s=(n, n))
     return ((x - x.mean()) / x.std()).astype(np.float32)
-
-
-def cellular(n: int, cells: int, rng: np.random.Generator, nearest: int = 2) -> tuple[F32, NDArray[np.int64]]:
-    """Distances (n, n, nearest) in tiles to the nearest of random points on the torus, and which points they are."""
-    tree = cKDTree(rng.random((cells, 2)), boxsize=1.0)
-    grid = (np.arange(n) + 0.5) / n
-    query = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    distance, index = tree.query(query, k=np.arange(1, nearest + 1))
-    return distance.reshape(n, n, nearest).astype(np.float32), index.reshape(n, n, nearest)
 
 
 def lattice(rng: np.random.Generator) -> F32:

@@ -26,7 +26,9 @@ class _Parts:
         self.material: list[np.ndarray] = []
         self._count = 0
 
-    def add(self, material: int, tile_m: float, corner: Array, u: Array, v: Array, edge: float, turn: float = 0) -> None:
+    def add(
+        self, material: int, tile_m: float, corner: Array, u: Array, v: Array, edge: float, turn: float = 0
+    ) -> None:
         """One rectangle, its texture starting at (``turn``, ``turn``) tiles."""
         vertices, uv, faces = rectangle(corner, u, v, edge)
         self.vertices.append(vertices)
@@ -61,8 +63,8 @@ def build(
 ) -> World:
     """A hall of ``width`` (x) by ``depth`` (y) by ``height`` [m] about the origin, floor at z = 0.
 
-    ``blank_walls`` of its four walls are plaster, the others masonry; ``boxes`` stand along them and ``posters`` hang on
-    them.
+    ``blank_walls`` of its four walls are plaster, the others masonry; ``boxes`` stand along them and ``posters``
+    hang on them.
 
     Raises
     ------
@@ -114,7 +116,9 @@ def _shell(parts: _Parts, size: Array, blank_walls: int, rng: np.random.Generato
     parts.add(_PLANKS, 3.0, np.array([-x / 2, -y / 2, 0]), np.array([x, 0, 0]), np.array([0, y, 0]), 0.25)
     parts.add(_PLASTER, 3.0, np.array([-x / 2, y / 2, z]), np.array([x, 0, 0]), np.array([0, -y, 0]), 0.25)
     for k in range(int(x // 1.5)):  # beams under the ceiling
-        parts.box(_BLOCKS, np.array([-x / 2 + 0.75 + 1.5 * k, 0, z - 0.3]), np.array([0.12, y - 0.02, 0.2]), 0.0, 0.1 * k)
+        parts.box(
+            _BLOCKS, np.array([-x / 2 + 0.75 + 1.5 * k, 0, z - 0.3]), np.array([0.12, y - 0.02, 0.2]), 0.0, 0.1 * k
+        )
     order = rng.permutation(4)
     for wall, (corner, along) in enumerate(_walls(size)):
         blank = order[wall] < blank_walls
@@ -154,5 +158,4 @@ def _lit(parts: _Parts, size: Array, rng: np.random.Generator) -> Mesh:
     lamps = grid * size + [0, 0, size[2] - 0.45]
     light = baker.lamps(lamps, np.full(len(lamps), 1.2), reach_m=30.0, size_m=1.2)
     openness = 0.3 + 0.7 * baker.openness(24, 1.0, rng)
-    f32 = [a.astype(np.float32) for a in (V, N, np.concatenate(parts.uv), light, openness)]
-    return Mesh(*f32, F, np.concatenate(parts.material))
+    return Mesh.of(V, N, np.concatenate(parts.uv), light, openness, F, np.concatenate(parts.material))

@@ -59,14 +59,15 @@ def _is_face(V: Array, a: int, b: int, c: int) -> bool:
     return a < b and a < c and near and float(np.linalg.det(V[[a, b, c]])) > 0
 
 
-def rectangle(corner: Sequence[float], u: Sequence[float], v: Sequence[float], edge: float) -> tuple[Array, Array, Faces]:
+def rectangle(
+    corner: Array | Sequence[float], u: Array | Sequence[float], v: Array | Sequence[float], edge: float
+) -> tuple[Array, Array, Faces]:
     """A rectangle from ``corner`` along ``u`` and ``v`` [m], cut into triangles with legs of at most ``edge``.
 
     Seen from the side of ``u x v``. Returns vertices (V, 3), coordinates along u and v [m] (V, 2), faces.
     """
     lengths = np.linalg.norm(u), np.linalg.norm(v)
     nu, nv = (max(int(np.ceil(length / edge)), 1) + 1 for length in lengths)
-    s, t = np.meshgrid(np.linspace(0, 1, nu), np.linspace(0, 1, nv))
-    s, t = s.ravel(), t.ravel()
+    s, t = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, nu), np.linspace(0, 1, nv)))
     vertices = np.asarray(corner, float) + s[:, None] * np.asarray(u, float) + t[:, None] * np.asarray(v, float)
     return vertices, np.stack([s * lengths[0], t * lengths[1]], axis=1), grid_faces(nv, nu)

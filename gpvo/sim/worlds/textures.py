@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.sim.worlds.noise import F32, cellular, spectral
+from gpvo.sim.worlds.noise import F32, spectral
 
 Texture = NDArray[np.uint8]
 
@@ -15,66 +15,18 @@ def encode(grey: NDArray[np.floating]) -> Texture:
     return (np.clip(grey, 0.04, 0.97) * 255 + 0.5).astype(np.uint8)
 
 
-def _slope(height: F32, along_x: float, along_y: float) -> F32:
-    gx = np.roll(height, -1, axis=1) - np.roll(height, 1, axis=1)
-    gy = np.roll(height, -1, axis=0) - np.roll(height, 1, axis=0)
-    return along_x * gx + along_y * gy
-
-
-def _stretch(image: F32, factor: int) -> F32:
-    return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
-
-
-def rock(n: int, rng: np.random.Generator) -> Texture:
-    """Broken rock: facets in relief, fine cracks, grain and specks."""
-    half = n // 2
-    relief = np.zeros((n, n), np.float32)
-    for cells, weight in ((160, 1.0), (900, 0.55), (6000, 0.25)):
-        distance, owner = cellular(half, cells, rng, 2)
-        tilt = rng.standard_normal((cells, 2)).astype(np.float32)
-        facet = tilt[owner[..., 0], 0] * 0.5
-        crack = np.exp(-(((distance[..., 1] - distance[..., 0]) * np.sqrt(cells) / 0.06) ** 2))
-        relief += weight * _stretch(facet - 0.9 * crack, 2)
-    wobble = [(spectral(n, rng, 1.3, 3) * n * 0.006).astype(np.int32) for _ in range(2)]
-    rows, columns = np.arange(n)[:, None] + wobble[0], np.arange(n)[None] + wobble[1]
-    relief = relief[rows % n, columns % n]
-    rough = spectral(n, rng, 1.0, 4)
-    lit = np.clip(_slope(rough, 0.8, 1.1), -2, 2)
-    grey = 0.42 + 0.065 * relief + 0.05 * rough + 0.05 * lit + 0.05 * spectral(n, rng, 0.5, n / 48)
-    grey += 0.04 * spectral(n, rng, 1.4, 2)
-    specks = cellular(half, 4000, rng, 1)[0][..., 0] < 0.0035
-    return encode(grey + _stretch(specks.astype(np.float32), 2) * 0.16 * np.sign(rough))
-
-
 def shotcrete(n: int, rng: np.random.Generator) -> Texture:
     """Sprayed concrete, nearly without features."""
     return encode(0.5 + 0.012 * spectral(n, rng, 1.6, 1) + 0.004 * spectral(n, rng, 0.3, n / 32))
 
 
-def regolith(n: int, rng: np.random.Generator) -> Texture:
-    """Lunar soil for tiles of 2.5 m: most energy at wavelengths of 1 to 15 cm, pebbles lit from one side."""
-    grey = 0.42 + 0.05 * spectral(n, rng, 0.9, 2) + 0.07 * spectral(n, rng, 0.6, 18, 160)
-    grey += 0.03 * spectral(n, rng, 0.2, n / 16)
-    height = np.zeros((n, n), np.float32)
-    for radius, count in ((16.0, 90), (10.0, 350), (6.0, 1400), (3.5, 5000)):
-        for _ in range(count):
-            _pebble(height, grey, radius * n / 2048, rng)
-    relief = np.clip(0.5 * _slope(height, 1.0, 0.0), -1.5, 1.5)
-    return encode(grey * (1 + 0.45 * relief))
-
-
-def _pebble(height: F32, grey: F32, radius: float, rng: np.random.Generator) -> None:
-    n = len(height)
-    radius *= rng.uniform(0.7, 1.4)
-    reach = int(radius * 1.5) + 1
-    row, column = rng.integers(0, n, 2)
-    angle, flat = rng.uniform(0, np.pi), rng.uniform(0.6, 1.0)
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float32)
-    along, across = x * np.cos(angle) + y * np.sin(angle), (y * np.cos(angle) - x * np.sin(angle)) / flat
-    bump = np.sqrt(np.clip(1 - (along**2 + across**2) / radius**2, 0, 1)) * np.float32(radius)
-    where = np.ix_(np.arange(row - reach, row + reach + 1) % n, np.arange(column - reach, column + reach + 1) % n)
-    height[where] = np.maximum(height[where], bump)
-    grey[where] += (bump > 0) * np.float32(rng.normal(0, 0.06))
+def duct(n: int, rng: np.random.Generator) -> Texture:
+    """Dusty sheet and painted steel: rings, stains and scratches."""
+    v = np.arange(n) / n
+    rings = 0.05 * np.sin(2 * np.pi * 10 * v) - 0.18 * (np.abs((v * 5) % 1 - 0.5) > 0.485)
+    stains = 0.07 * spectral(n, rng, 1.2, 2) + 0.02 * spectral(n, rng, 0.4, 20)
+    scratches = np.clip(spectral(n, rng, 0.9, 8) - 2.2, 0, 1)
+    return encode(0.52 + rings[:, None] + stains + 0.25 * scratches)
 
 
 def plaster(n: int, rng: np.random.Generator) -> Texture:

@@ -38,11 +38,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Tube:
-    """``vertices`` (n, m + 1, 3), first and last column equal; ``radius`` (n, m + 1) distance from the line."""
+    """``vertices`` (n, m + 1, 3), first and last column equal; ``radius`` (n, m + 1) distance from the line;
+    ``profile`` (n, m + 1, 3) the vertices before the rock was roughened; ``floor`` (n, m + 1) where one can walk.
+    """
 
     line: Line
     vertices: Array
     radius: Array
+    profile: Array
+    floor: NDArray[np.bool_]
 
     @property
     def faces(self) -> Faces:
@@ -51,11 +55,14 @@ class Tube:
         return grid_faces(rows, columns)[:, [0, 2, 1]]
 
     def uv(self, tile_m: float) -> Array:
-        """Texture coordinates (n, m + 1, 2) by arc length round and along, whole tiles round so that no seam shows."""
-        round_ = np.linalg.norm(np.diff(self.vertices, axis=1), axis=2)
+        """Texture coordinates (n, m + 1, 2) by arc length round and along, whole tiles round so that no seam shows.
+
+        They follow the smooth profile: lengths along rough rock differ from row to row and would shear the texture.
+        """
+        round_ = np.linalg.norm(np.diff(self.profile, axis=1), axis=2)
         u = np.concatenate([np.zeros((len(round_), 1)), np.cumsum(round_, axis=1)], axis=1)
         tiles = max(round(float(np.median(u[:, -1])) / tile_m), 1)
-        along = np.linalg.norm(np.diff(self.vertices, axis=0), axis=2).mean(axis=1)
+        along = np.linalg.norm(np.diff(self.profile, axis=0), axis=2).mean(axis=1)
         v = np.concatenate([[0.0], np.cumsum(along)]) / tile_m
         return np.stack([u / u[:, -1:] * tiles, np.broadcast_to(v[:, None], u.shape)], axis=2)
 
@@ -72,7 +79,18 @@ class Tube:
         return (np.hypot(y, z) < self.radius[near, nearest]) & (along < 1.0)
 
 
-def rough_tube(line: Line, radius: Array, roughness: Array, columns: int, values: F32) -> Tube:
+def facets(points: Array, width_m: float, slope: float, step: float, rng: np.random.Generator) -> Array:
+    """Heights (N,) [m] of a surface broken into tilted facets about ``width_m`` wide, with steps between them."""
+    count = max(int(1.3 * len(points) * 0.02 / width_m**2), 8)
+    centres = points[rng.integers(0, len(points), count)] + rng.normal(0, 0.3 * width_m, (count, 3))
+    owner = cKDTree(centres).query(points)[1]
+    tilt = slope * rng.standard_normal((count, 3))
+    return ((points - centres[owner]) * tilt[owner]).sum(axis=1) + step * rng.standard_normal(count)[owner]
+
+
+def rough_tube(
+    line: Line, radius: Array, roughness: Array, columns: int, values: F32, rng: np.random.Generator
+) -> Tube:
     """A tube of ``radius`` (n,) [m] about a line with a flattened floor, closed ends and rock of ``roughness`` (n,)."""
     angle = np.linspace(0, 2 * np.pi, columns + 1)
     r = radius[:, None] * (1 + 0.08 * np.cos(2 * angle))
@@ -85,12 +103,14 @@ def rough_tube(line: Line, radius: Array, roughness: Array, columns: int, values
     close = np.sqrt(np.maximum(1 - (1 - np.minimum(from_end / cap, 1)) ** 2, 1e-4))[:, None]
     y, z = y * close, z * close
     outward = y[..., None] * line.left[:, None] + z[..., None] * line.up[:, None]
-    vertices = line.points[:, None] + outward
+    profile = line.points[:, None] + outward
     outward /= np.linalg.norm(outward, axis=2, keepdims=True)
-    flat_points = vertices.reshape(-1, 3)
-    coarse = fractal(flat_points * 0.55, values, 5, 0.55).reshape(r.shape)
-    ridges = 1 - np.abs(fractal(flat_points * 0.9 + 31.0, values, 4, 0.5)).reshape(r.shape)
-    bump = roughness[:, None] * close * (0.55 * coarse + 0.45 * (ridges - 0.5)) * np.where(flat, 0.35, 1.0)
-    vertices = vertices - bump[..., None] * outward
+    points = profile.reshape(-1, 3)
+    coarse = fractal(points * 0.55, values, 5, 0.55)
+    ridges = 1 - np.abs(fractal(points * 0.9 + 31.0, values, 4, 0.5))
+    broken = facets(points, 1.1, 0.30, 0.10, rng) + facets(points, 0.45, 0.30, 0.05, rng)
+    shape = (0.42 * coarse + 0.30 * (ridges - 0.5) + 1.6 * np.clip(broken, -0.45, 0.45)).reshape(r.shape)
+    bump = roughness[:, None] * close * shape * np.where(flat, 0.22, 1.0)
+    vertices = profile - bump[..., None] * outward
     vertices[:, -1] = vertices[:, 0]
-    return Tube(line, vertices, np.linalg.norm(vertices - line.points[:, None], axis=2))
+    return Tube(line, vertices, np.linalg.norm(vertices - line.points[:, None], axis=2), profile, flat)

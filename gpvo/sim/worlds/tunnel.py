@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
+from gpvo.sim.worlds import fittings
 from gpvo.sim.worlds.baking import Baker
 from gpvo.sim.worlds.noise import fractal, lattice
 from gpvo.sim.worlds.shapes import vertex_normals
-from gpvo.sim.worlds.textures import rock, shotcrete
+from gpvo.sim.worlds.stone import gravel, rock
+from gpvo.sim.worlds.textures import duct, shotcrete
 from gpvo.sim.worlds.tubes import Line, Tube, rough_tube
 from gpvo.sim.worlds.world import Lighting, Mesh, World
 from gpvo.types import Array
@@ -18,6 +23,7 @@ _TILE_M = 3.0
 _TEXTURE_PX = 2048
 _CURVES = {"straight": 0.0, "curved": 0.28, "branching": 0.2}
 _SMOOTH_M = 9.0  # length of one smooth stretch
+_ROCK, _SHOTCRETE, _GRAVEL, _DUCT = range(4)
 
 
 def build(
@@ -28,7 +34,7 @@ def build(
     roughness: float = 0.3,
     smooth_stretches: int = 0,
     lamps: float = 11.0,
-    step: float = 0.17,
+    step: float = 0.14,
 ) -> World:
     """A tunnel of ``length`` [m] with a lamp every ``lamps`` [m] (0: none) and ``smooth_stretches`` of bare concrete.
 
@@ -52,8 +58,13 @@ def build(
     stretches = _stretches(length, smooth_stretches, rng)
     tubes = [_tube(line, roughness, stretches, step, values, rng)]
     if curve == "branching":
-        tubes += [_branch(line, at, side, roughness, step, values, rng) for at, side in ((0.35, 1), (0.68, -1))]
-    mesh = _mesh(tubes, stretches, lamps, values, rng)
+        for at, side in ((0.35, 1), (0.68, -1)):
+            tubes.append(_branch(line, _clear_of(at, line.s, stretches), side, roughness, step, values, rng))
+    makers = (rock, shotcrete, gravel, duct)
+    with ThreadPoolExecutor(2) as pool:
+        streams = [np.random.default_rng([seed, 1, k]) for k in range(len(makers))]
+        textures = pool.map(lambda make, stream: make(_TEXTURE_PX, stream), makers, streams)
+        mesh = _mesh(tubes, stretches, lamps, values, rng)
     start = int(6.0 / step)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([line.tangent[start], line.left[start], line.up[start]], axis=1)
@@ -63,7 +74,7 @@ def build(
         seed=seed,
         params={"length": length, "curve": curve, "roughness": roughness, "lamps": lamps, "step": step},
         mesh=mesh,
-        textures=(rock(_TEXTURE_PX, rng), shotcrete(_TEXTURE_PX, rng)),
+        textures=tuple(textures),
         lighting=Lighting(ambient=0.015, head_lamp=1.6),
         centreline=line.points[start:-start],
         start_pose=pose,
@@ -92,14 +103,19 @@ def _stretches(length: float, count: int, rng: np.random.Generator) -> Array:
     return np.stack([start, start + min(_SMOOTH_M, 0.4 * part)], axis=1)
 
 
-def _tube(
-    line: Line, roughness: float, bare: Array, step: float, values: np.ndarray, rng: np.random.Generator
-) -> Tube:
+def _tube(line: Line, roughness: float, bare: Array, step: float, values: np.ndarray, rng: np.random.Generator) -> Tube:
     radius = _RADIUS_M * (1 + _waves(line.s, 0.09, 8, 25, rng))
     rough = np.full(len(line.s), roughness)
     for begin, end in bare:
         rough *= 1 - 0.85 * np.clip(np.minimum(line.s - begin, end - line.s) / 0.8 + 1, 0, 1)
-    return rough_tube(line, radius, rough, int(2 * np.pi * _RADIUS_M / step), values)
+    return rough_tube(line, radius, rough, int(2 * np.pi * _RADIUS_M / step), values, rng)
+
+
+def _clear_of(at: float, s: Array, bare: Array) -> float:
+    """The share of the length nearest to ``at`` that is away from the bare stretches."""
+    shares = np.linspace(0.2, 0.8, 61)
+    free = shares[~_within(shares * s[-1], bare + [-6.0, 6.0])]
+    return float(free[np.abs(free - at).argmin()]) if len(free) else at
 
 
 def _branch(
@@ -117,7 +133,7 @@ def _branch(
 
 
 def _mesh(tubes: list[Tube], bare: Array, lamps: float, values: np.ndarray, rng: np.random.Generator) -> Mesh:
-    vertices, uv, faces, material, offset = [], [], [], [], 0
+    parts = fittings.Parts()
     for k, tube in enumerate(tubes):
         points, f = tube.vertices.reshape(-1, 3), tube.faces
         inside = np.zeros(len(points), bool)
@@ -125,32 +141,43 @@ def _mesh(tubes: list[Tube], bare: Array, lamps: float, values: np.ndarray, rng:
             if j != k:
                 inside |= other.contains(points)
         f = f[~inside[f].all(axis=1)]
-        s = tube.line.s[f[:, 0] // tube.vertices.shape[1]]
-        is_bare = np.zeros(len(f), bool)
+        material = np.where(tube.floor.ravel()[f].all(axis=1), _GRAVEL, _ROCK)
         if k == 0:
-            for begin, end in bare:
-                is_bare |= (s >= begin) & (s <= end)
-        vertices.append(points)
-        uv.append(tube.uv(_TILE_M).reshape(-1, 2))
-        faces.append(f + offset)
-        material.append(is_bare.astype(np.uint8))
-        offset += len(points)
-    V, F = np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+            material[_within(tube.line.s[f[:, 0] // tube.vertices.shape[1]], bare)] = _SHOTCRETE
+        parts.add(points, tube.uv(_TILE_M).reshape(-1, 2), f, material.astype(np.uint8))
+    positions, powers = _lamps(tubes[0].line, lamps, rng)
+    _furnish(parts, tubes[0], bare, positions, values, rng)
+    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces)
     N = _seamless(vertex_normals(V, F), tubes)
     baker = Baker(V, N, F)
-    positions, powers = _lamps(tubes[0].line, lamps, rng)
-    light = baker.lamps(positions, powers, reach_m=16.0)
+    light = baker.lamps(positions, powers, reach_m=16.0) + np.concatenate(parts.glow)
     patches = fractal(V * 0.35, values, 4)
     albedo = (0.35 + 0.65 * baker.openness(12, 1.2, rng)) * np.clip(1 + 0.3 * patches, 0.4, 1.8)
-    return Mesh(
-        vertices=V.astype(np.float32),
-        normals=N.astype(np.float32),
-        uv=np.concatenate(uv).astype(np.float32),
-        light=light.astype(np.float32),
-        albedo=albedo.astype(np.float32),
-        faces=F,
-        material=np.concatenate(material),
-    )
+    return Mesh.of(V, N, np.concatenate(parts.uv), light, albedo, F, np.concatenate(parts.material))
+
+
+def _within(s: Array, intervals: Array) -> NDArray[np.bool_]:
+    """Whether arc lengths (N,) lie in one of the intervals (M, 2)."""
+    return np.any((s[:, None] >= intervals[:, 0]) & (s[:, None] <= intervals[:, 1]), axis=1)
+
+
+def _furnish(
+    parts: fittings.Parts, tube: Tube, bare: Array, lamps: Array, values: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Lamps, duct, cables, bolts and rubble, none of them where the walls are bare."""
+    s = tube.line.s
+    rows = np.flatnonzero((s > 2.0) & (s < s[-1] - 2.0))
+    free = rows[~_within(s[rows], bare + [-0.5, 0.5])]
+    fittings.lamps(parts, lamps, tube, _SHOTCRETE)
+    for run in np.split(free, np.flatnonzero(np.diff(free) > 1) + 1):
+        third = run[:: max(round(0.25 / (s[1] - s[0])), 1)]
+        fittings.pipe(parts, tube, third, np.deg2rad(52), 0.42, 0.27, 14, 0.02, _DUCT, 1.5)
+        for angle in (148, 153, 160):
+            fittings.pipe(parts, tube, third, np.deg2rad(angle), 0.12, 0.025, 6, 0.07, _DUCT, 1.5)
+    fittings.bolts(parts, tube, free[:: max(round(1.5 / (s[1] - s[0])), 1)], _DUCT, rng)
+    fittings.rubble(parts, tube, free, 0.5, 0.28, int(4 * s[-1]), values, _ROCK, _TILE_M, rng)
+    for end in (rows[s[rows] < 3.5], rows[s[rows] > s[-1] - 3.5]):
+        fittings.rubble(parts, tube, end, 1.0, 0.7, 60, values, _ROCK, _TILE_M, rng)
 
 
 def _seamless(normals: Array, tubes: list[Tube]) -> Array:

@@ -34,6 +34,14 @@ class Mesh:
     faces: NDArray[np.int32]
     material: NDArray[np.uint8]
 
+    @classmethod
+    def of(
+        cls, vertices: Array, normals: Array, uv: Array, light: Array, albedo: Array, faces: Array, material: Array
+    ) -> Mesh:
+        """A mesh from arrays of any number type."""
+        floats = (np.ascontiguousarray(a, dtype=np.float32) for a in (vertices, normals, uv, light, albedo))
+        return cls(*floats, faces=faces.astype(np.int32), material=material.astype(np.uint8))
+
 
 @dataclass(frozen=True)
 class Lighting:

@@ -1,0 +1,125 @@
+"""Textures of broken stone, tileable and grey (uint8): facets, cracks and grain in relief."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.sim.worlds.noise import F32, spectral
+
+Texture = NDArray[np.uint8]
+_PAD = 8
+
+
+def enlarged(image: F32, n: int, shift_x: F32 | float = 0.0, shift_y: F32 | float = 0.0) -> F32:
+    """A tileable image (m, m) at (n, n) points, each moved by a shift in units of the tile."""
+    m = len(image)
+    grid = ((np.arange(n, dtype=np.float32) + np.float32(0.5)) / np.float32(n))[None]
+    x, y = (grid + shift_x) % 1.0 * m - 0.5, (grid.T + shift_y) % 1.0 * m - 0.5
+    x, y = np.broadcast_to(x, (n, n)), np.broadcast_to(y, (n, n))
+    padded = np.pad(image, _PAD, mode="wrap")
+    return cv2.remap(padded, (x + _PAD).astype(np.float32), (y + _PAD).astype(np.float32), cv2.INTER_LINEAR)
+
+
+def blurred(image: F32, sigma_px: float) -> F32:
+    """A tileable image smoothed by a Gaussian."""
+    pad = int(4 * sigma_px) + 1
+    padded = np.pad(image, pad, mode="wrap")
+    return cv2.GaussianBlur(padded, (0, 0), sigma_px)[pad:-pad, pad:-pad]
+
+
+class Cells:
+    """Cells about jittered points, ``count`` to a tile (S. Worley, "A cellular texture basis function", 1996).
+
+    For each of n x n pixels: ``owner`` (0 .. ``number`` - 1), its offset ``x, y`` from the owner's point, the distances
+    ``nearest`` and ``second``, all in widths of a cell, of which there are ``per_side`` along a tile.
+    """
+
+    def __init__(self, n: int, count: int, rng: np.random.Generator) -> None:
+        self.per_side = k = max(int(np.sqrt(count)), 3)
+        self.number = k * k
+        points = rng.random((k, k, 2)).astype(np.float32)
+        place = (np.arange(n, dtype=np.float32) + np.float32(0.5)) / n * k
+        cell = np.floor(place).astype(np.int64)
+        self.nearest, self.second = (np.full((n, n), 9, np.float32) for _ in range(2))
+        self.owner = np.zeros((n, n), np.int64)
+        self.x, self.y = np.zeros((n, n), np.float32), np.zeros((n, n), np.float32)
+        for j in (-1, 0, 1):
+            for i in (-1, 0, 1):
+                row, column = (cell + j) % k, (cell + i) % k
+                point = points[row[:, None], column[None]]
+                x = (place - cell - i)[None].astype(np.float32) - point[..., 0]
+                y = (place - cell - j)[:, None].astype(np.float32) - point[..., 1]
+                square = x * x + y * y
+                closer = square < self.nearest
+                self.second = np.where(closer, self.nearest, np.minimum(self.second, square))
+                for name, value in (("nearest", square), ("x", x), ("y", y)):
+                    setattr(self, name, np.where(closer, value, getattr(self, name)))
+                self.owner = np.where(closer, row[:, None] * k + column[None], self.owner)
+        self.nearest, self.second = np.sqrt(self.nearest), np.sqrt(self.second)
+
+
+def rock(n: int, rng: np.random.Generator) -> Texture:
+    """A blasted rock face for tiles of 3 m, lit mostly from the camera and a little from one side."""
+    half = n // 2
+    relief, tone, crack = (np.zeros((n, n), np.float32) for _ in range(3))
+    slow = [enlarged(spectral(n // 4, rng, 1.5, 3), n) for _ in range(2)]
+    quick = [enlarged(spectral(half, rng, 1.0, 20), n) for _ in range(2)]
+    for count, height, contrast, depth in ((45, 0.034, 0.06, 0.5), (300, 0.016, 0.05, 0.45), (2500, 0.005, 0.04, 0.3)):
+        cells = Cells(half, count, rng)
+        width = 1.0 / cells.per_side
+        shift = [0.16 * width * a + 0.05 * width * b for a, b in zip(slow, quick)]
+        tilt = rng.standard_normal((3, cells.number)).astype(np.float32)
+        own = cells.owner
+        relief += height * enlarged(tilt[0, own] * cells.x + tilt[1, own] * cells.y + 0.35 * tilt[2, own], n, *shift)
+        is_open = (rng.random(cells.number) < 0.6)[own]
+        border = np.exp(-(((cells.second - cells.nearest) / 0.05) ** 2)) * is_open
+        crack += depth * enlarged(border.astype(np.float32), n, *shift)
+        tone += contrast * enlarged(rng.standard_normal(cells.number).astype(np.float32)[own], n, *shift)
+    relief += 0.008 * spectral(n, rng, 1.35, 3) + 0.0008 * spectral(n, rng, 0.8, 40) - 0.006 * crack
+    relief = blurred(relief, 0.7)
+    hollow = np.clip((relief - blurred(relief, 12.0)) / 0.006, -1.5, 1.2)
+    grain = spectral(n, rng, 0.35, n / 24)
+    vein = enlarged(np.exp(-((spectral(half, rng, 1.9, 2) / 0.03) ** 2)).astype(np.float32), n)
+    albedo = 0.74 + 1.2 * tone + 0.06 * spectral(n, rng, 1.2, 2) + 0.035 * grain + 0.07 * hollow + 0.2 * vein
+    return finished(albedo * _lit(relief, n) - 0.12 * np.clip(crack, 0, 1), 0.42, 0.145)
+
+
+def gravel(n: int, rng: np.random.Generator) -> Texture:
+    """A trodden floor of crushed stone and mud for tiles of 3 m."""
+    half = n // 2
+    relief, tone = (np.zeros((n, n), np.float32) for _ in range(2))
+    slow = [enlarged(spectral(half, rng, 1.0, 30), n) for _ in range(2)]
+    for count, height, share in ((1225, 0.018, 0.4), (4900, 0.010, 0.7), (19600, 0.005, 0.9)):
+        cells = Cells(half, count, rng)
+        width = 1.0 / cells.per_side
+        shift = [0.10 * width * a for a in slow]
+        size = rng.uniform(0.5, 1.1, cells.number).astype(np.float32) * (rng.random(cells.number) < share)
+        tilt = 0.35 * rng.standard_normal((2, cells.number)).astype(np.float32)
+        own = cells.owner
+        edge = np.clip(1 - cells.nearest / np.maximum(cells.second, 1e-3), 0, 1) * size[own]
+        stone = np.sqrt(edge) * (1 + tilt[0, own] * cells.x + tilt[1, own] * cells.y)
+        relief = np.maximum(relief, height * enlarged(stone.astype(np.float32), n, *shift))
+        tone += 0.06 * enlarged((rng.standard_normal(cells.number) * (size > 0)).astype(np.float32)[own], n, *shift)
+    mud = np.clip(0.5 + 0.5 * spectral(n, rng, 1.4, 2), 0, 1)
+    relief = relief * (1 - 0.7 * mud) + 0.0012 * spectral(n, rng, 1.2, 6) + 0.0003 * spectral(n, rng, 0.7, 60)
+    relief = blurred(relief, 0.7)
+    hollow = np.clip((relief - blurred(relief, 8.0)) / 0.003, -1.5, 1.2)
+    albedo = 0.72 + tone * (1 - 0.6 * mud) - 0.10 * mud + 0.05 * hollow + 0.03 * spectral(n, rng, 0.4, n / 24)
+    return finished(albedo * _lit(relief, n), 0.40, 0.125)
+
+
+def _lit(relief: F32, n: int) -> F32:
+    """Brightness of a relief [tiles] of about a third of its slope, from in front and from one side."""
+    slope = 0.33 * 0.5 * n
+    gx = slope * (np.roll(relief, -1, axis=1) - np.roll(relief, 1, axis=1))
+    gy = slope * (np.roll(relief, -1, axis=0) - np.roll(relief, 1, axis=0))
+    facing = 1 / np.sqrt(1 + gx * gx + gy * gy)
+    return np.clip((0.78 + 0.42 * gy + 0.18 * gx) * facing, 0.08, 1.6)
+
+
+def finished(grey: F32, mean: float, deviation: float) -> Texture:
+    """To 8 bit with a given mean and standard deviation."""
+    scaled = mean + deviation * (grey - grey.mean()) / grey.std()
+    return (np.clip(scaled, 0.03, 0.98) * 255 + 0.5).astype(np.uint8)
