@@ -12,7 +12,7 @@ flight, many where one run is filtered under many noise settings.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,8 @@ class ErrorStateFilter:
     ) -> Innovation:
         """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame.
 
-        ``recover`` (B,): members for which a failing measurement is inflated, whatever the gate's policy.
+        ``recover`` (B,): members that have seen nothing pass for too long. Where the measurement fails again, the
+        state is doubted instead: its covariance grows until the measurement can move it.
         """
         gate = gate or Gate()
         if noise.jitter is not None:
@@ -179,7 +180,12 @@ class ErrorStateFilter:
         me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise.bias_root)
         r = me.residual(R_rel, t_rel, T_est, noise.mean)
         expected = H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None] + H[:, :, BIAS] @ self.bias_mean[:, :, None]
-        innovation = self.correct(H, r - expected[:, :, 0], noise.white, gate, recover)
+        r = r - expected[:, :, 0]
+        innovation = self.correct(H, r, noise.white, gate)
+        if recover is not None and (stuck := recover & ~innovation.used).any():
+            self._doubt(np.where(stuck, innovation.nis / gate.threshold(6), 1.0))
+            again = self.correct(H, r, noise.white, replace(gate, on_fail="inflate"), ~stuck)
+            innovation = replace(again, nis=innovation.nis, passed=innovation.passed, used=innovation.used | stuck)
         if innovation.used.any():
             self.inject()
         return innovation
@@ -190,11 +196,11 @@ class ErrorStateFilter:
         residual: Array,
         R: Array,
         gate: Gate | None = None,
-        recover: NDArray[np.bool_] | None = None,
+        leave: NDArray[np.bool_] | None = None,
     ) -> Innovation:
         """Linear update of the error's mean and covariance, Joseph form; :meth:`inject` moves it into the estimate.
 
-        ``H`` (B, m, 39), ``residual`` (B, m) at the estimate, ``R`` (b, m, m).
+        ``H`` (B, m, 39), ``residual`` (B, m) at the estimate, ``R`` (b, m, m). ``leave`` (B,): members to leave alone.
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ kernels.transpose(H)
@@ -207,11 +213,12 @@ class ErrorStateFilter:
         passed = nis <= limit
         used = passed
         alpha = np.ones(self.batch)
-        if gate and not passed.all():
-            everyone = np.full(self.batch, gate.on_fail == "inflate")
-            inflated = everyone if recover is None else everyone | recover
-            used = passed | inflated | (gate.on_fail == "accept")
-            alpha = np.where(inflated, np.maximum(nis / limit, 1.0), 1.0)
+        if gate and not passed.all() and gate.on_fail != "discard":
+            used = np.ones_like(passed)
+            if gate.on_fail == "inflate":
+                alpha = np.maximum(nis / limit, 1.0)
+        if leave is not None:
+            used = used & ~leave
         if used.any():
             whitened_H = np.asarray(whitened[:, :, :-1], dtype=np.float64)
             K = np.asarray(np.linalg.solve(kernels.transpose(L), whitened_H), dtype=np.float64).transpose(0, 2, 1)
@@ -220,6 +227,13 @@ class ErrorStateFilter:
             self._joseph(K * (used / alpha)[:, None, None], H, R)
             self.dx += (K @ r[:, :, None])[:, :, 0] * (used / alpha)[:, None]
         return Innovation(r, S, nis, passed, used)
+
+    def _doubt(self, factor: Array) -> None:
+        """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,)."""
+        D = np.ones((self.batch, JOINT))
+        for block in (V, TH, BA, BG, me.CLONE_TH):
+            D[:, block] = np.sqrt(np.maximum(factor, 1.0))[:, None]
+        self.P = self.P * (D[:, :, None] * D[:, None, :])
 
     def _joseph(self, K: Array, H: Array, R: Array) -> None:
         A = _EYE - K @ H
