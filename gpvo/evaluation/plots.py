@@ -10,37 +10,36 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from gpvo.evaluation import curves
 from gpvo.evaluation.accumulate import along
 from gpvo.evaluation.evaluate import Evaluation
-from gpvo.evaluation.statements import Statement
-from gpvo.stats.consistency import nees
+from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.stats.series import allan_deviation, autocorrelation
 from gpvo.types import Array, Status
 
 AXES = ("x", "y", "z", "rot x", "rot y", "rot z")
 _COLOURS = {
-    "constant": "#888888", "triangulation": "#1f77b4", "pointing_matching": "#ff7f0e",
+    "constant": "#888888", "triangulation": "#1f77b4", "pointing_matching": "#ff7f0e", "spherical": "#8c564b",
     "triangulation_scaled": "#17becf", "pointing_matching_scaled": "#bcbd22", "learned": "#2ca02c",
 }  # fmt: skip
 
 
-def best_statement(e: Evaluation) -> Statement | None:
-    """The statement to draw bounds of: ``learned`` where there is one, else ``triangulation``, else any full one."""
-    full = {s.method: s for s in e.statements if s.steps is not None}
-    return full.get("learned") or full.get("triangulation") or next(iter(full.values()), None)
+def colour(method: str) -> str:
+    """One colour per method, the same in every picture."""
+    return _COLOURS.get(method, "#9467bd")
 
 
 def _legend(ax: Axes, columns: int = 1) -> None:
     """A legend, where there is something to tell apart."""
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(frameon=False, fontsize=8, ncols=columns)
+        ax.legend(framealpha=0.8, edgecolor="none", fontsize=8, ncols=columns)
 
 
 def trajectory(e: Evaluation) -> Figure:
     """Top and side view of estimate and truth, with 3-sigma ellipses of the best statement."""
     figure = Figure(figsize=(9, 7), layout="constrained")
     top, side = figure.subplots(2, 1, height_ratios=(2, 1))
-    statement = best_statement(e)
+    statement = curves.best_statement(e)
     bounds = None if statement is None or statement.steps is None else along(statement.steps, e.run.log.parent)
     to_plane, names = level(e)
     p, q = e.T_est[:, :3, 3] @ to_plane.T, e.T_true[:, :3, 3] @ to_plane.T
@@ -51,7 +50,9 @@ def trajectory(e: Evaluation) -> Figure:
             for k in np.unique(np.linspace(0, len(p) - 1, 12).astype(int)):
                 R = to_plane @ e.T_est[k, :3, :3]
                 C = (R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]
-                axes.add_patch(_ellipse(p[k, [i, j]], C))
+                # As an artist the ellipse does not stretch the axes: a vast bound must not hide the path.
+                axes.add_artist(_ellipse(p[k, [i, j]], C))
+        axes.margins(0.15)
         axes.set_xlabel(f"{names[i]} [m]")
         axes.set_ylabel(f"{names[j]} [m]")
         axes.set_aspect("equal", adjustable="datalim")
@@ -65,7 +66,7 @@ def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
     """Axes to draw in. Truth in a camera's world (y down, as KITTI's) is turned so that the third axis points up."""
     down = e.T_true[e.covered][0, :3, :3] @ np.array([0.0, 1.0, 0.0])
     if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
-        return np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]), ("forward z", "right x", "up -y")
+        return R_FLU_OPTICAL, ("forward z", "left -x", "up -y")
     return np.eye(3), ("x", "y", "z")
 
 
@@ -80,8 +81,8 @@ def error_bounds(e: Evaluation) -> Figure:
     """Error of each motion against the 3-sigma bound, axis by axis."""
     figure = Figure(figsize=(10, 7), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True)
-    statement = best_statement(e)
-    t = (e.run.log.t_ns[e.errors.index] - e.run.log.t_ns[0]) * 1e-9
+    statement = curves.best_statement(e)
+    t = curves.error_times_s(e)
     for k in range(6):
         ax = axes[k % 3, k // 3]
         scale = 1e3
@@ -105,30 +106,13 @@ def reliability(e: Evaluation) -> Figure:
     """Share of errors inside the stated interval against its level: the diagonal is right, below is overconfident."""
     figure = Figure(figsize=(5.5, 5), layout="constrained")
     ax = figure.subplots()
-    levels = np.linspace(0.02, 0.98, 49)
-    for s in e.statements:
-        if s.steps is None:
-            continue
-        C = s.covariance[e.errors.index]
-        known = np.isfinite(C).all(axis=(1, 2))
-        if known.sum() < 2:
-            continue
-        sigma = np.sqrt(np.diagonal(C[known], axis1=1, axis2=2))
-        z = np.abs(e.errors.xi[known] - s.mean[e.errors.index][known]) / sigma
-        inside = np.array([(z <= q).mean() for q in _half_width(levels)])
-        ax.plot(levels, inside, label=s.method, color=_COLOURS.get(s.method))
+    for s in curves.full_statements(e):
+        ax.plot(curves.LEVELS, curves.reliability(e, s), label=s.method, color=colour(s.method))
     ax.plot([0, 1], [0, 1], color="black", lw=0.8, ls="--")
     ax.set(xlabel="stated probability", ylabel="share of errors inside", title=f"{e.run.name}: reliability")
     _legend(ax)
     ax.grid(alpha=0.3)
     return figure
-
-
-def _half_width(levels: Array) -> Array:
-    """Half-widths in sigmas of central normal intervals."""
-    from statistics import NormalDist
-
-    return np.array([NormalDist().inv_cdf(0.5 + p / 2) for p in levels])
 
 
 def memory(e: Evaluation) -> Figure:
@@ -155,10 +139,8 @@ def nees_over_time(e: Evaluation) -> Figure:
     """Joint NEES per degree of freedom, averaged over half a second, of every full method."""
     figure = Figure(figsize=(10, 3.5), layout="constrained")
     ax = figure.subplots()
-    t = (e.run.log.t_ns[e.errors.index] - e.run.log.t_ns[0]) * 1e-9
-    for s in e.statements:
-        if s.steps is not None:
-            _nees_line(ax, e, s, t)
+    for s in curves.full_statements(e):
+        ax.plot(*curves.nees_over_time(e, s), label=s.method, color=colour(s.method), lw=1)
     ax.axhline(1.0, color="black", lw=0.8, ls="--")
     ax.set(
         xlabel="time [s]", ylabel="NEES / dof", yscale="log", title=f"{e.run.name}: 1 is right, above is overconfident"
@@ -166,17 +148,6 @@ def nees_over_time(e: Evaluation) -> Figure:
     _legend(ax, 3)
     ax.grid(alpha=0.3)
     return figure
-
-
-def _nees_line(ax: Axes, e: Evaluation, s: Statement, t: Array) -> None:
-    C = s.covariance[e.errors.index]
-    known = np.isfinite(C).all(axis=(1, 2))
-    if known.sum() < 2:
-        return
-    values = nees(e.errors.xi[known] - s.mean[e.errors.index][known], C[known]) / 6
-    width = max(1, round(0.5 / max(float(np.median(e.errors.dt_s)), 1e-3)))
-    smooth = np.convolve(values, np.ones(width) / width, mode="same")
-    ax.plot(t[known], np.maximum(smooth, 1e-3), label=s.method, color=_COLOURS.get(s.method), lw=1)
 
 
 def inputs(e: Evaluation) -> Figure:

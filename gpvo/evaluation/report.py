@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import tempfile
@@ -10,11 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 
 from gpvo import __version__
-from gpvo.evaluation import plots
+from gpvo.evaluation import curves, panels, plots
 from gpvo.evaluation.accumulate import along
 from gpvo.evaluation.evaluate import Evaluation, document
 from gpvo.types import Array
@@ -47,8 +45,18 @@ def render(evaluations: Sequence[Evaluation]) -> str:
     environment.filters["number"] = _number
     runs = []
     for entry, evaluation in zip(document(evaluations)["runs"], evaluations, strict=True):
-        pictures = [(name, _svg(draw(evaluation))) for name, draw in plots.FIGURES.items()]
-        runs.append({"data": entry, "pictures": pictures, "scene": json.dumps(scene(evaluation))})
+        groups = panels.groups(evaluation)
+        for group in groups:
+            group["panels"] = [_embedded(panel) for panel in group["panels"]]
+        statement = curves.best_statement(evaluation)
+        runs.append(
+            {
+                "data": entry,
+                "groups": groups,
+                "scene": _embedded(scene(evaluation)),
+                "bounds_of": "no method" if statement is None else statement.method,
+            }
+        )
     return environment.get_template("report.html").render(runs=runs, version=__version__)
 
 
@@ -60,7 +68,7 @@ def scene(e: Evaluation) -> dict[str, Any]:
     shown = covered[np.unique(np.linspace(0, len(covered) - 1, _MAX_POINTS).astype(int))]
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T
     centre = (true.max(0) + true.min(0)) / 2
-    statement = plots.best_statement(e)
+    statement = curves.best_statement(e)
     ellipsoids: list[dict[str, Any]] = []
     if statement is not None and statement.steps is not None:
         bounds = along(statement.steps, e.run.log.parent)
@@ -82,13 +90,9 @@ def _rounded(values: Array) -> Any:
     return np.round(values, 5).tolist()
 
 
-def _svg(figure: Any) -> str:
-    # Text as text and a fixed salt: smaller, and the same input gives the same bytes.
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gpvo"}):
-        stream = io.StringIO()
-        figure.savefig(stream, format="svg", metadata={"Date": None})
-    text = stream.getvalue()
-    return text[text.index("<svg") :]
+def _embedded(value: Any) -> str:
+    """JSON that cannot end the element it stands in."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _number(value: float | None) -> str:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from evaluation_runs import make_run
-from gpvo.evaluation import plots
+from gpvo.evaluation import panels, plots
 from gpvo.evaluation.evaluate import Evaluation, document, evaluate_run
 from gpvo.evaluation.report import render, scene, write_report
 from gpvo.io.run import read_run, write_run
+from gpvo.types import VoLog
 from matplotlib.figure import Figure
 
 AXES = {
@@ -155,20 +158,80 @@ def test_the_file_is_whole_or_absent(evaluation, tmp_path, monkeypatch):
     assert [p.name for p in target.parent.iterdir()] == ["report.html"]
 
 
+def _embedded(page: str) -> list[dict]:
+    """Every JSON block of the page."""
+    return [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)]
+
+
+def test_every_panel_is_on_the_page(evaluation, page):
+    wanted = [panel for group in panels.groups(evaluation) for panel in group["panels"]]
+    assert _embedded(page)[1:] == wanted
+    labels = {panel["y"] for panel in wanted}
+    assert labels >= {"x [mm]", "rot z [mrad]", "share of errors inside", "NEES / dof", "autocorrelation", "points"}
+    # Both views, six axes, reliability and NEES, two memories, points alone: no images, no disparities.
+    assert len(wanted) == 2 + 6 + 2 + 2 + 1
+
+
+def test_a_panel_shows_the_lost_frame(evaluation):
+    (points,) = panels.inputs(evaluation)
+    assert points["shades"] == [{"from": 1.95, "to": 2.0, "colour": "#d62728"}]
+
+
+def test_thinning_loses_no_peak():
+    y = np.zeros(100_000)
+    y[12_345], y[77_777], y[500] = 5.0, -3.0, np.nan
+    x, thin = panels._thin(np.arange(100_000.0), y)
+    assert len(thin) <= panels.MAX_POINTS
+    assert (np.diff(x) > 0).all()
+    assert np.nanmax(thin) == 5.0
+    assert np.nanmin(thin) == -3.0
+
+
+def test_views_are_no_mirror_images(evaluation):
+    to_plane, _ = plots.level(evaluation)
+    assert np.linalg.det(to_plane) == pytest.approx(1.0)
+    T = np.tile(np.eye(4), (len(evaluation.T_true), 1, 1))
+    to_plane, names = plots.level(replace(evaluation, T_true=T))
+    assert names[0] == "forward z"
+    assert np.linalg.det(to_plane) == pytest.approx(1.0)
+
+
+def test_what_is_embedded_cannot_end_its_element(evaluation):
+    run = evaluation.run
+    said = {"</script><b>": np.eye(6) * 1e-6}
+    log = VoLog([replace(r, covariances=said if r.usable else {}, v_t={}) for r in run.log], run.log.camera)
+    nasty = render([evaluate_run(replace(run, log=log))])
+    assert "</script><b>" not in nasty
+    assert all(isinstance(block, dict) for block in _embedded(nasty))
+
+
 @pytest.mark.slow
-def test_a_browser_shows_the_page_without_errors(page, tmp_path):
+@pytest.mark.parametrize("width", [360, 1200])
+def test_a_browser_shows_the_page_without_errors(page, tmp_path, width):
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium here to open the report with")
-    # A mark at the end of the script tells that it ran to its end.
-    marked = page.replace("</body>", "<script>document.body.dataset.done = 'yes';</script></body>")
-    (tmp_path / "report.html").write_text(marked, encoding="utf-8")
+    # At the end of the scripts: did they run, does anything stick out sideways, and was anything fetched?
+    probe = """<script>
+    document.body.dataset.wide = document.documentElement.scrollWidth - window.innerWidth;
+    document.body.dataset.drawn = document.querySelectorAll("figure.panel svg path").length;
+    document.body.dataset.fetched = performance.getEntriesByType("resource").length;
+    document.body.dataset.letters = getComputedStyle(document.querySelector("figure text")).fontSize;
+    </script></body>"""
+    (tmp_path / "report.html").write_text(page.replace("</body>", probe), encoding="utf-8")
     command = [
         browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
-        f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", (tmp_path / "report.html").as_uri(),
+        f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
+        "--dump-dom", (tmp_path / "report.html").as_uri(),
     ]  # fmt: skip
     shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    assert 'data-done="yes"' in shown.stdout
+    found = dict(re.findall(r'data-(wide|drawn|fetched|letters)="([^"]*)"', shown.stdout))
+    assert int(found["wide"]) <= 0
+    assert int(found["drawn"]) >= 13
+    assert found["fetched"] == "0"
+    assert found["letters"] == "12px"
     # Drawing sets the size of the canvas.
     assert re.search(r'<canvas[^>]* width="\d+"', shown.stdout)
+    # The page forbids itself to fetch anything: an attempt would be an error here, as any other would.
+    assert "default-src 'none'" in page
     assert "CONSOLE" not in shown.stderr, shown.stderr

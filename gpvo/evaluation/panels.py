@@ -1,0 +1,196 @@
+"""What the page draws by itself: plain numbers for each panel, thinned to what a screen can show.
+
+A panel is ``{"title", "x": label, "y": label, "lines", "bands", "shades"}`` with optional ``log`` ("x", "y" or "xy"),
+``equal`` axes, ``limit`` (low, high) of y and ``level``, a reference line. NaN is None, a gap.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.evaluation import curves
+from gpvo.evaluation.accumulate import along
+from gpvo.evaluation.evaluate import Evaluation
+from gpvo.evaluation.plots import AXES, colour, level
+from gpvo.stats.series import allan_deviation, autocorrelation
+from gpvo.types import Array, Status
+
+Panel = dict[str, Any]
+
+MAX_POINTS = 500
+_BLACK, _RED, _GREEN = "#1b1b1b", "#d62728", "#2ca02c"
+_SIX = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
+_SHADES = {Status.DEGRADED: "#ffbf00", Status.LOST: _RED}
+
+
+def groups(e: Evaluation) -> list[dict[str, Any]]:
+    """Titled groups of panels, in the order of the page: ``{"title", "note", "panels"}``."""
+    statement = curves.best_statement(e)
+    method = "no method" if statement is None else statement.method
+    return [
+        {"title": "From above and from the side", "note": f"3-sigma ellipses of {method}.", "panels": views(e)},
+        {
+            "title": "Error of each motion against its bound",
+            "note": f"Black: error. Green: what {method} states, 3 sigma.",
+            "panels": errors(e),
+        },
+        {
+            "title": "Does it know?",
+            "note": "Overconfident is: below the diagonal; a NEES (mean over 0.5 s) above 1.",
+            "panels": [reliability(e), nees(e)],
+        },
+        {
+            "title": "How the error remembers",
+            "note": "A dip at the first lag: shared pixel noise. An Allan deviation that is flat or rises: bias.",
+            "panels": memory(e),
+        },
+        {"title": "What odometry saw", "note": "Amber: degraded. Red: lost.", "panels": inputs(e)},
+    ]
+
+
+def views(e: Evaluation) -> list[Panel]:
+    """Top and side view of truth and estimate, with 3-sigma ellipses."""
+    to_plane, names = level(e)
+    origin = e.T_true[e.covered][0, :3, 3]
+    p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
+    statement = curves.best_statement(e)
+    steps = None if statement is None else statement.steps
+    bounds = np.zeros((0, 6, 6)) if steps is None else along(steps, e.run.log.parent)
+    panels = []
+    for i, j in ((0, 1), (0, 2)):
+        lines = []
+        for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
+            R = to_plane @ e.T_est[k, :3, :3]
+            ring = _ring((R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]) + p[k, [i, j]]
+            lines.append({**_line(ring[:, 0], ring[:, 1], "", _GREEN, 0.8), "aside": True})
+        lines.append(_line(*_thin(q[:, i], q[:, j]), "truth", _BLACK, 1.6))
+        lines.append(_line(*_thin(p[:, i], p[:, j]), "visual odometry", _RED))
+        panels.append(_panel("", f"{names[i]} [m]", f"{names[j]} [m]", lines, equal=True))
+    return panels
+
+
+def errors(e: Evaluation) -> list[Panel]:
+    """The error of each motion and what is stated of it, axis by axis."""
+    statement, t, panels = curves.best_statement(e), curves.error_times_s(e), []
+    for k, axis in enumerate(AXES):
+        error = 1e3 * e.errors.xi[:, k]
+        bands = []
+        if statement is not None:
+            mean = 1e3 * statement.mean[e.errors.index, k]
+            reach = 3e3 * np.sqrt(statement.covariance[e.errors.index, k, k])
+            keep = _spread(len(t))
+            low, high = (mean - reach)[keep], (mean + reach)[keep]
+            bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
+        reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6) if len(error) else 1.0
+        lines = [_line(*_thin(t, error), "", _BLACK, 1.0)]
+        unit = "mm" if k < 3 else "mrad"
+        panels.append(_panel(axis, "time [s]", f"{axis} [{unit}]", lines, bands=bands, limit=[-reach, reach]))
+    return panels
+
+
+def reliability(e: Evaluation) -> Panel:
+    """Share of errors inside against the stated probability, of every method."""
+    lines = [
+        _line(curves.LEVELS, curves.reliability(e, s), s.method, colour(s.method)) for s in curves.full_statements(e)
+    ]
+    lines.append({**_line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
+    return _panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])
+
+
+def nees(e: Evaluation) -> Panel:
+    """NEES per degree of freedom over time, of every method."""
+    lines = []
+    for s in curves.full_statements(e):
+        t, values = curves.nees_over_time(e, s)
+        lines.append(_line(*_thin(t, values), s.method, colour(s.method)))
+    return _panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)
+
+
+def memory(e: Evaluation) -> list[Panel]:
+    """Autocorrelation and Allan deviation of the error, axis by axis."""
+    if len(e.errors.index) < 4:
+        return []
+    dt, rho, allan = float(np.median(e.errors.dt_s)), [], []
+    for k, axis in enumerate(AXES):
+        values = autocorrelation(e.errors.xi[:, k], min(60, len(e.errors.xi) // 2))
+        rho.append(_line(np.array([dt * lag for lag in range(len(values))]), values, axis, _SIX[k], 1.0))
+        allan.append(_line(*allan_deviation(e.errors.xi[:, k] / dt, dt), axis, _SIX[k], 1.0))
+    return [
+        _panel("Autocorrelation", "lag [s]", "autocorrelation", rho, level=0.0),
+        _panel("Allan deviation", "averaging time [s]", "deviation [m/s, rad/s]", allan, log="xy"),
+    ]
+
+
+def inputs(e: Evaluation) -> list[Panel]:
+    """Points, disparity and image over time, with the frames that were degraded or lost."""
+    log = e.run.log
+    t, shades = (log.t_ns - log.t_ns[0]) * 1e-9, _shades(e)
+    wanted = {
+        "points": ("n_stereo", "n_tracked", "n_inliers"),
+        "disparity [px]": ("disparity_p10_px", "disparity_p50_px", "disparity_p90_px"),
+        "image, 0 to 1": ("brightness", "contrast", "noise_level"),
+    }
+    panels = []
+    for label, names in wanted.items():
+        columns = {n: np.where(c < 0, np.nan, c) for n in names for c in [log.column(n).astype(np.float64)]}
+        known = [(n, c) for n, c in columns.items() if np.isfinite(c).any()]
+        lines = [_line(*_thin(t, c), n, _SIX[k]) for k, (n, c) in enumerate(known)]
+        if lines:
+            panels.append(_panel("", "time [s]", label, lines, shades=shades))
+    return panels
+
+
+def _shades(e: Evaluation) -> list[dict[str, Any]]:
+    """Stretches of time that were degraded or lost; each frame reaches back to the one before."""
+    t = (e.run.log.t_ns - e.run.log.t_ns[0]) * 1e-9
+    out: list[dict[str, Any]] = []
+    for k, record in enumerate(e.run.log):
+        tint = _SHADES.get(record.status)
+        if tint is None or k == 0:
+            continue
+        if out and out[-1]["colour"] == tint and out[-1]["k"] == k - 1:
+            out[-1].update(to=round(float(t[k]), 3), k=k)
+        else:
+            out.append({"from": round(float(t[k - 1]), 3), "to": round(float(t[k]), 3), "colour": tint, "k": k})
+    return [{key: shade[key] for key in ("from", "to", "colour")} for shade in out]
+
+
+def _panel(title: str, x: str, y: str, lines: list[dict[str, Any]], **more: Any) -> Panel:
+    return {"title": title, "x": x, "y": y, "lines": lines, **more}
+
+
+def _line(x: Array, y: Array, name: str, tint: str, width: float = 1.3) -> dict[str, Any]:
+    return {"x": _rounded(x), "y": _rounded(y), "name": name, "colour": tint, "width": width}
+
+
+def _ring(C: Array) -> Array:
+    """(49, 2) points of the 3-sigma ellipse of a (2, 2) covariance."""
+    values, vectors = np.linalg.eigh(C)
+    angle = np.linspace(0, 2 * np.pi, 49)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return 3 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
+def _spread(n: int) -> NDArray[np.int64]:
+    """At most ``MAX_POINTS`` indices, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS)).astype(np.int64)) if n else np.empty(0, np.int64)
+
+
+def _thin(x: Array, y: Array) -> tuple[Array, Array]:
+    """Lowest and highest y of each stretch, so that no peak is lost."""
+    n = len(x)
+    if n <= MAX_POINTS:
+        return x, y
+    edges = np.linspace(0, n, MAX_POINTS // 2 + 1).astype(int)
+    filled = np.where(np.isfinite(y), y, 0.0)
+    keep = sorted({a + int(pick(filled[a:b])) for a, b in pairwise(edges) for pick in (np.argmin, np.argmax)})
+    return x[keep], y[keep]
+
+
+def _rounded(values: Array) -> list[float | None]:
+    """Five digits are more than a screen shows."""
+    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=np.float64).tolist()]
