@@ -129,7 +129,9 @@ class SensorModel:
             x = cv2.GaussianBlur(x, (0, 0), p.psf_sigma_px)
         x = x * (self._fixed_pattern(side, x.shape) * np.float32(self.exposure or 1.0))
         if p.full_well_e > 0:
-            variance = np.maximum(x, 0) * np.float32(1 / p.full_well_e) + np.float32((p.read_noise_e / p.full_well_e) ** 2)
+            variance = np.maximum(x, 0) * np.float32(1 / p.full_well_e) + np.float32(
+                (p.read_noise_e / p.full_well_e) ** 2
+            )
             x += np.sqrt(variance, out=variance) * self._normal(x.shape, frame, side, _SHOT_STREAM)
         np.clip(x, 0, 1, out=x)
         x = np.sqrt(x, out=x) if p.gamma == 0.5 else np.power(x, np.float32(p.gamma), out=x)
@@ -162,4 +164,4 @@ def through_dust(linear: Image, depth: Image, extinction_per_m: float) -> Image:
     transmission = np.exp(-np.float32(extinction_per_m) * np.nan_to_num(np.abs(depth), nan=1e4))
     seen = linear[linear > 0]
     airlight = np.float32(np.median(seen[::16])) if len(seen) else np.float32(0)
-    return linear * transmission + airlight * (1 - transmission)
+    return (linear * transmission + airlight * (1 - transmission)).astype(np.float32)

@@ -15,13 +15,17 @@ _CHUNK = 4096
 class TriangleDistance:
     """Distance to the nearest of a mesh's triangles, found among those whose centres are near.
 
-    Good for meshes of roughly even triangles, as all worlds have. ``vertices`` (V, 3), ``faces`` (F, 3), visible from
-    the side of positive distance.
+    Triangles of each class of size are searched apart, lest many small ones hide a large one.
+    ``vertices`` (V, 3), ``faces`` (F, 3), visible from the side of positive distance.
     """
 
     def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
         self._corners = vertices[faces].astype(np.float64)
-        self._tree = cKDTree(self._corners.mean(axis=1))
+        centre = self._corners.mean(axis=1)
+        size = np.linalg.norm(self._corners - centre[:, None], axis=2).max(axis=1)
+        size_class = np.floor(np.log2(np.maximum(size, 1e-6)) / 1.5)
+        self._members = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
+        self._trees = [cKDTree(centre[members]) for members in self._members]
 
     def signed(self, points: Array) -> Array:
         """(N, 3) to (N,) [m], positive on the visible side."""
@@ -29,8 +33,11 @@ class TriangleDistance:
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def _signed(self, points: Array) -> Array:
-        count = min(_NEIGHBOURS, len(self._corners))
-        index = self._tree.query(points, k=count)[1].reshape(len(points), count)
+        found = []
+        for tree, members in zip(self._trees, self._members):
+            count = min(_NEIGHBOURS, len(members))
+            found.append(members[tree.query(points, k=count)[1].reshape(len(points), count)])
+        index = np.concatenate(found, axis=1)
         a, b, c = np.moveaxis(self._corners[index], 2, 0)
         nearest = closest_on_triangles(points[:, None], a, b, c)
         offset = points[:, None] - nearest

@@ -36,11 +36,29 @@ class Mesh:
 
     @classmethod
     def of(
-        cls, vertices: Array, normals: Array, uv: Array, light: Array, albedo: Array, faces: Array, material: Array
+        cls,
+        vertices: Array,
+        normals: Array,
+        uv: Array,
+        light: Array,
+        albedo: Array,
+        faces: NDArray[np.integer],
+        material: NDArray[np.integer],
     ) -> Mesh:
         """A mesh from arrays of any number type."""
-        floats = (np.ascontiguousarray(a, dtype=np.float32) for a in (vertices, normals, uv, light, albedo))
-        return cls(*floats, faces=faces.astype(np.int32), material=material.astype(np.uint8))
+
+        def single(a: Array) -> F32:
+            return np.ascontiguousarray(a, dtype=np.float32)
+
+        return cls(
+            vertices=single(vertices),
+            normals=single(normals),
+            uv=single(uv),
+            light=single(light),
+            albedo=single(albedo),
+            faces=faces.astype(np.int32),
+            material=material.astype(np.uint8),
+        )
 
 
 @dataclass(frozen=True)
