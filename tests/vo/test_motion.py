@@ -85,7 +85,7 @@ def nees_per_dof(count: int, disparity_px: tuple[float, float], sigma_px: float,
 
 
 # Near: 20 to 80 px of disparity. Far: from the cut-off of 10 sigmas of disparity to 30, sigma_d = 0.5 sqrt(2) px. With
-# all points between 10 and 14 sigmas their noise is as large as their spread in depth, and NEES/dof rises to 1.04 to 1.08.
+# all points between 10 and 14 sigmas their noise is as large as their spread in depth: NEES/dof is 1.04 to 1.08 there.
 NEAR, FAR = (20.0, 80.0), (0.5 * np.sqrt(2) * 10, 0.5 * np.sqrt(2) * 30)
 
 
