@@ -135,14 +135,15 @@ def _print(e: Evaluation) -> None:
         f"{d['run']}: {d['frames']} frames, {d['lost']} lost, {d['path_length_m']:.1f} m; ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )
+    errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
+    relative = (f"{name} {_text(m)} m, {_text(math.degrees(rad))} deg" for name, m, rad in errors)
+    console.print(f"  relative error (rms) over a {'; '.join(relative)}")
     for s in (s for s in d["segments"] if s["count"]):
         console.print(
             f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"
             f" ({s['count']})"
         )
-    table = Table(
-        "method", "NEES/dof", "interval", "median", "with truth noise", "1, 2, 3 sigma [%]", "NLL", "final [m]"
-    )
+    table = Table("method", "NEES/dof", "interval", "median", "over 1 s", "1, 2, 3 sigma [%]", "NLL", "final [m]")
     for method, m in d["methods"].items():
         block = "joint" if m["nees_dof"]["joint"] is not None else "translation"
         if m["nees_dof"][block] is None:
@@ -150,20 +151,31 @@ def _print(e: Evaluation) -> None:
         low, high = m["nees_dof_interval"][block]
         table.add_row(
             method + (" (translation)" if block == "translation" else ""),
-            _text(m["nees_dof"][block]),
+            _pair(m["nees_dof"][block], m["nees_dof_truth_noise"][block]),
             f"{_text(low)} to {_text(high)}",
             _text(m["nees_dof_median"][block]),
-            _text(m["nees_dof_truth_noise"][block]),
+            _pair(m["one_second"]["nees_dof"], m["one_second"]["nees_dof_truth_noise"]),
             " ".join(f"{100 * c:.0f}" for c in m["coverage"].values()),
             _text(m["nll_per_dim"]),
             _text(m["predicted_final_error_m"]),
         )
     if table.row_count:
         console.print(table)
+        sigma = d["truth_sigma"]
+        if sigma["translation_m"] or sigma["rotation_rad"]:
+            noise = f"{1e3 * sigma['translation_m']:.3g} mm, {1e3 * sigma['rotation_rad']:.3g} mrad per pose"
+            console.print(f"In brackets: with the truth's own noise ({noise}) added to what is stated.")
 
 
 def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+    return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
+
+
+def _pair(plain: float | None, with_truth_noise: float | None) -> str:
+    """Both in one cell; one number where the truth has no noise."""
+    if plain is None or _text(plain) == _text(with_truth_noise):
+        return _text(plain)
+    return f"{_text(plain)} ({_text(with_truth_noise)})"
 
 
 def register(app: typer.Typer) -> None:

@@ -168,30 +168,31 @@ class Predictor:
         ]
 
     def _publish(self, record: VoRecord, estimate: Estimate) -> Prediction:
-        parts, status, confidence = dict(estimate.parts), record.status, float(estimate.confidence)
+        status, confidence, mean = record.status, float(estimate.confidence), estimate.mean
         scale = self._adaptive.scale
-        parts = {name: C * np.outer(scale, scale) for name, C in parts.items()}
+        parts = {name: C * np.outer(scale, scale) for name, C in estimate.parts.items()}
         if estimate.in_domain < DEGRADED_BELOW and status is Status.OK:
             status = Status.DEGRADED
         if status is Status.DEGRADED:
             confidence *= 0.5
         if status is Status.LOST:
-            # No motion was measured: what stands in for it may be as wrong as the vehicle is fast, or the jump is long.
-            parts["white"] = parts["white"] + np.diag(self._lost_variance(record))
-            confidence = 0.0
+            # What was learnt of measured motions does not apply to one that was not: it may be as wrong as the vehicle
+            # is fast, or the jump is long.
+            parts = dict.fromkeys(PARTS, np.zeros((6, 6))) | {"white": np.diag(self._lost_variance(record))}
+            confidence, mean = 0.0, np.zeros(6)
         covariance = parts["jitter"] + parts["white"] + parts["bias"]
         sigma = np.sqrt(np.diagonal(covariance))
-        self._stated[record.t_ns] = (estimate.mean, sigma)
+        self._stated[record.t_ns] = (mean, sigma)
         if len(self._stated) > _REMEMBERED:
             del self._stated[next(iter(self._stated))]
         return Prediction(
             record.t_ns,
             record.dt_s,
-            estimate.mean,
+            mean,
             covariance,
             parts,
             self.model.bias_tau_s,
-            estimate.epistemic * scale**2,
+            np.minimum(estimate.epistemic * scale**2, np.diagonal(covariance)),
             confidence,
             float(estimate.in_domain),
             status,

@@ -115,6 +115,7 @@ def test_the_table_shows_the_numbers_of_json(evaluation, page):
     m = run["methods"]["triangulation"]
     expected = [m["nees_dof"][b] for b in ("joint", "translation", "rotation")]
     expected += [m["nees_dof_median"]["joint"], m["nees_dof_truth_noise"]["joint"]]
+    expected += [m["one_second"][name] for name in ("nees_dof", "nees_dof_truth_noise")]
     expected += [100 * m["coverage"][k] for k in "123"]
     expected += [m["nll_per_dim"], 1000 * m["crps"]["translation_m"], m["predicted_final_error_m"]]
     assert rows["triangulation"][1:] == [shown(v) for v in expected]

@@ -109,6 +109,19 @@ def test_a_slip_is_lost_and_its_covariance_covers_the_jump(predictor, flight):
     assert said[81].status is not Status.LOST
 
 
+def test_a_lost_motion_may_be_as_wrong_as_the_vehicle_is_fast_and_no_more(predictor, flight):
+    """Odometry's own words on a lost motion are no pixel noise: the scale learnt for that must not multiply them."""
+    records = list(flight[0].records)
+    vague = np.diag([0.1**2] * 3 + [0.05**2] * 3)
+    records[80] = replace(records[80], status=Status.LOST, covariances=dict.fromkeys(records[80].covariances, vague))
+    said = [predictor.step(r) for r in records[:81]][-1]
+    usual = predictor.arrays["lost_rate_var"] * records[80].dt_s ** 2
+    assert (said.sigma >= np.sqrt(usual) * (1 - 1e-9)).all()
+    assert (said.sigma < 3 * np.sqrt(usual) + 0.01).all()
+    assert not said.mean.any()
+    assert not said.parts["jitter"].any()
+
+
 def test_explanation_names_the_input_that_changed(predictor, flight):
     for record in flight[0].records[:30]:
         predictor.step(record)

@@ -34,8 +34,8 @@
   const label = v => v === 0 ? "0" : Math.abs(v) >= 1e4 || Math.abs(v) < 1e-3 ? v.toExponential(0).replace("e+", "e")
     : String(Number(v.toPrecision(4)));
 
-  function draw(figure, panel, index) {
-    const width = Math.max(260, figure.clientWidth), square = panel.equal;
+  function draw(figure, panel, index, fixed) {
+    const width = fixed || Math.max(260, figure.clientWidth), square = panel.equal;
     const left = 58, right = 10, top = 8, bottom = 40;
     const [logX, logY] = [(panel.log || "").includes("x"), (panel.log || "").includes("y")];
     let [x0, x1] = extent(panel, "x", logX), [y0, y1] = panel.limit || extent(panel, "y", logY);
@@ -108,7 +108,10 @@
   const figures = [...document.querySelectorAll("figure.panel")];
   const data = figures.map(f => JSON.parse(f.querySelector("script").textContent));
   let drawn = 0;
-  const drawAll = () => { drawn = window.innerWidth; figures.forEach((f, i) => draw(f, data[i], i)); };
+  const drawAll = fixed => { drawn = window.innerWidth; figures.forEach((f, i) => draw(f, data[i], i, fixed)); };
   window.addEventListener("resize", () => { if (window.innerWidth !== drawn) drawAll(); });
+  // Two panels stand side by side on paper, each this wide.
+  window.addEventListener("beforeprint", () => drawAll(340));
+  window.addEventListener("afterprint", () => drawAll());
   drawAll();
 })();
