@@ -1,12 +1,12 @@
 # make demo   set up and show the main job, in a few minutes
 # make test   set up and run lint, import contracts, types and tests
-# make check  the longer tests: every README command, notebooks, docs, other people's readers
+# make check  the longer tests: every README command, Monte Carlo, memory, pictures, a browser
 # make bench  speed and memory, as ratios within one run
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test check bench docs clean
+.PHONY: demo test check bench clean
 
 .venv/pip-ready:
 	$(PYTHON) -m venv .venv
@@ -39,8 +39,5 @@ check: .venv/test-ready
 bench: .venv/test-ready
 	$(BIN)/python -m bench
 
-docs: .venv/test-ready
-	$(BIN)/sphinx-build -W --keep-going -q docs docs/_build
-
 clean:
-	rm -rf .venv out docs/_build .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv out .pytest_cache .mypy_cache .ruff_cache
