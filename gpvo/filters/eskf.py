@@ -44,6 +44,7 @@ Array = NDArray[np.float64]
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _EYE = np.eye(JOINT)
 GRAVITY_MPS2 = 9.80665
+_MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
 
 
 @dataclass(frozen=True)
@@ -229,10 +230,12 @@ class ErrorStateFilter:
         return Innovation(r, S, nis, passed, used)
 
     def _doubt(self, factor: Array) -> None:
-        """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,)."""
+        """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,), within reason."""
+        variance = np.diagonal(self.P, axis1=1, axis2=2)
+        room = np.minimum(_MOST_SPEED_VAR / variance[:, V].max(axis=1), _MOST_ANGLE_VAR / variance[:, TH].max(axis=1))
         D = np.ones((self.batch, JOINT))
         for block in (V, TH, BA, BG, me.CLONE_TH):
-            D[:, block] = np.sqrt(np.maximum(factor, 1.0))[:, None]
+            D[:, block] = np.sqrt(np.maximum(np.minimum(factor, room), 1.0))[:, None]
         self.P = self.P * (D[:, :, None] * D[:, None, :])
 
     def _joseph(self, K: Array, H: Array, R: Array) -> None:

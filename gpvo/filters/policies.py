@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,22 +70,29 @@ class GeometricPolicy:
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """The predicted error: its mean taken off, its covariance in the parts by which it accumulates.
+    """The predicted error: its covariance in the parts by which it accumulates, and its mean.
 
-    ``use_parts`` False treats the total as independent from motion to motion, to show what the parts are worth.
+    ``mean``: ``subtract`` takes it off the measurement; ``absorb`` leaves the measurement alone and adds the mean's
+    square to the covariance. A mean that depends on VO's own motion pulls it towards the motions seen in training, a
+    prior that a filter with its own motion model would count twice; absorbing it does not. ``use_parts`` False treats
+    the total as independent from motion to motion, to show what the parts are worth.
     """
 
     name: str = LEARNED
     use_parts: bool = True
+    mean: Literal["subtract", "absorb"] = "subtract"
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
         """The prediction's parts as filter noise; None without a prediction for this frame."""
         if prediction is None or not is_positive_definite(prediction.covariance):
             return None
-        mean = np.asarray(prediction.mean, dtype=np.float64)[None]
+        mean = np.asarray(prediction.mean, dtype=np.float64)
+        covariance = prediction.covariance
+        if self.mean == "absorb":
+            covariance, mean = covariance + np.outer(mean, mean), _ZERO_MEAN[0]
         if not self.use_parts:
-            return MotionNoise(mean, prediction.covariance[None])
-        return split_noise(mean, prediction.covariance, prediction.parts, prediction.bias_tau_s)
+            return MotionNoise(mean[None], covariance[None])
+        return split_noise(mean[None], covariance, prediction.parts, prediction.bias_tau_s)
 
 
 def split_noise(mean: Array, covariance: Array, parts: Mapping[str, Array], bias_tau_s: Array) -> MotionNoise:
