@@ -14,10 +14,10 @@ class VoConfig:
     """Everything that changes what the odometry does. Pixels are those of the rectified image."""
 
     preset: str = "fast"
-    max_features: int = 450  # corners kept per frame
+    max_features: int = 300  # corners kept per frame
     min_distance_px: float = 9.0  # between corners
     corner_quality: float = 0.004  # relative to the best corner of the image
-    klt_window_px: int = 21
+    klt_window_px: int = 15
     klt_levels: int = 4
     max_row_error_px: float = 1.5  # of a left-right match; an ideal rectification gives 0
     min_disparity_px: float = 0.5  # below, depth is unknown even in order of magnitude

@@ -30,7 +30,7 @@ class _View:
     right: Image
     half_left: Image
     half_right: Image
-    survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) and disparity, of the half images
+    survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) of the half image, disparity of a quarter one
     uvd: Array  # (N, 3) points usable as reference
     left_uv: Points  # (N, 2) their positions in the left image, the templates' centres
 
@@ -113,13 +113,13 @@ class KltFrontend:
         return np.where(visible[:, None], moved.uvd.T, uvd)
 
     def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:
-        """Corners of the half-size left image, strongest first, and its block-matched disparity."""
+        """Corners of the half-size left image, strongest first, and disparity at a quarter of the size."""
         config = self._config
-        limit = int(config.max_disparity_share * self._camera.width / 2)
+        limit = int(config.max_disparity_share * self._camera.width / 4)
         found = opencv.corners(
             half_left, config.max_features, config.corner_quality, config.min_distance_px / 2, self._half_mask
         )
-        return found, opencv.coarse_disparity(half_left, half_right, limit)
+        return found, opencv.coarse_disparity(opencv.halve(half_left), opencv.halve(half_right), limit)
 
     def _new_corners(self, view: _View, taken_uv: Points) -> Points:
         """Corners (N, 2) away from those taken, on even pixels of the full image."""
@@ -135,12 +135,12 @@ class KltFrontend:
         if len(uv) == 0:
             return np.empty((0, 3)), np.empty(0, bool)
         coarse = view.survey.result()[1]
-        x, y = (uv / 2).astype(int).T
+        x, y = (uv / 4).astype(int).T
         near = coarse[np.clip(y, 0, coarse.shape[0] - 1), np.clip(x, 0, coarse.shape[1] - 1)]
         known = near >= 0
         # Where the block matcher saw nothing, the median of what it saw is the fairest start.
-        default = np.median(near[known]) if known.any() else 4.0
-        return self._find_right(view, uv, 2.0 * np.where(known, near, default))
+        default = np.median(near[known]) if known.any() else 2.0
+        return self._find_right(view, uv, 4.0 * np.where(known, near, default))
 
     def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) measurements of left points, from a guessed disparity; and which of them can be believed."""

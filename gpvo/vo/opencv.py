@@ -42,7 +42,7 @@ def track(
         winSize=(window_px, window_px),
         maxLevel=levels - 1,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02),
         minEigThreshold=1e-4,
     )
     moved = moved[:, 0]
