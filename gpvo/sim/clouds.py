@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import GpvoError
-from gpvo.sim import paths
+from gpvo.sim import paths, recorded
 from gpvo.sim.paths import Path3
 from gpvo.types import Array
 
@@ -51,7 +51,7 @@ def _path(
     file = Path(path)
     if not file.is_file():
         raise GpvoError(f"'{path}' is neither a path kind nor a file", cure="along, wander, straight, hover or a file")
-    return paths.flown(file, low, high, duration_s, rng)
+    return recorded.flown(file, low, high, duration_s, rng)
 
 
 def _tunnel_line(length_m: float, rng: np.random.Generator, bend: float) -> Array:

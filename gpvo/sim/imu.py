@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.types import Array, ImuLog, ImuNoise
 
@@ -20,7 +21,8 @@ class ImuModel:
 
     ``noise``: densities and walks. ``vibration_mps2``: amplitude of the rotors' vibration on the accelerometer at
     ``vibration_hz``. ``misalignment_rad``: standard deviation of the sensor's mounting error, drawn once per flight.
-    ``bias_gyro_radps``, ``bias_acc_mps2``: standard deviations of the biases at the start.
+    ``bias_gyro_radps``, ``bias_acc_mps2``: standard deviations of the biases at the start. ``exact``: nothing is added
+    at all; ``noise`` is then only what the calibration file says, so that filters have a number above zero.
     """
 
     noise: ImuNoise
@@ -29,12 +31,13 @@ class ImuModel:
     misalignment_rad: float = 0.0
     bias_gyro_radps: float = 0.0
     bias_acc_mps2: float = 0.0
+    exact: bool = False
 
 
 # Densities: the values of Kalibr's files for the ADIS16448 of the EuRoC MAV data set and, for the T265's BMI055, of its
 # data sheet (0.014 deg/s/sqrt(Hz), 150 ug/sqrt(Hz)).
 PRESETS: dict[str, ImuModel] = {
-    "perfect": ImuModel(ImuNoise(1e-6, 1e-6, 1e-8, 1e-8)),
+    "perfect": ImuModel(ImuNoise(1e-6, 1e-6, 1e-8, 1e-8), exact=True),
     "euroc": ImuModel(ImuNoise(1.7e-4, 2.0e-3, 1.9e-5, 3.0e-3), 0.3, 85.0, 0.0, 0.005, 0.05),
     "t265": ImuModel(ImuNoise(2.4e-4, 1.5e-3, 2.0e-5, 1.0e-3), 0.5, 95.0, 0.002, 0.01, 0.1),
 }
@@ -43,8 +46,7 @@ PRESETS: dict[str, ImuModel] = {
 @dataclass(frozen=True)
 class Motion:
     """Truth of a body at equal steps: ``t_s`` (N,), ``position_m`` (N, 3) and ``R_world_body`` (N, 3, 3) in a z-up
-    world,
-    ``velocity_mps``, ``acceleration_mps2`` (N, 3) in world axes, ``rate_radps`` (N, 3) in body axes."""
+    world, ``velocity_mps``, ``acceleration_mps2`` (N, 3) in world axes, ``rate_radps`` (N, 3) in body axes."""
 
     t_s: Array
     position_m: Array
@@ -56,6 +58,10 @@ class Motion:
     def thinned(self, every: int) -> Motion:
         """Every n-th sample."""
         return Motion(*(getattr(self, name)[::every] for name in self.__dataclass_fields__))
+
+    def at(self, index: NDArray[np.int64]) -> Motion:
+        """The samples of these indices."""
+        return Motion(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
 def exact_imu(motion: Motion, gravity_mps2: float = GRAVITY_MPS2) -> tuple[Array, Array]:
@@ -72,6 +78,9 @@ def measured_imu(
     n, dt = len(motion.t_s), float(motion.t_s[1] - motion.t_s[0])
     noise = model.noise
     gyro, force = exact_imu(motion, gravity_mps2)
+    t_ns = t_start_ns + np.rint(motion.t_s * 1e9).astype(np.int64)
+    if model.exact:
+        return ImuLog(t_ns, gyro, force, noise), np.zeros((n, 3)), np.zeros((n, 3))
     tilt = model.misalignment_rad * rng.standard_normal(3)
     turn = np.eye(3) + np.array([[0, -tilt[2], tilt[1]], [tilt[2], 0, -tilt[0]], [-tilt[1], tilt[0], 0]])
 
@@ -87,5 +96,4 @@ def measured_imu(
     white = 1.0 / np.sqrt(dt)
     gyro = gyro @ turn.T + bias_gyro + noise.gyro_density_radps_sqrthz * white * rng.standard_normal((n, 3))
     force = force @ turn.T + bias_acc + shake + noise.acc_density_mps2_sqrthz * white * rng.standard_normal((n, 3))
-    t_ns = t_start_ns + np.rint(motion.t_s * 1e9).astype(np.int64)
     return ImuLog(t_ns, gyro, force, noise), bias_gyro, bias_acc

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
-from gpvo.errors import SourceError
+from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.sim.imu import GRAVITY_MPS2, Motion
 from gpvo.types import Array
@@ -50,18 +49,19 @@ def smooth_start(t_s: Array, rest_s: float, ramp_s: float = 2.0) -> Array:
 
 
 def along_curve(
-    centre: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, *, sway_m: float, rest_s: float = 3.0
-) -> Path3:
+    centre: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, *, sway_m: float, rest_s: float = 3.0,
+    agility: float = 1.0,
+) -> Path3:  # fmt: skip
     """Flight along a polyline (N, 3) [m] with lateral and vertical sway, the nose along the curve.
 
-    The speed varies by a third around ``speed_mps``. Where the curve ends before the time does, the flight slows and
-    hovers there.
+    The speed varies by a third around ``speed_mps``. ``agility`` multiplies how quickly it sways, turns and changes
+    speed. Where the curve ends before the time does, the flight slows and hovers there.
     """
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
     curve = make_interp_spline(arc, gaussian_filter1d(centre, 3.0, axis=0, mode="nearest"), k=5)
-    t = _knots(duration_s)
+    t = knots(duration_s)
     pace = smooth_start(t, rest_s)
-    w, ph = rng.uniform(0.15, 0.5, 5), rng.uniform(0, 2 * np.pi, 5)
+    w, ph = agility * rng.uniform(0.15, 0.5, 5), rng.uniform(0, 2 * np.pi, 5)
     s = speed_mps * (pace + 0.33 / w[0] * (np.sin(w[0] * pace + ph[0]) - np.sin(ph[0])))
     room = arc[-1] - 1.0
     s = room * np.tanh(s / room * 1.0) if s[-1] > 0.8 * room else s
@@ -78,22 +78,25 @@ def along_curve(
 
 
 def wandering(
-    low: Array, high: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float = 3.0
-) -> Path3:
-    """A smooth random flight within a box [m]: sums of sines, the nose turning slowly."""
-    t = _knots(duration_s)
+    low: Array, high: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float = 3.0,
+    agility: float = 1.0,
+) -> Path3:  # fmt: skip
+    """A smooth random flight within a box [m]: sums of sines, the nose turning slowly. ``agility`` makes the bends at
+    the same speed tighter, and the turns of the nose quicker."""
+    t = knots(duration_s)
     pace = smooth_start(t, rest_s)
     half, middle = (np.asarray(high) - low) / 2, (np.asarray(high) + low) / 2
     w = rng.uniform(0.5, 1.5, (3, 3))
     amplitude = rng.uniform(0.3, 1.0, (3, 3))
-    amplitude *= half / amplitude.sum(0)
+    amplitude *= half / amplitude.sum(0) / max(agility, 1.0)
     # Mean speed of the sum of sines is near its root mean square: scale the frequencies to the speed asked for.
     rms = np.sqrt(0.5 * ((amplitude * w) ** 2).sum())
     w = w * speed_mps / rms
     ph = rng.uniform(0, 2 * np.pi, (3, 3))
     angle = w[None] * pace[:, None, None] + ph[None]
     position = middle + (amplitude * np.sin(angle)).sum(1)
-    yaw = rng.uniform(-np.pi, np.pi) + 1.2 * np.sin(0.25 * pace + ph[0, 0]) + 0.4 * np.sin(0.7 * pace + ph[1, 1])
+    turn = agility * pace
+    yaw = rng.uniform(-np.pi, np.pi) + 1.2 * np.sin(0.25 * turn + ph[0, 0]) + 0.4 * np.sin(0.7 * turn + ph[1, 1])
     return _flat(t, position, yaw, duration_s)
 
 
@@ -103,7 +106,7 @@ def straight(
 ) -> Path3:  # fmt: skip
     """A straight drive; ``ground(xy (N, 2)) -> z (N,)`` gives the height of the wheels' path, whose slope it
     follows."""
-    t = _knots(duration_s)
+    t = knots(duration_s)
     s = speed_mps * smooth_start(t, rest_s)
     unit = np.asarray(direction, float) / np.linalg.norm(direction)
     position = np.asarray(start, float) + s[:, None] * unit
@@ -121,47 +124,38 @@ def straight(
 
 def hover(at: Array, yaw_rad: float, duration_s: float) -> Path3:
     """Standing in the air."""
-    t = _knots(duration_s)
+    t = knots(duration_s)
     return _flat(t, np.tile(np.asarray(at, float), (len(t), 1)), np.full(len(t), yaw_rad), duration_s)
 
 
-def flown(
-    file: Path, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
-) -> Path3:
-    """A recorded path (TUM lines, z up) scaled down to fit a box [m], level at its start, looking in a random
-    direction.
+def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float = 3.0) -> Path3:
+    """Flight through points (N, 3) [m] on a cubic spline, the nose along it; it slows down and hovers at the last.
 
     Raises
     ------
-    SourceError
-        Where the file is no trajectory, or is shorter than the flight.
+    GpvoError
+        For fewer than two points, or two equal ones in a row.
     """
-    from gpvo.io.trajectory import read_tum
+    corners = np.asarray(points, float).reshape(-1, 3)
+    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    if len(corners) < 2 or (np.diff(chord) < 1e-3).any():
+        raise GpvoError("waypoints need at least two places, none twice in a row", cure="waypoints = [[x, y, z], ...]")
+    curve = make_interp_spline(chord, corners, k=min(3, len(corners) - 1))
+    fine = np.linspace(0.0, chord[-1], max(2000, int(50 * chord[-1])))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
+    at_arc = CubicSpline(along, fine)
+    t = knots(duration_s)
+    u = at_arc(soft_end(speed_mps * smooth_start(t, rest_s), along[-1], 0.5 * speed_mps))
+    # A step straight up has no heading of its own: it keeps a trace of the first one.
+    tangent = curve.derivative(1)(u) + 1e-3 * (corners[-1] - corners[0])
+    return _flat(t, curve(u), np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), duration_s)
 
-    recorded = read_tum(file)
-    clock = (recorded.t_ns - recorded.t_ns[0]) * 1e-9
-    needed = float(smooth_start(np.array([duration_s]), rest_s)[0])
-    if clock[-1] < needed:
-        raise SourceError(f"lasts {clock[-1]:.1f} s, the flight needs {needed:.1f} s", where=file)
-    # Laser and motion capture jitter by millimetres: smoothed over a tenth of a second before it is flown.
-    grid = np.arange(0.0, needed + 0.3, 0.02)
-    poses = _resample(clock, recorded.T_world_body, np.minimum(grid, clock[-1]))
-    p = gaussian_filter1d(poses[:, :3, 3], 5.0, axis=0, mode="nearest")
-    turned = _continuous(se3.rotation_to_quaternion_xyzw(poses[:, :3, :3] @ poses[0, :3, :3].T))
-    turned = gaussian_filter1d(turned, 5.0, axis=0, mode="nearest")
-    spin = se3.so3_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
-    p = p - p.mean(0)
-    scale = min(1.0, float(((np.asarray(high) - low) / np.maximum(np.ptp(p, axis=0), 1e-6)).min()))
-    middle = (np.asarray(high) + low) / 2
-    p = (p - (p.max(0) + p.min(0)) / 2) * scale + middle
-    place, pose = make_interp_spline(grid, p, k=5), make_interp_spline(grid, turned, k=5)
-    t = _knots(duration_s)
-    pace = smooth_start(t, rest_s)
-    return Path3(
-        make_interp_spline(t, place(pace), k=5),
-        lambda u: se3.from_quaternion(np.zeros((len(u), 3)), pose(smooth_start(u, rest_s)))[:, :3, :3] @ spin,
-        duration_s,
-    )
+
+def soft_end(distance: Array, limit: float, width: float) -> Array:
+    """The same distance as long as it is far from ``limit`` [m], which it approaches smoothly and never passes."""
+    width = min(width, 0.2 * limit)
+    left = width * np.logaddexp(0.0, (limit - np.asarray(distance)) / width)
+    return np.clip(width * np.logaddexp(0.0, limit / width) - left, 0.0, limit)
 
 
 def _smoothstep(x: Array) -> Array:
@@ -170,7 +164,8 @@ def _smoothstep(x: Array) -> Array:
     return 35 * y**4 - 84 * y**5 + 70 * y**6 - 20 * y**7
 
 
-def _knots(duration_s: float) -> Array:
+def knots(duration_s: float) -> Array:
+    """Times [s] of a path's support points."""
     # A margin, so that differences at the ends stay inside.
     return np.arange(-0.2, duration_s + 0.24, 1.0 / _KNOTS_PER_S)
 
@@ -197,15 +192,3 @@ def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float 
 def _from_rpy(rpy: Array) -> Array:
     roll, pitch, yaw = (se3.so3_exp(rpy[:, i, None] * np.eye(3)[i]) for i in range(3))
     return yaw @ pitch @ roll
-
-
-def _resample(clock: Array, T: Array, at: Array) -> Array:
-    j = np.clip(np.searchsorted(clock, at), 1, len(clock) - 1)
-    share = (at - clock[j - 1]) / np.maximum(clock[j] - clock[j - 1], 1e-9)
-    return se3.interpolate(T[j - 1], T[j], np.clip(share, 0, 1))
-
-
-def _continuous(q_xyzw: Array) -> Array:
-    """The same rotations with signs that do not jump: q and -q are equal."""
-    flips = np.where((q_xyzw[1:] * q_xyzw[:-1]).sum(1) < 0, -1.0, 1.0)
-    return q_xyzw * np.cumprod(np.concatenate([[1.0], flips]))[:, None]

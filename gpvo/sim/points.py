@@ -26,7 +26,8 @@ from gpvo.types import Array, ImuLog, StereoCamera
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Standard deviations of the written calibration's error: what a data sheet allows, drawn once per flight."""
+    """Standard deviations of how the true rig differs from the written one: what a data sheet allows, drawn once per
+    flight."""
 
     baseline: float = 0.0  # fraction
     focal: float = 0.0  # fraction
@@ -57,6 +58,7 @@ class PointsScenario:
     dark: tuple[float, float] | None = None  # no tracks from, to
     frozen: tuple[float, float] | None = None  # the same picture from, to
     tolerance: Tolerance = field(default_factory=Tolerance)
+    offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
 
 
 SCENARIOS: dict[str, PointsScenario] = {
@@ -265,13 +267,12 @@ class _TrueRig:
 
     @classmethod
     def draw(cls, scenario: PointsScenario, rng: np.random.Generator) -> _TrueRig:
-        tolerance, c = scenario.tolerance, scenario.camera
+        tolerance, offset, c = scenario.tolerance, scenario.offset, scenario.camera
         e = rng.standard_normal(5)
-        focal = 1 + tolerance.focal * e[1]
-        camera = replace(
-            c, baseline_m=c.baseline_m * (1 + tolerance.baseline * e[0]), fx_px=c.fx_px * focal, fy_px=c.fy_px * focal
-        )
-        return cls(camera, se3.so3_exp(tolerance.rotation_rad * e[2:]))
+        focal = 1 + offset.focal + tolerance.focal * e[1]
+        baseline_m = c.baseline_m * (1 + offset.baseline + tolerance.baseline * e[0])
+        camera = replace(c, baseline_m=baseline_m, fx_px=c.fx_px * focal, fy_px=c.fy_px * focal)
+        return cls(camera, se3.so3_exp(tolerance.rotation_rad * e[2:] + [0.0, offset.rotation_rad, 0.0]))
 
     def project(self, T_world_cam: Array, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Left and right pixels (n, 2) of world points, and which are in both images between 0.4 and 40 m."""

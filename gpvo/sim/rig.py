@@ -16,6 +16,8 @@ from gpvo.types import Array
 
 # The left camera looks forward from the nose, level. The IMU is the body's origin.
 T_BODY_LEFT = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
+# Where it sits on a vehicle, in body axes [m]: a rover carries it on a mast.
+PLACE_M = {"quadrotor": (0.12, 0.0, 0.02), "path": (0.12, 0.0, 0.02), "rover": (0.35, 0.0, 0.75)}
 
 
 @dataclass(frozen=True)
@@ -63,17 +65,50 @@ def camera_rig(name: str) -> StereoRig:
     return _PRESETS[name]()
 
 
-def draw_rig(written: StereoRig, tolerance: RigTolerance, rng: np.random.Generator) -> StereoRig:
-    """The rig that draws the pictures, given what its calibration says: baseline, focal length, the turn between the
-    cameras and distortion differ by what ``tolerance`` allows."""
-    e = rng.standard_normal(7)
+def mounted(rig: StereoRig, vehicle: str, pitch_deg: float) -> StereoRig:
+    """The rig on a vehicle, looking ``pitch_deg`` below straight ahead."""
+    down = se3.so3_exp(np.array([0.0, np.deg2rad(pitch_deg), 0.0]))
+    T = se3.from_rt(down @ R_FLU_OPTICAL, np.array(PLACE_M[vehicle]))
+    return replace(rig, T_body_left=T, T_imu_left=T)
+
+
+@dataclass(frozen=True)
+class RigError:
+    """By how much the true rig differs from the written one: fractions of baseline and focal length, turn (3,) of the
+    right camera [rad], change of the first distortion coefficient of both lenses."""
+
+    baseline: float
+    focal: float
+    rotation_rad: tuple[float, float, float]
+    distortion: tuple[float, float]
+
+    @classmethod
+    def draw(cls, tolerance: RigTolerance, rng: np.random.Generator, offset: RigTolerance | None = None) -> RigError:
+        """Normal within the tolerance, about a fixed ``offset``, whose turn is about the vertical axis of the image."""
+        e, fixed = rng.standard_normal(7), offset or RigTolerance()
+        turn = tolerance.rotation_rad * e[1:4] + [0.0, fixed.rotation_rad, 0.0]
+        bend = fixed.distortion + tolerance.distortion * e[5:]
+        return cls(
+            baseline=float(fixed.baseline + tolerance.baseline * e[0]),
+            focal=float(fixed.focal + tolerance.focal * e[4]),
+            rotation_rad=(float(turn[0]), float(turn[1]), float(turn[2])),
+            distortion=(float(bend[0]), float(bend[1])),
+        )
+
+
+def true_rig(written: StereoRig, error: RigError) -> StereoRig:
+    """The rig that draws the pictures, given what its calibration says.
+
+    Raises
+    ------
+    CalibrationError
+        Where the error makes a rig that cannot exist.
+    """
     T = written.T_right_left.copy()
-    T[:3, 3] *= 1 + tolerance.baseline * e[0]
-    T[:3] = se3.so3_exp(tolerance.rotation_rad * e[1:4]) @ T[:3]
-    left, right = (
-        _altered(lens, 1 + tolerance.focal * e[4], tolerance.distortion * e[k])
-        for lens, k in ((written.left, 5), (written.right, 6))
-    )
+    T[:3, 3] *= 1 + error.baseline
+    T[:3] = se3.so3_exp(np.array(error.rotation_rad)) @ T[:3]
+    left = _altered(written.left, 1 + error.focal, error.distortion[0])
+    right = _altered(written.right, 1 + error.focal, error.distortion[1])
     return replace(written, left=left, right=right, T_right_left=T)
 
 

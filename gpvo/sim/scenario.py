@@ -21,6 +21,7 @@ except ModuleNotFoundError:  # Python 3.10
     import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
 
 _MAX_BYTES = 100_000
+CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Share = Field(0.0, ge=0.0, le=0.5)
 
 
@@ -28,11 +29,14 @@ class Scenario(BaseModel):
     """Everything that decides a sequence beside its seed. Times in s, lengths in m.
 
     ``world_seed``: that of the flight where not given. ``path``: ``along`` the world's centre line, ``wander``,
-    ``straight``, ``hover``; ``trajectory``: a TUM file whose motion is flown instead. ``noise_sigma``: standard
+    ``straight``, ``hover``, through ``waypoints``; ``trajectory``: a TUM or EuRoC file whose motion is flown instead.
+    ``agility``: how quickly the vehicle bends and turns at that speed, 1 is calm. ``noise_sigma``: standard
     deviation on a 0..1 scale, in every ``noise_every``-th frame. ``episodes_share``: share of the flight in which
     seeing goes wrong. ``dark``: from, to. ``dropped, frozen, late, black``: shares of the frames.
-    ``calibration``: standard deviations of the written calibration's errors. ``points``: values for flights without
-    images alone.
+    ``camera_pitch_deg``: how far the cameras look down. ``right_light``: light of the right camera over that of the
+    left. ``depth``: write the left camera's depth too. ``calibration``: standard deviations of how the rig that draws
+    the pictures differs from the written one; ``calibration_offset``: the fixed part of that difference. ``points``:
+    values for flights without images alone.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -43,15 +47,19 @@ class Scenario(BaseModel):
     world_seed: int | None = Field(None, ge=0)
     world_params: dict[str, Any] = {}
     vehicle: Literal["quadrotor", "rover", "path"] = "quadrotor"
-    path: Literal["along", "wander", "straight", "hover"] = "along"
+    path: Literal["along", "wander", "straight", "hover", "waypoints"] = "along"
+    waypoints: tuple[tuple[float, float, float], ...] = ()
     trajectory: str | None = None
     needs_trajectory: bool = False
     duration_s: float = Field(60.0, ge=4.0, le=7200.0)
     rate_hz: float = Field(20.0, ge=1.0, le=200.0)
     speed_mps: float = Field(1.2, ge=0.05, le=10.0)
     sway_m: float = Field(0.3, ge=0.0, le=2.0)
+    agility: float = Field(1.0, ge=0.1, le=5.0)
     rest_s: float = Field(3.0, ge=0.0, le=60.0)
     camera: Literal["pinhole", "euroc", "t265"] = "pinhole"
+    camera_pitch_deg: float = Field(0.0, ge=-60.0, le=60.0)
+    right_light: float = Field(1.0, ge=0.1, le=10.0)
     exposure_s: float = Field(0.0, ge=0.0, le=0.1)
     sensor: dict[str, Any] = {}
     noise_sigma: float = Field(0.0, ge=0.0, le=1.0)
@@ -66,13 +74,20 @@ class Scenario(BaseModel):
     imu: Literal["perfect", "euroc", "t265"] = "euroc"
     imu_rate_hz: float = Field(200.0, ge=50.0, le=1000.0)
     imu_offset_s: float = Field(0.0, ge=-0.1, le=0.1)
-    calibration: dict[Literal["baseline", "focal", "rotation_rad", "distortion"], float] = {}
+    depth: bool = False
+    calibration: dict[CalibrationKey, float] = {}
+    calibration_offset: dict[CalibrationKey, float] = {}
     points: dict[str, Any] = {}
 
     @property
     def tolerance(self) -> RigTolerance:
         """Standard deviations of the calibration's error."""
         return RigTolerance(**self.calibration)
+
+    @property
+    def offset(self) -> RigTolerance:
+        """Fixed part of the calibration's error."""
+        return RigTolerance(**self.calibration_offset)
 
 
 def names() -> tuple[str, ...]:
@@ -96,10 +111,19 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
         table, where = tomllib.loads(text), name
     else:
         raise GpvoError(f"unknown scenario '{name}'", cure=_nearest(name, names()))
+    # A resolved scenario, as it lies beside a sequence, may be flown again.
+    table.pop("seed", None)
+    table.pop("drawn", None)
     table.setdefault("name", Path(name).stem if name.endswith(".toml") else name)
     for key, value in (overrides or {}).items():
         _put(table, key, value)
     return _validated(table, where)
+
+
+def stated_seed(name: str) -> int:
+    """The seed in a scenario's file, 0 where there is none."""
+    seed = _read_toml(Path(name)).get("seed", 0) if name.endswith(".toml") else 0
+    return seed if isinstance(seed, int) and seed >= 0 else 0
 
 
 def points_scenario(scenario: Scenario) -> PointsScenario:
@@ -118,7 +142,6 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
     if unknown := sorted(set(scenario.points) - known):
         raise GpvoError(f"unknown value 'points.{unknown[0]}'", cure=_nearest(unknown[0], known))
     camera = base.camera if scenario.camera in ("pinhole", "t265") else Rectifier(camera_rig(scenario.camera)).camera
-    bias = scenario.calibration
     values: dict[str, Any] = {
         "world": scenario.world,
         "path": scenario.trajectory or scenario.path,
@@ -130,9 +153,15 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
         "imu_rate_hz": scenario.imu_rate_hz,
         "bursts": scenario.episodes_share > 0,
         "dark": scenario.dark,
-        "tolerance": Tolerance(bias.get("baseline", 0.0), bias.get("focal", 0.0), bias.get("rotation_rad", 0.0)),
+        "tolerance": _pinhole_part(scenario.calibration),
+        "offset": _pinhole_part(scenario.calibration_offset),
     }
     return replace(base, **{**values, **scenario.points})
+
+
+def _pinhole_part(errors: Mapping[CalibrationKey, float]) -> Tolerance:
+    """Errors that a rectified pair without distortion can have."""
+    return Tolerance(errors.get("baseline", 0.0), errors.get("focal", 0.0), errors.get("rotation_rad", 0.0))
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:
@@ -157,6 +186,8 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"] if part != "[key]")
         raise GpvoError(f"{key} = {first['input']!r}: {first['msg']}", where=where) from None
+    if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
+        raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")
     if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:
         raise GpvoError("late_s is longer than the time between frames", where=where)
     return scenario

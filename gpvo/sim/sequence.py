@@ -5,9 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,20 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.io.jsonfile import write_json
 from gpvo.io.toml import to_toml
-from gpvo.sim import imu, sequence_files, sequence_plan, vehicles
+from gpvo.sim import imu, routes, sequence_files, sequence_plan, vehicles
+from gpvo.sim.episodes import Episode
+from gpvo.sim.eye import Eye
 from gpvo.sim.imu import Motion
-from gpvo.sim.rig import camera_rig, draw_rig
+from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
 from gpvo.sim.scenario import Scenario
-from gpvo.sim.worlds import World, build_world
+from gpvo.sim.sequence_plan import FramePlan
+from gpvo.sim.worlds import build_world
 from gpvo.types import Array
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 # Stamps of 19 digits, as real recordings have them.
 START_NS = 1_600_000_000_000_000_000
@@ -64,27 +73,51 @@ def simulate(
     """
     target = Path(out)
     resolved = to_toml({"seed": seed, **scenario.model_dump()})
-    if _is_finished(target, resolved):
-        poses = np.loadtxt(_truth_file(target), delimiter=",", usecols=(1, 2, 3), ndmin=2)
-        frames = sum(1 for _ in (target / "mav0" / "cam0" / "data.csv").open()) - 1
-        return SequenceInfo(target, scenario.name, seed, frames, _length(poses), False)
-    part = target.with_name(target.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        part.mkdir(parents=True)
-        frames, distance = _write(scenario, seed, part, threads, on_frame or (lambda: None))
-        (part / "scenario.toml").write_text(resolved, encoding="utf-8")
-        if target.is_dir():
-            target.rmdir()
-        os.replace(part, target)
-    except OSError as error:
+    with _only_writer(target):
+        if _is_finished(target, resolved):
+            poses = np.loadtxt(_truth_file(target), delimiter=",", usecols=(1, 2, 3), ndmin=2)
+            frames = sum(1 for _ in (target / "mav0" / "cam0" / "data.csv").open()) - 1
+            return SequenceInfo(target, scenario.name, seed, frames, _length(poses), False)
+        part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
-        cure = "free some space and run again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else None
-        raise GpvoError(f"cannot be written: {error.strerror}", where=target, cure=cure) from None
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
+        try:
+            part.mkdir(parents=True)
+            frames, distance, drawn = _write(scenario, seed, part, threads, on_frame or (lambda: None))
+            (part / "scenario.toml").write_text(resolved + "\n" + to_toml({"drawn": drawn}), encoding="utf-8")
+            if target.is_dir():
+                target.rmdir()
+            os.replace(part, target)
+        except OSError as error:
+            shutil.rmtree(part, ignore_errors=True)
+            cure = "free some space and run again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else None
+            raise GpvoError(f"cannot be written: {error.strerror}", where=target, cure=cure) from None
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)
+            raise
     return SequenceInfo(target, scenario.name, seed, frames, distance, True)
+
+
+@contextmanager
+def _only_writer(target: Path) -> Iterator[None]:
+    """Hold a lock beside the folder, so that two processes never fill one; it falls when the process dies."""
+    lock = target.with_name(target.name + ".lock")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(lock, os.O_CREAT | os.O_RDWR)
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror}", where=target) from None
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise GpvoError("is being written by another process", where=target) from None
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+    finally:
+        os.close(handle)
 
 
 def _is_finished(target: Path, resolved: str) -> bool:
@@ -92,84 +125,79 @@ def _is_finished(target: Path, resolved: str) -> bool:
         return False
     file = target / "scenario.toml"
     if file.is_file():
-        if file.read_text(encoding="utf-8") == resolved:
+        text = file.read_text(encoding="utf-8")
+        if text.startswith(resolved + "\n"):
             return True
-        raise GpvoError("holds another sequence", where=target, cure="remove it, or give another --out")
+        raise GpvoError(
+            f"holds another sequence{_difference(text, resolved)}",
+            where=target,
+            cure="remove it, or give another --out",
+        )
     if target.is_dir() and not any(target.iterdir()):
         return False
     raise GpvoError("exists and is no simulated sequence", where=target, cure="give another --out")
 
 
+def _difference(text: str, resolved: str) -> str:
+    """The first line in which two scenarios differ, in brackets."""
+    for there, here in zip(text.splitlines(), resolved.splitlines()):
+        if there != here:
+            return f" ({there}, not {here})"
+    return ""
+
+
 def _write(
     scenario: Scenario, seed: int, folder: Path, threads: int, on_frame: Callable[[], None]
-) -> tuple[int, float]:
+) -> tuple[int, float, dict[str, Any]]:
+    """Fill the folder; returns frames, length of the path [m] and what was drawn."""
     # One stream per purpose: more noise must not move the path.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 78]).spawn(5)]
     world_seed = seed if scenario.world_seed is None else scenario.world_seed
-    world = build_world(scenario.world, world_seed, **scenario.world_params)
-    path = sequence_plan.plan_path(scenario, world, streams[0])
-    motion = sequence_plan.move(scenario, path)
+    parameters = routes.world_parameters(scenario)
+    world = build_world(scenario.world, world_seed, **parameters)
+    path = routes.plan_path(scenario, world, streams[0])
+    motion = sequence_plan.move(scenario, path, world)
     sequence_plan.check_motion(scenario, world, motion)
-    written = camera_rig(scenario.camera)
+    written = mounted(camera_rig(scenario.camera), scenario.vehicle, scenario.camera_pitch_deg)
     sequence_files.write_calibration(folder, written, scenario.rate_hz, scenario.imu_offset_s)
-    _write_states(scenario, folder, motion, streams[1])
     episodes = sequence_plan.plan_episodes(scenario, streams[2])
     frames = sequence_plan.plan_frames(scenario, episodes, streams[3])
-    write_json(
-        folder / "episodes.json",
-        {
-            "schema": 1,
-            "episodes": [{"begin_s": e.begin_s, "end_s": e.end_s, "cause": e.cause} for e in episodes],
-            "frames": {f"{k}": f.fate for k, f in enumerate(frames) if f.fate != "shown"},
-            "t_start_ns": START_NS,
-        },
-    )
-    eye = _Eye(scenario, seed, world, draw_rig(written, scenario.tolerance, streams[4]), motion, threads)
+    _write_states(scenario, folder, motion, frames, streams[1])
+    error = RigError.draw(scenario.tolerance, streams[4], scenario.offset)
+    _write_episodes(folder, episodes, frames)
+    eye = Eye(scenario, seed, world, true_rig(written, error), motion, threads)
     count = _write_images(scenario, folder, frames, eye, threads, on_frame)
-    return count, _length(motion.position_m[::50])
+    drawn = {"world_seed": world_seed, "world_params": parameters, "rig_error": asdict(error)}
+    return count, _length(motion.position_m[::50]), drawn
 
 
-def _write_states(scenario: Scenario, folder: Path, motion: Motion, rng: np.random.Generator) -> None:
+def _write_episodes(folder: Path, episodes: tuple[Episode, ...], frames: list[FramePlan]) -> None:
+    document = {
+        "schema": 1,
+        "t_start_ns": START_NS,
+        "episodes": [{"begin_s": e.begin_s, "end_s": e.end_s, "cause": e.cause} for e in episodes],
+        "frames": {f"{k}": f.fate for k, f in enumerate(frames) if f.fate != "shown"},
+    }
+    write_json(folder / "episodes.json", document)
+
+
+def _write_states(
+    scenario: Scenario, folder: Path, motion: Motion, frames: list[FramePlan], rng: np.random.Generator
+) -> None:
+    """IMU at its rate; truth at its rate and at every frame, so that no pose of a frame need be interpolated."""
     every = max(1, round(vehicles.RATE_HZ / scenario.imu_rate_hz))
     thin = motion.thinned(every)
     gravity = sequence_plan.gravity_mps2(scenario)
     shift = START_NS + round(scenario.imu_offset_s * 1e9)
     log, bias_gyro, bias_acc = imu.measured_imu(thin, imu.PRESETS[scenario.imu], rng, shift, gravity)
     sequence_files.write_imu(folder, log, vehicles.RATE_HZ / every, gravity)
-    t_ns = START_NS + np.rint(thin.t_s * 1e9).astype(np.int64)
-    sequence_files.write_truth(folder, t_ns, thin, bias_gyro, bias_acc)
-
-
-class _Eye:
-    """World to pictures: renderer and sensor of the true rig."""
-
-    def __init__(self, scenario: Scenario, seed: int, world: World, rig: Any, motion: Motion, threads: int) -> None:
-        from gpvo.sim.render import StereoRenderer
-        from gpvo.sim.sensor import SensorModel, SensorParams
-
-        self._renderer = StereoRenderer(world, rig.left, rig.right, rig.T_right_left, threads=threads)
-        try:
-            params = SensorParams(**scenario.sensor)
-        except TypeError as error:
-            raise GpvoError(f"unknown value of 'sensor': {error}") from None
-        self._sensor = SensorModel(params, seed, threads=threads)
-        self._motion, self._T_body_left = motion, rig.T_body_left
-
-    def see(self, index: int, plan: sequence_plan.FramePlan) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        pose, blur = sequence_plan.camera_poses(self._motion, plan.step, plan.exposure_s, self._T_body_left)
-        left, right, depth = self._renderer.render(pose, motion=blur)
-        both = self._renderer.depth_right
-        depths = depth if both is None else [depth, both]
-        a, b = self._sensor.expose(
-            left, right, index, depth=depths, darkness=plan.light, dust=plan.dust, noise_sigma=plan.noise_sigma
-        )
-        if plan.fate == "black":
-            return np.zeros_like(a), np.zeros_like(b)
-        return a, b
+    steps = np.union1d(np.arange(0, len(motion.t_s), every), [f.step for f in frames if f.step < len(motion.t_s)])
+    t_ns = START_NS + np.rint(motion.t_s[steps] * 1e9).astype(np.int64)
+    sequence_files.write_truth(folder, t_ns, motion.at(steps), bias_gyro[steps // every], bias_acc[steps // every])
 
 
 def _write_images(
-    scenario: Scenario, folder: Path, frames: list[sequence_plan.FramePlan], eye: _Eye, threads: int,
+    scenario: Scenario, folder: Path, frames: list[FramePlan], eye: Eye, threads: int,
     on_frame: Callable[[], None],
 ) -> int:  # fmt: skip
     for camera in ("cam0", "cam1"):
@@ -187,6 +215,8 @@ def _write_images(
             late = scenario.late_s if plan.fate == "late" else 0.0
             stamp = START_NS + plan.step * round(1e9 / vehicles.RATE_HZ) + round(late * 1e9)
             stamps.append(stamp)
+            if scenario.depth and eye.depth_m is not None:
+                pending.append(pool.submit(_save_depth, folder / "mav0" / "depth0" / f"{stamp}.npy", eye.depth_m))
             for camera, image in zip(("cam0", "cam1"), shown):
                 pending.append(pool.submit(_save, folder / "mav0" / camera / "data" / f"{stamp}.png", image))
             while len(pending) > _AHEAD:
@@ -200,6 +230,11 @@ def _write_images(
 
 def _save(path: Path, image: NDArray[np.uint8]) -> None:
     path.write_bytes(cv2.imencode(".png", image, _PNG)[1].tobytes())
+
+
+def _save_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, depth_m, allow_pickle=False)
 
 
 def _truth_file(folder: Path) -> Path:

@@ -1,14 +1,12 @@
-"""Vehicles that fly or drive a path: a quadrotor with real dynamics in MuJoCo, and a rover that follows the ground.
+"""A quadrotor that flies a path, simulated in MuJoCo.
 
 The quadrotor is pushed by four rotors with lag, slowed by drag, and steered by a cascaded controller, so that it sways
 and overshoots as real ones do. Its rate and acceleration are central differences of the 1 kHz states that MuJoCo
-computed: poses and IMU then agree by construction. The rover's wheels follow the terrain kinematically: it pitches
-and rolls with the ground under its wheels, but neither slips nor bounces.
+computed: poses and IMU then agree by construction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,16 +151,3 @@ class _Controller:
         torque = -self._attitude_gain * [E[2, 1], E[0, 2], E[1, 0]] - self._rate_gain * rate
         torque += np.cross(rate, self._inertia * rate)
         return np.clip(self._unmix @ np.concatenate([[force @ R[:, 2]], torque]), 0.0, quad.max_thrust)
-
-
-def footprint(height: Callable[[Array, Array], Array], radius_m: float = 0.35) -> Callable[[Array], Array]:
-    """Height of the ground as a sprung vehicle feels it: the mean over a disc under it, (N, 2) -> (N,)."""
-    angle = np.arange(8) * np.pi / 4
-    ring = np.stack([np.cos(angle), np.sin(angle)], 1)
-    places = np.concatenate([np.zeros((1, 2)), 0.5 * radius_m * ring, radius_m * ring])
-
-    def smooth(xy: Array) -> Array:
-        at = np.asarray(xy)[:, None] + places
-        return np.asarray(height(at[..., 0].ravel(), at[..., 1].ravel())).reshape(at.shape[:2]).mean(axis=1)
-
-    return smooth

@@ -17,7 +17,17 @@ def test_lunar_gravity():
     assert np.allclose(imu.exact_imu(motion, 1.62)[1], [0, 0, 1.62], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", sorted(imu.PRESETS))
+def test_perfect_is_exact():
+    motion = paths.wandering(-np.ones(3), np.ones(3), 5.0, 1.0, np.random.default_rng(0)).motion(200.0)
+    log, bias_gyro, bias_acc = imu.measured_imu(motion, imu.PRESETS["perfect"], np.random.default_rng(1))
+    gyro, force = imu.exact_imu(motion)
+    assert np.array_equal(log.gyro_radps, gyro)
+    assert np.array_equal(log.acc_mps2, force)
+    assert not bias_gyro.any()
+    assert not bias_acc.any()
+
+
+@pytest.mark.parametrize("name", ["euroc", "t265"])
 def test_white_noise_has_its_density(name):
     model = imu.PRESETS[name]
     motion = paths.hover(np.zeros(3), 0.0, 100.0).motion(200.0)

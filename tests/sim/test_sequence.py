@@ -10,7 +10,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.sim import sequence, sequence_plan
-from gpvo.sim.rig import RigTolerance, camera_rig, draw_rig
+from gpvo.sim.rig import RigError, RigTolerance, camera_rig, true_rig
 from gpvo.sim.scenario import load_scenario
 
 SHORT = {"duration_s": 4.0, "rate_hz": 5.0, "rest_s": 2.0, "speed_mps": 0.5}
@@ -29,6 +29,8 @@ def quick(monkeypatch):
     monkeypatch.setattr(sequence, "build_world", lambda kind, seed, **params: world)
 
     class Eye:
+        depth_m = None
+
         def __init__(self, scenario, seed, world, rig, motion, threads):
             self.seed = seed
 
@@ -37,7 +39,7 @@ def quick(monkeypatch):
             pair = rng.integers(1, 256, (2, 480, 640), dtype=np.uint8)
             return (pair[0], pair[1]) if plan.fate != "black" else (pair[0] * 0, pair[1] * 0)
 
-    monkeypatch.setattr(sequence, "_Eye", Eye)
+    monkeypatch.setattr(sequence, "Eye", Eye)
     return lambda **values: load_scenario("tunnel", {**SHORT, "vehicle": "path", "path": "straight", **values})
 
 
@@ -125,20 +127,23 @@ def test_a_recorded_path_must_be_given(quick, tmp_path):
 @pytest.mark.parametrize("camera", ["pinhole", "euroc", "t265"])
 def test_drawn_rig(camera):
     written = camera_rig(camera)
-    same = draw_rig(written, RigTolerance(), np.random.default_rng(0))
+    same = true_rig(written, RigError.draw(RigTolerance(), np.random.default_rng(0)))
     assert np.allclose(same.T_right_left, written.T_right_left, atol=1e-15)
     assert same.left == written.left
-    drawn = [draw_rig(written, RigTolerance(0.01, 0.003, 5e-4, 1e-3), np.random.default_rng(s)) for s in range(200)]
+    errors = [RigError.draw(RigTolerance(0.01, 0.003, 5e-4, 1e-3), np.random.default_rng(s)) for s in range(200)]
+    drawn = [true_rig(written, e) for e in errors]
     ratio = np.array([d.baseline_m / written.baseline_m for d in drawn])
     assert ratio.std() == pytest.approx(0.01, rel=0.2)
     assert all(d.left.fx_px != written.left.fx_px for d in drawn)
+    fixed = true_rig(written, RigError.draw(RigTolerance(), np.random.default_rng(0), RigTolerance(baseline=0.01)))
+    assert fixed.baseline_m / written.baseline_m == pytest.approx(1.01, abs=1e-12)
 
 
 def test_episodes_reach_the_frames():
     scenario = load_scenario("tunnel-bursts", {"duration_s": 60.0})
     episodes = sequence_plan.plan_episodes(scenario, np.random.default_rng(2))
     plans = sequence_plan.plan_frames(scenario, episodes, np.random.default_rng(3))
-    bad = [p for p in plans if p.light < 1 or p.dust > 0 or p.noise_sigma > 0 or p.exposure_s > 0]
+    bad = [p for p in plans if p.light < 1 or p.dust or p.noise_sigma or p.exposure_s or p.bare]
     assert 0.15 < len(bad) / len(plans) < 0.25
 
 

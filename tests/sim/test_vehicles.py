@@ -60,8 +60,3 @@ def test_what_it_cannot_follow_is_refused():
     pytest.importorskip("mujoco")
     with pytest.raises(GpvoError, match="loses its path"):
         vehicles.fly(paths.straight(np.zeros(3), np.array([1.0, 0, 0]), 12.0, 40.0))
-
-
-def test_footprint_averages_the_ground():
-    ground = vehicles.footprint(lambda x, y: 0.1 * x - 0.2 * y + 0.3, 0.4)
-    assert ground(np.array([[1.0, 2.0]]))[0] == pytest.approx(0.0, abs=1e-12)

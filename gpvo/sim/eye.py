@@ -1,0 +1,68 @@
+"""World to pictures: the renderer and the sensor of one flight's true rig, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.cameras.rig import StereoRig
+from gpvo.errors import GpvoError
+from gpvo.sim import sequence_plan
+from gpvo.sim.imu import Motion
+from gpvo.sim.scenario import Scenario
+from gpvo.sim.worlds import World
+
+_BARE_SIGMA_PX = 16.0
+
+
+class Eye:
+    """Draws what a rig sees on a motion.
+
+    Raises
+    ------
+    GpvoError
+        For an unknown value of the scenario's ``sensor``.
+    MissingExtraError
+        Without numba.
+    """
+
+    def __init__(
+        self, scenario: Scenario, seed: int, world: World, rig: StereoRig, motion: Motion, threads: int
+    ) -> None:
+        from gpvo.sim.render import StereoRenderer
+        from gpvo.sim.sensor import SensorModel, SensorParams
+
+        known = [f.name for f in fields(SensorParams)]
+        if unknown := sorted(set(scenario.sensor) - set(known)):
+            raise GpvoError(f"unknown value 'sensor.{unknown[0]}'", cure=f"known: {', '.join(known)}")
+        assert rig.T_body_left is not None
+        self._renderer = StereoRenderer(world, rig.left, rig.right, rig.T_right_left, threads=threads)
+        self._sensor = SensorModel(SensorParams(**scenario.sensor), seed, threads=threads)
+        self._motion, self._T_body_left, self._right_light = motion, rig.T_body_left, scenario.right_light
+        self.depth_m: NDArray[np.float32] | None = None
+
+    def see(self, index: int, plan: sequence_plan.FramePlan) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Left and right picture (H, W); ``depth_m`` then holds the left camera's depth, NaN where there is nothing."""
+        pose, blur = sequence_plan.camera_poses(self._motion, plan.step, plan.exposure_s, self._T_body_left)
+        left, right, depth = self._renderer.render(pose, motion=blur)
+        self.depth_m = depth
+        if plan.bare:
+            left, right = without_texture(left, plan.bare), without_texture(right, plan.bare)
+        if self._right_light != 1.0:
+            right = right * np.float32(self._right_light)
+        depths = [depth, self._renderer.depth_right] if plan.dust else None
+        pair = self._sensor.expose(
+            left, right, index, depth=depths, darkness=plan.light, dust=plan.dust, noise_sigma=plan.noise_sigma
+        )
+        return (np.zeros_like(pair[0]), np.zeros_like(pair[1])) if plan.fate == "black" else pair
+
+
+def without_texture(linear: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+    """Radiance (H, W) with ``share`` of its detail finer than about 40 px gone, as on a plastered wall."""
+    seen = (linear > 0).astype(np.float32)
+    weight = cv2.GaussianBlur(seen, (0, 0), _BARE_SIGMA_PX)
+    smooth = cv2.GaussianBlur(linear, (0, 0), _BARE_SIGMA_PX) / np.maximum(weight, np.float32(1e-6))
+    return np.asarray(seen * (np.float32(share) * smooth + np.float32(1 - share) * linear), np.float32)

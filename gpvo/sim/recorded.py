@@ -1,0 +1,121 @@
+"""Recorded motion to be flown again: a TUM or EuRoC trajectory, smoothed, scaled and put where it fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import gaussian_filter1d
+
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.sim.paths import Path3, knots, smooth_start
+from gpvo.types import Array
+
+_STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Motion relative to its start: ``position_m`` (N, 3) about the middle of its extent, every 0.02 s, z up;
+    ``turned_xyzw`` (N, 4) how far the body has turned since the start, in world axes."""
+
+    position_m: Array
+    turned_xyzw: Array
+
+    @property
+    def length_s(self) -> float:
+        """How long it lasts [s]."""
+        return (len(self.position_m) - 1) * _STEP_S
+
+    @property
+    def main_direction_rad(self) -> float:
+        """Heading of the longest horizontal extent [rad]."""
+        xy = self.position_m[:, :2] - self.position_m[:, :2].mean(0)
+        x, y = np.linalg.svd(xy, full_matrices=False)[2][0]
+        return float(np.arctan2(y, x))
+
+    def turned_by(self, yaw_rad: float) -> Array:
+        """Positions (N, 3) of the recording turned about the vertical."""
+        return self.position_m @ _about_z(yaw_rad).T
+
+    def placed(
+        self, middle: Array, yaw_rad: float, scale: float, heading_rad: float, duration_s: float, rest_s: float = 3.0
+    ) -> Path3:
+        """The recording as a path: turned by ``yaw_rad``, scaled, its extent about ``middle`` (3,), the body level at
+        the start with the nose at ``heading_rad``."""
+        turn = _about_z(yaw_rad)
+        grid = np.arange(len(self.position_m)) * _STEP_S
+        place = make_interp_spline(grid, self.turned_by(yaw_rad) * scale + middle, k=5)
+        pose = make_interp_spline(grid, self.turned_xyzw, k=5)
+        t = knots(duration_s)
+
+        def attitude(u: Array) -> Array:
+            turned = se3.from_quaternion(np.zeros((len(u), 3)), pose(smooth_start(u, rest_s)))[:, :3, :3]
+            return turn @ turned @ turn.T @ _about_z(heading_rad)
+
+        return Path3(make_interp_spline(t, place(smooth_start(t, rest_s)), k=5), attitude, duration_s)
+
+
+def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Recording:
+    """The part of a trajectory file that a flight of ``duration_s`` needs. ``.csv`` is EuRoC's layout, else TUM lines.
+
+    Laser and motion capture jitter by millimetres: the motion is smoothed over a tenth of a second.
+
+    Raises
+    ------
+    SourceError
+        Where the file is no trajectory, or is shorter than the flight.
+    """
+    from gpvo.io.trajectory import read_euroc_csv, read_tum
+
+    recorded = read_euroc_csv(file) if file.suffix.lower() == ".csv" else read_tum(file)
+    clock = (recorded.t_ns - recorded.t_ns[0]) * 1e-9
+    needed = float(smooth_start(np.array([duration_s]), rest_s)[0])
+    if clock[-1] < needed:
+        longest = clock[-1] + duration_s - needed
+        raise SourceError(
+            f"lasts {clock[-1]:.1f} s, the flight needs {needed:.1f} s of it",
+            where=file,
+            cure=f"a duration of at most {np.floor(longest * 10) / 10:g} s",
+        )
+    grid = np.arange(0.0, needed + 0.3, _STEP_S)
+    poses = _resample(clock, recorded.T_world_body, np.minimum(grid, clock[-1]))
+    p = gaussian_filter1d(poses[:, :3, 3], 5.0, axis=0, mode="nearest")
+    turned = _continuous(se3.rotation_to_quaternion_xyzw(poses[:, :3, :3] @ poses[0, :3, :3].T))
+    turned = gaussian_filter1d(turned, 5.0, axis=0, mode="nearest")
+    return Recording(p - (p.max(0) + p.min(0)) / 2, turned)
+
+
+def flown(
+    file: Path, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
+) -> Path3:
+    """A recorded path scaled down to fit a box [m], looking in a random direction at its start.
+
+    Raises
+    ------
+    SourceError
+        As :func:`read_recording`.
+    """
+    recording = read_recording(file, duration_s, rest_s)
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    scale = min(1.0, float(((high - low) / np.maximum(np.ptp(recording.position_m, axis=0), 1e-6)).min()))
+    return recording.placed((high + low) / 2, 0.0, scale, rng.uniform(-np.pi, np.pi), duration_s, rest_s)
+
+
+def _about_z(angle_rad: float) -> Array:
+    return se3.so3_exp(np.array([0.0, 0.0, angle_rad]))
+
+
+def _resample(clock: Array, T: Array, at: Array) -> Array:
+    j = np.clip(np.searchsorted(clock, at), 1, len(clock) - 1)
+    share = (at - clock[j - 1]) / np.maximum(clock[j] - clock[j - 1], 1e-9)
+    return se3.interpolate(T[j - 1], T[j], np.clip(share, 0, 1))
+
+
+def _continuous(q_xyzw: Array) -> Array:
+    """The same rotations with signs that do not jump: q and -q are equal."""
+    flips = np.where((q_xyzw[1:] * q_xyzw[:-1]).sum(1) < 0, -1.0, 1.0)
+    return q_xyzw * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
