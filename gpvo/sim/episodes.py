@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,10 +32,14 @@ CAUSES: dict[str, tuple[float, float, float]] = {
 
 
 def draw_episodes(
-    duration_s: float, rng: np.random.Generator, share: float = 0.2, rest_s: float = 4.0
+    duration_s: float,
+    rng: np.random.Generator,
+    share: float = 0.2,
+    rest_s: float = 4.0,
+    causes: Sequence[str] = tuple(CAUSES),
 ) -> tuple[Episode, ...]:
     """Episodes of 2 to 5 s that fill ``share`` of the flight, none during the rest at its start, none touching
-    another."""
+    another, each with one of the ``causes``."""
     lengths: list[float] = []
     while sum(lengths) < share * duration_s - 1.0:
         lengths.append(min(rng.uniform(2.0, 5.0), max(share * duration_s - sum(lengths), 2.0)))
@@ -44,7 +49,7 @@ def draw_episodes(
     gaps = rng.dirichlet(np.ones(len(lengths) + 1)) * free
     out, t = [], rest_s
     for gap, length in zip(gaps[:-1], lengths, strict=True):
-        cause = str(rng.choice(list(CAUSES)))
+        cause = str(rng.choice(list(causes)))
         t += gap
         out.append(Episode(t, t + length, cause, *CAUSES[cause]))
         t += length + 0.5

@@ -19,7 +19,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.sim import clouds, imu
-from gpvo.sim.episodes import Episode, draw_episodes
+from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3
 from gpvo.types import Array, ImuLog, StereoCamera
 
@@ -53,6 +53,7 @@ class PointsScenario:
     outliers: float = 0.03  # share of the tracks that jump
     drop: float = 0.04  # share of the tracks that end, per frame
     bursts: bool = False  # episodes over a fifth of the flight in which VO gets ten times worse
+    causes: tuple[str, ...] = tuple(CAUSES)  # of the episodes
     noise_every: int = 0  # every n-th frame is noisy by noise_px
     noise_px: float = 0.0
     dark: tuple[float, float] | None = None  # no tracks from, to
@@ -178,7 +179,7 @@ def _fly(
     at_frames = motion.thinned(every)
     T_world_cam = se3.from_rt(at_frames.R_world_body, at_frames.position_m) @ T_BODY_CAM
     log, _, _ = imu.measured_imu(motion, imu.PRESETS[scenario.imu], streams[1])
-    episodes = draw_episodes(scenario.duration_s, streams[2]) if scenario.bursts else ()
+    episodes = draw_episodes(scenario.duration_s, streams[2], causes=scenario.causes) if scenario.bursts else ()
     frames = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams)
     counts = [len(f[0]) for f in frames]
     return PointsFlight(

@@ -65,7 +65,7 @@ def plan_path(scenario: Scenario, world: World, rng: np.random.Generator) -> Pat
         path = paths.straight(start, ahead * [1, 1, 0], duration, speed, rest_s=rest)
         refuse_outside(world, path.position(_times(scenario)) * [1, 1, 0], _times(scenario), flat=True)
         return path
-    if scenario.path == "wander":
+    if scenario.path == "wander" or scenario.world == "room":
         return _wander(scenario, world, rng)
     return _along(scenario, world, rng)
 

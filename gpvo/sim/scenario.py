@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -22,21 +22,23 @@ except ModuleNotFoundError:  # Python 3.10
 
 _MAX_BYTES = 100_000
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
+Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
 Share = Field(0.0, ge=0.0, le=0.5)
 
 
 class Scenario(BaseModel):
     """Everything that decides a sequence beside its seed. Times in s, lengths in m.
 
-    ``world_seed``: that of the flight where not given. ``path``: ``along`` the world's centre line, ``wander``,
-    ``straight``, ``hover``, through ``waypoints``; ``trajectory``: a TUM or EuRoC file whose motion is flown instead.
-    ``agility``: how quickly the vehicle bends and turns at that speed, 1 is calm. ``noise_sigma``: standard
-    deviation on a 0..1 scale, in every ``noise_every``-th frame. ``episodes_share``: share of the flight in which
-    seeing goes wrong. ``dark``: from, to. ``dropped, frozen, late, black``: shares of the frames.
-    ``camera_pitch_deg``: how far the cameras look down. ``right_light``: light of the right camera over that of the
-    left. ``depth``: write the left camera's depth too. ``calibration``: standard deviations of how the rig that draws
-    the pictures differs from the written one; ``calibration_offset``: the fixed part of that difference. ``points``:
-    values for flights without images alone.
+    ``world_seed``: that of the flight where not given. ``path``: ``along`` the world's centre line (a hall has none:
+    there it wanders), ``wander``, ``straight``, ``hover``, through ``waypoints``. ``trajectory``: a TUM or EuRoC file
+    whose motion is flown instead. ``agility``: how quickly the vehicle bends and turns at its speed, 1 is calm.
+    ``noise_sigma``: standard deviation on a 0..1 scale, in every ``noise_every``-th frame. ``episodes_share``: share of
+    the flight in which seeing goes wrong, by one of the ``causes`` each time. ``dark``: from, to. ``dropped, frozen,
+    late, black``: shares of the frames; a late one is stamped ``late_s`` after it was taken. ``camera_pitch_deg``: how
+    far the cameras look down. ``right_light``: light of the right camera over that of the left. ``depth``: write the
+    left camera's depth too. ``calibration``: standard deviations of how the rig that draws the pictures differs from
+    the written one; ``calibration_offset``: the fixed part of that difference. ``points``: values for flights without
+    images alone.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,6 +67,7 @@ class Scenario(BaseModel):
     noise_sigma: float = Field(0.0, ge=0.0, le=1.0)
     noise_every: int = Field(1, ge=1)
     episodes_share: float = Field(0.0, ge=0.0, le=0.5)
+    causes: tuple[Cause, ...] = Field(get_args(Cause), min_length=1)
     dark: tuple[float, float] | None = None
     dropped: float = Share
     frozen: float = Share
@@ -152,6 +155,7 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
         "imu": scenario.imu,
         "imu_rate_hz": scenario.imu_rate_hz,
         "bursts": scenario.episodes_share > 0,
+        "causes": scenario.causes,
         "dark": scenario.dark,
         "tolerance": _pinhole_part(scenario.calibration),
         "offset": _pinhole_part(scenario.calibration_offset),

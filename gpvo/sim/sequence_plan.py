@@ -82,7 +82,8 @@ def plan_episodes(scenario: Scenario, rng: np.random.Generator) -> tuple[Episode
     """When seeing goes wrong, and why. A bare wall is imitated: the fine texture of all that is in view goes."""
     found: list[Episode] = []
     if scenario.episodes_share > 0:
-        found += draw_episodes(scenario.duration_s, rng, scenario.episodes_share, scenario.rest_s + 1.0)
+        begin = scenario.rest_s + 1.0
+        found += draw_episodes(scenario.duration_s, rng, scenario.episodes_share, begin, scenario.causes)
     if scenario.dark:
         found.append(Episode(*scenario.dark, "blackout"))
     return tuple(found)
