@@ -47,7 +47,8 @@ class Gate:
     ``accept`` uses it as it is (the gate then only counts).
 
     A filter that discards cannot tell whether it or the measurement is wrong. So after ``recover_after_s`` without
-    one that passed, the state's own covariance is widened until one passes again; 5 s is PX4's EKF2_NOAID_TOUT.
+    one that passed, the state's own covariance is widened until one passes again; 5 s is how long PX4 calls a
+    horizontal estimate without aid valid (EKF2_NOAID_TOUT).
     """
 
     probability: float = THREE_SIGMA

@@ -139,7 +139,8 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
         ("yaw", "EKF2_EVA_NOISE", pose[:, 5:6], "rad"),
     ):
         value = getattr(p, name)
-        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=p.minimum(name)))
+        typical = 0.05 if quantity == "velocity" else 0.5
+        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=p.minimum(name), typical=typical))
     return out
 
 
@@ -151,8 +152,8 @@ def _check_ardupilot(pose: Array, twist: Array, good: Sequence[Odometry]) -> lis
         ("angle", "VISO_YAW_M_NSE", np.cbrt((pose[:, 3:] ** 2).sum(1)), np.sqrt(pose[:, 3:].sum(1)), "rad"),
     ):
         value = getattr(p, name)
-        out.append(_verdict(quantity, name, value, new, unit, minimum=0.05))
-        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit, minimum=0.05))
+        out.append(_verdict(quantity, name, value, new, unit))
+        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit))
     low, middle, high = np.quantile(np.sqrt(twist[:, :3]).max(axis=1), [0.05, 0.5, 0.95])
     lever = "VISO_QUAL_MIN lets quality decide frame by frame"
     out.append(
@@ -164,21 +165,33 @@ def _check_ardupilot(pose: Array, twist: Array, good: Sequence[Odometry]) -> lis
             (float(low), float(middle), float(high)),
             "m/s",
             "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request "
-            f"32478), or set VISO_VEL_M_NSE to {max(middle, 0.05):.2g}; {lever}",
+            f"32478), or set VISO_VEL_M_NSE to {middle:.2g}; {lever}",
         )
     )
     return out
 
 
 def _verdict(
-    quantity: str, name: str, value: float, sigma: Array, unit: str, *, minimum: float = 0.0, floor: float | None = None
+    quantity: str,
+    name: str,
+    value: float,
+    sigma: Array,
+    unit: str,
+    *,
+    minimum: float = 0.0,
+    typical: float = 0.5,
+    floor: float | None = None,
 ) -> Verdict:
+    """``typical``: the quantile of the predicted sigma that the parameter should not exceed. A velocity's sigma has a
+    usual level and its low end matters; a pose's grows from nothing, so its middle does."""
     low, middle, high = (float(q) for q in np.quantile(sigma, [0.05, 0.5, 0.95]))
     hidden = 100.0 * float((sigma < (value if floor is None else floor)).mean())
     advice = ""
     if hidden > 1.0 and floor is None:
-        wanted = max(low, minimum)
-        advice = f"Set {name} to {wanted:.2g}"
-        if low < minimum:
-            advice += f", the least it accepts; a sigma of {low:.2g} {unit} stays hidden"
+        wanted = float(np.quantile(sigma, typical))
+        if wanted >= value:
+            return Verdict(quantity, name, value, hidden, (low, middle, high), unit)
+        advice = f"Set {name} to {max(wanted, minimum):.2g}"
+        if wanted < minimum:
+            advice += f", the least it accepts; a sigma of {wanted:.2g} {unit} stays hidden"
     return Verdict(quantity, name, value, hidden, (low, middle, high), unit, advice)
