@@ -63,17 +63,21 @@ def _invert_monotone(
 ) -> Array:
     """Solve ``function(x) = target`` on [0, upper], where it grows, by Newton steps kept inside a bracket.
 
-    Returns NaN where the target is out of range. (N,) -> (N,).
+    A step that is not half as long as the one before is replaced by halving the bracket: near a turning point of the
+    slope, Newton's steps may go to and fro for ever. Returns NaN where the target is out of range. (N,) -> (N,).
     """
     low, high = np.zeros_like(target), np.full_like(target, upper)
     x = np.clip(target, 0.0, upper)
+    last_step = np.full_like(target, np.inf)
     for _ in range(_NEWTON_STEPS):
         residual = function(x) - target
         low, high = np.where(residual <= 0, x, low), np.where(residual >= 0, x, high)
         slope = derivative(x)
         with np.errstate(divide="ignore", invalid="ignore"):
             new = x - residual / slope
-        new = np.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        good = (new >= low) & (new <= high) & (np.abs(new - x) <= np.maximum(0.5 * last_step, 1e-15))
+        new = np.where(good, new, 0.5 * (low + high))
+        last_step = np.abs(new - x)
         if np.nanmax(np.abs(new - x), initial=0.0) <= 1e-16:
             x = new
             break
