@@ -64,7 +64,8 @@ def _invert_monotone(
     """Solve ``function(x) = target`` on [0, upper], where it grows, by Newton steps kept inside a bracket.
 
     A step that is not half as long as the one before is replaced by halving the bracket: near a turning point of the
-    slope, Newton's steps may go to and fro for ever. Returns NaN where the target is out of range. (N,) -> (N,).
+    slope, Newton's steps may go to and fro for ever. Steps of the size of rounding are left alone, since the bracket
+    may still be wide open on the other side. Returns NaN where the target is out of range. (N,) -> (N,).
     """
     low, high = np.zeros_like(target), np.full_like(target, upper)
     x = np.clip(target, 0.0, upper)
@@ -75,13 +76,13 @@ def _invert_monotone(
         slope = derivative(x)
         with np.errstate(divide="ignore", invalid="ignore"):
             new = x - residual / slope
-        good = (new >= low) & (new <= high) & (np.abs(new - x) <= np.maximum(0.5 * last_step, 1e-15))
+        step = np.abs(new - x)
+        rounding = step <= 1e-12 * (1.0 + x)
+        good = rounding | ((new >= low) & (new <= high) & (step <= 0.5 * last_step))
         new = np.where(good, new, 0.5 * (low + high))
-        last_step = np.abs(new - x)
-        if np.nanmax(np.abs(new - x), initial=0.0) <= 1e-16:
-            x = new
+        last_step, x = np.abs(new - x), new
+        if np.nanmax(last_step, initial=0.0) <= 1e-16:
             break
-        x = new
     return np.where((target >= 0) & (target <= function(np.array(upper))), x, np.nan)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from gpvo.cameras.models import KannalaBrandt, PinholeRadtan
+import pytest
+from gpvo.cameras.models import KannalaBrandt, PinholeRadtan, _invert_monotone
 from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.geometry import se3
 from hypothesis import given, settings
@@ -42,6 +43,23 @@ def test_radtan_round_trip(lens, seed):
     uv, valid = lens.project(rays * rng.uniform(0.1, 50, size=(200, 1)))
     assert valid.all()
     assert _angle(lens.unproject(uv), rays).max() < 1e-9
+
+
+@pytest.mark.parametrize("least_slope", [0.5, 0.05, 0.001])
+def test_radial_inverse_where_the_polynomial_is_nearly_flat(least_slope):
+    # 1 + 3 k r^2 + 5 q r^4 is least at r = 1, where it is `least_slope`; rounding there moves the root by eps / slope.
+    k = -(1 - least_slope) / 1.5
+    q = -0.3 * k
+    x = np.random.default_rng(0).uniform(0, 1.2, 200_000)
+
+    def radial(r):
+        return r * (1 + r**2 * (k + r**2 * q))
+
+    def slope(r):
+        return 1 + r**2 * (3 * k + 5 * q * r**2)
+
+    found = _invert_monotone(radial, slope, radial(x), 1e3)
+    assert np.abs(found - x).max() < 20 * np.finfo(float).eps / least_slope
 
 
 @settings(max_examples=60, deadline=None)
