@@ -35,6 +35,19 @@ class _View:
     left_uv: Points  # (N, 2) their positions in the left image, the templates' centres
 
 
+@dataclass(frozen=True)
+class _New:
+    """New corners of the current frame: how many were found, and those (N, 2) with their measurement (N, 3)."""
+
+    detected: int
+    left_uv: Points
+    uvd: Array
+
+
+_NO_POINTS: Points = np.empty((0, 2), np.float32)
+_NONE_NEW = _New(0, _NO_POINTS, np.empty((0, 3)))
+
+
 class KltFrontend:
     """See the module's text. One instance per run; not for use from several threads at once."""
 
@@ -45,7 +58,8 @@ class KltFrontend:
         self._half_mask = None if half is None else np.ascontiguousarray(half.astype(np.uint8) * 255)
         self._reference: _View | None = None
         self._current: _View | None = None
-        self._matched_left: Points = np.empty((0, 2), np.float32)
+        self._new = _NONE_NEW
+        self._matched_left = _NO_POINTS
         self._matched_uvd: Array = np.empty((0, 3))
         self._pool = ThreadPoolExecutor(1)
 
@@ -56,9 +70,7 @@ class KltFrontend:
         half_left, half_right = opencv.halve(frame.left), opencv.halve(frame.right)
         # New corners and rough depth are wanted only after the motion; they are found beside it.
         survey = self._pool.submit(self._survey, half_left, half_right)
-        self._current = _View(
-            frame.left, frame.right, half_left, half_right, survey, np.empty((0, 3)), np.empty((0, 2), np.float32)
-        )
+        self._current = _View(frame.left, frame.right, half_left, half_right, survey, np.empty((0, 3)), _NO_POINTS)
         # Comparing the small images first leaves the costly comparison to true repetitions.
         repeated = (
             before is not None
@@ -83,7 +95,13 @@ class KltFrontend:
             reference.left, current.left, left_uv, guess[:, :2], config.klt_window_px, config.klt_levels
         )
         uvd, cur_left, disparity = uvd[found], cur_left[found], guess[found, 2]
-        uvd_cur, good = self._find_right(current, cur_left, disparity)
+        # One search in the right image serves both the followed points and the new corners between them.
+        new_uv, new_disparity = self._new_corners(current, cur_left)
+        both_uv = np.concatenate([cur_left, new_uv])
+        both_uvd, both_good = self._find_right(current, both_uv, np.concatenate([disparity, new_disparity]))
+        n = len(cur_left)
+        self._new = _New(len(new_uv), new_uv[both_good[n:]], both_uvd[n:][both_good[n:]])
+        uvd_cur, good = both_uvd[:n], both_good[:n]
         self._matched_left, self._matched_uvd = cur_left[good], uvd_cur[good]
         return Matches(uvd[good], uvd_cur[good], int(found.sum()))
 
@@ -91,16 +109,19 @@ class KltFrontend:
         """Carry on the inliers, and add new corners where there are none."""
         current = self._current
         assert current is not None
-        carried = np.zeros(len(self._matched_uvd), bool) if inliers is None else inliers
-        uv, uvd = self._matched_left[carried], self._matched_uvd[carried]
-        new_uv = self._new_corners(current, uv)
-        new_uvd, good = self._new_stereo(current, new_uv)
-        current.left_uv = np.concatenate([uv, new_uv[good]])
-        current.uvd = np.concatenate([uvd, new_uvd[good]])
+        if inliers is None:
+            self._matched_left, self._matched_uvd = _NO_POINTS, np.empty((0, 3))
+            new_uv, disparity = self._new_corners(current, _NO_POINTS)
+            new_uvd, good = self._find_right(current, new_uv, disparity)
+            self._new = _New(len(new_uv), new_uv[good], new_uvd[good])
+            inliers = np.zeros(0, bool)
+        uv, new = self._matched_left[inliers], self._new
+        current.left_uv = np.concatenate([uv, new.left_uv])
+        current.uvd = np.concatenate([self._matched_uvd[inliers], new.uvd])
         if len(current.uvd) >= at_least:
             self._reference = current
-        self._matched_left, self._matched_uvd = np.empty((0, 2), np.float32), np.empty((0, 3))
-        return len(uv) + len(new_uv), len(current.uvd)
+        self._matched_left, self._matched_uvd, self._new = _NO_POINTS, np.empty((0, 3)), _NONE_NEW
+        return len(uv) + new.detected, len(current.uvd)
 
     def _predict(self, T_prev_cur: Array) -> Array:
         """(N, 3) where the guess puts the reference's points; the old place for those it puts out of sight."""
@@ -121,26 +142,22 @@ class KltFrontend:
         )
         return found, opencv.coarse_disparity(opencv.halve(half_left), opencv.halve(half_right), limit)
 
-    def _new_corners(self, view: _View, taken_uv: Points) -> Points:
-        """Corners (N, 2) away from those taken, on even pixels of the full image."""
-        room = self._config.max_features - len(taken_uv)
-        found = view.survey.result()[0] * 2.0
-        if len(taken_uv) == 0 or len(found) == 0:
-            return found[:room]
-        distance2 = ((found[:, None] - taken_uv[None]) ** 2).sum(-1).min(1)
-        return found[distance2 > self._config.min_distance_px**2][:room]
-
-    def _new_stereo(self, view: _View, uv: Points) -> tuple[Array, NDArray[np.bool_]]:
-        """Stereo measurement of new corners: the rough disparity starts Lucas-Kanade at full resolution."""
-        if len(uv) == 0:
-            return np.empty((0, 3)), np.empty(0, bool)
-        coarse = view.survey.result()[1]
-        x, y = (uv / 4).astype(int).T
-        near = coarse[np.clip(y, 0, coarse.shape[0] - 1), np.clip(x, 0, coarse.shape[1] - 1)]
+    def _new_corners(self, view: _View, taken_uv: Points) -> tuple[Points, Array]:
+        """Corners (N, 2) away from those taken, on even pixels of the full image, and their rough disparity (N,)."""
+        corners, coarse = view.survey.result()
+        uv = corners * 2.0
+        if len(taken_uv) and len(uv):
+            # Axis by axis in float32: a tenth of the time of a sum over the last axis.
+            (x, y), (taken_x, taken_y) = uv.T, taken_uv.astype(np.float32).T
+            distance2 = (x[:, None] - taken_x) ** 2 + (y[:, None] - taken_y) ** 2
+            uv = uv[distance2.min(1) > self._config.min_distance_px**2]
+        uv = uv[: self._config.max_features - len(taken_uv)]
+        column, row = (uv / 4).astype(int).T
+        near = coarse[np.clip(row, 0, coarse.shape[0] - 1), np.clip(column, 0, coarse.shape[1] - 1)]
         known = near >= 0
         # Where the block matcher saw nothing, the median of what it saw is the fairest start.
         default = np.median(near[known]) if known.any() else 2.0
-        return self._find_right(view, uv, 4.0 * np.where(known, near, default))
+        return uv, 4.0 * np.where(known, near, default)
 
     def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) measurements of left points, from a guessed disparity; and which of them can be believed."""
