@@ -130,13 +130,17 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
     kind = settings.to or "bag"
     out = settings.out or Path(f"{run.name}_{kind}")
-    if kind == "bag" and out.suffix == ".bag":
+    ros1 = kind == "bag" and out.suffix == ".bag"
+    if ros1:
         count = ros.write_ros1(out, odometry, settings.topic)
     else:
         count = ros.write_ros2(out, odometry, settings.topic, mcap=kind == "mcap")
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
     parameters = out.with_name(f"{out.stem}_robot_localization.yaml")
-    parameters.write_text(ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz)), encoding="utf-8")
+    temporary = parameters.with_name(f".{parameters.name}.part")
+    text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=ros1)
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(parameters)
     return str(out), count
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -109,34 +110,37 @@ def _replacing(path: Path, fill: Any) -> int:
     return count
 
 
-def robot_localization_yaml(topic: str = TOPIC, *, rate_hz: float = 30.0) -> str:
+def robot_localization_yaml(topic: str = TOPIC, *, rate_hz: float = 30.0, ros1: bool = False) -> str:
     """Parameters for robot_localization that use the twist alone, as its manual advises for odometry.
 
-    The pose of an odometry is its integrated twist: fusing both would count one measurement twice.
+    The pose of an odometry is its integrated twist: fusing both would count one measurement twice. ``ros1``: for
+    ``rosparam load`` into the namespace of an ekf_localization_node; else a parameter file of ROS 2's ekf_node.
     """
     row = "false, false, false"
     use = "true,  true,  true "
-    return f"""# robot_localization (ekf_node) fed by gpvo: body twist with its full covariance.
+    head = f"""# robot_localization fed by gpvo: body twist with its full covariance.
 # gpvo publishes {topic} in odom -> base_link and broadcasts no transform; this node does.
-ekf_filter_node:
-  ros__parameters:
-    frequency: {rate_hz:.1f}
-    sensor_timeout: 0.2
-    two_d_mode: false
-    publish_tf: true
-    map_frame: map
-    odom_frame: odom
-    base_link_frame: base_link
-    world_frame: odom
-    odom0: {topic}
-    # x, y, z | roll, pitch, yaw | vx, vy, vz | vroll, vpitch, vyaw | ax, ay, az
-    odom0_config: [{row},
-                   {row},
-                   {use},
-                   {use},
-                   {row}]
-    odom0_differential: false
-    odom0_relative: false
-    odom0_queue_size: 10
-    odom0_twist_rejection_threshold: 3.0
 """
+    parameters = f"""frequency: {rate_hz:.1f}
+sensor_timeout: 0.2
+two_d_mode: false
+publish_tf: true
+map_frame: map
+odom_frame: odom
+base_link_frame: base_link
+world_frame: odom
+odom0: {topic}
+# x, y, z | roll, pitch, yaw | vx, vy, vz | vroll, vpitch, vyaw | ax, ay, az
+odom0_config: [{row},
+               {row},
+               {use},
+               {use},
+               {row}]
+odom0_differential: false
+odom0_relative: false
+odom0_queue_size: 10
+odom0_twist_rejection_threshold: 3.0
+"""
+    if ros1:
+        return head + parameters
+    return f"{head}ekf_filter_node:\n  ros__parameters:\n{textwrap.indent(parameters, '    ')}"

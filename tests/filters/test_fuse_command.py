@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.filters.policies import POLICIES
@@ -114,7 +115,11 @@ def test_publish_writes(runs: list[Path], tmp_path: Path, to: str, name: str) ->
     assert out["messages"] == 161 - (to != "mavlink")
     assert (tmp_path / name).exists()
     if to != "mavlink":
-        assert (tmp_path / f"{Path(name).stem}_robot_localization.yaml").is_file()
+        parameters = yaml.safe_load((tmp_path / f"{Path(name).stem}_robot_localization.yaml").read_text())
+        if not name.endswith(".bag"):  # ROS 2 nests parameters under the node, ROS 1 does not
+            parameters = parameters["ekf_filter_node"]["ros__parameters"]
+        assert parameters["odom0"] == "/gpvo/odometry"
+        assert np.flatnonzero(parameters["odom0_config"]).tolist() == [6, 7, 8, 9, 10, 11]
 
 
 def test_publish_check_alone_writes_nothing(runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
