@@ -39,6 +39,7 @@ class PointsScenario:
     """A kind of flight. Times in s, lengths in m, pixels of the rectified image."""
 
     world: str = "tunnel"  # tunnel, lunar, room
+    world_seed: int | None = None  # of landmarks and path, in place of the flight's own
     path: str = "along"  # along, wander, straight, hover, or a TUM file
     duration_s: float = 60.0
     rate_hz: float = 20.0
@@ -167,7 +168,10 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
         raise GpvoError(f"unknown scenario value: {error}", cure="see gpvo.sim.points.PointsScenario") from None
     # One stream per purpose: more noise must not move the path.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 77]).spawn(6)]
-    path, cloud = clouds.make(chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, streams[0])
+    scene = streams[0]
+    if chosen.world_seed is not None:
+        scene = np.random.default_rng(np.random.SeedSequence([chosen.world_seed, 77]).spawn(1)[0])
+    path, cloud = clouds.make(chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene)
     return _fly(name, seed, chosen, path, cloud, streams)
 
 

@@ -31,7 +31,18 @@ class VoConfig:
     sigma_px: float = 1.0  # triangulation: of each image coordinate
     sigma_p_px: float | None = 0.1  # pointing; None: estimated from the residuals so far
     sigma_m_px: float | None = 0.5  # matching; None: likewise
+    sigma_pairs_px: tuple[tuple[float, float], ...] = ()  # further pairs, each stated as a method of its own
     seed: int = 0
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """Every covariance that a record states: the methods, then the further pairs."""
+        return (*self.methods, *(pair_method(p, m) for p, m in self.sigma_pairs_px))
+
+
+def pair_method(sigma_p_px: float, sigma_m_px: float) -> str:
+    """Name of pointing/matching with these sigmas [px], such as ``pointing_matching_0p1_0p5``."""
+    return f"pointing_matching_{sigma_p_px:.6g}_{sigma_m_px:.6g}".replace(".", "p").replace("-", "m")
 
 
 PRESETS: dict[str, VoConfig] = {

@@ -14,6 +14,7 @@ import numpy as np
 
 from gpvo.geometry.covariance import symmetrise
 from gpvo.types import Array, StereoCamera
+from gpvo.vo.config import pair_method
 from gpvo.vo.motion import Transfer, apply_whitener, residual_covariance, transfer, whitener
 from gpvo.vo.points import (
     point_covariance,
@@ -104,8 +105,9 @@ def covariances_by_method(
     sigma_px: float,
     sigma_p_px: float,
     sigma_m_px: float,
+    sigma_pairs_px: tuple[tuple[float, float], ...] = (),
 ) -> dict[str, MotionCovariance]:
-    """Every asked-for method over the same inliers, sharing the derivatives."""
+    """Every asked-for method and pair of sigmas over the same inliers, sharing the derivatives."""
     moved = transfer(T_prev_cur, uvd_prev, camera)
     S = {
         "triangulation": triangulation_pixel_covariance(sigma_px),
@@ -118,4 +120,7 @@ def covariances_by_method(
             out[method] = spherical_covariance(T_prev_cur, uvd_prev[near], uvd_cur[near], camera, S["triangulation"])
         else:
             out[method] = motion_covariance(T_prev_cur, uvd_prev, camera, S[method], moved=moved)
+    for p, m in sigma_pairs_px:
+        S_pair = pointing_matching_pixel_covariance(p, m)
+        out[pair_method(p, m)] = motion_covariance(T_prev_cur, uvd_prev, camera, S_pair, moved=moved)
     return out

@@ -138,8 +138,8 @@ class StereoOdometry:
             return replace(
                 record,
                 n_tracked=matches.n_tracked,
-                covariances=dict.fromkeys(config.methods, C),
-                v_t=dict.fromkeys(config.methods, C[:3, :3]),
+                covariances=dict.fromkeys(config.stated, C),
+                v_t=dict.fromkeys(config.stated, C[:3, :3]),
             )
         self._sigmas.update(record.residual_sigma_p_px, record.residual_sigma_m_px)
         sigma_p_px, sigma_m_px = self._sigmas.values
@@ -152,6 +152,7 @@ class StereoOdometry:
             sigma_px=config.sigma_px,
             sigma_p_px=sigma_p_px,
             sigma_m_px=sigma_m_px,
+            sigma_pairs_px=config.sigma_pairs_px,
         )
         return replace(
             record,

@@ -47,6 +47,17 @@ def test_noise_does_not_move_the_path():
     assert np.array_equal(a.T_world_cam, b.T_world_cam)
 
 
+def test_a_world_may_be_flown_again_with_other_noise():
+    one, two = (simulate_points("tunnel-clean", seed, duration_s=4.0, world_seed=5) for seed in (1, 2))
+    assert np.array_equal(one.T_world_cam, two.T_world_cam)
+    assert one.uv_left.shape != two.uv_left.shape or not np.array_equal(one.uv_left, two.uv_left)
+    own, given = (
+        simulate_points("tunnel-clean", 5, duration_s=4.0),
+        simulate_points("tunnel-clean", 5, world_seed=5, duration_s=4.0),
+    )
+    assert np.array_equal(own.uv_left, given.uv_left)
+
+
 def test_wrong_baseline_shows_as_scale(tmp_path):
     """Written calibration with a baseline 1 % too long: every motion comes out 1 % too long."""
     file = clean(tmp_path, 1)

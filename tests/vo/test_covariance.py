@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
+from gpvo.vo.config import pair_method
 from gpvo.vo.covariance import covariances_by_method, motion_covariance, spherical_covariance
 from gpvo.vo.points import (
     point_covariance,
@@ -89,3 +90,14 @@ def test_every_method_is_symmetric_positive_definite() -> None:
 def test_points_in_one_place_do_not_determine_the_motion() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         motion_covariance(T, BEFORE[:1], CAMERA, triangulation_pixel_covariance(1.0))
+
+
+def test_further_pairs_of_sigmas_are_stated_beside_the_methods() -> None:
+    pairs = ((0.1, 0.5), (0.1, 1.0))
+    found = covariances_by_method(
+        ("pointing_matching",), T, BEFORE, AFTER, CAMERA,
+        sigma_px=1.0, sigma_p_px=0.1, sigma_m_px=0.5, sigma_pairs_px=pairs,
+    )  # fmt: skip
+    same, wider = (found[pair_method(*p)].full for p in pairs)
+    np.testing.assert_array_equal(same, found["pointing_matching"].full)
+    assert np.trace(wider) > 1.5 * np.trace(same)
