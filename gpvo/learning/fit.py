@@ -22,7 +22,7 @@ from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_
 from gpvo.learning.rows import Rows
 from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import WITHOUT_MEAN, ErrorModelArrays
 from gpvo.online.guard import Domain
 from gpvo.types import Array
 
@@ -49,6 +49,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     base, base_oof = choose_base(rows)
     name, inputs, fitted, trust, scores = choose_inputs(rows, base, base_oof, config)
     columns = tuple(dict.fromkeys((*inputs, *base_columns(base.method))))
+    plain = fitted
     fitted, mean_gain = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
     fitted = None if fitted is None else shrink(fitted, trust)
     error, variance = _out_of_fold(rows, base_oof, fitted)
@@ -56,6 +57,10 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     lost = np.mean([(s.select(base_columns(None)) ** 2).mean(axis=0) for s in sets], axis=0)
     arrays = {**model.to_arrays(), "lost_rate_var": np.maximum(lost, 1e-6)}
     use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
+    if plain is not None and any(use_mean):
+        plain = shrink(plain, trust)
+        without, _ = assemble(rows, base, columns, inputs, plain, *_out_of_fold(rows, base_oof, plain))
+        arrays |= {f"{WITHOUT_MEAN}{name}": array for name, array in without.to_arrays().items()}
     choices = {
         "base": base.method or "motion",
         "inputs": name,

@@ -16,6 +16,8 @@ from gpvo.online.guard import Domain, growth
 from gpvo.types import Array
 
 PARTS = ("jitter", "white", "bias")
+WITHOUT_MEAN = "without_mean."
+"""Prefix of the arrays of the same model fitted to the errors as they stand; there where the model uses a mean."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,18 @@ class ErrorModelArrays:
             out[known] = w * R[known] + (1.0 - w) * self.correlation
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
         return out * (1.0 - 1e-6) + 1e-6 * np.eye(6)
+
+
+def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The arrays of a model file with those of the model without a mean in their place; as they are where it has none.
+
+    The mean is that of the error given, among others, VO's own motion, and so holds what was usual in training: where
+    VO sees little it says "you did not really move like that". A filter knows better how it moved, and would count
+    its own knowledge twice. It needs the covariance of the error itself.
+    """
+    plain = {name.removeprefix(WITHOUT_MEAN): a for name, a in arrays.items() if name.startswith(WITHOUT_MEAN)}
+    dropped = (WITHOUT_MEAN, "basis.") if plain else (WITHOUT_MEAN,)
+    return {**{name: a for name, a in arrays.items() if not name.startswith(dropped)}, **plain}
 
 
 _OWN = ("inputs", "factor", "high", "correlation", "geometry_weight", "share", "bias_tau_s", "typical_ln_det")

@@ -131,7 +131,10 @@ class OdometryBuilder:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
             jitter, bias = prediction.parts.get("jitter", zero), prediction.parts.get("bias", zero)
-            return prediction.covariance - jitter - bias, jitter, _root(bias), prediction.bias_tau_s
+            white = prediction.covariance - jitter - bias
+            if not self.correct_twist:  # what is not taken off remains part of the error
+                white = white + np.outer(prediction.mean, prediction.mean)
+            return white, jitter, _root(bias), prediction.bias_tau_s
         covariance = record.covariances.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
             raise GpvoError(
