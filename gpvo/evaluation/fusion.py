@@ -16,6 +16,7 @@ from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
     POLICIES,
+    MeanUse,
     constant_from_errors,
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
@@ -36,9 +37,9 @@ def predictions_of(predictor: Predictor, run: Run) -> dict[int, Prediction]:
     return {t: p for t, p in stepped if p is not None}
 
 
-def load_predictor(path: str | Path) -> Predictor:
-    """A model that filters can use: one that predicts the error of single motions."""
-    predictor = Predictor.load(path)
+def load_predictor(path: str | Path, mean: MeanUse = "absorb") -> Predictor:
+    """A model that filters can use: one that predicts the error of single motions, its mean only to be subtracted."""
+    predictor = Predictor.load(path, with_mean=mean == "subtract")
     if predictor.target != "frame":
         raise ModelError(
             f"predicts the error over {predictor.target}, a filter needs that of each motion",
@@ -126,6 +127,7 @@ class FusionSettings:
     model: Path | None = None
     training: tuple[Path, ...] = ()
     use_imu: bool = True
+    mean: MeanUse = "absorb"
     options: FuseOptions = field(default_factory=FuseOptions)
 
 
@@ -164,7 +166,7 @@ def fuse_runs(
     unknown = [p for p in settings.policies if p not in POLICIES]
     if unknown:
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
-    predictor = None if settings.model is None else load_predictor(settings.model)
+    predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
@@ -173,11 +175,12 @@ def fuse_runs(
         warnings += [f"{flight.name}: {finding}" for finding in require_sane(flight)]
         flights.append(flight)
     constants = _constants(settings, predictor, flights, options, tell)
-    policies = make_policies(constants, names=settings.policies, learned=any(f.predictions for f in flights))
+    learned = any(f.predictions for f in flights)
+    policies = make_policies(constants, names=settings.policies, learned=learned, mean=settings.mean)
     traces: list[Trace] = []
 
     def keep(flight: Flight, fused: FusedRun) -> None:
-        traces.append(_trace(flight, fused))
+        traces.append(trace_of(flight, fused))
         if on_run:
             on_run(fused)
 
@@ -213,7 +216,7 @@ def _constants(
     return constants
 
 
-def _trace(flight: Flight, fused: FusedRun) -> Trace:
+def trace_of(flight: Flight, fused: FusedRun) -> Trace:
     position = fused.T_world_cam[:, :3, 3]
     truth = None
     error = np.full(len(position), np.nan)

@@ -1,9 +1,9 @@
-"""What a filter gains, measured: simulated flights without pictures, VO, a model from some, the policies on the others.
+"""What a filter gains, measured: simulated flights, VO, a model from some, the policies on the others.
 
     python -m gpvo.evaluation.fusion_experiment tunnel-bursts --train 12 --test 50 -o experiment
 
-Every fourth test flight has two seconds of darkness and one second of frozen pictures besides. Train and test seeds
-differ, and with them path, world and sensors. Prints every run, paired intervals, and by how much VO's error rose.
+Training and test seeds differ, and with them path, world and sensors. Prints every run, paired intervals, and by how
+much VO's error rose; writes the same as Markdown, JSON and a figure. Flights that the folder holds are not flown again.
 """
 
 from __future__ import annotations
@@ -11,128 +11,157 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.dataset.build import build_run
-from gpvo.dataset.errors import motion_errors
-from gpvo.evaluation.fusion import constants_of, flight_of
-from gpvo.filters.policies import LEARNED, LearnedPolicy
-from gpvo.filters.run import FuseOptions
-from gpvo.filters.study import Study, fit_scalars, make_policies, study, table
-from gpvo.io import open_source
-from gpvo.io.run import Run, read_run
+from gpvo.errors import GpvoError
+from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
+from gpvo.evaluation.fusion_figure import plot_experiment
+from gpvo.evaluation.fusion_flights import Campaign, Rise, rise, training_runs, unseen_runs
+from gpvo.evaluation.fusion_report import document
+from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
+from gpvo.filters.run import Flight, FusedRun, FuseOptions
+from gpvo.filters.study import Study, fit_scalars, make_policies, study
+from gpvo.io.jsonfile import write_json
+from gpvo.io.run import Run
 from gpvo.learning.config import TrainConfig
+from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets
-from gpvo.runner import run as run_vo
-from gpvo.sim.points import simulate_points
 
-Array = NDArray[np.float64]
-
-FIRST_TRAIN_SEED, FIRST_TEST_SEED = 1000, 0
-_DARK_S, _FROZEN_S = (20.0, 22.0), (40.0, 41.0)
+LEARNED_WHITE, LEARNED_SUBTRACT = "learned_white", "learned_subtract"
+_POINTS_S, _PICTURES_S = 60.0, 25.0
+_COLUMNS = (
+    ("ATE m", "ate_rmse_m", 4),
+    ("final m", "final_error_m", 4),
+    ("NEES position", "nees_position", 2),
+    ("NEES attitude", "nees_attitude", 2),
+    ("NIS", "nis_dof", 2),
+    ("rejected", "rejected", 1),
+)
 
 
 @dataclass(frozen=True)
-class Rise:
-    """VO's error in bad episodes against the rest: ``share`` of the motions, ratio of standard deviations (6,) per axis
-    and of median absolute values, which a few failures do not move."""
+class Outcome:
+    """The study of the test flights, its traces, and by how much VO's error rose in their episodes."""
 
-    share: float
-    standard_deviation: Array
-    median: Array
+    title: str
+    report: FusionReport
+    rise: Rise
 
-    def __str__(self) -> str:
-        sd, median = (" ".join(f"{v:.1f}" for v in values) for values in (self.standard_deviation, self.median))
-        share = f"{100 * self.share:.0f} % of the motions are bad"
-        return f"{share}: error x ({sd}) in standard deviation, x ({median}) in median"
-
-
-def make_runs(scenario: str, seeds: Sequence[int], folder: Path, *, accidents: bool, jobs: int) -> list[Run]:
-    """Simulate and run VO where the folder does not hold the run yet."""
-    tasks = [(scenario, seed, folder, accidents and seed % 4 == 3) for seed in seeds]
-    with ProcessPoolExecutor(jobs) as pool:
-        return [read_run(path) for path in pool.map(_make_run, tasks)]
+    @property
+    def study(self) -> Study:
+        """Scores of every run under every policy."""
+        return self.report.study
 
 
-def _make_run(task: tuple[str, int, Path, bool]) -> Path:
-    scenario, seed, folder, accident = task
-    out = folder / f"{scenario}-{seed:04d}{'-accidents' if accident else ''}"
-    if not (out / "run.json").is_file():
-        events = {"dark": _DARK_S, "frozen": _FROZEN_S} if accident else {}
-        tracks = simulate_points(scenario, seed, **events).save(folder / f"{out.name}.npz")
-        run_vo(open_source(tracks), out)
-        tracks.unlink()
-    return out
-
-
-def rise(runs: Sequence[Run], bad_rms_factor: float = 2.5) -> Rise:
-    """Bad motions are those whose reprojection error is so many times the run's median."""
-    calm, bad = [], []
-    for run in runs:
-        if run.truth is None:
-            continue
-        errors = motion_errors(run.log, run.truth)
-        rms = np.array([run.log.records[i].reproj_rms_px for i in errors.index])
-        is_bad = rms > bad_rms_factor * np.median(rms)
-        calm.append(errors.xi[~is_bad])
-        bad.append(errors.xi[is_bad])
-    a, b = np.concatenate(calm), np.concatenate(bad)
-    if not len(b):
-        return Rise(0.0, np.ones(6), np.ones(6))
-    medians = np.median(np.abs(b), axis=0) / np.median(np.abs(a), axis=0)
-    return Rise(len(b) / (len(a) + len(b)), b.std(axis=0) / a.std(axis=0), medians)
-
-
-def experiment(training: Sequence[Run], test: Sequence[Run], *, hindsight: bool = True) -> Study:
-    """Train on some runs, tune the constants on them, filter the others under every policy.
+def experiment(
+    title: str, training: Sequence[Run], test: Sequence[Run], model: Path, *, hindsight: bool = True
+) -> Outcome:
+    """Tune the constants on the training runs and filter the others under every policy.
 
     ``learned_white`` is the learned covariance taken as independent from motion to motion: what the parts are worth.
+    ``learned_subtract`` takes the predicted mean off the measurement: what that costs or brings.
     """
     options = FuseOptions(history_s=0.0)
-    model = train_sets([build_run(r) for r in training], TrainConfig(), judge=False)
-    predictor = model.predictor()
     constants = constants_of(training)
     constants = replace(constants, best=fit_scalars([flight_of(r) for r in training], constants, options))
+    predictor = load_predictor(model)
     flights = [flight_of(r, predictor) for r in test]
     if hindsight:
         constants = replace(constants, hindsight=fit_scalars(flights, constants, options))
-    names = ("constant", "constant_best", "constant_hindsight", "triangulation", "pointing_matching", LEARNED)
-    policies = make_policies(constants, names=names, learned=True)
-    policies["learned_white"] = LearnedPolicy("learned_white", use_parts=False)
-    return study(flights, {k: v for k, v in policies.items() if v is not None}, options, constants=constants)
+    policies = make_policies(constants, names=POLICIES, learned=True)
+    policies[LEARNED_WHITE] = LearnedPolicy(LEARNED_WHITE, use_parts=False)
+    traces: list[Trace] = []
+
+    def keep(flight: Flight, fused: FusedRun) -> None:
+        traces.append(trace_of(flight, fused))
+
+    result = study(flights, policies, options, constants=constants, on_run=keep)
+    predictor = load_predictor(model, "subtract")
+    flights = [flight_of(r, predictor) for r in test]
+    subtracted = study(flights, {LEARNED_SUBTRACT: LearnedPolicy(LEARNED_SUBTRACT, mean="subtract")}, options)
+    result = replace(result, scores={**result.scores, **subtracted.scores})
+    return Outcome(title, FusionReport(result, tuple(traces), ()), rise(test))
 
 
-def report(result: Study, risen: Rise) -> str:
-    """The table of every run, the paired comparisons and the rise beside them."""
-    lines = [table(result), "", str(risen)]
-    lines += [str(result.compare(LEARNED, other)) for other in result.scores if other != LEARNED]
+def markdown(outcome: Outcome) -> str:
+    """Means, paired comparisons, the rise, and every run."""
+    result = outcome.study
+    names = list(result.scores)
+    parts = [f"# {outcome.title}", "", f"{len(result.runs)} flights that no model and no constant has seen.", ""]
+    parts += _table(["policy", *(c[0] for c in _COLUMNS), "diverged"], [_mean_row(result, n) for n in names])
+    parts += ["", f"VO in the episodes: {outcome.rise}.", ""]
+    parts += [f"* {result.compare(LEARNED, other)}" for other in names if other != LEARNED]
     if result.constants:
-        lines.append(
-            f"scalars (translation, rotation): best {result.constants.best}, hindsight {result.constants.hindsight}"
-        )
-    return "\n".join(lines)
+        parts += ["", f"Factors on the constant's variances (translation, rotation): best {result.constants.best}, "]
+        parts[-1] += f"hindsight {result.constants.hindsight}."
+    parts += ["", "## Every run: ATE [m], and the learned policy's NEES per degree of freedom", ""]
+    return "\n".join(parts + _table(["run", *names, "position", "attitude"], _run_rows(result))) + "\n"
+
+
+def _mean_row(result: Study, name: str) -> list[str]:
+    values = [f"{result.mean(name, key):.{digits}f}" for _, key, digits in _COLUMNS]
+    return [name, *values, f"{int(np.nansum(result.column(name, 'diverged')))}"]
+
+
+def _run_rows(result: Study) -> list[list[str]]:
+    columns = [result.column(n, "ate_rmse_m") for n in result.scores]
+    nees = [result.column(LEARNED, f"nees_{part}") for part in ("position", "attitude")]
+    return [
+        [run, *(f"{c[i]:.4f}" for c in columns), *(f"{c[i]:.2f}" for c in nees)] for i, run in enumerate(result.runs)
+    ]
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    cells = [head, ["---"] * len(head), *rows]
+    return [f"| {' | '.join(row)} |" for row in cells]
+
+
+def write(outcome: Outcome, stem: Path) -> None:
+    """``stem.md``, ``stem.json`` and ``stem.png``."""
+    text = stem.with_suffix(".md.part")
+    text.write_text(markdown(outcome), encoding="utf-8")
+    text.replace(stem.with_suffix(".md"))
+    risen = outcome.rise
+    extra = {"share": risen.share, "standard_deviation": risen.standard_deviation, "median": risen.median}
+    write_json(stem.with_suffix(".json"), {**document(outcome.report), "title": outcome.title, "rise": extra})
+    plot_experiment(outcome.study, outcome.title, stem.with_suffix(".png"))
+
+
+def trained(training: Sequence[Run], path: Path) -> Path:
+    """Train on the runs and keep the model beside them."""
+    save_model(train_sets([build_run(r) for r in training], TrainConfig(), judge=False), path)
+    return path
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of the experiment."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenario", help="points-only scenario, such as tunnel-bursts")
+    parser.add_argument("scenario", help="such as tunnel-bursts, tunnel-clean, tunnel-noise")
     parser.add_argument("--train", type=int, default=12, help="training flights")
     parser.add_argument("--test", type=int, default=50, help="test flights")
-    parser.add_argument("-o", "--out", type=Path, default=Path("experiment"), help="folder for the runs")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes for VO")
+    parser.add_argument("--pictures", action="store_true", help="draw the pictures: real VO, a hundred times slower")
+    parser.add_argument("--duration", type=float, help=f"s; default {_POINTS_S:g}, with pictures {_PICTURES_S:g}")
+    parser.add_argument("--model", type=Path, help="use this model, such as one trained on points, in place of a new")
+    parser.add_argument("-o", "--out", type=Path, default=Path("experiment"), help="folder for runs and results")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes that fly")
     given = parser.parse_args(arguments)
-    given.out.mkdir(parents=True, exist_ok=True)
-    train_seeds = range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + given.train)
-    test_seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + given.test)
-    training = make_runs(given.scenario, train_seeds, given.out, accidents=False, jobs=given.jobs)
-    test = make_runs(given.scenario, test_seeds, given.out, accidents=True, jobs=given.jobs)
-    print(report(experiment(training, test), rise([r for r in test if "accidents" not in r.name])))
+    if given.train < 2 or given.test < 2:
+        raise GpvoError("too few flights to learn or to judge", cure="--train and --test of 2 at least")
+    duration = given.duration or (_PICTURES_S if given.pictures else _POINTS_S)
+    campaign = Campaign(given.scenario, given.out, duration, given.pictures)
+    training = training_runs(campaign, given.train, given.jobs)
+    test = unseen_runs(campaign, given.test, given.jobs)
+    kind = "pictures" if given.pictures else "points"
+    stem = given.out / f"{given.scenario}-{kind}{'-other-model' if given.model else ''}"
+    model = given.model or trained(training, stem.with_suffix(".gpvo"))
+    title = f"{given.scenario}, {kind}, {given.train} training flights" + (f", model {given.model}" * bool(given.model))
+    outcome = experiment(title, training, test, model)
+    write(outcome, stem)
+    print(markdown(outcome))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT = "constant", "constant_best", "cons
 TRIANGULATION, POINTING_MATCHING, LEARNED = "triangulation", "pointing_matching", "learned"
 POLICIES = (CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT, TRIANGULATION, POINTING_MATCHING, LEARNED)
 
+MeanUse = Literal["absorb", "subtract"]
+
 _ZERO_MEAN = np.zeros((1, 6))
 _ZERO_MEAN.setflags(write=False)
 
@@ -72,15 +74,16 @@ class GeometricPolicy:
 class LearnedPolicy:
     """The predicted error: its covariance in the parts by which it accumulates, and its mean.
 
-    ``mean``: ``subtract`` takes it off the measurement; ``absorb`` leaves the measurement alone and adds the mean's
-    square to the covariance. A mean that depends on VO's own motion pulls it towards the motions seen in training, a
-    prior that a filter with its own motion model would count twice; absorbing it does not. ``use_parts`` False treats
-    the total as independent from motion to motion, to show what the parts are worth.
+    ``mean``: ``absorb`` leaves the measurement alone and adds the mean's square to the covariance; ``subtract`` takes
+    it off the measurement. A mean that depends on VO's own motion pulls it towards the motions seen in training, a
+    prior that a filter with its own motion model would count twice. A model fitted without a mean
+    (``Predictor.load(path, with_mean=False)``) has nothing to absorb and is better than either. ``use_parts`` False
+    treats the total as independent from motion to motion, to show what the parts are worth.
     """
 
     name: str = LEARNED
     use_parts: bool = True
-    mean: Literal["subtract", "absorb"] = "subtract"
+    mean: MeanUse = "absorb"
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
         """The prediction's parts as filter noise; None without a prediction for this frame."""

@@ -19,6 +19,7 @@ from gpvo.filters.policies import (
     ConstantPolicy,
     GeometricPolicy,
     LearnedPolicy,
+    MeanUse,
     Policy,
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
@@ -31,6 +32,7 @@ Progress = Callable[[str], None]
 # Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
 _COARSE: Array = np.power(4.0, np.arange(-6, 2))
 _FINE: Array = np.power(4.0, [-0.67, -0.33, 0.0, 0.33, 0.67])
+_COARSE_FLIGHTS = 12  # so many are enough to tell factors of four apart
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ def fit_scalars(
     options = options or FuseOptions()
     with np.errstate(all="ignore"):
         coarse = _pairs(_COARSE, _COARSE)
-        centre = coarse[np.argmin(grid_scores(flights, constants, coarse, options, progress))]
+        some = flights[:: -(-len(flights) // _COARSE_FLIGHTS)]
+        centre = coarse[np.argmin(grid_scores(some, constants, coarse, options, progress))]
         fine = _pairs(_FINE * centre[0], _FINE * centre[1])
         best = fine[np.argmin(grid_scores(flights, constants, fine, options, progress))]
     return float(best[0]), float(best[1])
@@ -91,15 +94,17 @@ def _pairs(a: Array, b: Array) -> Array:
     return np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def make_policies(constants: Constants | None, *, names: Sequence[str], learned: bool) -> dict[str, Policy | None]:
-    """The named policies; None for one that lacks what it needs."""
+def make_policies(
+    constants: Constants | None, *, names: Sequence[str], learned: bool, mean: MeanUse = "absorb"
+) -> dict[str, Policy | None]:
+    """The named policies; None for one that lacks what it needs. ``mean``: what the learned one does with its mean."""
     out: dict[str, Policy | None] = {}
     for name in names:
         out[name] = None
         if name in (TRIANGULATION, POINTING_MATCHING):
             out[name] = GeometricPolicy(name)
         elif name == LEARNED:
-            out[name] = LearnedPolicy() if learned else None
+            out[name] = LearnedPolicy(mean=mean) if learned else None
         elif constants is not None:
             scalars = {CONSTANT: (1.0, 1.0), CONSTANT_BEST: constants.best, CONSTANT_HINDSIGHT: constants.hindsight}
             if scalars.get(name) is not None:
