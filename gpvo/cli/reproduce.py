@@ -1,0 +1,69 @@
+"""``gpvo reproduce``: the thesis' tables and figures beside ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def reproduce(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of results; its stages are kept between runs.")],
+    quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
+    seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
+    points_seeds: Annotated[int | None, typer.Option(min=0, help="Further seeds without [20, quick: 10].")] = None,
+    data: Annotated[
+        Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes; -1: one per core.")] = -1,
+    backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
+    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Run every experiment of the thesis on simulated and real data; killed and started again, it goes on.
+
+    Example: gpvo reproduce -o out/thesis --quick
+    """
+    from gpvo.cli.output import print_json, progress
+    from gpvo.reproduce.plan import Plan
+    from gpvo.reproduce.result import reproduce as run
+    from gpvo.reproduce.run import Workers
+
+    given: dict[str, Any] = {"seeds": seeds, "points_seeds": points_seeds, "data": data}
+    chosen = {k: v for k, v in given.items() if v is not None}
+    plan = Plan.quick(**chosen) if quick else Plan(**chosen)
+    result = run(plan, out, Workers(jobs, backend, scheduler, progress))
+    if json_:
+        print_json(result)
+    else:
+        _print(result, out)
+
+
+def _print(result: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from gpvo.reproduce import claims, tables
+
+    console = Console(width=max(Console().width, 190), highlight=False, markup=False)
+    for title, rows in (("", result["rows"]), ("sensitivity", result["sensitivity"]), ("real", result["real"])):
+        if rows:
+            table = Table(*tables.HEADS, title=title)
+            for row in rows:
+                for line in tables.cells(row):
+                    table.add_row(*line)
+                table.add_section()
+            console.print(table)
+    for line in (*claims.lines(result["claims"]), *result["failed"]):
+        console.print(line)
+    asked = [t["met"] for t in result["targets"]]
+    console.print(
+        f"targets of the full model: {asked.count(True)} met, {asked.count(False)} not, {asked.count(None)} open"
+    )
+    console.print(str(out / "report.html"))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this file's commands to the application."""
+    app.command()(reproduce)

@@ -1,0 +1,111 @@
+"""How much is flown: seeds, durations, and every flight that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from gpvo import __version__
+from gpvo.errors import GpvoError
+from gpvo.reproduce.experiments import FLIGHTS, FlightSet
+from gpvo.reproduce.store import Store, digest_of, digest_of_file
+from gpvo.sim.scenario import Scenario, load_scenario
+
+Mode = Literal["images", "points"]
+MODES: tuple[Mode, ...] = ("images", "points")
+_RECORDINGS = "flown_paths"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """``seeds``: test flights with images; ``points_seeds``: further ones without. ``training``: flights that a model
+    learns from, by mode. ``duration_s`` of a flight; ``stretch``: long straights are longer, as in the thesis.
+    ``curve``: numbers of training flights of the learning curve. ``data``: folder of real data, of whose logs at most
+    ``real_frames`` are taken."""
+
+    seeds: int = 5
+    points_seeds: int = 20
+    training: Mapping[Mode, int] = field(default_factory=lambda: {"images": 6, "points": 12})
+    duration_s: float = 60.0
+    rate_hz: float = 10.0
+    stretch: bool = True
+    curve: tuple[int, ...] = (1, 2, 4, 6)
+    data: Path | None = None
+    real_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.seeds < 0 or self.points_seeds < 0 or self.seeds + self.points_seeds == 0:
+            raise GpvoError("there is nothing to fly", cure="--seeds or --points-seeds above 0")
+        if self.data is not None and not self.data.is_dir():
+            raise GpvoError("no such folder", where=self.data, cure="--data FOLDER, or set GPVO_DATA")
+
+    @classmethod
+    def quick(cls, seeds: int = 1, points_seeds: int = 10, data: Path | None = None) -> Plan:
+        """One seed, flights of 20 s."""
+        return cls(seeds, points_seeds, {"images": 4, "points": 8}, 20.0, 10.0, False, (1, 2, 4), data, 600)
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The modes in which anything is flown."""
+        return tuple(m for m in MODES if self.test_seeds(m))
+
+    def test_seeds(self, mode: Mode) -> range:
+        """Seeds of the test flights: those without images go on where those with images end."""
+        return range(self.seeds) if mode == "images" else range(self.seeds, self.seeds + self.points_seeds)
+
+    def recordings(self, half: str) -> list[Path]:
+        """Recorded paths of one half, ``training`` or ``test``: no path is in both. Empty without data."""
+        if self.data is None:
+            return []
+        files = sorted(p for p in (self.data / _RECORDINGS).glob("*") if p.suffix in (".txt", ".csv", ".tum"))
+        return files[0::2] if half == "training" else files[1::2]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One flight to simulate. ``key``: digest of everything that decides it."""
+
+    set_name: str
+    mode: Mode
+    seed: int
+    scenario: Scenario
+    key: str
+    presets: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Short, and unique within one folder."""
+        return f"{self.set_name}-{self.mode}-{self.seed}-{self.key}"
+
+
+def flights_of(plan: Plan, name: str, mode: Mode, store: Store) -> list[Flight]:
+    """The flights of a set, in order; cuts pieces of recordings where it flies them."""
+    chosen = FLIGHTS[name]
+    if chosen.points_only and mode != "points":
+        return []
+    first, count = chosen.first_seed, plan.training[mode]
+    seeds = range(first, first + count) if chosen.is_training else plan.test_seeds(mode)
+    return [_flight(plan, chosen, mode, seed, k, store) for k, seed in enumerate(seeds)]
+
+
+def _flight(plan: Plan, chosen: FlightSet, mode: Mode, seed: int, k: int, store: Store) -> Flight:
+    duration = plan.duration_s * (chosen.longer if plan.stretch else 1.0)
+    overrides: dict[str, Any] = {**chosen.overrides, "duration_s": duration, "rate_hz": plan.rate_hz}
+    recordings = plan.recordings(chosen.recorded) if chosen.recorded else []
+    content = ""
+    if recordings:
+        from gpvo.reproduce.recordings import cut
+
+        piece = cut(recordings[seed % len(recordings)], seed, duration, store)
+        overrides["trajectory"], content = str(piece), digest_of_file(piece)
+    elif chosen.recorded:
+        # Without recordings there is no path for a vehicle of that name: a quadrotor wanders.
+        overrides["vehicle"] = "quadrotor"
+    if mode == "images":
+        overrides = {k: v for k, v in overrides.items() if not k.startswith("points.")}
+    scenario = load_scenario(chosen.scenarios[k % len(chosen.scenarios)], overrides)
+    decided = scenario.model_dump(mode="json") | {"trajectory": content}
+    key = digest_of(decided, seed, mode, __version__)
+    return Flight(chosen.name, mode, seed, scenario, key, ("fast", "thesis") if chosen.thesis_preset else ("fast",))

@@ -1,0 +1,77 @@
+"""What is kept between runs: files named by the digest of what they were made from, each whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import GpvoError
+from gpvo.io.jsonfile import plain
+
+_LENGTH = 12
+
+
+def digest_of(*parts: Any) -> str:
+    """Short SHA-256 of anything JSON can hold."""
+    text = json.dumps(plain(list(parts)), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]
+
+
+def digest_of_file(path: Path) -> str:
+    """Short SHA-256 of a file's bytes."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:_LENGTH]
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder of stages: ``paths``, ``flights`` (on their way to odometry), ``runs``, ``models``, ``bounds``."""
+
+    root: Path
+
+    def folder(self, kind: str) -> Path:
+        """The folder of one stage, made on first use."""
+        path = self.root / "stages" / kind
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+        return path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path`` to write to; it takes the place of ``path`` at the end, or goes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write an ``.npz`` whole or not at all."""
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)

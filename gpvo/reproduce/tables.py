@@ -1,0 +1,111 @@
+"""The tables as text: CSV for spreadsheets, Markdown for people."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+MODES = {"images": "images", "points": "points only", "real": "real"}
+_THESIS = ("rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "residual_m", "residual_over_rmse")
+_OURS = (
+    "rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "ratio_interval", "vector_residual_m",
+    "vector_over_rmse", "magnitude_residual_m", "magnitude_over_rmse", "coverage_3_sigma",
+)  # fmt: skip
+
+
+def number(value: float | None) -> str:
+    """Three digits, as every table shows them; a dash for what could not be computed."""
+    return "–" if value is None else f"{value:.3g}"
+
+
+def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
+    """A number, with its interval where there is one."""
+    return number(value) if interval is None else f"{number(value)} [{number(interval[0])}, {number(interval[1])}]"
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One line per row and way, every digit."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    ours = [c for name in _OURS for c in ((f"{name}_low", f"{name}_high") if name == "ratio_interval" else (name,))]
+    writer.writerow(["key", "table", "title", "mode", "seeds", "way", *ours, *(f"thesis_{n}" for n in _THESIS)])
+    for row in rows:
+        thesis = row.get("thesis") or {}
+        for way, found in row["ways"].items():
+            values: list[Any] = []
+            for name in _OURS:
+                values += (found[name] or [None, None]) if name == "ratio_interval" else [found[name]]
+            head = [row["key"], row["table"], row["title"], row["mode"], found["seeds"], way]
+            writer.writerow([*head, *values, *(thesis.get(n) for n in _THESIS)])
+    return stream.getvalue()
+
+
+def as_markdown(document: Mapping[str, Any]) -> str:
+    """All tables of the document."""
+    parts = ["# The thesis' experiments, reproduced", ""]
+    parts += [f"* {line}" for line in document["notes"]]
+    for title, rows in (
+        ("Tables 4.1 to 4.6", document["rows"]),
+        ("Sensitivity to sigma_p and sigma_m", document["sensitivity"]),
+        ("Real data", document["real"]),
+    ):
+        if rows:
+            parts += ["", f"## {title}", "", *_table(rows)]
+    parts += ["", "## What is asked of the full model", ""]
+    parts += _grid(
+        ("row", "flights", "target", "value", "met"),
+        [(t["key"], MODES[t["mode"]], t["target"], number(t["value"]), verdict(t["met"])) for t in document["targets"]],
+    )
+    if document["claims"]:
+        parts += ["", "## The thesis' claims", ""]
+        parts += _grid(
+            ("claim", "verdict", "evidence"), [(c["claim"], c["verdict"], c["evidence"]) for c in document["claims"]]
+        )
+    for title, key in (("Errata", "errata"), ("Out of scope", "out_of_scope"), ("Not flown", "failed")):
+        if document[key]:
+            parts += ["", f"## {title}", "", *(f"* {line}" for line in document[key])]
+    return "\n".join(parts) + "\n"
+
+
+def verdict(met: bool | None) -> str:
+    """In a word."""
+    return {True: "yes", False: "no", None: "too few seeds"}[met]
+
+
+HEADS = (
+    "table", "experiment", "flights", "seeds", "way", "RMSE [m]", "final [m]", "predicted [m]", "predicted / actual",
+    "vector / RMSE", "magnitude / RMSE", "thesis: RMSE, final, predicted [m]", "ratio", "residual / RMSE",
+)  # fmt: skip
+
+
+def cells(row: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The lines of one row: a line per way, the thesis beside the first."""
+    out = []
+    for k, (way, f) in enumerate(row["ways"].items()):
+        t = row.get("thesis") if k == 0 else None
+        first = (row["table"], row["title"], MODES[row["mode"]]) if k == 0 else ("", "", "")
+        thesis = ("", "", "")
+        if t is not None:
+            three = ", ".join(number(t[n]) for n in ("rmse_m", "final_error_m", "predicted_final_error_m"))
+            thesis = (three, number(t["ratio"]), number(t["residual_over_rmse"]))
+        out.append(
+            (
+                *first, str(f["seeds"]), way, number(f["rmse_m"]), number(f["final_error_m"]),
+                number(f["predicted_final_error_m"]), with_interval(f["ratio"], f["ratio_interval"]),
+                number(f["vector_over_rmse"]), number(f["magnitude_over_rmse"]), *thesis,
+            )
+        )  # fmt: skip
+    return out
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    return _grid(HEADS, [line for row in rows for line in cells(row)])
+
+
+def _grid(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    def line(values: Sequence[str]) -> str:
+        return "| " + " | ".join(v.replace("|", "\\|") for v in values) + " |"
+
+    return [line(heads), line(["---"] * len(heads)), *(line(values) for values in lines)]
