@@ -16,6 +16,7 @@ def reproduce(
     data: Annotated[
         Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
     ] = None,
+    only: Annotated[str | None, typer.Option(help="Tables or rows, such as 4.3,4.1-clean; by default all.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1: one per core.")] = -1,
     backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
@@ -31,6 +32,8 @@ def reproduce(
     from gpvo.reproduce.run import Workers
 
     given: dict[str, Any] = {"seeds": seeds, "points_seeds": points_seeds, "data": data}
+    if only is not None:
+        given["only"] = tuple(name.strip() for name in only.split(",") if name.strip())
     chosen = {k: v for k, v in given.items() if v is not None}
     plan = Plan.quick(**chosen) if quick else Plan(**chosen)
     result = run(plan, out, Workers(jobs, backend, scheduler, progress))

@@ -46,7 +46,7 @@ class RealRun:
 
 @dataclass(frozen=True)
 class RealRow:
-    """One row of the table of real data: an experiment to take the ways from, and the bounds of every sequence by way."""
+    """One row of the table of real data: an experiment that gives the ways, and the bounds of every sequence by way."""
 
     experiment: Experiment
     bounds: dict[str, list[Path]]
@@ -112,14 +112,15 @@ def real_rows(data: Path, frames: int | None, store: Store, workers: Workers) ->
         stated = replace(gp, key="real-tracks", title=title, method="pointing_matching", sigma_px=_PAIR_PX)
         learned = replace(gp, key="real-tracks-gp", title="stereo tracks of drives, GP trained on the other drives")
         for e in (stated, learned):
-            out.append(_row(e, lambda preset: [j.path(store) for j in runs[preset]], store, workers))
+            out.append(_row(e, "tracks", lambda preset: [j.path(store) for j in runs[preset]], store, workers))
     if len(imported) > 1:
         e = replace(gp, key="real-logs-gp", title="logs of another odometry, GP trained on the other logs")
-        out.append(_row(e, lambda preset: [j.path(store) for j in imported], store, workers))
+        out.append(_row(e, "logs", lambda preset: [j.path(store) for j in imported], store, workers))
     return out, [error for error in dict.fromkeys(errors) if error]
 
 
-def _row(e: Experiment, runs_of: Callable[[str], Sequence[Path]], store: Store, workers: Workers) -> RealRow:
+def _row(e: Experiment, kind: str, runs_of: Callable[[str], Sequence[Path]], store: Store, workers: Workers) -> RealRow:
+    """All ways over all sequences; rows of one ``kind`` share what they have in common."""
     e = replace(e, table="real", published=None, figure="", stands_in="real data", warning=False)
     models: list[ModelJob] = []
     jobs: dict[str, list[SayingJob]] = {}
@@ -129,10 +130,10 @@ def _row(e: Experiment, runs_of: Callable[[str], Sequence[Path]], store: Store, 
         jobs[way] = []
         for k, run in enumerate(runs):
             others = runs[:k] + runs[k + 1 :]
-            model = model_job(e.key, saying, others)
+            model = model_job(f"real-{kind}", saying, others)
             models += [model] if model else []
             own = others if saying.kind == "motion" else ()
-            jobs[way].append(SayingJob(e.key, saying, (run,), own, model.path(store) if model else None))
+            jobs[way].append(SayingJob(f"real-{kind}", saying, (run,), own, model.path(store) if model else None))
     workers.map("models of real data", fit, [(m, store) for m in dict.fromkeys(models)])
     workers.map("bounds", say, [(j, store) for group in jobs.values() for j in group])
     return RealRow(e, {way: [j.path(store) for j in group] for way, group in jobs.items()})

@@ -40,8 +40,9 @@ def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str
     table = cells(plan, flights, store)
     compute(table, store, workers)
     studied = studies.run_studies(plan, flights, store, workers)
-    claimed = claims(table, flights, studied, store, workers)
-    real, refused = ([], []) if plan.data is None else real_rows(plan.data, plan.real_frames, store, workers)
+    claimed = [] if plan.only else claims(table, flights, studied, store, workers)
+    wants_real = plan.data is not None and not plan.only
+    real, refused = real_rows(plan.data, plan.real_frames, store, workers) if wants_real and plan.data else ([], [])
     scores = document.scores_of(table, store)
     rows = document.rows({c: s for c, s in scores.items() if c.experiment.table != "sensitivity"})
     result: dict[str, Any] = {

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gpvo.learning.parallel import map_jobs
-from gpvo.reproduce.experiments import EXPERIMENTS, FLIGHTS, SENSITIVITY, WAYS, Experiment, Way
+from gpvo.reproduce.experiments import WAYS, Experiment, Way
 from gpvo.reproduce.flights import Flown, fly
 from gpvo.reproduce.learn import ModelJob, fit
 from gpvo.reproduce.plan import Flight, Mode, Plan, flights_of
@@ -56,7 +56,7 @@ class Flights:
 def fly_all(plan: Plan, store: Store, workers: Workers) -> Flights:
     """Stages one and two, for every set of flights in every mode."""
     wanted: dict[tuple[str, Mode], list[Flight]] = {
-        (name, mode): flights_of(plan, name, mode, store) for mode in plan.modes for name in FLIGHTS
+        (name, mode): flights_of(plan, name, mode, store) for mode in plan.modes for name in plan.flight_sets
     }
     listed = [f for group in wanted.values() for f in group]
     # The long ones first, so that no core waits for a last long one.
@@ -81,7 +81,7 @@ def cells(plan: Plan, flights: Flights, store: Store) -> list[Cell]:
     """Every cell of the tables for which there are flights."""
     out = []
     for mode in plan.modes:
-        for e in (*EXPERIMENTS, *SENSITIVITY):
+        for e in plan.experiments:
             for way in WAYS:
                 if e.table == "sensitivity" and way == "full":
                     continue
