@@ -35,9 +35,6 @@ def fly(flight: Flight, store: Store) -> Flown:
     runs = {preset: run_path(flight, preset, store) for preset in flight.presets}
     missing = {preset: path for preset, path in runs.items() if not is_complete(path)}
     sequence = store.folder("flights") / (flight.name + (".npz" if flight.mode == "points" else ""))
-    failed = store.folder("flights") / f"{flight.name}.failed"
-    if failed.is_file():
-        return Flown(flight, {}, failed.read_text(encoding="utf-8"))
     try:
         if missing:
             _simulate(flight, sequence)
@@ -45,9 +42,7 @@ def fly(flight: Flight, store: Store) -> Flown:
             config = make_config(preset, sigma_pairs_px=sigma_pairs(flight.set_name, preset))
             runner.run(open_source(sequence), path, config)
     except GpvoError as error:
-        # A path that no vehicle can fly stays one: it is not tried again.
-        _remove(sequence)
-        failed.write_text(str(error), encoding="utf-8")
+        # One path that no vehicle can fly does not stop the others.
         return Flown(flight, {}, str(error))
     _remove(sequence)
     return Flown(flight, runs)

@@ -121,7 +121,7 @@ def _flight(plan: Plan, chosen: FlightSet, mode: Mode, seed: int, k: int, store:
         from gpvo.reproduce.recordings import cut
 
         piece = cut(recordings[seed % len(recordings)], seed, duration, store)
-        overrides["trajectory"], content = str(piece), digest_of_file(piece)
+        overrides["trajectory"], content = str(piece.resolve()), digest_of_file(piece)
     elif chosen.recorded:
         # Without recordings there is no path for a vehicle of that name: a quadrotor wanders.
         overrides["vehicle"] = "quadrotor"

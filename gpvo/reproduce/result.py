@@ -20,7 +20,7 @@ from gpvo.reproduce.plan import Plan
 from gpvo.reproduce.real import RealRow, real_rows
 from gpvo.reproduce.run import Cell, Workers, cells, compute, fly_all
 from gpvo.reproduce.scores import score
-from gpvo.reproduce.store import Store, write_text
+from gpvo.reproduce.store import Store, only_user, write_text
 from gpvo.reproduce.studies import Studies
 
 
@@ -35,7 +35,15 @@ def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str
     GpvoError
         Where the folder cannot be written, or the folder of data is missing.
     """
-    store, workers = Store(out), workers or Workers()
+    with only_user(out):
+        result = _computed(plan, out, workers or Workers())
+        _write(plain(result), out)
+    return result
+
+
+def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
+    """Every stage, then the document and its figures."""
+    store = Store(out)
     flights = fly_all(plan, store, workers)
     table = cells(plan, flights, store)
     compute(table, store, workers)
@@ -62,7 +70,6 @@ def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str
         "failed": [*flights.failed, *refused],
     }
     result["figures"] = _draw(table, real, studied, store, out)
-    _write(plain(result), out)
     return result
 
 
@@ -74,7 +81,7 @@ def _real(row: RealRow) -> dict[str, Any]:
 
 def _notes(plan: Plan) -> list[str]:
     """What stands for what, in plain words."""
-    length = f"{plan.duration_s:g} s" + (", long straights up to 3.5 times as long" if plan.stretch else "")
+    length = f"{plan.duration_s:g} s" + (", the long straight twice as long" if plan.stretch else "")
     notes = [
         "The thesis' flights are not available; ours stand in for them. Compare ratios, not metres.",
         f"Flights of {length}, {plan.rate_hz:g} Hz. {plan.seeds} seeds with images; {plan.points_seeds} further seeds "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +21,7 @@ from gpvo.reproduce.bounds import Bounds, as_arrays, bounds_of, compounded, mean
 from gpvo.reproduce.experiments import Experiment, Way, printed
 from gpvo.reproduce.learn import ModelJob, sets_of
 from gpvo.reproduce.store import Store, digest_of, write_arrays
-from gpvo.types import Array, Status
+from gpvo.types import Array, Status, VoLog
 from gpvo.vo.config import pair_method
 
 Kind = Literal["v_t", "joint", "position", "motion", "learned"]
@@ -105,7 +105,11 @@ def bounds(job: SayingJob) -> list[Bounds]:
 
 
 def _joint(run: Run, method: str) -> Bounds:
-    steps = next(s.steps for s in statements(run.log) if s.method == method)
+    # Of all that the records state, this method alone is wanted.
+    log = VoLog(
+        [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in run.log]
+    )
+    steps = statements(log)[0].steps
     assert steps is not None
     return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, steps))
 
@@ -133,7 +137,8 @@ def _motion(run: Run, state: Statement) -> Bounds:
 
 def _learned(run: Run, predictor: Predictor) -> Bounds:
     predictions = predictions_by_stamp(run, predictor)
-    said = next(s for s in statements(run.log, predictions) if s.method == "learned")
+    bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
+    said = statements(bare, predictions)[0]
     assert said.steps is not None
     mean: Array = np.where([[r.status is Status.LOST] for r in run.log], 0.0, said.mean)
     return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, said.steps))

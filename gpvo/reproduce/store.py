@@ -18,6 +18,11 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.io.jsonfile import plain
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _LENGTH = 12
 
 
@@ -46,6 +51,25 @@ class Store:
         except OSError as error:
             raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
         return path
+
+
+@contextmanager
+def only_user(root: Path) -> Iterator[None]:
+    """Hold the folder, so that two reproductions never fill one; the hold falls when the process dies.
+
+    Raises
+    ------
+    GpvoError
+        Where another process has it.
+    """
+    lock = Store(root).folder(".") / "lock"
+    with lock.open("w") as handle:
+        if fcntl is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise GpvoError("another reproduction is at work here", where=root, cure="give another --out") from None
+        yield
 
 
 @contextmanager

@@ -8,15 +8,17 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.reproduce import tables
+from gpvo.reproduce.flights import fly
 from gpvo.reproduce.plan import Plan, flights_of
 from gpvo.reproduce.result import reproduce
-from gpvo.reproduce.store import Store
+from gpvo.reproduce.store import Store, only_user
 from typer.testing import CliRunner
 
 SMALL = {"seeds": 0, "points_seeds": 2, "training": {"images": 0, "points": 2}, "duration_s": 5.0, "only": ("4.3",)}
@@ -139,6 +141,21 @@ def test_wrong_wishes_are_one_line():
         Plan(only=("9.9",))
     with pytest.raises(GpvoError, match="--data"):
         Plan(data=Path("/no/such"))
+
+
+def test_two_reproductions_do_not_share_a_folder(tmp_path):
+    with only_user(tmp_path), pytest.raises(GpvoError, match="another reproduction"):
+        reproduce(Plan(**SMALL), tmp_path)
+
+
+def test_a_flight_that_cannot_be_flown_is_told_and_does_not_stop_the_others(tmp_path):
+    store = Store(tmp_path)
+    good, bad = flights_of(Plan(**SMALL), "tunnel", "points", store)
+    bad = replace(bad, scenario=bad.scenario.model_copy(update={"points": {"nonsense": 1}}))
+    flown = [fly(f, store) for f in (good, bad)]
+    assert set(flown[0].runs) == {"fast", "thesis"}
+    assert "nonsense" in flown[1].error
+    assert len(flown[1].error.splitlines()) == 1
 
 
 def test_help_names_the_options():
