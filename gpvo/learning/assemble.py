@@ -41,7 +41,7 @@ def assemble(
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     sigma = np.sqrt(variance * scale.factor)
     z = error / sigma
-    split = fit_parts(rows.stretches(z), float(np.median(rows.dt_s)))
+    split = fit_parts(rows.chains(z), float(np.median(rows.dt_s)))
     correlation = residual_correlation(z)
     geometry = rows.geometry(base.method)
     weight = choose_geometry_weight(error, sigma, correlation, geometry, split.share)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,13 @@ from scipy.optimize import nnls
 
 from gpvo.types import Array
 
-SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_TAU_FRAMES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0)
+SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+_TAU_FRAMES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0, 2048.0, 4096.0)
 _MIN_WINDOWS = 3.0
 _MIN_SHARE = 1e-6
 _REWEIGHTINGS = 8
+_SAME_NS = 1000
+_MAX_DOUBT = 1.0
 
 
 @dataclass(frozen=True)
@@ -38,37 +39,66 @@ class Parts:
     fitted: Array
 
 
-def fit_parts(z: Sequence[Array], step_s: float) -> Parts:
-    """From normalised residuals, one array (n_i, D) per unbroken stretch; ``step_s``: usual duration of a motion.
+@dataclass(frozen=True)
+class SpanVariances:
+    """``spans`` (S,) that occur; ``mean_square`` (S, D) of sums over each; ``doubt`` (S, D): squared relative standard
+    error of that, by which sequences differ or, where they are few, by the number of separate windows."""
+
+    spans: NDArray[np.int64]
+    mean_square: Array
+    doubt: Array
+
+    @property
+    def predictive(self) -> Array:
+        """(S, D) variance to state of a sequence not seen: what is squared over an uncertain variance ``v`` is, on
+        average, too large by ``1 + var(v) / v^2``."""
+        return self.mean_square * (1.0 + self.doubt)
+
+
+def fit_parts(z: Sequence[Sequence[Array]], step_s: float) -> Parts:
+    """From normalised residuals: per sequence its unbroken chains (n_i, D); ``step_s``: usual duration of a motion.
 
     Translation and rotation (each three axes) have one time constant each; the shares are the axis' own.
     """
-    spans, measured, windows = span_variances(z)
-    curve = measured / measured[0]
+    found = span_variances(z)
+    spans, curve = found.spans, found.predictive / found.predictive[0]
+    windows = 2.0 / found.doubt
     share, tau = np.empty((3, curve.shape[1])), np.empty(curve.shape[1])
     for start in range(0, curve.shape[1], 3):
         block = range(start, min(start + 3, curve.shape[1]))
-        fits = {t: [_fit_axis(spans, curve[:, j], windows, t) for j in block] for t in _TAU_FRAMES}
+        fits = {t: [_fit_axis(spans, curve[:, j], windows[:, j], t) for j in block] for t in _TAU_FRAMES}
         best = min(fits, key=lambda t: sum(loss for loss, _ in fits[t]))
-        for j, (_, found) in zip(block, fits[best]):
-            share[:, j], tau[j] = found, best
+        for j, (_, chosen) in zip(block, fits[best]):
+            share[:, j], tau[j] = chosen, best
     fitted = np.stack([curves(spans, tau[j]) @ share[:, j] for j in range(curve.shape[1])], axis=1)
     return Parts(share, tau * step_s, spans, curve, fitted)
 
 
-def span_variances(z: Sequence[Array]) -> tuple[NDArray[np.int64], Array, Array]:
-    """Mean square of sums over each span that occurs: spans (S,), (S, D), and how many separate windows fit (S,)."""
-    spans, out, windows = [], [], []
+def span_variances(z: Sequence[Sequence[Array]]) -> SpanVariances:
+    """Of the sums over each of :data:`SPANS` that occurs three times at least; sequences count by their length."""
+    spans, mean_square, doubt = [], [], []
     for m in SPANS:
-        sums = [_sums(s, m) for s in z if len(s) >= m]
-        count = sum(len(s) for s in z if len(s) >= m) / m
-        if sums and count >= _MIN_WINDOWS:
+        long = [[chain for chain in chains if len(chain) >= m] for chains in z]
+        squares = np.array([np.concatenate([_sums(c, m) ** 2 for c in some]).mean(axis=0) for some in long if some])
+        windows = np.array([sum(len(c) for c in some) / m for some in long if some])
+        if windows.sum() >= _MIN_WINDOWS:
+            weight = windows / windows.sum()
+            mean = np.maximum(weight @ squares, 1e-12)
+            between = (weight**2) @ (squares / mean - 1.0) ** 2
             spans.append(m)
-            out.append((np.concatenate(sums) ** 2).mean(axis=0))
-            windows.append(count)
+            mean_square.append(mean)
+            doubt.append(np.clip(_by_block(between), 2.0 / windows.sum(), _MAX_DOUBT))
     if not spans:
         raise ValueError("no residuals to fit the parts to")
-    return np.array(spans), np.maximum(np.array(out), 1e-12), np.array(windows)
+    return SpanVariances(np.array(spans), np.array(mean_square), np.array(doubt))
+
+
+def _by_block(values: Array) -> Array:
+    """Each block of three axes at its mean, as three axes show better than one by how much sequences differ."""
+    out = values.copy()
+    for start in range(0, len(out), 3):
+        out[start : start + 3] = out[start : start + 3].mean()
+    return out
 
 
 def _sums(z: Array, m: int) -> Array:
@@ -100,11 +130,15 @@ def _fit_axis(spans: NDArray[np.int64], measured: Array, windows: Array, tau_fra
     return float(windows @ (np.log(curve) + measured / curve)), share
 
 
-def stretches(t_ns: NDArray[np.int64], dt_s: Array) -> list[slice]:
-    """Unbroken stretches of motions: each starts where the one before ended."""
+def chains(t_ns: NDArray[np.int64], dt_s: Array) -> list[NDArray[np.int64]]:
+    """Rows of the motions that add up to the path, in unbroken chains: each starts where the one before ended.
+
+    A vehicle that hardly moves keeps its reference, and several motions start there; only the last of them leads on.
+    """
     if len(t_ns) == 0:
         return []
-    begins = t_ns[1:] - np.round(dt_s[1:] * 1e9).astype(np.int64)
-    breaks = np.flatnonzero(np.abs(begins - t_ns[:-1]) > 1000) + 1
-    edges = [0, *breaks.tolist(), len(t_ns)]
-    return [slice(a, b) for a, b in pairwise(edges)]
+    begins = t_ns - np.round(dt_s * 1e9).astype(np.int64)
+    last_of_reference = np.append(np.abs(np.diff(begins)) > _SAME_NS, True)
+    rows = np.flatnonzero(last_of_reference)
+    breaks = np.flatnonzero(np.abs(begins[rows[1:]] - t_ns[rows[:-1]]) > _SAME_NS) + 1
+    return list(np.split(rows, breaks))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import group_labels
-from gpvo.learning.parts import stretches
+from gpvo.learning.parts import chains
 from gpvo.types import Array
 
 
@@ -43,10 +43,11 @@ class Rows:
         """Means of (n, ...) over each group, (G, ...)."""
         return np.array([values[self.group == g].mean(axis=0) for g in np.unique(self.group)])
 
-    def stretches(self, values: Array) -> list[Array]:
-        """Rows of (n, ...) in unbroken stretches of motions."""
+    def chains(self, values: Array) -> list[list[Array]]:
+        """Rows of (n, ...) of each sequence, in unbroken chains of motions."""
         out, start = [], 0
         for s in self.sets:
-            out += [values[start : start + len(s)][part] for part in stretches(s.t_ns, s.dt_s)]
+            mine = values[start : start + len(s)]
+            out.append([mine[rows] for rows in chains(s.t_ns, s.dt_s)])
             start += len(s)
         return out

@@ -64,7 +64,7 @@ def test_parts_of_a_known_mixture():
         out.append(
             np.sqrt(0.3) * (n[1:] - n[:-1]) + np.sqrt(0.3) * rng.standard_normal((1000, 3)) + np.sqrt(0.1) * bias
         )
-    parts = fit_parts(out, 0.1)
+    parts = fit_parts([[chain] for chain in out], 0.1)
     np.testing.assert_allclose(parts.share.mean(axis=1), [0.6, 0.3, 0.1], atol=0.06)
     assert 1.0 < parts.tau_s.mean() < 8.0
 
