@@ -1,0 +1,189 @@
+"""Is the learned covariance true in every scenario, per motion and over 1, 10 and 100 m? Simulated flights, a model.
+
+    python -m gpvo.evaluation.scenario_experiment --train 10 --test 12 -o scenarios
+
+Per scenario: a model from the training flights, judged on flights whose seeds, and with them path, world, noise and
+calibration, it has never seen; ``--together`` adds one model of all scenarios at the same rate. A flight is the unit of
+every mean and interval, as its calibration is one draw. Flights that the folder holds are not flown again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.build import TrainingSet, build_run
+from gpvo.dataset.errors import motion_errors
+from gpvo.errors import GpvoError
+from gpvo.evaluation.consistency import HORIZONS_M, consistency
+from gpvo.evaluation.evaluate import judged, predictions_by_stamp
+from gpvo.evaluation.fusion_flights import Campaign, flights
+from gpvo.evaluation.statements import statements
+from gpvo.io.jsonfile import write_json
+from gpvo.io.run import Run
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.train import train_sets
+from gpvo.online.predictor import Predictor
+from gpvo.stats.bootstrap import Interval, sequence_bootstrap
+
+DURATIONS_S: Mapping[str, float] = {
+    "tunnel-clean": 125.0,
+    "tunnel-noise": 125.0,
+    "tunnel-bursts": 125.0,
+    "lunar-straight": 130.0,
+    "room-t265": 210.0,
+}
+"""The scenarios, each flown far enough for 100 m."""
+
+METHODS = ("constant", "triangulation_scaled", "learned")
+NEES_COLUMNS = ("frame", *(f"{m:g} m" for m in HORIZONS_M))
+FIRST_TRAIN_SEED, FIRST_TEST_SEED = 1000, 2000
+
+
+@dataclass(frozen=True)
+class MethodScores:
+    """Of one method over F flights: ``nees`` (F, 4) joint NEES per degree of freedom per motion and over 1, 10, 100 m,
+    NaN where no window fits; ``median`` (F,) of the motions' NEES; ``nll`` (F,) per axis [nats]."""
+
+    nees: np.ndarray
+    median: np.ndarray
+    nll: np.ndarray
+
+    def interval(self, column: int) -> Interval:
+        """Mean over flights of a column of ``nees``, with its bootstrap interval."""
+        values = self.nees[:, column]
+        return sequence_bootstrap(values[np.isfinite(values)])
+
+
+def score_flights(runs: Sequence[Run], predictor: Predictor) -> dict[str, MethodScores]:
+    """Every method of :data:`METHODS` that the runs and the model allow."""
+    rows: dict[str, list[list[float]]] = {}
+    for run in runs:
+        for method, row in _score_flight(run, predictor).items():
+            rows.setdefault(method, []).append(row)
+    tables = {m: np.array(r, dtype=np.float64) for m, r in rows.items()}
+    return {m: MethodScores(t[:, :-2], t[:, -2], t[:, -1]) for m, t in tables.items()}
+
+
+def _score_flight(run: Run, predictor: Predictor) -> dict[str, list[float]]:
+    """NEES per motion and by horizon, its median over the motions, and the NLL, by method."""
+    if run.truth is None:
+        raise GpvoError("has no ground truth to judge by", where=run.path)
+    predictions = predictions_by_stamp(run, predictor)
+    log = judged(run.log, predictions)
+    T_true, known = interpolate_truth(run.truth, log.t_ns)
+    errors = motion_errors(log, run.truth)
+    out = {}
+    for statement in statements(log, predictions, predictor):
+        c = consistency(statement, errors, log, T_true, known) if statement.method in METHODS else None
+        joint, nll = (c.nees_dof["joint"], c.nll_per_dim) if c else (None, None)
+        if c is not None and joint is not None and nll is not None:
+            far = [h.nees_dof for h in c.horizons]
+            out[statement.method] = [joint.mean, *far, float(c.nees_dof_median["joint"] or np.nan), nll]
+    return out
+
+
+@dataclass(frozen=True)
+class ScenarioFlights:
+    """Flights of one scenario: what a model may learn from, and what it is judged on."""
+
+    name: str
+    training: Sequence[TrainingSet]
+    test: Sequence[Run]
+
+
+def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRST_TEST_SEED, jobs: int = 1,
+        duration_s: float | None = None) -> ScenarioFlights:  # fmt: skip
+    """Simulate as points, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
+    campaign = Campaign(name, folder, duration_s or DURATIONS_S[name])
+    seen = flights(campaign, range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + train), jobs)
+    unseen = flights(campaign, range(test_seed, test_seed + test), jobs)
+    return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
+
+
+def judge(flown: ScenarioFlights, training: Sequence[TrainingSet] | None = None) -> dict[str, MethodScores]:
+    """Train on the scenario's own flights, or on ``training``, and score the unseen ones."""
+    model = train_sets(flown.training if training is None else training, TrainConfig(), judge=False)
+    return score_flights(flown.test, model.predictor())
+
+
+def markdown(results: Mapping[str, Mapping[str, MethodScores]]) -> str:
+    """One row per scenario and method: NEES per degree of freedom with 95 % intervals over flights, median, NLL."""
+    head = ["scenario", "method", "flights", *(f"NEES, {c}" for c in NEES_COLUMNS), "median", "NLL"]
+    rows = [head, ["---"] * len(head)]
+    for scenario, methods in results.items():
+        for method, s in methods.items():
+            cells = [_cell(s, i) for i in range(len(NEES_COLUMNS))]
+            ends = [f"{s.median.mean():.2f}", f"{s.nll.mean():.3f}"]
+            rows.append([scenario, method, str(len(s.nll)), *cells, *ends])
+    return "\n".join(f"| {' | '.join(r)} |" for r in rows)
+
+
+def _cell(scores: MethodScores, column: int) -> str:
+    if not np.isfinite(scores.nees[:, column]).any():
+        return "-"
+    i = scores.interval(column)
+    return f"{i.mean:.2f} [{i.low:.2f}, {i.high:.2f}]"
+
+
+def document(results: Mapping[str, Mapping[str, MethodScores]]) -> dict[str, Any]:
+    """The same for machines, flight by flight."""
+    return {
+        "schema": 1,
+        "columns": list(NEES_COLUMNS),
+        "scenarios": {
+            scenario: {
+                m: {"nees_dof": s.nees, "nees_dof_median": s.median, "nll_per_dim": s.nll} for m, s in methods.items()
+            }
+            for scenario, methods in results.items()
+        },
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line of the experiment."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenarios", nargs="*", default=list(DURATIONS_S), help="default: all")
+    parser.add_argument("--train", type=int, default=10, help="training flights of each scenario")
+    parser.add_argument("--test", type=int, default=12, help="test flights of each scenario")
+    parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="seed of the first test flight")
+    parser.add_argument("--duration", type=float, help="s; default: far enough for 100 m")
+    parser.add_argument("--together", action="store_true", help="also one model of all scenarios of equal rate")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that fly")
+    parser.add_argument("-o", "--out", type=Path, default=Path("scenarios"), help="folder for runs and results")
+    given = parser.parse_args(arguments)
+    unknown = [s for s in given.scenarios if s not in DURATIONS_S]
+    if unknown or given.train < 2 or given.test < 2:
+        raise GpvoError(f"cannot judge {unknown or 'so few flights'}", cure="names of --help; two flights at least")
+    results: dict[str, Mapping[str, MethodScores]] = {}
+    flown = []
+    for name in given.scenarios:
+        flown.append(
+            fly(name, given.out, given.train, given.test, test_seed=given.test_seed, jobs=given.jobs,
+                duration_s=given.duration)
+        )  # fmt: skip
+        results[name] = judge(flown[-1])
+        print(markdown({name: results[name]}), flush=True)
+    if given.together:
+        results |= _together(flown)
+    write_json(given.out / "scenarios.json", document(results))
+    print(markdown(results))
+
+
+def _together(flown: Sequence[ScenarioFlights]) -> dict[str, Mapping[str, MethodScores]]:
+    """One model of all scenarios that share the first one's rate, judged on each."""
+    step = float(np.median(flown[0].training[0].dt_s))
+    alike = [f for f in flown if abs(float(np.median(f.training[0].dt_s)) / step - 1) < 0.01]
+    model = train_sets([s for f in alike for s in f.training], TrainConfig(), judge=False)
+    predictor = model.predictor()
+    return {f"{f.name}, model of all": score_flights(f.test, predictor) for f in alike}
+
+
+if __name__ == "__main__":
+    main()
