@@ -1,12 +1,13 @@
 # make demo   set up and show the main job, in a few minutes
 # make test   set up and run lint, import contracts, types and tests
 # make check  the longer tests: every README command, Monte Carlo, memory, pictures, a browser
+# make docs   the documentation, as pages in docs/_build
 # make bench  speed and memory, as ratios within one run
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench docs clean
 
 .venv/pip-ready:
 	$(PYTHON) -m venv .venv
@@ -38,6 +39,10 @@ check: .venv/test-ready
 
 bench: .venv/test-ready
 	$(BIN)/python -m bench
+
+docs: .venv/test-ready
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
+	@echo docs/_build/html/index.html
 
 clean:
 	rm -rf .venv out .pytest_cache .mypy_cache .ruff_cache

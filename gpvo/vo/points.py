@@ -45,8 +45,7 @@ def triangulation_pixel_covariance(sigma_px: float = 1.0, pixel_covariance: Arra
     """Covariance (3, 3) of (u, v, d) from the four image coordinates [px^2].
 
     With equal independent noise it is ``s^2 [[1, 0, 1], [0, 1/2, 0], [1, 0, 2]]``: never diagonal, as u takes part in
-    d.
-    ``pixel_covariance`` (4, 4) of (uL, vL, uR, vR) replaces ``sigma_px``^2 times the identity.
+    d. ``pixel_covariance`` (4, 4) of (uL, vL, uR, vR) stands in for the square of ``sigma_px`` times the identity.
     """
     S = np.eye(4) * sigma_px**2 if pixel_covariance is None else np.asarray(pixel_covariance, dtype=np.float64)
     if S.shape != (4, 4):
