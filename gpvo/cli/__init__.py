@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from gpvo import __version__
-from gpvo.cli import evaluate, files, fuse, learn, reproduce, run, simulate
+from gpvo.cli import evaluate, files, forecast, fuse, learn, reproduce, run, simulate
 from gpvo.errors import GpvoError
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ def _root(
     """Options that stand before the command."""
 
 
-for group in (simulate, run, files, learn, evaluate, fuse, reproduce):
+for group in (simulate, run, files, learn, evaluate, forecast, fuse, reproduce):
     group.register(app)
 
 

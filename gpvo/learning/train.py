@@ -19,6 +19,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
 from gpvo.learning.methods import METHODS, method_arrays, simple_statements, thesis_gp
 from gpvo.learning.parallel import map_jobs
+from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score
 from gpvo.online.estimate import Estimate
 from gpvo.online.features import units
@@ -59,7 +60,8 @@ def train_sets(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool 
     sets = _checked(sets)
     table = train_table(sets, config) if judge else {}
     learned = fit_model(sets, config)
-    arrays = {**learned.arrays, **method_arrays(sets)}
+    sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
+    arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays()}
     header = _header(sets, config, learned, table)
     return TrainedModel(
         arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets

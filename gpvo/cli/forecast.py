@@ -1,0 +1,160 @@
+"""``gpvo forecast``: the uncertainty that odometry would have along a planned path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from gpvo.evaluation.forecast import Forecast
+
+_LINES = 11
+
+
+def forecast(
+    model: Annotated[Path, typer.Argument(help="Model file.")],
+    path: Annotated[Path, typer.Option("--path", help="Planned poses, TUM lines at any spacing.")],
+    frame: Annotated[
+        str, typer.Option(help="What the poses are of: cam (left camera, z forward) or body (FLU, camera forward).")
+    ] = "cam",
+    draws: Annotated[int, typer.Option(min=1, max=1000, help="Flights of the plan, each in other conditions.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over the distance.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Every pose, as .parquet or .csv.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """The covariance that VO would have along a planned path, the first pose known exactly.
+
+    Example: gpvo forecast errors.gpvo --path plan.tum --plot plan.png
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.evaluation.forecast import forecast as run_forecast
+    from gpvo.evaluation.plan import read_plan
+    from gpvo.online.predictor import Predictor
+
+    if out is not None and out.suffix not in (".parquet", ".csv"):
+        raise GpvoError("is no kind of table", where=out, cure="give -o a name that ends in .parquet or .csv")
+    predictor = Predictor.load(model)
+    found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
+    if out is not None:
+        _write(out, found)
+    if plot is not None:
+        _draw(plot, found, path.name)
+    if json_:
+        print_json(document(found, model, path, frame))
+    else:
+        _print(found, path, frame)
+
+
+def document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
+    """The result as scripts read it: SI units, positions in the axes of the plan's world, 1 sigma."""
+    rows = [_row(f, k) for k in _stops(len(f.plan.t_s))]
+    return {
+        "schema": 1,
+        "model": str(model),
+        "path": str(path),
+        "frame": frame,
+        "rate_hz": 1.0 / f.plan.step_s,
+        "duration_s": float(f.plan.t_s[-1]),
+        "length_m": float(f.plan.distance_m[-1]),
+        "draws": f.draws,
+        "outside_domain": f.outside_share,
+        "outside": [o.__dict__ for o in f.outside],
+        "predicted_final_error_m": float(f.sigma_m[-1]),
+        "predicted_final_error_independent_m": f.independent_m,
+        "final_sigma_m": dict(zip("xyz", f.position_sigma_m[-1].tolist(), strict=True)),
+        "final_mean_error_m": dict(zip("xyz", f.mean_error_m[-1].tolist(), strict=True)),
+        "along": rows,
+    }
+
+
+def _stops(n: int) -> list[int]:
+    """Poses for a short table, evenly in time, the last among them."""
+    from numpy import linspace
+
+    return sorted({int(k) for k in linspace(0, n - 1, min(n, _LINES)).round()})
+
+
+def _row(f: Forecast, k: int) -> dict[str, float]:
+    sigma = dict(zip(("sigma_x_m", "sigma_y_m", "sigma_z_m"), f.position_sigma_m[k].tolist(), strict=True))
+    return {
+        "t_s": float(f.plan.t_s[k]),
+        "distance_m": float(f.plan.distance_m[k]),
+        **sigma,
+        "sigma_m": float(f.sigma_m[k]),
+    }
+
+
+def _print(f: Forecast, path: Path, frame: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    p = f.plan
+    console = Console(width=max(Console().width, 110), highlight=False, markup=False)
+    console.print(
+        f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m of the {frame}, {len(p.t_s) - 1} motions at"
+        f" {1 / p.step_s:.3g} Hz"
+    )
+    console.print(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
+    for o in f.outside:
+        a, b = o.planned, o.trained
+        console.print(
+            f"  {o.feature}: {a[0]:.3g} to {a[1]:.3g}, the training knows {b[0]:.3g} to {b[1]:.3g}"
+            f" ({100 * o.share:.0f} % beyond)"
+        )
+    table = Table("time [s]", "distance [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
+    for k in _stops(len(p.t_s)):
+        row = _row(f, k)
+        table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
+    console.print(table)
+    console.print("1 sigma of the position since the first pose, in the axes of the plan's world")
+    if f.mean[-1].any():
+        x, y, z = f.mean_error_m[-1]
+        console.print(f"and an error to be expected at the end of {x:.3g}, {y:.3g}, {z:.3g} m")
+
+
+def _write(out: Path, f: Forecast) -> None:
+    """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
+    import os
+
+    from gpvo.io.parquet import make_table, write_table
+
+    position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
+    columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}
+    columns |= {f"{a}_m": position[:, i] for i, a in enumerate("xyz")}
+    columns |= {f"sigma_{a}_m": sigma[:, i] for i, a in enumerate("xyz")}
+    columns |= {"sigma_m": f.sigma_m, "in_domain": [1.0, *f.in_domain]}
+    columns |= {f"cov_{i}_{j}": f.covariance[:, i, j] for i in range(6) for j in range(i, 6)}
+    table = make_table(columns)
+    try:
+        if out.suffix == ".parquet":
+            write_table(out, table)
+        else:
+            from pyarrow.csv import write_csv
+
+            write_csv(table, out.with_name(out.name + ".part"))
+            os.replace(out.with_name(out.name + ".part"), out)
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror or error}", where=out) from None
+
+
+def _draw(plot: Path, f: Forecast, title: str) -> None:
+    import os
+
+    from gpvo.evaluation.forecast_figure import draw
+
+    temporary = plot.with_name(plot.name + ".part")
+    try:
+        draw(f, title).savefig(temporary, dpi=110, format="png")
+        os.replace(temporary, plot)
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror or error}", where=plot) from None
+
+
+def register(app: typer.Typer) -> None:
+    """Add this file's command to the application."""
+    app.command()(forecast)

@@ -1,0 +1,208 @@
+"""The covariance that odometry would have along a planned path.
+
+The plan says how fast the camera moves and turns. What else the model looks at (points, texture, noise) is not known
+before the flight: it is drawn, several times, from training rows of like motion, and each draw keeps to few training
+sequences, so that what differs between flights stays together along the path. Draws are joined by the law of total
+variance: the mean of their covariances plus the covariance of their means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import ModelError
+from gpvo.evaluation.accumulate import Step, along
+from gpvo.evaluation.plan import Plan
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import position_in_world, symmetrise
+from gpvo.online.base import TWIST_COLUMNS, positions
+from gpvo.online.estimate import PARTS, Estimate
+from gpvo.online.features import FeatureStream
+from gpvo.online.guard import DEGRADED_BELOW
+from gpvo.online.predictor import Predictor
+from gpvo.online.sample import TrainingSample
+from gpvo.types import Array, Status, VoRecord
+
+DRAWS = 8
+PLANNED = (*TWIST_COLUMNS, "acceleration_mps2", "angular_acceleration_radps2")
+"""Features that follow from the plan."""
+
+_NEIGHBOURS = 16
+
+
+@dataclass(frozen=True)
+class Outside:
+    """A planned feature that leaves the training's range: share of the motions, the plan's range and the training's."""
+
+    feature: str
+    share: float
+    planned: tuple[float, float]
+    trained: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Of the N poses of a plan, the first known exactly.
+
+    ``covariance`` (N, 6, 6): of each pose's error, right perturbation, in ``cam`` there [m, rad]; ``mean`` (N, 6):
+    error to be expected, zero unless the model states one. ``independent_m``: the last pose's position sigma if
+    motions were independent. ``in_domain`` (N - 1,): of each motion, averaged over the draws, in [0, 1].
+    """
+
+    plan: Plan
+    covariance: Array
+    mean: Array
+    independent_m: float
+    in_domain: Array
+    outside: tuple[Outside, ...]
+    draws: int
+
+    @property
+    def position_covariance(self) -> Array:
+        """(N, 3, 3) in the axes of the plan's world [m^2]."""
+        return position_in_world(self.plan.T_world_cam, self.covariance)
+
+    @property
+    def position_sigma_m(self) -> Array:
+        """(N, 3) standard deviation per axis of the plan's world [m]."""
+        return np.sqrt(np.diagonal(self.position_covariance, axis1=1, axis2=2))
+
+    @property
+    def sigma_m(self) -> Array:
+        """(N,) square root of the trace of the position's covariance [m]."""
+        return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
+
+    @property
+    def mean_error_m(self) -> Array:
+        """(N, 3) expected error of the position, in the axes of the plan's world [m]."""
+        return np.einsum("nij,nj->ni", self.plan.T_world_cam[:, :3, :3], self.mean[:, :3])
+
+    @property
+    def outside_share(self) -> float:
+        """Share of the motions that lie outside the training domain."""
+        return float((self.in_domain < DEGRADED_BELOW).mean())
+
+
+def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int = 0) -> Forecast:
+    """Fly the plan ``draws`` times in the conditions of training flights.
+
+    Raises
+    ------
+    ModelError
+        If the model predicts something else than the error of a motion, or keeps no sample of its training rows.
+    """
+    if predictor.target != "frame":
+        raise ModelError(
+            f"this model predicts the error over {predictor.target}, not that of each motion",
+            cure="train with --target frame",
+        )
+    sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
+    rng = np.random.default_rng(seed)
+    flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]
+    sums = [_sum_up(flight, predictor.model.bias_tau_s, plan) for flight in flown]
+    C, m = np.array([c for c, _, _ in sums]), np.array([m for _, m, _ in sums])
+    spread = m - m.mean(axis=0)
+    return Forecast(
+        plan=plan,
+        covariance=symmetrise(C.mean(axis=0) + np.einsum("dni,dnj->nij", spread, spread) / draws),
+        mean=m.mean(axis=0),
+        independent_m=float(np.sqrt(np.mean([v for _, _, v in sums]))),
+        in_domain=np.mean([f.said.in_domain for f in flown], axis=0),
+        outside=_outside(predictor, plan),
+        draws=draws,
+    )
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """One draw: the pose each motion starts from (N,), -1 for the first pose, and what the model says of the motions
+    that end at poses 1 to N - 1."""
+
+    parent: NDArray[np.int64]
+    said: Estimate
+    dt_s: Array
+
+
+def _fly(predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.random.Generator) -> _Flight:
+    """What the model says of every motion of the plan in the conditions of training rows that moved alike.
+
+    A row is taken as it is, with the velocities as odometry measured them, noise and all: the model knows no others.
+    Only where the plan leaves the range of the training does the plan's own value stand in its place. Where odometry
+    kept its reference over several frames, so it does here.
+    """
+    names = [n for n in PLANNED if n in predictor.features]
+    at, domain = positions(predictor.features, names), predictor.model.domain
+    planned = _features(names, plan)
+    like = _like(planned[:, : len(TWIST_COLUMNS)], sample, at[: len(TWIST_COLUMNS)], domain.scale, rng)
+    parent, rows = _references(like, np.round(sample.dt_s / plan.step_s).astype(int))
+    X = sample.X[rows].copy()
+    low, high = (domain.centre[at] + domain.scale[at] * edge[at] for edge in (domain.low, domain.high))
+    X[:, at] = np.where((planned < low) | (planned > high), planned, X[:, at])
+    dt_s = plan.t_s[1:] - plan.t_s[parent[1:]]
+    return _Flight(parent, predictor.predict(X, None if sample.geometry is None else sample.geometry[rows], dt_s), dt_s)
+
+
+def _references(like: NDArray[np.int64], frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Parents of the N poses and rows of the N - 1 motions, from the row that each motion (N - 1,) is most like and the
+    number of frames that each row's motion spans."""
+    n = len(like)
+    parent, rows = np.full(n + 1, -1, dtype=np.int64), np.empty(n, dtype=np.int64)
+    here = 0
+    while here < n:
+        end = min(here + max(1, int(frames[like[here]])), n)
+        parent[here + 1 : end + 1], rows[here:end] = here, like[here]
+        here = end
+    return parent, rows
+
+
+def _like(twist: Array, sample: TrainingSample, at: list[int], scale: Array, rng: np.random.Generator) -> NDArray:
+    """For each motion (n, 6) one of the rows that moved most alike, as indices (n,).
+
+    Of these the row whose sequence comes first in an order drawn once: conditions last as long as the motion allows.
+    """
+    A, B = twist / scale[at], sample.X[:, at] / scale[at]
+    order = rng.permutation(int(sample.sequence.max()) + 1)[sample.sequence] + rng.random(len(B))
+    few = min(_NEIGHBOURS, len(B))
+    out = np.empty(len(A), dtype=np.int64)
+    for k, a in enumerate(A):
+        near = np.argpartition(np.nan_to_num(((B - a) ** 2).sum(axis=1), nan=np.inf), few - 1)[:few]
+        out[k] = near[np.argmin(order[near])]
+    return out
+
+
+def _features(names: list[str], plan: Plan) -> Array:
+    """(n, len(names)) by the one definition that flight and training share."""
+    stream, t_ns = FeatureStream(names), np.round(plan.t_s * 1e9).astype(np.int64).tolist()
+    records = (VoRecord(t_ns[k + 1], t_ns[k], Status.OK, T) for k, T in enumerate(plan.motions))
+    return np.array([stream.step(r) for r in records]).reshape(-1, len(names))
+
+
+def _sum_up(flight: _Flight, tau_s: Array, plan: Plan) -> tuple[Array, Array, float]:
+    """Covariance (N, 6, 6) and mean (N, 6) of every pose's error, and the last position's variance if independent."""
+    parent, parts, T_world = flight.parent, flight.said.parts, plan.T_world_cam
+    steps = [Step.independent(np.eye(4), np.zeros((6, 6)))]
+    mean, plain = np.zeros((len(parent), 6)), np.zeros((len(parent), 6, 6))
+    for k in range(1, len(parent)):
+        T = se3.inverse(T_world[parent[k]]) @ T_world[k]
+        jitter, white, bias = (parts[name][k - 1] for name in PARTS)
+        steps.append(Step(T, jitter, white, bias, tau_s, float(flight.dt_s[k - 1])))
+        moved = se3.adjoint(se3.inverse(T))
+        mean[k] = moved @ mean[parent[k]] + flight.said.mean[k - 1]
+        plain[k] = moved @ plain[parent[k]] @ moved.T + flight.said.covariance[k - 1]
+    return along(steps, parent), mean, float(np.trace(plain[-1, :3, :3]))
+
+
+def _outside(predictor: Predictor, plan: Plan) -> tuple[Outside, ...]:
+    """Planned velocities and turn rates beyond the training's range, the most frequent first."""
+    domain, at = predictor.model.domain, positions(predictor.features, TWIST_COLUMNS)
+    low, high = (domain.centre + domain.scale * edge for edge in (domain.low, domain.high))
+    twist = se3.log(plan.motions) / plan.step_s
+    found = []
+    for name, i, v in zip(TWIST_COLUMNS, at, twist.T, strict=True):
+        share = float(((v < low[i]) | (v > high[i])).mean())
+        if share > 0:
+            found.append(Outside(name, share, (float(v.min()), float(v.max())), (float(low[i]), float(high[i]))))
+    return tuple(sorted(found, key=lambda o: -o.share))
