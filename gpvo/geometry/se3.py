@@ -9,6 +9,8 @@ appendices B (SO(3)) and D (SE(3)); T. Barfoot, "State Estimation for Robotics" 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,9 +108,42 @@ def exp(xi: Array) -> Array:
 def log(T: Array) -> Array:
     """Pose (..., 4, 4) to tangent (..., 6)."""
     T = np.asarray(T, dtype=np.float64)
+    if T.ndim == 2:
+        return _log_one(T)
     phi = so3_log(T[..., :3, :3])
     rho = (so3_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)
+
+
+def _log_one(T: Array) -> Array:
+    """The same of a single pose, in plain numbers: a tenth of the time, as arrays of three are all overhead."""
+    (r00, r01, r02, tx), (r10, r11, r12, ty), (r20, r21, r22, tz), _ = T.tolist()
+    # The quaternion by its largest component, as rotation_to_quaternion_xyzw does.
+    trace = r00 + r11 + r22
+    largest = max(r00, r11, r22, trace)
+    if largest == r00:
+        q = (1 + r00 - r11 - r22, r01 + r10, r20 + r02, r21 - r12)
+    elif largest == r11:
+        q = (r01 + r10, 1 - r00 + r11 - r22, r12 + r21, r02 - r20)
+    elif largest == r22:
+        q = (r20 + r02, r12 + r21, 1 - r00 - r11 + r22, r10 - r01)
+    else:
+        q = (r21 - r12, r02 - r20, r10 - r01, 1 + trace)
+    length = math.copysign(math.hypot(*q), q[3] if q[3] else 1.0)
+    x, y, z, w = (v / length for v in q) if length else (math.nan,) * 4
+    sine = math.hypot(x, y, z)
+    scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, w) / sine
+    x, y, z = x * scale, y * scale, z * scale
+    theta2 = x * x + y * y + z * z
+    if theta2 < 1e-4:
+        d = 1.0 / 12.0 + theta2 / 720.0 + theta2**2 / 30240.0
+    else:
+        theta = math.sqrt(theta2)
+        d = (1.0 - theta * math.sin(theta) / (4.0 * math.sin(theta / 2.0) ** 2)) / theta2
+    # (I - W / 2 + d W^2) t, with W v = phi x v.
+    ax, ay, az = y * tz - z * ty, z * tx - x * tz, x * ty - y * tx
+    bx, by, bz = y * az - z * ay, z * ax - x * az, x * ay - y * ax
+    return np.array([tx - 0.5 * ax + d * bx, ty - 0.5 * ay + d * by, tz - 0.5 * az + d * bz, x, y, z])
 
 
 def inverse(T: Array) -> Array:

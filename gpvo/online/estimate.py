@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from gpvo.online.guard import Domain, growth
 from gpvo.types import Array
 
 PARTS = ("jitter", "white", "bias")
+_EYE = np.eye(6)
 WITHOUT_MEAN = "without_mean."
 """Prefix of the arrays of the same model fitted to the errors as they stand; there where the model uses a mean."""
 
@@ -121,8 +123,7 @@ class ErrorModelArrays:
         correlation = self.correlations(len(X), geometry)
         sigma = np.sqrt(variance)
         whole = sigma[:, :, None] * correlation * sigma[:, None, :]
-        root = np.sqrt(self.share)
-        parts = {name: whole * np.outer(root[i], root[i]) for i, name in enumerate(PARTS)}
+        parts = {name: whole * kept for name, kept in zip(PARTS, self._root_share)}
         covariance = parts["jitter"] + parts["white"] + parts["bias"]
         _, ln_det = np.linalg.slogdet(covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
@@ -140,36 +141,52 @@ class ErrorModelArrays:
     def variances(self, X: Array, inside: Array, place: Any, dt_s: Array | None) -> tuple[Array, Array, Array, Array]:
         """Aleatoric, aleatoric with ignorance, mean, and the mean's variance: each (n, 6), before calibration."""
         said = self.basis.predict(inside[:, self.inputs])
-        base = self.base(self._base_columns(X), np.full(len(X), self.dt_s) if dt_s is None else dt_s)
+        duration = np.full(len(X), self.dt_s) if dt_s is None else dt_s
+        base = self.base(self._base_columns(X), duration)
+        # What VO is wrong by on average is a drift: as much larger as the motion is longer.
+        longer = (duration / self.dt_s)[:, None]
+        drift = said.mean * longer
         outside = (1.0 - place.in_domain)[:, None]
         known = said.log_noise_var - 0.5 * said.log_noise_spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = said.log_noise_var + outside * np.maximum(self.high - said.log_noise_var, 0.0)
         grown = growth(place.distance)[:, None]
-        mean = said.mean * place.in_domain[:, None]
-        mean_var = (said.epistemic_var + (said.mean - mean) ** 2) * grown
+        mean = drift * place.in_domain[:, None]
+        mean_var = (said.epistemic_var * longer**2 + (drift - mean) ** 2) * grown
         return base * np.exp(known), base * np.exp(cautious) * grown, mean, mean_var
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones typical, geometric variances never below the training's smallest."""
-        at = positions(self.columns, base_columns(self.base.method))
-        d = self.domain
-        C = np.where(np.isfinite(X[:, at]), X[:, at], d.centre[at])
-        C[:, 6:] = np.maximum(C[:, 6:], (d.centre + d.scale * d.low)[at][6:])
+        at, centre, smallest = self._base_place
+        C = X[:, at]
+        C = np.where(np.isfinite(C), C, centre)
+        C[:, 6:] = np.maximum(C[:, 6:], smallest)
         return C
+
+    @cached_property
+    def _base_place(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """Where the base's columns are, their typical values, and the smallest geometric variances of the training."""
+        at = np.array(positions(self.columns, base_columns(self.base.method)), dtype=np.int64)
+        d = self.domain
+        return at, d.centre[at], (d.centre + d.scale * d.low)[at][6:]
+
+    @cached_property
+    def _root_share(self) -> Array:
+        """(3, 6, 6) products of the square roots of the shares."""
+        root = np.sqrt(self.share)
+        return root[:, :, None] * root[:, None, :]
 
     def correlations(self, n: int, geometry: Array | None) -> Array:
         """(n, 6, 6) positive definite correlation matrices."""
-        out = np.broadcast_to(self.correlation, (n, 6, 6))
+        out = np.repeat(self.correlation[None], n, axis=0)
         w = float(self.geometry_weight[0])
         if geometry is not None and w > 0:
             sigma = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
             R = geometry / (sigma[:, :, None] * sigma[:, None, :])
             known = np.isfinite(R).all(axis=(1, 2))
-            out = out.copy()
             out[known] = w * R[known] + (1.0 - w) * self.correlation
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
-        return out * (1.0 - 1e-6) + 1e-6 * np.eye(6)
+        return out * (1.0 - 1e-6) + 1e-6 * _EYE
 
 
 def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
