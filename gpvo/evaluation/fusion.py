@@ -15,7 +15,10 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
+    LEARNED,
+    POINTING_MATCHING,
     POLICIES,
+    TRIANGULATION,
     MeanUse,
     constant_from_errors,
 )
@@ -192,7 +195,17 @@ def fuse_runs(
         progress=tell,
         on_run=keep,
     )
+    warnings += [f"{name}: {_why_not(name)}" for name, row in result.scores.items() if not any(row)]
     return FusionReport(result, tuple(traces), tuple(warnings))
+
+
+def _why_not(policy: str) -> str:
+    """Why a policy could not run at all, and the cure."""
+    if policy == LEARNED:
+        return "the runs hold no predictions; give --model"
+    if policy in (TRIANGULATION, POINTING_MATCHING):
+        return f"the runs hold too few usable covariances; run VO with --methods {policy}"
+    return "no training errors to take a constant from; give --train, or a --model that carries them"
 
 
 def _constants(

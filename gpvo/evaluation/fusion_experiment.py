@@ -20,7 +20,7 @@ from gpvo.dataset.build import build_run
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
 from gpvo.evaluation.fusion_figure import plot_experiment
-from gpvo.evaluation.fusion_flights import Campaign, Rise, rise, training_runs, unseen_runs
+from gpvo.evaluation.fusion_flights import Campaign, Rise, rise, training_runs, unseen_runs, with_accidents
 from gpvo.evaluation.fusion_report import document
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
@@ -84,7 +84,8 @@ def experiment(
     flights = [flight_of(r, predictor) for r in test]
     subtracted = study(flights, {LEARNED_SUBTRACT: LearnedPolicy(LEARNED_SUBTRACT, mean="subtract")}, options)
     result = replace(result, scores={**result.scores, **subtracted.scores})
-    return Outcome(title, FusionReport(result, tuple(traces), ()), rise(test))
+    calm = [r for r in test if not with_accidents(r)]
+    return Outcome(title, FusionReport(result, tuple(traces), ()), rise(calm))
 
 
 def markdown(outcome: Outcome) -> str:

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 FIRST_TRAIN_SEED, FIRST_TEST_SEED = 1000, 0
 _DARK_S, _FROZEN_S, _FROZEN_SHARE = 2.0, 1.0, 0.05
-_EPISODES = "episodes.json"
+_EPISODES, _ACCIDENTS = "episodes.json", "-accidents"
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Campaign:
     def run_path(self, seed: int, accidents: bool) -> Path:
         """Where the run of a flight lies."""
         kind = "pictures" if self.pictures else "points"
-        return self.folder / f"{self.scenario}-{kind}-{seed:04d}{'-accidents' if accidents else ''}"
+        return self.folder / f"{self.scenario}-{kind}-{seed:04d}{_ACCIDENTS if accidents else ''}"
 
 
 def training_runs(campaign: Campaign, count: int, jobs: int = 1) -> list[Run]:
@@ -60,6 +60,11 @@ def unseen_runs(campaign: Campaign, count: int, jobs: int = 1) -> list[Run]:
 def flights(campaign: Campaign, seeds: Iterable[int], jobs: int = 1) -> list[Run]:
     """Flights of any seeds without accidents."""
     return _make(campaign, [(seed, False) for seed in seeds], jobs)
+
+
+def with_accidents(run: Run) -> bool:
+    """Whether this is a flight in which pictures were missing or frozen, which no episode accounts for."""
+    return run.path.name.endswith(_ACCIDENTS)
 
 
 def _make(campaign: Campaign, flights: Sequence[tuple[int, bool]], jobs: int) -> list[Run]:

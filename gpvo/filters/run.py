@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 # Truth whose vertical is further than this from +z [rad] is taken to be in another frame, and gravity is measured.
 _LEVEL_RAD = 0.17
+_IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the pictures is usual
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,22 @@ class Flight:
         return self.T_world_cam if self.T_imu_cam is None else self.T_world_cam @ se3.inverse(self.T_imu_cam)
 
     @property
+    def covered(self) -> NDArray[np.bool_]:
+        """(N,) which records the IMU reaches; all without one. Beyond its ends nothing is known to fuse with."""
+        t_ns = np.array([r.t_ns for r in self.records], dtype=np.int64)
+        if self.imu is None or not len(self.imu.t_ns):
+            return np.ones(len(t_ns), bool)
+        return (t_ns >= self.imu.t_ns.min() - _IMU_MARGIN_NS) & (t_ns <= self.imu.t_ns.max() + _IMU_MARGIN_NS)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(N,) which of these have truth, where there is any."""
+        return self.covered if self.truth_valid is None else self.covered & self.truth_valid
+
+    @property
     def first(self) -> int:
-        """Index of the record to start from: the first with truth, else the first."""
-        return 0 if self.truth_valid is None else int(np.argmax(self.truth_valid))
+        """Index of the record to start from: the first that the IMU reaches, with truth where there is any."""
+        return int(np.argmax(self.known))
 
 
 @dataclass(frozen=True)
@@ -102,7 +116,7 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
         return from_rest(flight.imu, t0, still, yaw_rad=yaw, position=flight.T_world_imu[k, :3, 3]), None
     if not known:
         raise GpvoError("--init truth needs ground truth", where=flight.name, cure="use --init static")
-    valid = np.flatnonzero(np.ones(len(flight.records), bool) if flight.truth_valid is None else flight.truth_valid)
+    valid = np.flatnonzero(flight.known)
     if len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
     t = np.array([flight.records[i].t_ns for i in valid[:5]], dtype=np.int64)
@@ -125,6 +139,8 @@ def _aligned_with_gravity(flight: Flight, start: Start, valid: NDArray[np.int64]
 
 def vertical_in_world(imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array) -> Array:
     """Unit vector (3,) of the vertical: the mean specific force turned into the world, less the mean acceleration."""
+    finite = np.isfinite(imu.acc_mps2).all(axis=1)
+    imu = ImuLog(imu.t_ns[finite], imu.gyro_radps[finite], imu.acc_mps2[finite])
     seconds = (t_ns - t_ns[0]) * 1e-9
     force = np.stack([np.interp(seconds, (imu.t_ns - t_ns[0]) * 1e-9, imu.acc_mps2[:, i]) for i in range(3)], axis=1)
     world = (T_world_imu[:, :3, :3] @ force[:, :, None])[:, :, 0].mean(axis=0)
@@ -159,7 +175,7 @@ def fuse_flight(
     """Filter one run under one policy; one result per member (a policy may set several noises side by side)."""
     options = options or FuseOptions()
     start, gravity = begin(flight, options)
-    records = flight.records[flight.first :]
+    records = [flight.records[int(i)] for i in np.flatnonzero(flight.covered) if i >= flight.first]
     filter = make_filter(flight, start, gravity, batch, options)
     timeline = Timeline(
         filter,

@@ -3,40 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.filters.eskf import GRAVITY_MPS2
+from gpvo.filters.imu_sanity import Finding, units_and_axes
 from gpvo.filters.run import Flight
-from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import ImuLog
 
 Array = NDArray[np.float64]
-
-# The 48 ways to call three axes by the wrong names and signs; the right one is the first.
-_RELABELLINGS = sorted(
-    (np.eye(3)[list(p)] * np.array(s)[:, None] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)),
-    key=lambda M: -np.trace(M),
-)
-_MIN_ROTATION_RAD = 0.02  # rms rotation of all motions together below which rotation says nothing about axes
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong; ``fatal`` where filtering on would give nonsense."""
-
-    kind: str
-    text: str
-    cure: str = ""
-    fatal: bool = True
-
-    def __str__(self) -> str:
-        return self.text + (f" ({self.cure})" if self.cure else "")
 
 
 def check_flight(flight: Flight) -> list[Finding]:
@@ -47,7 +24,7 @@ def check_flight(flight: Flight) -> list[Finding]:
         found += clocks
         found += _samples(flight.imu)
         if not any(f.kind == "clock" and f.fatal for f in clocks):
-            found += _units_and_axes(flight, flight.imu)
+            found += units_and_axes(flight, flight.imu)
     return sorted(found, key=lambda f: not f.fatal)
 
 
@@ -79,7 +56,8 @@ def _clocks(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
             "bring both to one clock, or use --no-imu",
         )
     elif overlap < 0.9 * span:
-        yield Finding("clock", f"the IMU covers {overlap:.1f} of the camera's {span:.1f} s", fatal=False)
+        text = f"the IMU covers {overlap:.1f} of the camera's {span:.1f} s; the frames outside are left out"
+        yield Finding("clock", text, fatal=False)
     step = np.diff(imu.t_ns)
     if (step <= 0).any():
         n = int((step <= 0).sum())
@@ -102,130 +80,6 @@ def _samples(imu: ImuLog) -> Iterator[Finding]:
         )
 
 
-# -- units and axes -------------------------------------------------------------------------------------------------
-
-
-def _units_and_axes(flight: Flight, imu: ImuLog) -> list[Finding]:
-    good = np.isfinite(imu.gyro_radps).all(axis=1) & np.isfinite(imu.acc_mps2).all(axis=1)
-    if good.sum() < 20:
-        return []
-    clean = ImuLog(imu.t_ns[good], imu.gyro_radps[good], imu.acc_mps2[good])
-    acc_unit = list(_accelerometer_unit(clean))
-    gyro = list(_gyroscope(flight, clean))
-    if acc_unit or gyro:
-        return acc_unit + gyro
-    return list(_accelerometer_axes(clean))
-
-
-def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
-    g = float(np.median(np.linalg.norm(imu.acc_mps2, axis=1)))
-    ratio = g / GRAVITY_MPS2
-    # Gravity dominates and keeps its side of the vehicle; bare linear acceleration points everywhere.
-    steady = float(np.linalg.norm(imu.acc_mps2.mean(axis=0)) / np.linalg.norm(imu.acc_mps2, axis=1).mean())
-    if 0.6 < ratio < 1.6:
-        return
-    for unit, factor in (("g", 1.0), ("mg", 1e3), ("cm/s^2", 100 * GRAVITY_MPS2)):
-        if 0.7 < g / factor < 1.4 and steady > 0.8:
-            to_si = GRAVITY_MPS2 / factor
-            text = f"the accelerometer's median reading is {g:.4g} where gravity is 9.81 m/s^2: it is in {unit}"
-            yield Finding("acc_unit", text, f"multiply it by {to_si:.6g}")
-            return
-    if ratio < 0.5:
-        text = f"the accelerometer's median reading is {g:.3g} m/s^2: gravity has been taken out of it"
-        yield Finding("acc_unit", text, "give raw specific force, or use --no-imu")
-        return
-    yield Finding("acc_unit", f"the accelerometer's median reading is {g:.4g} m/s^2 where gravity is 9.81 m/s^2")
-
-
-def rotations(flight: Flight, imu: ImuLog) -> tuple[Array, Array]:
-    """Rotation vectors (M, 3) of VO's motions and of the integrated gyroscope, both in IMU axes [rad]."""
-    R_imu_cam = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3]
-    used = [r for r in flight.records if r.usable and np.isfinite(r.T_prev_cur).all() and 0 < r.dt_s < 1.0]
-    used = [r for r in used if imu.t_ns[0] <= r.t_prev_ns and r.t_ns <= imu.t_ns[-1]]
-    if not used:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    vo = se3.so3_log(np.array([r.T_prev_cur[:3, :3] for r in used])) @ R_imu_cam.T
-    t = (imu.t_ns - imu.t_ns[0]) * 1e-9
-    steps = 0.5 * (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) * np.diff(t)[:, None]
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    ends = [np.array([(getattr(r, n) - imu.t_ns[0]) * 1e-9 for r in used]) for n in ("t_ns", "t_prev_ns")]
-    at = [np.stack([np.interp(e, t, turned[:, i]) for i in range(3)], axis=1) for e in ends]
-    return vo, at[0] - at[1]
-
-
-def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
-    vo, gyro = rotations(flight, imu)
-    if len(vo) >= 10:
-        # The largest twentieth of VO's rotations may be failures.
-        size = np.linalg.norm(vo, axis=1)
-        keep = size <= np.quantile(size, 0.95)
-        vo, gyro = vo[keep] - vo[keep].mean(axis=0), gyro[keep] - gyro[keep].mean(axis=0)
-    energy_vo, energy_gyro = (vo**2).sum(), (gyro**2).sum()
-    if len(vo) < 10 or energy_vo < _MIN_ROTATION_RAD**2 or energy_gyro == 0:
-        rms = float(np.sqrt((imu.gyro_radps**2).sum(axis=1).mean()))
-        if rms > 8.0:
-            text = f"the gyroscope turns at {rms:.0f} rad/s on average: it is in degrees per second"
-            yield Finding("gyro_unit", text, "multiply it by pi / 180")
-        return
-    # Axis by axis, so that much yaw does not outvote little roll and pitch.
-    correlation = vo.T @ gyro / (np.linalg.norm(vo, axis=0)[:, None] * np.linalg.norm(gyro, axis=0) + 1e-300)
-    agreement = [float((M * correlation).sum() / 3.0) for M in _RELABELLINGS]
-    best = int(np.argmax(agreement))
-    if np.abs(correlation).max() < 0.5:
-        text = f"gyroscope and VO do not turn together (correlation {agreement[0]:.2f} as given)"
-        yield Finding("gyro_axes", text, "check clock offset and T_imu_cam", fatal=False)
-        return
-    scale = float(np.sqrt(energy_gyro / energy_vo))
-    if 30 < scale < 110:
-        text = f"the gyroscope turns {scale:.0f} times as fast as VO: it is in degrees per second"
-        yield Finding("gyro_unit", text, "multiply it by pi / 180")
-    elif not 0.4 < scale < 2.5:
-        yield Finding("gyro_unit", f"the gyroscope turns {scale:.3g} times as fast as VO: its unit is wrong")
-    if best != 0 and agreement[best] - agreement[0] > 0.2:
-        text = (
-            f"gyroscope and VO agree only with its axes renamed to {_describe(_RELABELLINGS[best])} "
-            f"(correlation {agreement[best]:.2f}, as given {agreement[0]:.2f})"
-        )
-        yield Finding("gyro_axes", text, "the IMU's axes are swapped, or T_imu_cam is wrong")
-
-
-def _accelerometer_axes(imu: ImuLog, window_s: float = 10.0) -> Iterator[Finding]:
-    """Gravity stays put while the gyroscope says how the IMU turns; renamed axes let it wander."""
-    t = (imu.t_ns - imu.t_ns[0]) * 1e-9
-    stride = max(1, round(0.02 / max(float(np.median(np.diff(t))), 1e-6)))
-    constancy = np.zeros(len(_RELABELLINGS))
-    total = 0.0
-    for begin in np.arange(0.0, max(t[-1] - 0.5 * window_s, 1e-9), window_s):
-        rows = np.flatnonzero((t >= begin) & (t < begin + window_s))[::stride]
-        if len(rows) < 20:
-            continue
-        R = np.eye(3)
-        turned = np.empty((len(rows), 3, 3))
-        steps = se3.so3_exp(imu.gyro_radps[rows] * np.gradient(t[rows])[:, None])
-        for k in range(len(rows)):
-            turned[k] = R
-            R = R @ steps[k]
-        force = imu.acc_mps2[rows]
-        constancy += [np.linalg.norm((turned @ (M @ force.T).T[:, :, None]).mean(axis=0)) for M in _RELABELLINGS]
-        total += float(np.linalg.norm(force, axis=1).mean())
-    if total == 0.0:
-        return
-    constancy /= total
-    best = int(np.argmax(constancy))
-    wander = np.maximum(1.0 - constancy**2, 1e-12)
-    if constancy[best] > 0.9 and wander[0] > 0.01 and wander[0] > 4.0 * wander[best]:
-        text = (
-            f"gravity stays put only with the accelerometer's axes renamed to {_describe(_RELABELLINGS[best])} "
-            f"({constancy[best]:.2f} of it, as given {constancy[0]:.2f})"
-        )
-        yield Finding("acc_axes", text, "accelerometer and gyroscope axes differ: swapped axes")
-
-
-def _describe(M: Array) -> str:
-    """Signed axis names: ``(y, x, -z)`` means that the true x is what the log calls y."""
-    return "(" + ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in M) + ")"
-
-
 # -- covariances ----------------------------------------------------------------------------------------------------
 
 
@@ -236,6 +90,9 @@ def _covariances(flight: Flight) -> Iterator[Finding]:
         yield Finding("motion", f"{_count(broken, len(usable))} hold a motion that is not finite", fatal=False)
     for method in dict.fromkeys(m for r in usable for m in r.covariances):
         have = {r.t_ns: r.covariances[method] for r in usable if method in r.covariances}
+        if lacking := [r.t_ns for r in usable if method not in r.covariances]:
+            text = f"{_count(lacking, len(usable))} have no finite {method} covariance; that policy does not fuse them"
+            yield Finding("covariance", text, fatal=False)
         yield from _bad(f"{method} covariances", have)
     yield from _bad("predicted covariances", {t: p.covariance for t, p in flight.predictions.items()})
 

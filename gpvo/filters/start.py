@@ -93,8 +93,9 @@ def from_rest(
     """
     test = test or StaticTest()
     sigmas, span = test.sigmas, round(test.window_s * 1e9)
-    window = (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
-    before = (imu.t_ns >= t_ns - span) & (imu.t_ns <= t_ns)
+    finite = np.isfinite(imu.gyro_radps).all(axis=1) & np.isfinite(imu.acc_mps2).all(axis=1)
+    window = finite & (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
+    before = finite & (imu.t_ns >= t_ns - span) & (imu.t_ns <= t_ns)
     window = before if before.sum() >= 10 else window
     if window.sum() < 10:
         raise GpvoError(f"a static start needs 10 IMU samples within {test.window_s} s of the first frame")

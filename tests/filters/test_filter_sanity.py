@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.filters.run import Flight
+from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight, require_sane
 from gpvo.filters.synthetic import synthetic_flight, with_geometric
 from gpvo.types import ImuLog
@@ -42,6 +43,7 @@ def test_a_good_flight_has_no_findings(seed: int) -> None:
             "gyro_axes",
             "axes renamed to (y, z, x)",
         ),
+        (lambda i: replace(i, acc_mps2=-i.acc_mps2), "acc_sign", "its sign is wrong"),
         (lambda i: replace(i, t_ns=i.t_ns + 10**12), "clock", "do not overlap"),
     ],
 )
@@ -96,3 +98,22 @@ def test_a_level_flight_without_rotation_in_degrees(flight: Flight) -> None:
     gyro = np.full_like(flight.imu.gyro_radps, 20.0)
     found = check_flight(replace(flight, records=still, imu=replace(flight.imu, gyro_radps=gyro)))
     assert any(f.kind == "gyro_unit" for f in found)
+
+
+def test_a_missing_covariance_is_counted(flight: Flight) -> None:
+    some = with_geometric(flight, np.eye(6) * 1e-4)
+    records = [replace(r, covariances={}) if i == 7 else r for i, r in enumerate(some.records)]
+    assert "have no finite triangulation covariance" in str(require_sane(replace(some, records=records))[0])
+
+
+def test_frames_beyond_the_imu_are_left_out_and_a_bad_sample_spoils_nothing(flight: Flight) -> None:
+    assert flight.imu is not None
+    acc = flight.imu.acc_mps2.copy()
+    acc[100:110] = np.nan
+    half = ImuLog(flight.imu.t_ns[:2000], flight.imu.gyro_radps[:2000], acc[:2000], flight.imu.noise)
+    short = replace(flight, imu=half)
+    assert "left out" in str([str(f) for f in check_flight(short)])
+    run = fuse_flight(short, LearnedPolicy())[0]
+    assert run.t_ns[-1] <= half.t_ns[-1] + 100_000_000
+    assert run.scores is not None
+    assert run.scores.ate_rmse_m < 0.1
