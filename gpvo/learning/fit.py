@@ -140,15 +140,20 @@ def _fit_gp(
     options = HeteroscedasticOptions(
         regressor=config.regressor, inducing=config.inducing, noise_inducing=config.noise_inducing, seed=config.seed
     )
+    # In the mean a motion of twice the usual duration drifts twice as far; of the noise the base knows the duration.
+    longer = (rows.dt_s / np.median(rows.dt_s))[:, None]
     log_base = np.log(base(_base_inputs(rows, base.method), rows.dt_s))
-    return fit_heteroscedastic(
+    fitted = fit_heteroscedastic(
         _gp_inputs(rows, columns, inputs),
-        rows.error,
+        rows.error / longer,
         rows.group,
-        base_log_var=log_base,
+        base_log_var=log_base - 2.0 * np.log(longer),
         use_mean=use_mean,
         sample_weight=rows.weight,
         options=options,
+    )
+    return replace(
+        fitted, oof_mean=fitted.oof_mean * longer, oof_epistemic_var=fitted.oof_epistemic_var * longer**2
     )
 
 

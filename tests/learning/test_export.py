@@ -191,3 +191,15 @@ def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="one of: onnx, c"):
         export_model(tmp_path / "model", tmp_path / "out", "fortran")
+
+
+def test_the_mean_is_a_drift():
+    """A motion of twice the duration drifts twice as far, and its drift is twice as uncertain."""
+    model = some_model()
+    X = np.random.default_rng(3).standard_normal((5, len(model.columns)))
+    X[:, 6:12] -= 9.0
+    usual = np.full(5, model.dt_s)
+    once, twice = (model.estimate(X, None, usual * k) for k in (1.0, 2.0))
+    assert np.abs(once.mean).max() > 0
+    np.testing.assert_allclose(twice.mean, 2.0 * once.mean, rtol=1e-12)
+    assert (twice.epistemic > once.epistemic).all()

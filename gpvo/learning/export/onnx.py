@@ -105,7 +105,9 @@ class _Graph:
 def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     """The whole graph; line by line ``ErrorModelArrays.estimate``."""
     inside, distance, in_domain = _locate(g, model)
-    mean, mean_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
+    rate, rate_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
+    longer = g.expand(g("Div", "dt_s", model.dt_s), 1)
+    mean, mean_var = g("Mul", rate, longer), g("Mul", rate_var, g("Mul", longer, longer))
     base = _base(g, model)
     near = g.expand(in_domain, 1)
     growth = g.expand(g("Add", distance, 1.0), 1)

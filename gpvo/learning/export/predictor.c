@@ -133,11 +133,12 @@ static double gpvo_log_det(const double C[36]) {
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
     double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], R[36], sigma[6], distance, outside, growth;
+    double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, longer = duration / GPVO_DT_S;
     int i, j;
     distance = gpvo_locate(features, inside);
     for (i = 0; i < GPVO_N_INPUTS; ++i) inputs[i] = inside[gpvo_input[i]];
     gpvo_basis(inputs, said);
-    gpvo_base(features, dt_s > 0.0 ? dt_s : GPVO_DT_S, base);
+    gpvo_base(features, duration, base);
     gpvo_correlations(geometry, R);
     out->distance = distance;
     out->in_domain = exp(-0.5 * distance * distance);
@@ -146,9 +147,10 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     for (j = 0; j < 6; ++j) {
         double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
-        out->mean[j] = said[0][j] * out->in_domain;
-        lost = said[0][j] - out->mean[j];
-        variance = (base[j] * exp(cautious) * growth + (said[1][j] + lost * lost) * growth) * gpvo_factor[j];
+        double drift = said[0][j] * longer, drift_var = said[1][j] * longer * longer;
+        out->mean[j] = drift * out->in_domain;
+        lost = drift - out->mean[j];
+        variance = (base[j] * exp(cautious) * growth + (drift_var + lost * lost) * growth) * gpvo_factor[j];
         out->epistemic[j] = variance - known * gpvo_factor[j];
         sigma[j] = sqrt(variance);
     }
