@@ -152,9 +152,7 @@ def _fit_gp(
         sample_weight=rows.weight,
         options=options,
     )
-    return replace(
-        fitted, oof_mean=fitted.oof_mean * longer, oof_epistemic_var=fitted.oof_epistemic_var * longer**2
-    )
+    return replace(fitted, oof_mean=fitted.oof_mean * longer, oof_epistemic_var=fitted.oof_epistemic_var * longer**2)
 
 
 def shrink(fitted: HeteroscedasticFit, trust: float) -> HeteroscedasticFit:
