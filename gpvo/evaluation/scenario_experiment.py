@@ -39,7 +39,10 @@ DURATIONS_S: Mapping[str, float] = {
     "lunar-straight": 130.0,
     "room-t265": 210.0,
 }
-"""The scenarios, each flown far enough for 100 m."""
+"""The scenarios, and how long a test flight is: far enough for 100 m."""
+
+TRAINING_S = 60.0
+"""How long a training flight is: many flights teach more of what differs between flights than long ones."""
 
 METHODS = ("constant", "triangulation_scaled", "learned")
 NEES_COLUMNS = ("frame", *(f"{m:g} m" for m in HORIZONS_M))
@@ -101,15 +104,16 @@ class ScenarioFlights:
 def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRST_TEST_SEED, jobs: int = 1,
         duration_s: float | None = None) -> ScenarioFlights:  # fmt: skip
     """Simulate as points, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
-    campaign = Campaign(name, folder, duration_s or DURATIONS_S[name])
-    seen = flights(campaign, range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + train), jobs)
-    unseen = flights(campaign, range(test_seed, test_seed + test), jobs)
+    seeds = range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + train)
+    seen = flights(Campaign(name, folder, min(TRAINING_S, duration_s or TRAINING_S)), seeds, jobs)
+    long = Campaign(name, folder, duration_s or DURATIONS_S[name])
+    unseen = flights(long, range(test_seed, test_seed + test), jobs)
     return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
 
 
-def judge(flown: ScenarioFlights, training: Sequence[TrainingSet] | None = None) -> dict[str, MethodScores]:
-    """Train on the scenario's own flights, or on ``training``, and score the unseen ones."""
-    model = train_sets(flown.training if training is None else training, TrainConfig(), judge=False)
+def judge(flown: ScenarioFlights) -> dict[str, MethodScores]:
+    """Train on the scenario's training flights and score the unseen ones."""
+    model = train_sets(flown.training, TrainConfig(), judge=False)
     return score_flights(flown.test, model.predictor())
 
 
@@ -153,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--train", type=int, default=10, help="training flights of each scenario")
     parser.add_argument("--test", type=int, default=12, help="test flights of each scenario")
     parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="seed of the first test flight")
-    parser.add_argument("--duration", type=float, help="s; default: far enough for 100 m")
+    parser.add_argument("--duration", type=float, help="of a test flight [s]; default: far enough for 100 m")
     parser.add_argument("--together", action="store_true", help="also one model of all scenarios of equal rate")
     parser.add_argument("--jobs", type=int, default=1, help="processes that fly")
     parser.add_argument("-o", "--out", type=Path, default=Path("scenarios"), help="folder for runs and results")
