@@ -57,6 +57,11 @@ class Innovation:
     passed: NDArray[np.bool_]
     used: NDArray[np.bool_]
 
+    def of_member(self, b: int) -> Innovation:
+        """The same of one member."""
+        one = slice(b, b + 1)
+        return Innovation(self.residual[one], self.S[one], self.nis[one], self.passed[one], self.used[one])
+
 
 class ErrorStateFilter:
     """The state, its covariance and the three things that happen to them: propagate, update, clone.

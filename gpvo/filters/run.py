@@ -183,7 +183,7 @@ def fuse_flight(
         policy,
         gate=options.gate,
         with_imu=flight.imu is not None,
-        history_s=options.history_s if batch == 1 else 0.0,
+        history_s=options.history_s,
     )
     states: dict[int, tuple[Nominal, Array]] = {}
     steps: dict[int, Step] = {}
@@ -223,13 +223,13 @@ def _member(
     options: FuseOptions,
 ) -> FusedRun:
     t_ns = np.array(sorted(states), dtype=np.int64)
-    ordered = [steps[int(t)] for t in t_ns]
+    ordered = [steps[int(t)].of_member(b) for t in t_ns]
     nominal = [states[int(t)][0] for t in t_ns]
     T_imu = se3.from_rt(np.array([x.R_world_imu[b] for x in nominal]), np.array([x.position[b] for x in nominal]))
     T_cam = T_imu if flight.T_imu_cam is None else T_imu @ flight.T_imu_cam
     covariance = np.array([states[int(t)][1][b] for t in t_ns])
-    nis = np.array([np.nan if s.innovation is None else s.innovation.nis[b] for s in ordered])
-    failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[b])
+    nis = np.array([np.nan if s.innovation is None else s.innovation.nis[0] for s in ordered])
+    failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
     counts = {**timeline.counts, "rejected": failed}
     scores = None
     if flight.T_world_cam is not None:

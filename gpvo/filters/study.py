@@ -23,6 +23,7 @@ from gpvo.filters.policies import (
     Policy,
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
+from gpvo.filters.side_by_side import fuse_side_by_side
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ Progress = Callable[[str], None]
 
 # Variance factors tried for (translation, rotation): first these powers of four, then between the neighbours.
 _COARSE: Array = np.power(4.0, np.arange(-6, 2))
-_FINE: Array = np.power(4.0, [-0.67, -0.33, 0.0, 0.33, 0.67])
+_FINE: Array = np.power(4.0, [-0.5, 0.0, 0.5])
 _COARSE_FLIGHTS = 12  # so many are enough to tell factors of four apart
 
 
@@ -57,7 +58,7 @@ def grid_scores(
     for flight in flights:
         if progress:
             progress(flight.name)
-        scores = [run.scores for run in fuse_flight(flight, policy, options, batch=len(grid))]
+        scores = [run.scores for run in fuse_flight(flight, policy, replace(options, history_s=0.0), batch=len(grid))]
         total += [np.nan if s is None else s.ate_rmse_m for s in scores]
     return np.where(np.isfinite(total), total / max(len(flights), 1), np.inf)
 
@@ -175,14 +176,12 @@ def study(
     for flight in flights:
         if progress:
             progress(flight.name)
-        for name, policy in policies.items():
-            if policy is None or not has_noise(flight, policy):
-                scores[name].append(None)
-                continue
-            fused = fuse_flight(flight, policy, options)[0]
-            scores[name].append(fused.scores)
-            if on_run:
-                on_run(flight, fused)
+        able = {name: p for name, p in policies.items() if p is not None and has_noise(flight, p)}
+        fused = fuse_side_by_side(flight, able, options)
+        for name in policies:
+            scores[name].append(fused[name].scores if name in fused else None)
+            if on_run and name in fused:
+                on_run(flight, fused[name])
     return Study(tuple(f.name for f in flights), {k: tuple(v) for k, v in scores.items()}, constants)
 
 

@@ -36,6 +36,13 @@ class Step:
     outcome: str
     innovation: Innovation | None = None
 
+    def of_member(self, b: int) -> Step:
+        """What it did to one member."""
+        if self.innovation is None:
+            return self
+        innovation = self.innovation.of_member(b)
+        return Step(self.t_ns, _outcome(innovation), innovation)
+
 
 @dataclass(frozen=True)
 class _Entry:
@@ -47,6 +54,10 @@ class _Entry:
     t_ns: int
     reference_ns: int | None
     passed_ns: NDArray[np.int64]
+
+
+def _outcome(innovation: Innovation) -> str:
+    return "used" if innovation.passed.all() else "rejected"
 
 
 class Timeline:
@@ -158,7 +169,7 @@ class Timeline:
         recover = record.t_ns - self._passed_ns > self.gate.recover_after_s * 1e9
         innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate, recover)
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
-        return Step(record.t_ns, "used" if innovation.passed.all() else "rejected", innovation)
+        return Step(record.t_ns, _outcome(innovation), innovation)
 
     def _remember(self, record: VoRecord, noise: MotionNoise | None) -> None:
         if self._history_ns <= 0:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.filters import metrics
 from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy, split_noise
+from gpvo.filters.run import FuseOptions, fuse_flight
+from gpvo.filters.side_by_side import fuse_side_by_side
 from gpvo.filters.study import Constants, fit_scalars, has_noise, make_policies, study, table
 from gpvo.filters.synthetic import ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
@@ -89,3 +93,18 @@ def test_study_tells_a_better_policy_and_leaves_out_what_cannot_run() -> None:
     assert not has_noise(flights[0], GeometricPolicy("triangulation"))
     assert has_noise(with_geometric(flights[0], np.eye(6)), GeometricPolicy("triangulation"))
     assert has_noise(flights[0], LearnedPolicy())
+
+
+def test_policies_side_by_side_are_as_each_alone() -> None:
+    flight = with_geometric(synthetic_flight(3, duration_s=6, law=ErrorLaw(burst_factor=10.0)), 1e-4 * np.eye(6))
+    some = [replace(r, covariances={}) if i == 9 else r for i, r in enumerate(flight.records)]
+    flight = replace(flight, records=some)  # one record of which the geometry says nothing
+    constant = ConstantPolicy(np.full(6, 1e-5), 0.05)
+    policies = {"learned": LearnedPolicy(), "constant": constant, "triangulation": GeometricPolicy("triangulation")}
+    together = fuse_side_by_side(flight, policies, FuseOptions())
+    for name, policy in policies.items():
+        alone = fuse_flight(flight, policy, FuseOptions())[0]
+        assert together[name].policy == name
+        np.testing.assert_allclose(together[name].T_world_cam, alone.T_world_cam, atol=1e-9)
+        np.testing.assert_allclose(together[name].covariance, alone.covariance, rtol=1e-6, atol=1e-15)
+        assert [s.outcome for s in together[name].steps] == [s.outcome for s in alone.steps]
