@@ -13,9 +13,9 @@ import numpy as np
 
 from gpvo.errors import SourceError
 from gpvo.io.run import RunWriter
-from gpvo.types import ImuLog, Prediction, Status, TrackFrame, VoRecord
+from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo.config import VoConfig
-from gpvo.vo.odometry import StereoOdometry
+from gpvo.vo.odometry import Followed, StereoOdometry
 
 if TYPE_CHECKING:
     from gpvo.io.source import Source
@@ -45,7 +45,7 @@ def run(
     out: Path,
     config: VoConfig | None = None,
     predictor: Predictor | None = None,
-    on_frame: Callable[[VoRecord, Prediction | None], None] | None = None,
+    on_frame: Callable[[Step, Prediction | None], None] | None = None,
 ) -> RunSummary:
     """Run stereo VO over a source and write the run folder ``out``.
 
@@ -74,14 +74,15 @@ def run(
         meta=meta,
         calibration=source.calibration,
     ) as writer:
-        for record, seconds in records(source, config):
+        for step in steps(source, config):
+            record = step.record
             prediction = None if predictor is None else predictor.step(record)
             writer.append(record, prediction)
             status[record.status.value] += 1
             length_m += float(np.linalg.norm(record.T_prev_cur[:3, 3])) if record.is_reference else 0.0
-            busy_s += seconds
+            busy_s += step.seconds
             if on_frame is not None:
-                on_frame(record, prediction)
+                on_frame(step, prediction)
         frames = sum(status.values())
         if frames == 0:
             raise SourceError("no readable stereo pair", where=source.path, cure="look at the images of both cameras")
@@ -90,8 +91,18 @@ def run(
     return summary
 
 
-def records(source: Source, config: VoConfig) -> Iterator[tuple[VoRecord, float]]:
-    """The records of a source, one by one, with the seconds that each took."""
+@dataclass(frozen=True)
+class Step:
+    """One frame gone through odometry: its record, the points behind it, and the seconds that it took."""
+
+    frame: StereoFrame | TrackFrame
+    record: VoRecord
+    followed: Followed
+    seconds: float
+
+
+def steps(source: Source, config: VoConfig) -> Iterator[Step]:
+    """The frames of a source through odometry, one by one."""
     odometry = StereoOdometry(source.camera, config, source.mask)
     t_last_ns: int | None = None
     for k, frame in enumerate(source):
@@ -102,7 +113,7 @@ def records(source: Source, config: VoConfig) -> Iterator[tuple[VoRecord, float]
         record = odometry.step(frame, samples)
         seconds = time.perf_counter() - start
         t_last_ns = frame.t_ns
-        yield record, seconds
+        yield Step(frame, record, odometry.last, seconds)
 
 
 def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | None:

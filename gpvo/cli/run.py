@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gpvo.cli import source_options as flags
 from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from gpvo.types import Prediction
 
 
 def run(
@@ -35,6 +38,8 @@ def run(
     imu_topic: flags.ImuTopic = None,
     truth_topic: flags.TruthTopic = None,
     truth_frame: flags.TruthFrame = None,
+    view: Annotated[bool, typer.Option("--view", help="Watch it live in rerun (extra gpvo[viz]).")] = False,
+    record_view: Annotated[Path | None, typer.Option(help="Write what --view would show to this .rrd file.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Run stereo VO over a sequence: log, trajectory and covariances.
@@ -73,8 +78,19 @@ def run(
         from gpvo.online.predictor import Predictor
 
         predictor = Predictor.load(model)
+    show = None
+    if view or record_view is not None:
+        from gpvo.evaluation.live_view import LiveView
+
+        show = LiveView(sequence.camera, str(sequence.name), record_view).show
     with progress("frames", len(sequence)) as advance:
-        summary = runner.run(sequence, out, config, predictor, on_frame=lambda record, prediction: advance())
+
+        def on_frame(step: runner.Step, prediction: Prediction | None) -> None:
+            advance()
+            if show is not None:
+                show(step, prediction)
+
+        summary = runner.run(sequence, out, config, predictor, on_frame=on_frame)
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:

@@ -12,12 +12,20 @@ from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFr
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
-from gpvo.vo.frontend import Frontend, Matches
+from gpvo.vo.frontend import EMPTY, Frontend, Matches
 from gpvo.vo.motion import Motion, refine
 from gpvo.vo.parts import Stopwatch, check_frame, imu_fields, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.sigmas import SigmaEstimator
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The matches of one motion, and which of them (N,) agree with it."""
+
+    matches: Matches
+    inliers: NDArray[np.bool_]
 
 
 class StereoOdometry:
@@ -29,7 +37,8 @@ class StereoOdometry:
     config : settings; default the preset ``fast``.
     mask : (H, W) bool, where the left image may be used.
 
-    Frames must be rectified and of the camera's size, in time order.
+    Frames must be rectified and of the camera's size, in time order. ``last``: the points behind the last motion, for
+    drawing.
     """
 
     def __init__(
@@ -41,6 +50,7 @@ class StereoOdometry:
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
         self._state: _State | None = None
+        self.last: Followed = Followed(EMPTY, np.zeros(0, bool))
 
     def step(self, frame: StereoFrame | TrackFrame, imu: ImuLog | None = None) -> VoRecord:
         """Take in one frame and say how the camera moved since the reference frame.
@@ -64,6 +74,7 @@ class StereoOdometry:
             return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **imu_fields(imu))
         guess = self._state.guess(frame.t_ns)
         matches, motion = self._solve(guess, clock)
+        self.last = Followed(matches, np.zeros(len(matches.uvd_cur), bool) if motion is None else motion.inliers)
         verdict = judge(matches, motion, seen.repeated and self._state.parallax_px > 0.3, self.camera, self.config)
         record = self._record(frame.t_ns, guess, matches, motion, verdict)
         clock.lap("covariance")

@@ -5,7 +5,7 @@ import pytest
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
 from gpvo.io import open_source
-from gpvo.runner import records
+from gpvo.runner import steps
 from gpvo.sim.points import simulate_points
 from gpvo.types import VoLog
 from gpvo.vo.config import make_config
@@ -23,7 +23,7 @@ def clean(tmp_path, seed, duration_s=20.0, **values):
 
 def odometry(file, **settings):
     source = open_source(file)
-    log = VoLog([record for record, _ in records(source, make_config(**settings))], source.camera)
+    log = VoLog([step.record for step in steps(source, make_config(**settings))], source.camera)
     return motion_errors(log, source.truth)
 
 
@@ -78,7 +78,7 @@ def test_covariance_is_honest_at_the_true_noise(tmp_path):
     for seed in range(3):
         file = clean(tmp_path, seed)
         source = open_source(file)
-        log = VoLog([record for record, _ in records(source, make_config(**settings))], source.camera)
+        log = VoLog([step.record for step in steps(source, make_config(**settings))], source.camera)
         errors = motion_errors(log, source.truth)
         for index, xi in zip(errors.index, errors.xi):
             covariance = log.records[index].covariances["triangulation"]
