@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from gpvo.errors import GpvoError, MissingExtraError
@@ -15,20 +15,31 @@ def map_jobs(
     jobs: int = 1,
     backend: str = "local",
     scheduler: str | None = None,
+    on_done: Callable[[], None] = lambda: None,
 ) -> list[Any]:
     """``[function(*arguments) for arguments in jobs_arguments]``, in order, in parallel.
 
     ``backend`` "local": ``jobs`` processes (-1: all cores). "dask": the cluster at ``scheduler``, or one started here.
+    ``on_done`` is called once per result, for progress bars.
     """
     if backend == "dask":
-        return _on_dask(function, jobs_arguments, scheduler)
+        return _told(_on_dask(function, jobs_arguments, scheduler), on_done)
     if backend != "local":
         raise GpvoError(f"there is no backend '{backend}'", cure="local or dask")
     if jobs == 1 or len(jobs_arguments) < 2:
-        return [function(*arguments) for arguments in jobs_arguments]
+        return _told((function(*arguments) for arguments in jobs_arguments), on_done)
     from joblib import Parallel, delayed
 
-    return list(Parallel(n_jobs=jobs)(delayed(function)(*arguments) for arguments in jobs_arguments))
+    calls = (delayed(function)(*arguments) for arguments in jobs_arguments)
+    return _told(Parallel(n_jobs=jobs, return_as="generator")(calls), on_done)
+
+
+def _told(results: Iterable[Any], on_done: Callable[[], None]) -> list[Any]:
+    out = []
+    for result in results:
+        out.append(result)
+        on_done()
+    return out
 
 
 def _on_dask(
