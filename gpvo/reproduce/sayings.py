@@ -109,7 +109,7 @@ def _joint(run: Run, method: str) -> Bounds:
     log = VoLog(
         [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in run.log]
     )
-    steps = statements(log)[0].steps
+    steps = next(s.steps for s in statements(log) if s.method == method)
     assert steps is not None
     return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, steps))
 
@@ -138,7 +138,7 @@ def _motion(run: Run, state: Statement) -> Bounds:
 def _learned(run: Run, predictor: Predictor) -> Bounds:
     predictions = predictions_by_stamp(run, predictor)
     bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
-    said = statements(bare, predictions)[0]
+    said = next(s for s in statements(bare, predictions) if s.method == "learned")
     assert said.steps is not None
     mean: Array = np.where([[r.status is Status.LOST] for r in run.log], 0.0, said.mean)
     return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, said.steps))
