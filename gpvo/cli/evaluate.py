@@ -12,10 +12,13 @@ from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation
+    from gpvo.evaluation.matches import MatchPicture
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
 Model = Annotated[Path | None, typer.Option(help="Error model: adds constant, scaled and learned.")]
-Truth = Annotated[Path | None, typer.Option(help="Ground truth (TUM lines, left camera), for a run without.")]
+Truth = Annotated[
+    Path | None, typer.Option(help="Ground truth (TUM lines, left camera), taken as exact unless --truth-sigma.")
+]
 Segments = Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")]
 TruthSigma = Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none.")]
 Align = Annotated[str, typer.Option(help="rotation: fit a fixed rotation between log and truth; none.")]
@@ -44,13 +47,15 @@ def evaluate(
     if plots is not None:
         from gpvo.evaluation.plots import save_all
 
-        for evaluation in found:
-            save_all(evaluation, plots)
+        for evaluation, name in zip(found, _distinct([e.run.name for e in found]), strict=True):
+            save_all(evaluation, plots, name)
     if json_:
         print_json(document(found))
     else:
         for evaluation in found:
             _print(evaluation)
+        if truth is not None and truth_sigma is None:
+            print(f"{truth.name} states no noise of its own and is taken as exact; --truth-sigma says otherwise")
 
 
 def report(
@@ -62,6 +67,8 @@ def report(
     truth_sigma: TruthSigma = None,
     align: Align = "none",
     time_offset: TimeOffset = "0",
+    frames: Annotated[str | None, typer.Option(help="Also show the matches of these frames, e.g. 5,80.")] = None,
+    sequence: Annotated[Path | None, typer.Option(help="The sequence of the run, for --frames.")] = None,
 ) -> None:
     """One self-contained page: trajectory, error against bounds, reliability, features, the table.
 
@@ -70,8 +77,17 @@ def report(
     from gpvo.evaluation.report import write_report
 
     found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
-    write_report(found, out)
+    write_report(found, out, [] if frames is None else _pictures(runs, frames, sequence))
     print(out)
+
+
+def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
+    from gpvo.evaluation.matches import config_of, match_pictures
+    from gpvo.io import open_source
+
+    if sequence is None or len(runs) != 1:
+        raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
+    return match_pictures(open_source(sequence), config_of(runs[0]), [int(f) for f in _numbers("--frames", frames)])
 
 
 def options_of(segments: str | None, truth_sigma: str | None, align: str, time_offset: str) -> EvaluateOptions:
@@ -121,6 +137,17 @@ def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options:
     if given is not None:
         loaded = [replace(run, truth=given) for run in loaded]
     return [evaluate_run(run, predictor, options) for run in loaded]
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """The names, later ones of a kind numbered: ``a``, ``a-2``."""
+    out: list[str] = []
+    for name in names:
+        k, candidate = 2, name
+        while candidate in out:
+            candidate, k = f"{name}-{k}", k + 1
+        out.append(candidate)
+    return out
 
 
 def _print(e: Evaluation) -> None:

@@ -15,15 +15,16 @@ from gpvo import __version__
 from gpvo.evaluation import curves, panels, plots
 from gpvo.evaluation.accumulate import along
 from gpvo.evaluation.evaluate import Evaluation, document
+from gpvo.evaluation.matches import MatchPicture
 from gpvo.types import Array
 
 _MAX_POINTS = 600
 
 
-def write_report(evaluations: Sequence[Evaluation], path: Path) -> None:
-    """Write the page, by way of a temporary name."""
+def write_report(evaluations: Sequence[Evaluation], path: Path, pictures: Sequence[MatchPicture] = ()) -> None:
+    """Write the page, by way of a temporary name. ``pictures``: matches of single frames of the only run."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = render(evaluations)
+    text = render(evaluations, pictures)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
@@ -35,7 +36,7 @@ def write_report(evaluations: Sequence[Evaluation], path: Path) -> None:
         raise
 
 
-def render(evaluations: Sequence[Evaluation]) -> str:
+def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] = ()) -> str:
     """The page as text. Its table shows the numbers of ``gpvo evaluate --json``."""
     from jinja2 import Environment, PackageLoader, select_autoescape
 
@@ -57,7 +58,7 @@ def render(evaluations: Sequence[Evaluation]) -> str:
                 "bounds_of": "no method" if statement is None else statement.method,
             }
         )
-    return environment.get_template("report.html").render(runs=runs, version=__version__)
+    return environment.get_template("report.html").render(runs=runs, pictures=pictures, version=__version__)
 
 
 def scene(e: Evaluation) -> dict[str, Any]:

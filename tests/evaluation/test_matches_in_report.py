@@ -1,0 +1,43 @@
+"""Matches of single frames on the report page."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from gpvo import cli
+from gpvo.sim.points import simulate_points
+
+
+def main(*words: object) -> int:
+    """One command as the shell would call it; its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["gpvo", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flight")
+    simulate_points("tunnel-clean", 0, duration_s=4.0, rate_hz=10.0).save(folder / "flight.npz")
+    assert main("run", folder / "flight.npz", "-o", folder / "run") == 0
+    return folder
+
+
+def test_the_page_shows_the_frames_asked_for(flight: Path) -> None:
+    page = flight / "report.html"
+    words = ["report", flight / "run", "-o", page, "--frames", "5,20", "--sequence", flight / "flight.npz"]
+    assert main(*words) == 0
+    text = page.read_text()
+    assert re.findall(r"<figcaption>frame (\d+): ok; \d+ of \d+ matches agree", text) == ["5", "20"]
+    assert text.count("data:image/jpeg;base64,") == 2
+
+
+@pytest.mark.parametrize("frames", ["999", "-1", "x"])
+def test_a_frame_that_is_not_there(flight: Path, frames: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["report", flight / "run", "--frames", frames, "--sequence", flight / "flight.npz"]
+    assert main(*words) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
