@@ -99,7 +99,9 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
     return Evaluation(
         run=run,
         errors=errors,
-        trajectory=trajectory_errors(log.t_ns[known], T_est[known], T_true[known], options.segments_m),
+        trajectory=trajectory_errors(
+            log.t_ns[known], T_est[known], T_true[known], options.segments_m, np.flatnonzero(known)
+        ),
         statements=tuple(made),
         consistency={m: c for m, c in found.items() if c is not None},
         covered=known,
@@ -148,7 +150,30 @@ def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
 
 
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """The result as scripts read it; what could not be computed is None."""
+    """The result as scripts read it; what could not be computed is None. SI units; the names are part of the interface.
+
+    Of each run, beside its name, counts, path length, ATE and segments:
+
+    * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
+    * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
+    * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose and axis, as its source states
+      or ``--truth-sigma`` says; 0 for a file that states none.
+    * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
+      {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
+      frame or a second do not reach across a gap in the truth.
+
+    Of each method, beside NEES, coverage, NLL and CRPS:
+
+    * ``nees_dof_interval``: by block, 95 % interval [low, high] of ``nees_dof`` by a bootstrap over blocks of time.
+    * ``nees_dof_truth_noise``: by block, ``nees_dof`` with the truth's own noise added to what the method states.
+    * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``count``}: joint, of the motion over windows of a second;
+      ``horizons`` are the same over lengths of path.
+    * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
+      ``predicted_final_error_independent_m``: the same if all motions were independent.
+
+    ``constant`` is said of the motion of one frame: a motion that bridges lost frames has as many times its covariance.
+    ``gp_thesis`` needs a model file that holds it, as all written by this version do.
+    """
     return {"schema": 1, "runs": [_run_document(e) for e in evaluations]}
 
 

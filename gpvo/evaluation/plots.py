@@ -184,12 +184,12 @@ FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
 }
 
 
-def save_all(e: Evaluation, folder: Path) -> list[Path]:
-    """Every figure of a run as ``<run>_<figure>.png``."""
+def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]:
+    """Every figure of a run as ``<name>_<figure>.png``; ``name``: by default the run's."""
     folder.mkdir(parents=True, exist_ok=True)
     out = []
-    for name, draw in FIGURES.items():
-        path = folder / f"{e.run.name}_{name}.png"
+    for figure, draw in FIGURES.items():
+        path = folder / f"{name or e.run.name}_{figure}.png"
         draw(e).savefig(path, dpi=110)
         out.append(path)
     return out

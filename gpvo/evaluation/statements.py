@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gpvo.evaluation.accumulate import Step
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.online.features import FeatureStream
+from gpvo.online.thesis import ThesisModel
 from gpvo.types import Array, Prediction, Status, VoLog
 
 if TYPE_CHECKING:
@@ -37,13 +39,13 @@ def statements(
 ) -> list[Statement]:
     """All methods that can be stated of this log.
 
-    Geometric ones from its records, each with its translation-only ``_vt``; ``constant`` and ``_scaled`` from the model
-    file; ``learned`` from predictions by stamp.
+    Geometric ones from its records, each with its translation-only ``_vt``; ``constant``, ``_scaled`` and
+    ``gp_thesis`` from the model file (null where it holds none); ``learned`` from predictions by stamp.
     """
     out: list[Statement] = []
     arrays = predictor.arrays if predictor is not None else {}
     if "method.constant" in arrays and arrays["method.constant"].shape == (6, 6):
-        out.append(_plain(log, "constant", np.broadcast_to(arrays["method.constant"], (len(log), 6, 6))))
+        out.append(_plain(log, "constant", arrays["method.constant"] * _frames_bridged(log)[:, None, None]))
     for method in log.methods:
         covariance = _where_stated(log.covariance(method))
         out.append(_plain(log, method, covariance))
@@ -51,6 +53,9 @@ def statements(
         if scale is not None:
             out.append(_plain(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
         out.append(_translation_only(log, method))
+    thesis = ThesisModel.from_arrays(arrays)
+    if thesis is not None and len(thesis.axes) == 6 and predictor is not None and predictor.target == "frame":
+        out.append(_thesis(log, thesis))
     if predictions:
         out.append(_learned(log, predictions))
     return out
@@ -60,6 +65,22 @@ def _where_stated(covariance: Array) -> Array:
     """NaN in place of what is no covariance: zeros, say, with which other software marks what it does not know."""
     stated = np.array([is_positive_definite(C) for C in covariance], dtype=bool)
     return np.where(stated[:, None, None], covariance, np.nan)
+
+
+def _frames_bridged(log: VoLog) -> Array:
+    """(N,) one, and one more for each lost frame that a motion bridges: a constant is said of the motion of a frame."""
+    lost = np.cumsum([r.status is Status.LOST for r in log])
+    start = np.maximum(log.parent, 0)
+    return 1.0 + np.where(log.usable, lost - lost[start], 0)
+
+
+def _thesis(log: VoLog, model: ThesisModel) -> Statement:
+    stream = FeatureStream(model.columns, log.camera)
+    mean, covariance = model.predict(np.array([stream.step(r) for r in log]).reshape(-1, len(model.columns)))
+    usable = log.usable[:, None]
+    # Of a motion that was not measured it knows nothing.
+    stated = _plain(log, "gp_thesis", np.where(usable[:, None], covariance, np.nan))
+    return replace(stated, mean=np.where(usable, mean, 0.0))
 
 
 def _scaled(log: VoLog, covariance: Array, root: Array) -> Array:

@@ -135,24 +135,41 @@ def segments(T_est: Array, T_true: Array, lengths_m: Sequence[float], every: int
 
 
 def trajectory_errors(
-    t_ns: NDArray[np.int64], T_est: Array, T_true: Array, lengths_m: Sequence[float] | None = None
+    t_ns: NDArray[np.int64],
+    T_est: Array,
+    T_true: Array,
+    lengths_m: Sequence[float] | None = None,
+    frame: NDArray[np.int64] | None = None,
 ) -> TrajectoryErrors:
-    """Every error of one run; ``lengths_m`` default to 10 to 100 m, for paths above 800 m to KITTI's 100 to 800 m."""
+    """Every error of one run; ``lengths_m`` default to 10 to 100 m, for paths above 800 m to KITTI's 100 to 800 m.
+
+    ``frame`` (N,): number of each pose in the run, where poses without truth were left out. Relative errors of a frame
+    and of a second are not taken across such a gap.
+    """
+    frame = np.arange(len(t_ns)) if frame is None else frame
     arc = path_length_m(T_true)
     lengths = lengths_m or (LONG_M if arc[-1] > _LONG_PATH_M else SHORT_M)
     from_start = se3.inverse(T_true[0]) @ T_true
     drift = (T_est[0] @ from_start)[:, :3, 3] - T_est[:, :3, 3]
     off = np.linalg.norm(drift, axis=1)
     t_s = (t_ns - t_ns[0]) * 1e-9
-    frames = np.arange(len(t_ns) - 1)
+    each = np.arange(len(t_ns) - 1)
     # A span, not an instant: a start at every frame, the end one second or ten metres on.
     return TrajectoryErrors(
         path_length_m=float(arc[-1]),
         ate_rmse_m=ate_rmse(T_est[:, :3, 3], T_true[:, :3, 3]),
         rmse_origin_m=float(np.sqrt((off**2).mean())),
         final_error_m=float(off[-1]),
-        rpe_frame=rpe(T_est, T_true, frames, frames + 1),
-        rpe_second=rpe(T_est, T_true, *pairs_ahead(t_s, 1.0)),
+        rpe_frame=rpe(T_est, T_true, *_unbroken(frame, each, each + 1)),
+        rpe_second=rpe(T_est, T_true, *_unbroken(frame, *pairs_ahead(t_s, 1.0))),
         rpe_10m=rpe(T_est, T_true, *pairs_ahead(arc, 10.0)),
         segments=segments(T_est, T_true, lengths),
     )
+
+
+def _unbroken(
+    frame: NDArray[np.int64], start: NDArray[np.int64], end: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The pairs without a left-out pose between them."""
+    whole = frame[end] - frame[start] == end - start
+    return start[whole], end[whole]

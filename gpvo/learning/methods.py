@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.config import supported_columns
 from gpvo.learning.regressors import get_regressor
+from gpvo.online.basis import SharedBasis
 from gpvo.online.features import THESIS
+from gpvo.online.thesis import ThesisModel
 from gpvo.types import Array
 
 Statement = Callable[[TrainingSet], tuple[Array, Array] | None]
@@ -106,6 +108,12 @@ def _translation_only(method: str) -> Statement:
 
 
 def thesis_gp(sets: Sequence[TrainingSet], *, seed: int = 0) -> Statement:
+    """What the thesis' model, fitted to these sequences, says of another."""
+    model = fit_thesis(sets, seed=seed)
+    return lambda s: model.predict(s.select(model.columns))
+
+
+def fit_thesis(sets: Sequence[TrainingSet], *, seed: int = 0) -> ThesisModel:
     """The thesis' model: GP of each axis of the error on velocity and inlier count (velocity alone where the log has no
     counts), one isotropic RBF kernel, constant noise."""
     names = supported_columns(sets, THESIS) or THESIS[:3]
@@ -115,17 +123,8 @@ def thesis_gp(sets: Sequence[TrainingSet], *, seed: int = 0) -> Statement:
     X, Y = X[keep], Y[keep]
     centre, spread = X.mean(axis=0), np.maximum(X.std(axis=0), 1e-9)
     U, scale = (X - centre) / spread, np.maximum(Y.std(axis=0), 1e-12)
-    fits = []
+    axes = []
     for j in range(Y.shape[1]):
-        regressor = get_regressor("sparse", isotropic=True, inducing=128)
-        fits.append(regressor.fit(U, Y[:, [j]] / scale[j], seed=seed))
-
-    def state(s: TrainingSet) -> tuple[Array, Array]:
-        V = (np.nan_to_num(s.select(names), nan=0.0) - centre) / spread
-        mean, variance = np.zeros_like(s.Y), np.zeros_like(s.Y)
-        for j, fit in enumerate(fits):
-            m, v = fit.predict(V)
-            mean[:, j], variance[:, j] = m[:, 0] * scale[j], (v[:, 0] + fit.hyper.noise_var[0]) * scale[j] ** 2
-        return mean, variance[:, :, None] * np.eye(s.Y.shape[1])
-
-    return state
+        fit = get_regressor("sparse", isotropic=True, inducing=128).fit(U, Y[:, [j]] / scale[j], seed=seed)
+        axes.append(SharedBasis(fit.gp, None, np.log(fit.hyper.noise_var)))
+    return ThesisModel(tuple(names), centre, spread, scale, tuple(axes))

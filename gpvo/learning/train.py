@@ -17,7 +17,7 @@ from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
-from gpvo.learning.methods import METHODS, method_arrays, simple_statements, thesis_gp
+from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_gp
 from gpvo.learning.parallel import map_jobs
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score
@@ -62,6 +62,7 @@ def train_sets(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool 
     learned = fit_model(sets, config)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays()}
+    arrays |= fit_thesis(sets, seed=config.seed).to_arrays()
     header = _header(sets, config, learned, table)
     return TrainedModel(
         arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets

@@ -3,6 +3,19 @@
 Layout: as any safetensors file, with the single metadata entry ``gpvo``: a JSON object with ``schema``, ``kind``,
 ``digest`` and ``header`` (the caller's). ``digest`` is the SHA-256 of the canonical header and of every array's name,
 type, shape and bytes. Equal content gives equal bytes.
+
+Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers ignore what they do not know, and older
+files lack what is marked optional:
+
+* ``basis.*``: GPs of the mean and of the log noise variance, see :class:`gpvo.online.basis.SharedBasis`;
+* ``domain.*``: the training domain, see :class:`gpvo.online.guard.Domain`;
+* ``theta`` (6, 4): the base variance, see :class:`gpvo.online.base.BaseVariance`;
+* ``inputs``, ``factor``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``bias_tau_s``, ``typical_ln_det``:
+  see :class:`gpvo.online.estimate.ErrorModelArrays`; ``lost_rate_var`` (6,): mean square velocity [m^2/s^2, rad^2/s^2];
+* ``without_mean.*`` (optional): ``basis.*`` and others of the same model fitted without a mean;
+* ``method.constant`` (6, 6), ``method.<geometric>.scale`` (6,): the simple methods that ``evaluate`` compares with;
+* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`;
+* ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.online.sample.TrainingSample`.
 """
 
 from __future__ import annotations

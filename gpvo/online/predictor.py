@@ -23,6 +23,9 @@ from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoRecord
 
+MODEL_SCHEMA = 1
+"""Of the arrays and header keys described in :mod:`gpvo.online.modelfile`."""
+
 _NO_MOTION_VAR = 1e-12
 _REMEMBERED = 512
 
@@ -42,6 +45,14 @@ class Influence:
         far = f", {self.outside:.1f} sigma outside the training data" if self.outside > 0 else ""
         value = f"{self.feature} = {self.value:.4g} {self.unit}"
         return f"{value}: sigma x{self.on_translation:.2f} translation, x{self.on_rotation:.2f} rotation{far}"
+
+
+def _check_schema(header: Mapping[str, Any]) -> None:
+    """Refuse a model whose arrays mean what this version does not know; arrays it does not know are left alone."""
+    schema = header.get("model_schema", MODEL_SCHEMA)
+    if not isinstance(schema, int) or schema > MODEL_SCHEMA:
+        what = f"was written by a newer gpvo (model schema {schema}, this one reads up to {MODEL_SCHEMA})"
+        raise ModelError(what, cure="update gpvo")
 
 
 def _check_known(features: tuple[str, ...]) -> None:
@@ -64,6 +75,7 @@ class Predictor:
     ) -> None:
         arrays = dict(arrays) if with_mean else arrays_without_mean(arrays)
         self.header, self.digest, self.arrays = dict(header), digest, arrays
+        _check_schema(header)
         try:
             self.features = tuple(header["features"])
             method, target = header["base_method"], header["target"]

@@ -10,11 +10,20 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo import cli
+from gpvo.dataset.build import build
+from gpvo.errors import ModelError
 from gpvo.evaluation.evaluate import METHODS, EvaluateOptions, document, evaluate_run
+from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3
-from gpvo.io.run import read_run, write_run
+from gpvo.io.run import Run, read_run, write_run
 from gpvo.io.trajectory import write_tum
-from gpvo.types import Prediction, Status, TruthLog, VoLog
+from gpvo.learning.methods import thesis_gp
+from gpvo.learning.scores import score
+from gpvo.learning.store import save_model
+from gpvo.online.predictor import Predictor
+from gpvo.types import Mounting, Prediction, Status, TruthLog, VoLog
+from small_model import small_model
+from synthetic_runs import make_run as synthetic_run
 
 RUN_KEYS = {"run", "source", "frames", "lost", "path_length_m", "ate_rmse_m", "rmse_origin_m", "final_error_m"}
 METHOD_KEYS = {"nees_dof", "nees_dof_median", "coverage", "nll_per_dim", "crps", "predicted_final_error_m", "horizons"}
@@ -194,3 +203,71 @@ def test_a_run_that_was_lost_throughout_is_evaluated(capsys, tmp_path):
     (run,) = json.loads(out)["runs"]
     assert run["lost"] == 30
     assert run["methods"]["triangulation"]["nees_dof"]["joint"] is None
+
+
+def test_pictures_of_two_runs_of_one_name_lie_side_by_side(capsys, run_folder, tmp_path):
+    run = read_run(run_folder)
+    write_run(tmp_path / "b" / "hall", run.log, truth=run.truth)
+    code, _, _ = _main(capsys, "evaluate", run_folder, tmp_path / "b" / "hall", "--plots", tmp_path / "pictures")
+    assert code == 0
+    drawn = {p.name for p in (tmp_path / "pictures").glob("*_trajectory.png")}
+    assert drawn == {"hall_trajectory.png", "hall-2_trajectory.png"}
+
+
+def test_a_gap_in_the_truth_is_no_frame():
+    log, truth = make_run(300)
+    gap = np.ones(301, dtype=bool)
+    gap[100:160] = False
+    run = Run(Path("gap"), "gap", log, TruthLog(truth.t_ns[gap], truth.T_world_cam[gap]), None, Mounting(), [])
+    whole = evaluate_run(replace(run, truth=truth)).trajectory
+    found = evaluate_run(run).trajectory
+    assert (whole.rpe_frame.translation_m.count, found.rpe_frame.translation_m.count) == (300, 239)
+    assert found.rpe_frame.translation_m.max <= whole.rpe_frame.translation_m.max
+    # Starts whose second ends in the gap have no pair.
+    assert found.rpe_second.translation_m.count == whole.rpe_second.translation_m.count - 60 - 20
+    assert found.rpe_second.translation_m.max <= whole.rpe_second.translation_m.max
+
+
+def test_truth_from_a_file_is_said_to_be_taken_as_exact(capsys, run_folder, tmp_path):
+    run = read_run(run_folder)
+    write_tum(tmp_path / "truth.tum", run.truth.t_ns, run.truth.T_world_cam)
+    args = ("evaluate", run_folder, "--truth", tmp_path / "truth.tum")
+    assert "truth.tum states no noise of its own and is taken as exact" in _main(capsys, *args)[1]
+    told = _main(capsys, *args, "--truth-sigma", "0.01")[1]
+    assert "taken as exact" not in told
+    assert "10 mm" in told
+
+
+def test_the_model_file_gives_constant_and_the_thesis_row(capsys, tmp_path):
+    """The thesis' row of a model read from its file is that of the fit in memory; other files have none."""
+    trained = small_model()
+    save_model(trained, tmp_path / "m.gpvo")
+    log, truth = synthetic_run(50, n=200)
+    write_run(tmp_path / "flight", log, truth=truth)
+    code, out, _ = _main(capsys, "evaluate", tmp_path / "flight", "--model", tmp_path / "m.gpvo", "--json")
+    assert code == 0
+    methods = json.loads(out)["runs"][0]["methods"]
+    held_out = build(log, truth, name="flight")
+    expected = score(held_out.Y, *thesis_gp(trained.sets)(held_out))
+    assert methods["gp_thesis"]["nll_per_dim"] == pytest.approx(expected["nll_per_dim"], abs=1e-4)
+    assert methods["gp_thesis"]["nees_dof"]["joint"] == pytest.approx(expected["nees_dof"]["joint"], rel=1e-3)
+    assert methods["gp_thesis"]["predicted_final_error_m"] > 0
+    assert methods["constant"]["nees_dof"]["joint"] is not None
+    older = {k: v for k, v in trained.arrays.items() if not k.startswith("thesis.")}
+    e = evaluate_run(read_run(tmp_path / "flight"), Predictor(older, trained.header))
+    assert "gp_thesis" not in e.consistency
+    assert "learned" in e.consistency
+    damaged = {k: v for k, v in trained.arrays.items() if k != "thesis.centre"}
+    with pytest.raises(ModelError, match=r"thesis\.centre"):
+        evaluate_run(read_run(tmp_path / "flight"), Predictor(damaged, trained.header))
+    with pytest.raises(ModelError, match="newer gpvo"):
+        Predictor(trained.arrays, {**trained.header, "model_schema": 2})
+
+
+def test_constant_is_said_of_one_frame():
+    """A motion that bridges two lost frames has three times the covariance; one after it, its own again."""
+    log, _ = make_run(60, lost={20, 21})
+    (constant,) = [s for s in statements(log, None, small_model().predictor()) if s.method == "constant"]
+    one = constant.covariance[5]
+    np.testing.assert_allclose(constant.covariance[22], 3 * one)
+    np.testing.assert_allclose(constant.covariance[23], one)
