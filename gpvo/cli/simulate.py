@@ -19,15 +19,20 @@ _SEED_LIMIT = 100_000
 def simulate(
     scenario: Annotated[str | None, typer.Argument(help="A name of --list, or a TOML file.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to write; with --points a .npz.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Everything random follows from it. 0, or that of the TOML file.")
+    ] = None,
     seeds: Annotated[str | None, typer.Option(help="Many: 0..9 or 1,4,7. Each goes to OUT/seed_N.")] = None,
     duration: Annotated[float | None, typer.Option(help="Length of the flight [s].")] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     speed: Annotated[float | None, typer.Option(help="Speed [m/s].")] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="Fly this recorded path (TUM lines, z up).")] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Fly this recorded path, scaled to fit: TUM lines or EuRoC's csv, z up.")
+    ] = None,
     camera: Annotated[str | None, typer.Option(help="pinhole, euroc or t265.")] = None,
     points: Annotated[bool, typer.Option("--points", help="No images: landmark tracks, far faster.")] = False,
-    jobs: Annotated[int, typer.Option(help="Flights at a time.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Flights at a time, with --seeds; -1 for one per core.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of one flight; the files are the same.")] = 2,
     backend: Annotated[str, typer.Option(help="joblib, or dask.")] = "joblib",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
     preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the pictures (PNG).")] = None,
@@ -46,14 +51,16 @@ def simulate(
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
     if points and preview:
         raise GpvoError("--points draws no pictures to preview", cure="leave out one of --points, --preview")
-    from gpvo.sim.scenario import load_scenario
+    from gpvo.sim.scenario import load_scenario, stated_seed
 
     given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,
              "trajectory": None if trajectory is None else str(trajectory)}  # fmt: skip
     overrides = {k: v for k, v in given.items() if v is not None} | dict(map(_assignment, set_ or []))
     chosen = load_scenario(scenario, overrides)
+    if seeds is not None and seed is not None:
+        raise GpvoError("--seed and --seeds exclude one another", cure="leave out one of them")
     if seeds is None:
-        flights = [_one(chosen, seed, out, points)]
+        flights = [_one(chosen, stated_seed(scenario) if seed is None else seed, out, points, threads)]
     else:
         from gpvo.sim.campaign import fly_campaign
 
@@ -63,7 +70,7 @@ def simulate(
     _tell(chosen, flights, json_, preview)
 
 
-def _one(scenario: Scenario, seed: int, out: Path, points: bool) -> Flight:
+def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -> Flight:
     from gpvo.cli.output import progress
     from gpvo.sim.campaign import Flight, fly_points
 
@@ -72,7 +79,7 @@ def _one(scenario: Scenario, seed: int, out: Path, points: bool) -> Flight:
     from gpvo.sim.sequence import simulate as simulate_images
 
     with progress("frames", int(scenario.duration_s * scenario.rate_hz) + 1) as advance:
-        info = simulate_images(scenario, seed, out, on_frame=advance)
+        info = simulate_images(scenario, seed, out, threads=threads, on_frame=advance)
     return Flight(seed, out, info.frames, info.distance_m, info.redone)
 
 

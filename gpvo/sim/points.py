@@ -282,13 +282,19 @@ class _TrueRig:
     def project(self, T_world_cam: Array, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Left and right pixels (n, 2) of world points, and which are in both images between 0.4 and 40 m."""
         c = self.camera
-        P = se3.transform(se3.inverse(T_world_cam), points)
+        depth = (points - T_world_cam[:3, 3]) @ T_world_cam[:3, 2]
+        near = np.flatnonzero((depth > 0.4) & (depth < 40.0))
+        P = se3.transform(se3.inverse(T_world_cam), points[near])
         Q = (P - [c.baseline_m, 0, 0]) @ self.R_right_left.T
-        visible = (P[:, 2] > 0.4) & (P[:, 2] < 40.0)
-        focal, centre, size = np.array([c.fx_px, c.fy_px]), np.array([c.cx_px, c.cy_px]), np.array([c.width, c.height])
-        pixels = []
+        focal, centre = np.array([c.fx_px, c.fy_px]), np.array([c.cx_px, c.cy_px])
+        seen, pixels = np.ones(len(near), bool), []
         for X in (P, Q):
-            uv = focal * X[:, :2] / np.where(visible, X[:, 2], 1.0)[:, None] + centre
-            visible &= ((uv > 2) & (uv < size - 3)).all(1)
-            pixels.append(uv)
+            uv = focal * X[:, :2] / X[:, 2:] + centre
+            u, v = uv[:, 0], uv[:, 1]
+            seen &= (u > 2) & (v > 2) & (u < c.width - 3) & (v < c.height - 3)
+            whole = np.full((len(points), 2), np.nan)
+            whole[near] = uv
+            pixels.append(whole)
+        visible = np.zeros(len(points), bool)
+        visible[near] = seen
         return pixels[0], pixels[1], visible

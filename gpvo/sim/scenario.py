@@ -130,20 +130,11 @@ def stated_seed(name: str) -> int:
 
 
 def points_scenario(scenario: Scenario) -> PointsScenario:
-    """The same flight without images.
-
-    Raises
-    ------
-    GpvoError
-        For an unknown value in the scenario's ``points``.
-    """
+    """The same flight without images."""
     from gpvo.cameras.rectify import Rectifier
     from gpvo.sim.rig import camera_rig
 
     base = SCENARIOS.get(scenario.name, PointsScenario())
-    known = {f.name for f in fields(PointsScenario)}
-    if unknown := sorted(set(scenario.points) - known):
-        raise GpvoError(f"unknown value 'points.{unknown[0]}'", cure=_nearest(unknown[0], known))
     camera = base.camera if scenario.camera in ("pinhole", "t265") else Rectifier(camera_rig(scenario.camera)).camera
     values: dict[str, Any] = {
         "world": scenario.world,
@@ -188,8 +179,18 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
         scenario = Scenario(**table)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if part != "[key]")
+        table_name = str(first["loc"][0])
+        if first["loc"][-1] == "[key]":
+            raise GpvoError(
+                f"unknown parameter '{table_name}.{first['input']}'",
+                where=where,
+                cure=_nearest(str(first["input"]), get_args(CalibrationKey)),
+            ) from None
+        key = ".".join(str(part) for part in first["loc"])
         raise GpvoError(f"{key} = {first['input']!r}: {first['msg']}", where=where) from None
+    known = {f.name for f in fields(PointsScenario)}
+    if unknown := sorted(set(scenario.points) - known):
+        raise GpvoError(f"unknown parameter 'points.{unknown[0]}'", where=where, cure=_nearest(unknown[0], known))
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")
     if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:

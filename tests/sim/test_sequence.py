@@ -2,7 +2,7 @@
 
 import errno
 import hashlib
-from types import SimpleNamespace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,37 +10,10 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.sim import sequence, sequence_plan
+from gpvo.sim.eye import without_texture
+from gpvo.sim.imu import GRAVITY_MPS2
 from gpvo.sim.rig import RigError, RigTolerance, camera_rig, true_rig
-from gpvo.sim.scenario import load_scenario
-
-SHORT = {"duration_s": 4.0, "rate_hz": 5.0, "rest_s": 2.0, "speed_mps": 0.5}
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """A hall of air in which pictures are noise of the seed: all but rendering stays as it is."""
-    world = SimpleNamespace(
-        bounds=np.array([[-5.0, -5.0, 0.0], [5.0, 5.0, 4.0]]),
-        clearance=lambda p: np.minimum(5.0 - np.abs(p[:, 0]), 5.0 - np.abs(p[:, 1])),
-        start_pose=se3.from_rt(np.eye(3), np.array([-3.0, 0.0, 1.5])),
-        centreline=np.stack([np.linspace(-4, 4, 40), np.zeros(40), np.full(40, 1.5)], 1),
-        heights=(),
-    )
-    monkeypatch.setattr(sequence, "build_world", lambda kind, seed, **params: world)
-
-    class Eye:
-        depth_m = None
-
-        def __init__(self, scenario, seed, world, rig, motion, threads):
-            self.seed = seed
-
-        def see(self, index, plan):
-            rng = np.random.default_rng([self.seed, index])
-            pair = rng.integers(1, 256, (2, 480, 640), dtype=np.uint8)
-            return (pair[0], pair[1]) if plan.fate != "black" else (pair[0] * 0, pair[1] * 0)
-
-    monkeypatch.setattr(sequence, "Eye", Eye)
-    return lambda **values: load_scenario("tunnel", {**SHORT, "vehicle": "path", "path": "straight", **values})
+from gpvo.sim.scenario import load_scenario, stated_seed
 
 
 def digest(folder):
@@ -109,6 +82,68 @@ def test_faults_are_written_and_told(quick, tmp_path):
     for k, fate in enumerate(seen):
         if fate == "frozen":
             assert np.array_equal(pictures[k], pictures[k - 1])
+
+
+def test_resolved_scenario_flies_the_same_again(quick, tmp_path):
+    info = sequence.simulate(quick(calibration={"baseline": 0.01}), 5, tmp_path / "seq")
+    text = (tmp_path / "seq" / "scenario.toml").read_text()
+    assert "seed = 5" in text
+    assert "[drawn.rig_error]" in text
+    again = load_scenario(str(tmp_path / "seq" / "scenario.toml"))
+    assert stated_seed(str(tmp_path / "seq" / "scenario.toml")) == 5
+    second = sequence.simulate(again, 5, tmp_path / "again")
+    assert digest(info.path) == digest(second.path)
+    with pytest.raises(GpvoError, match=r"holds another sequence \(speed_mps = 0.5, not speed_mps = 0.4\)"):
+        sequence.simulate(quick(calibration={"baseline": 0.01}, speed_mps=0.4), 5, tmp_path / "seq")
+
+
+def test_one_writer_at_a_time(quick, tmp_path):
+    with (
+        sequence._only_writer(tmp_path / "seq"),
+        pytest.raises(GpvoError, match="written by another process"),
+    ):
+        sequence.simulate(quick(), 1, tmp_path / "seq")
+    assert sequence.simulate(quick(), 1, tmp_path / "seq").redone
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["seq"]
+
+
+def test_truth_holds_every_frame(quick, tmp_path):
+    sequence.simulate(quick(rate_hz=30.0), 1, tmp_path / "seq")
+    truth = np.loadtxt(
+        tmp_path / "seq" / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",", dtype=str, skiprows=1
+    )
+    frames = np.loadtxt(tmp_path / "seq" / "mav0" / "cam0" / "data.csv", delimiter=",", dtype=str, skiprows=1)
+    assert set(frames[:, 0]) <= set(truth[:, 0])
+    assert (np.diff(truth[:, 0].astype(np.int64)) > 0).all()
+
+
+def test_perfect_imu_in_the_file_integrates_to_the_truth(quick, tmp_path):
+    """What a reader of the files finds, not what the simulator holds: 10 s by the trapezoid at 1 kHz."""
+    values = {"duration_s": 14.0, "path": "wander", "imu": "perfect", "imu_rate_hz": 1000.0, "rate_hz": 1.0}
+    sequence.simulate(quick(**values), 1, tmp_path / "seq")
+    mav = tmp_path / "seq" / "mav0"
+    readings = np.loadtxt(mav / "imu0" / "data.csv", delimiter=",")[3500:13501]
+    truth = np.loadtxt(mav / "state_groundtruth_estimate0" / "data.csv", delimiter=",")[3500:13501]
+    q_xyzw = np.roll(truth[:, 4:8], -1, axis=1)
+    R, v, p = se3.from_quaternion(truth[:, 1:4], q_xyzw)[0, :3, :3], truth[0, 8:11], truth[0, 1:4]
+    down, h = np.array([0.0, 0.0, -GRAVITY_MPS2]), 1e-3
+    for now, then in pairwise(readings):
+        R_then = R @ se3.so3_exp(0.5 * h * (now[1:4] + then[1:4]))
+        a = 0.5 * (R @ now[4:] + R_then @ then[4:]) + down
+        p, v, R = p + h * v + 0.5 * h * h * a, v + h * a, R_then
+    end = se3.from_quaternion(truth[-1:, 1:4], q_xyzw[-1:])[0]
+    assert np.linalg.norm(p - end[:3, 3]) < 1e-3
+    assert np.rad2deg(np.linalg.norm(se3.so3_log(R.T @ end[:3, :3]))) < 1e-3
+
+
+def test_bare_pictures_keep_their_brightness():
+    rng = np.random.default_rng(0)
+    linear = rng.uniform(0.2, 0.6, (120, 160)).astype(np.float32)
+    linear[:, :20] = 0.0
+    bare = without_texture(linear, 0.97)
+    assert not bare[:, :20].any(), "what is behind the rim stays black"
+    assert bare[:, 20:].mean() == pytest.approx(linear[:, 20:].mean(), rel=0.02)
+    assert bare[20:-20, 60:-20].std() < 0.06 * linear[20:-20, 60:-20].std()
 
 
 @pytest.mark.parametrize("speed, message", [(9.0, "leaves the world"), (1.88, "crashes at t")])
