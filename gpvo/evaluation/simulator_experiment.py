@@ -3,9 +3,9 @@
 ``python -m gpvo.evaluation.simulator_experiment -o DIR [--seeds 10] [--only clean,baseline,bursts,lunar]``
 
 ``clean``: perfect calibration, no image noise: the mean error of a motion, in percent of the motion, over seeds.
-``baseline``: the same with a rig whose baseline is 1 % longer than its calibration says: the scale error. ``bursts``:
-by how much the standard deviation of the error rises inside the episodes. ``noise``: features, stated sigma and drift with
-and without image noise. ``lunar``: two hundred metres over the moon.
+``baseline``: the same with a rig whose baseline is 1 % longer than its calibration says: the scale error.
+``bursts``: by how much the standard deviation of the error rises inside the episodes. ``noise``: features, stated
+sigma and drift with and without image noise. ``lunar``: two hundred metres over the moon.
 """
 
 from __future__ import annotations
