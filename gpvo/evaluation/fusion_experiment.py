@@ -72,7 +72,8 @@ def experiment(
     flights = [flight_of(r, predictor) for r in test]
     if hindsight:
         constants = replace(constants, hindsight=fit_scalars(flights, constants, options))
-    policies = make_policies(constants, names=POLICIES, learned=True)
+    able = make_policies(constants, names=POLICIES, learned=True)
+    policies = {name: policy for name, policy in able.items() if policy is not None}
     policies[LEARNED_WHITE] = LearnedPolicy(LEARNED_WHITE, use_parts=False)
     traces: list[Trace] = []
 
