@@ -19,6 +19,7 @@ from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_base, t_negative_log_likelihood
 from gpvo.learning.config import TrainConfig, candidates, geometric_method
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
+from gpvo.learning.parts import span_variances
 from gpvo.learning.rows import Rows
 from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
@@ -180,7 +181,8 @@ def _with_mean(
     trust: float,
     config: TrainConfig,
 ) -> tuple[HeteroscedasticFit | None, list[float]]:
-    """Add the mean on the axes where it makes left-out groups more likely, beyond what groups differ by chance."""
+    """Add the mean on the axes where it makes left-out groups more likely, beyond what groups differ by chance, and
+    the error over a distance no larger."""
     if fitted is None:
         return None, [0.0] * 6
     # The question is put with few inducing points; only a mean that proves itself is fitted as asked.
@@ -190,11 +192,21 @@ def _with_mean(
     corrected = (rows.error - with_mean.oof_mean) ** 2
     plain = t_negative_log_likelihood(rows.error**2, v0)
     gain = rows.by_group(plain - t_negative_log_likelihood(corrected, v0 + with_mean.oof_epistemic_var))
-    proven = surely_positive(gain)
+    proven = surely_positive(gain) & helps_over_distance(rows, with_mean.oof_mean, np.sqrt(v0))
     gains = gain.mean(axis=0).tolist()
     if not proven.any():
         return fitted, gains
     return _fit_gp(rows, base, columns, inputs, proven, config), gains
+
+
+def helps_over_distance(rows: Rows, oof_mean: Array, sigma: Array) -> NDArray[np.bool_]:
+    """(6,) whether what the mean leaves is smaller than the error itself when summed over any number of motions.
+
+    A mean given VO's own motion holds what was usual in training: it draws each motion towards that, which makes the
+    single one better, but what it takes off of true motions adds up along the path.
+    """
+    plain, left = (span_variances(rows.chains(e / sigma)).mean_square for e in (rows.error, rows.error - oof_mean))
+    return np.asarray((left <= plain).all(axis=0))
 
 
 def surely_positive(gain: Array, risk: float = 0.05) -> NDArray[np.bool_]:

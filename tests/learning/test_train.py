@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError, ModelError
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.fit import surely_positive
+from gpvo.learning.fit import helps_over_distance, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
 from gpvo.learning.parts import fit_parts
+from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, rows_path, save_model
 from gpvo.learning.train import train_sets
@@ -67,6 +68,19 @@ def test_parts_of_a_known_mixture():
     parts = fit_parts([[chain] for chain in out], 0.1)
     np.testing.assert_allclose(parts.share.mean(axis=1), [0.6, 0.3, 0.1], atol=0.06)
     assert 1.0 < parts.tau_s.mean() < 8.0
+
+
+def test_a_mean_that_adds_up_is_no_help():
+    """Half of each error removed helps; with a little of every true motion removed too, it helps one motion alone."""
+    rows = Rows.stack(training_sets(range(3), n=300))
+    sigma = rows.error.std(axis=0)
+    white = sigma * np.random.default_rng(0).standard_normal(rows.error.shape)
+    rows = replace(rows, error=white)
+    good = 0.5 * white
+    drawn = good + np.where(np.arange(6) < 3, 0.3, 0.0) * sigma
+    assert ((white - drawn) ** 2).mean() < (white**2).mean()
+    assert helps_over_distance(rows, good, sigma).all()
+    assert helps_over_distance(rows, drawn, sigma).tolist() == [False] * 3 + [True] * 3
 
 
 def test_same_data_and_seed_give_the_same_bytes(tmp_path):
