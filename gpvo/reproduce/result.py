@@ -98,8 +98,8 @@ def _notes(plan: Plan) -> list[str]:
         notes.append(
             "Tables 4.5, 4.6: no T265 flight under motion capture is at hand. Pictures of a T265-like fisheye pair are "
             f"drawn along recorded paths, the calibration off by a draw from the datasheet's tolerance in every "
-            f"flight; test paths: {names[0]}; training paths and draws are others: {names[1]}. Points-only rows see the "
-            "same paths through a rectified pair of the T265's baseline, without a lens."
+            f"flight; test paths: {names[0]}; training paths and draws are others: {names[1]}. Points-only rows see "
+            "such paths through a rectified pair of the T265's baseline, without a lens."
         )
     else:
         notes.append(
