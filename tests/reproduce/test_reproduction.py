@@ -151,10 +151,10 @@ def test_two_reproductions_do_not_share_a_folder(tmp_path):
 def test_a_flight_that_cannot_be_flown_is_told_and_does_not_stop_the_others(tmp_path):
     store = Store(tmp_path)
     good, bad = flights_of(Plan(**SMALL), "tunnel", "points", store)
-    bad = replace(bad, scenario=bad.scenario.model_copy(update={"points": {"nonsense": 1}}))
+    bad = replace(bad, scenario=bad.scenario.model_copy(update={"trajectory": "/no/such.txt"}))
     flown = [fly(f, store) for f in (good, bad)]
     assert set(flown[0].runs) == {"fast", "thesis"}
-    assert "nonsense" in flown[1].error
+    assert "/no/such.txt" in flown[1].error
     assert len(flown[1].error.splitlines()) == 1
 
 
