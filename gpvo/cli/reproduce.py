@@ -12,7 +12,7 @@ def reproduce(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of results; its stages are kept between runs.")],
     quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
     seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
-    points_seeds: Annotated[int | None, typer.Option(min=0, help="Further seeds without [20, quick: 10].")] = None,
+    points_seeds: Annotated[int | None, typer.Option(min=0, help="Further seeds without [20, quick: 6].")] = None,
     data: Annotated[
         Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
     ] = None,

@@ -50,8 +50,8 @@ class Plan:
     def quick(cls, **given: Any) -> Plan:
         """One seed, flights of 20 s; ``given`` values go before."""
         usual: dict[str, Any] = {
-            "seeds": 1, "points_seeds": 10, "training": {"images": 4, "points": 8}, "duration_s": 20.0,
-            "stretch": False, "curve": (1, 2, 4), "real_frames": 600,
+            "seeds": 1, "points_seeds": 6, "training": {"images": 4, "points": 8}, "duration_s": 20.0,
+            "stretch": False, "curve": (1, 2, 4), "real_frames": 400,
         }  # fmt: skip
         return cls(**{**usual, **given})
 
