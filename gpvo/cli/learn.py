@@ -10,9 +10,10 @@ import typer
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
+    from gpvo.learning.config import TrainConfig
     from gpvo.learning.train import TrainedModel
 
-Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth.")]
+Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth, or one file of training rows.")]
 Model = Annotated[Path, typer.Argument(help="Model file.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -27,6 +28,9 @@ def train(
         str, typer.Option(help="rotation: fit a fixed rotation between log and truth first; none.")
     ] = "none",
     update: Annotated[Path | None, typer.Option(help="Add the runs to this model's own.")] = None,
+    max_rows: Annotated[
+        int, typer.Option(min=1000, help="Rows held in memory; of more, the noise learns from blocks.")
+    ] = 100_000,
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
     jobs: Annotated[int, typer.Option(help="Folds at a time; -1 for all cores.")] = 1,
     backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
@@ -46,6 +50,7 @@ def train(
         "regressor": regressor,
         "align": align,
         "seed": seed,
+        "max_rows": max_rows,
     }
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     trained = _train(runs, settings, update)
@@ -55,7 +60,10 @@ def train(
         print_json(document)
     else:
         _print_table(document)
-        print(f"{out}: {sum(len(s) for s in trained.sets)} rows of {len(trained.sets)} runs")
+        kept = sum(len(s) for s in trained.sets)
+        given = trained.header.get("rows", {}).get("given", kept)
+        streamed = f", of {given} that streamed" if given > kept else ""
+        print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
 
 
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> TrainedModel:
@@ -63,6 +71,10 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
+    if any(p.is_file() for p in paths):
+        return _train_file(paths, config, update)
+    if update is None and config.target != "position" and _frames(paths) > config.max_rows:
+        return _train_streaming(paths, config)
     runs = [read_run(p) for p in paths]
     if config.target == "position":
         from gpvo.dataset.build import build_run
@@ -76,6 +88,36 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     from gpvo.learning.train import train as train_model
 
     return train_model(runs, config)
+
+
+def _train_file(paths: list[Path], config: TrainConfig, update: Path | None) -> TrainedModel:
+    from gpvo.learning.stream import train_stored
+
+    if len(paths) > 1 or update is not None:
+        raise GpvoError("a file of training rows stands alone", where=paths[0], cure="give that file, or run folders")
+    return train_stored(paths[0], config)
+
+
+def _frames(paths: list[Path]) -> int:
+    """How many frames the runs say they have."""
+    from gpvo.io.jsonfile import read_json
+
+    return sum(int(read_json(p / "run.json").get("frames") or 0) for p in paths if (p / "run.json").is_file())
+
+
+def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
+    """Runs that do not fit into memory together: their rows go through a file, one run at a time."""
+    import tempfile
+
+    from gpvo.dataset.build import build_run
+    from gpvo.dataset.table import write_sets
+    from gpvo.io.run import read_run
+    from gpvo.learning.stream import train_stored
+
+    with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
+        rows = Path(folder) / "rows.parquet"
+        write_sets(rows, (build_run(read_run(p), target=config.target, align=config.align) for p in paths))
+        return train_stored(rows, config)
 
 
 def _print_table(document: dict[str, Any]) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,29 +21,34 @@ from gpvo.types import StereoCamera
 SCHEMA = 1
 
 
-def write_sets(path: str | Path, sets: Sequence[TrainingSet]) -> None:
-    """One file of all sequences, in place of what was there; a row group per sequence."""
+def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
+    """One file of all sequences, in place of what was there; a row group per sequence, one at a time in memory."""
     path = Path(path)
-    about = [
-        {
-            "name": s.name,
-            "target": s.target,
-            "counts": dict(s.counts),
-            "camera": None if s.camera is None else asdict(s.camera),
-            "columns": list(s.columns),
-        }
-        for s in sets
-    ]
-    tables = [_table(i, s) for i, s in enumerate(sets)]
-    schema = pa.unify_schemas([t.schema for t in tables])
-    schema = schema.with_metadata({"gpvo": json.dumps({"schema": SCHEMA, "sequences": about}, sort_keys=True)})
-    temporary = path.with_name(f".{path.name}.part")
-    with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
-        for table in tables:
-            n = table.num_rows
-            columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
-            writer.write_table(pa.Table.from_arrays(columns, schema=schema), row_group_size=max(n, 1))
-    os.replace(temporary, path)
+    about, schemas = [], []
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        for i, s in enumerate(sets):
+            table = _table(i, s)
+            pq.write_table(table, Path(folder) / str(i), row_group_size=max(len(s), 1))
+            schemas.append(table.schema)
+            about.append(
+                {
+                    "name": s.name,
+                    "target": s.target,
+                    "counts": dict(s.counts),
+                    "camera": None if s.camera is None else asdict(s.camera),
+                    "columns": list(s.columns),
+                }
+            )
+        metadata = {"gpvo": json.dumps({"schema": SCHEMA, "sequences": about}, sort_keys=True)}
+        schema = pa.unify_schemas(schemas).with_metadata(metadata)
+        temporary = Path(folder) / "whole"
+        with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+            for i in range(len(about)):
+                table = pq.read_table(Path(folder) / str(i))
+                n = table.num_rows
+                columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
+                writer.write_table(pa.Table.from_arrays(columns, schema=schema), row_group_size=max(n, 1))
+        os.replace(temporary, path)
 
 
 def read_sets(path: str | Path) -> list[TrainingSet]:
@@ -63,7 +69,7 @@ def stream_sets(path: str | Path) -> Iterator[TrainingSet]:
             raise
         raise SourceError(f"is not a training set: {problem}", where=path) from None
     for i, entry in enumerate(about):
-        yield _set(entry, file.read_row_group(i))
+        yield set_of_table(entry, file.read_row_group(i))
 
 
 def _table(i: int, s: TrainingSet) -> pa.Table:
@@ -77,7 +83,9 @@ def _table(i: int, s: TrainingSet) -> pa.Table:
     return pa.table({k: pa.array(v) for k, v in columns.items()})
 
 
-def _set(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
+def set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
+    """Rows of one sequence; ``entry``: what the file's metadata says of it."""
+
     def column(name: str) -> Any:
         return table[name].to_numpy(zero_copy_only=False)
 

@@ -36,7 +36,8 @@ class TrainConfig:
 
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``:
     ``rotation`` first fits a fixed rotation between each log and its truth. ``inducing``, ``noise_inducing``: points of
-    the GPs. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
+    the GPs. ``max_rows``: held in memory, of larger files the rest streams. ``jobs``, ``backend`` (``local`` or
+    ``dask``), ``scheduler``: where folds are fitted.
     """
 
     features: str = "auto"
@@ -46,6 +47,7 @@ class TrainConfig:
     align: str = "none"
     inducing: int = 256
     noise_inducing: int = 64
+    max_rows: int = 100_000
     jobs: int = 1
     backend: str = "local"
     scheduler: str | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -55,11 +55,18 @@ def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedMode
     return train_sets([build_run(r, target=config.target, align=config.align) for r in runs], config)
 
 
-def train_sets(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
-    """The same from training sets. ``judge`` False leaves the table out."""
+def train_sets(
+    sets: Sequence[TrainingSet],
+    config: TrainConfig,
+    *,
+    judge: bool = True,
+    refine: Callable[[Learned], Learned] | None = None,
+) -> TrainedModel:
+    """The same from training sets. ``judge`` False leaves the table out; ``refine``: a last step of the final fit."""
     sets = _checked(sets)
     table = train_table(sets, config) if judge else {}
     learned = fit_model(sets, config)
+    learned = learned if refine is None else refine(learned)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays()}
     arrays |= fit_thesis(sets, seed=config.seed).to_arrays()

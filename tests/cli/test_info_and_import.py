@@ -214,3 +214,35 @@ def test_a_camera_is_described_by_plain_numbers(tmp_path):
 
     lens = PinholeRadtan(400.0, 400.0, 320.0, 240.0, 640, 480)
     json.dumps(StereoRig(lens, lens, seq.T_RIGHT_LEFT).describe())
+
+
+def test_simulated_log_with_turned_truth_is_put_right(gpvo, tmp_path):
+    """Odometry on simulated tracks, written as TUM; its truth in a tracker's frame, turned, on a clock 250 ms ahead."""
+    from gpvo.dataset.errors import motion_errors
+    from gpvo.io import open_source
+    from gpvo.runner import run as run_vo
+    from gpvo.sim.points import simulate_points
+
+    flight = simulate_points("room-t265", 3, duration_s=20.0)
+    run_vo(open_source(flight.save(tmp_path / "flight.npz")), tmp_path / "vo")
+    own = read_run(tmp_path / "vo")
+    R_cam_tracker = se3.so3_exp(np.array([1.1, -0.6, 2.0]))
+    turned = own.truth.T_world_cam @ se3.from_rt(R_cam_tracker, np.zeros(3))
+    write_tum(tmp_path / "gt.txt", own.truth.t_ns + 250_000_000, turned)
+    args = ("--align", "rotation", "--time-offset", "auto", "--json")
+    code, out, err = gpvo(
+        "import", tmp_path / "vo" / "trajectory.tum", "--truth", tmp_path / "gt.txt", "-o", tmp_path / "run", *args
+    )
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    assert document["time_offset_s"] == pytest.approx(0.25, abs=5e-3)
+    found = read_run(tmp_path / "run")
+    t = own.truth.t_ns + 250_000_000
+    np.testing.assert_array_equal(found.truth.t_ns, t)
+    # What the import took off the truth's axes is what was put on them, to half a degree.
+    left = np.swapaxes(own.truth.T_world_cam[:, :3, :3], 1, 2) @ found.truth.T_world_cam[:, :3, :3]
+    assert np.degrees(np.linalg.norm(se3.so3_log(left), axis=1).max()) < 0.5
+    # And the errors of the imported log are about those that the odometry really had.
+    a, b = (motion_errors(r.log, r.truth).xi for r in (own, found))
+    rms = [np.sqrt((x[:, :3] ** 2).sum(axis=1).mean()) for x in (a, b)]
+    assert rms[1] < 2 * rms[0]
