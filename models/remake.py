@@ -13,7 +13,7 @@ from pathlib import Path
 from gpvo.io import open_source
 from gpvo.io.run import Run, read_run
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.store import save_model
+from gpvo.learning.store import rows_path, save_model
 from gpvo.learning.train import train
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
@@ -42,11 +42,15 @@ def remake(name: str, folder: Path) -> Path:
     """Write ``folder/name.gpvo`` and its card."""
     with tempfile.TemporaryDirectory() as temporary:
         trained = train(fly(MODELS[name], Path(temporary)), TrainConfig(jobs=2))
-    save_model(trained, folder / f"{name}.gpvo")
-    return folder / f"{name}.gpvo"
+    path = folder / f"{name}.gpvo"
+    save_model(trained, path)
+    # Larger than the model, and they follow from the seeds above.
+    rows_path(path).unlink()
+    return path
 
 
 if __name__ == "__main__":
     target = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    target.mkdir(parents=True, exist_ok=True)
     for model in MODELS:
         print(remake(model, target))
