@@ -98,7 +98,11 @@ def _load(target: str) -> Any:
 
 
 def source_kinds() -> dict[str, Callable[[], Any]]:
-    """Names of all sources with a loader of each class, those of other packages after the built-in ones."""
+    """Names of all sources with a loader of each class, those of other packages after the built-in ones.
+
+    A package joins with ``[project.entry-points."gpvo.sources"]`` and ``name = "package.module:Class"``; the class
+    follows :class:`Source` and is built from a path. A built-in name cannot be taken over.
+    """
     kinds: dict[str, Callable[[], Any]] = {}
     for name, target in BUILT_IN.items():
         kinds[name] = partial(_load, target)

@@ -221,7 +221,12 @@ THESIS = ("v_x_mps", "v_y_mps", "v_z_mps", "n_inliers")
 
 @cache
 def groups() -> dict[str, FeatureGroup]:
-    """All groups by name: the built-in ones, then those of installed packages (entry points ``gpvo.features``)."""
+    """All groups by name: the built-in ones, then those of installed packages.
+
+    A package joins with ``[project.entry-points."gpvo.features"]`` and ``name = "package.module:GROUP"``, GROUP being a
+    :class:`FeatureGroup`. A model that uses its columns is refused where the package is not installed. A built-in name
+    cannot be taken over.
+    """
     found = {g.name: g for g in BUILT_IN}
     for entry in entry_points(group="gpvo.features"):
         group = entry.load()

@@ -23,7 +23,12 @@ _BUILT_IN = {
 
 
 def regressor_names() -> tuple[str, ...]:
-    """Names that :func:`get_regressor` knows: the built-in ones, then those of installed packages."""
+    """Names that :func:`get_regressor` knows: the built-in ones, then those of installed packages.
+
+    A package joins with ``[project.entry-points."gpvo.regressors"]`` and ``name = "package.module:Class"``; the class
+    follows :class:`Regressor`, takes options as keywords, and is chosen by ``gpvo train --regressor name``. A built-in
+    name cannot be taken over.
+    """
     outside = {entry.name for entry in entry_points(group="gpvo.regressors")}
     return (*_BUILT_IN, *sorted(outside - set(_BUILT_IN)))
 
