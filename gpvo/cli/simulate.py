@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -47,7 +49,7 @@ def simulate(
     if list_:
         _show_list(json_)
         return
-    if scenario is None or out is None:
+    if scenario is None or (out is None and preview is None):
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
     if points and preview:
         raise GpvoError("--points draws no pictures to preview", cure="leave out one of --points, --preview")
@@ -59,15 +61,18 @@ def simulate(
     chosen = load_scenario(scenario, overrides)
     if seeds is not None and seed is not None:
         raise GpvoError("--seed and --seeds exclude one another", cure="leave out one of them")
-    if seeds is None:
-        flights = [_one(chosen, stated_seed(scenario) if seed is None else seed, out, points, threads)]
-    else:
-        from gpvo.sim.campaign import fly_campaign
+    # A contact sheet alone keeps no sequence.
+    with nullcontext() if out is not None else TemporaryDirectory() as temporary:
+        target = out or Path(temporary or "") / chosen.name
+        if seeds is None:
+            flights = [_one(chosen, stated_seed(scenario) if seed is None else seed, target, points, threads)]
+        else:
+            from gpvo.sim.campaign import fly_campaign
 
-        flights = fly_campaign(
-            chosen, _seeds(seeds), out, points=points, jobs=jobs, backend=backend, scheduler=scheduler
-        )
-    _tell(chosen, flights, json_, preview)
+            flights = fly_campaign(
+                chosen, _seeds(seeds), target, points=points, jobs=jobs, backend=backend, scheduler=scheduler
+            )
+        _tell(chosen, flights, json_, preview)
 
 
 def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -> Flight:
