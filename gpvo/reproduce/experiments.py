@@ -138,11 +138,11 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "moon-training", "pointing_matching", Published(3.01, 1.79, 4.36), "4.6", (0.1, 0.5), stands_in=_ROVER,
     ),
     Experiment(
-        "4.5", "4.5", "real UAV, T265 fisheye, sigma_p 0.5, sigma_m 0.5", "t265", "t265-training",
+        "4.5", "4.5", "real UAV (here drawn), T265 fisheye, sigma_p 0.5, sigma_m 0.5", "t265", "t265-training",
         "pointing_matching", Published(1.57, 1.41, 1.92), "4.7", (0.5, 0.5), stands_in=_UAV,
     ),
     Experiment(
-        "4.6", "4.6", "real UAV, GP trained on simulation", "t265", "t265-training", "gp",
+        "4.6", "4.6", "real UAV (here drawn), GP trained on simulation", "t265", "t265-training", "gp",
         Published(1.57, 1.41, 2.99, 2.49), "4.8", stands_in=_UAV,
     ),
     Experiment(

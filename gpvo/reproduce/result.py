@@ -53,6 +53,9 @@ def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
     real, refused = real_rows(plan.data, plan.real_frames, store, workers) if wants_real and plan.data else ([], [])
     scores = document.scores_of(table, store)
     rows = document.rows({c: s for c, s in scores.items() if c.experiment.table != "sensitivity"})
+    if not (plan.recordings("test") and plan.recordings("training")):
+        for row in rows:
+            row["title"] += ", NO RECORDED PATHS: random ones" if row["table"] in ("4.5", "4.6") else ""
     result: dict[str, Any] = {
         "schema": 1,
         "gpvo": __version__,
@@ -84,9 +87,9 @@ def _notes(plan: Plan) -> list[str]:
     length = f"{plan.duration_s:g} s" + (", the long straight twice as long" if plan.stretch else "")
     notes = [
         "The thesis' flights are not available; ours stand in for them. Compare ratios, not metres.",
-        f"Flights of {length}, {plan.rate_hz:g} Hz. {plan.seeds} seeds with images; {plan.points_seeds} further seeds "
-        "in points-only mode (landmark tracks without pictures), in rows of their own. They also train apart: on "
-        f"{plan.training['images']} flights with images, on {plan.training['points']} without.",
+        f"Flights of {length}, {plan.rate_hz:g} Hz. Seeds with images: {plan.seeds}; further seeds in "
+        f"points-only mode: {plan.points_seeds} (landmark tracks without pictures), in rows of their own. "
+        f"They also train apart: on {plan.training['images']} flights with images, on {plan.training['points']} without.",
         "RMSE, final and predicted final error are roots of mean squares over the seeds; brackets are 95 % intervals "
         "of a bootstrap by seed. Predicted: root of the expected squared error, 1 sigma.",
         "Tables 4.1, 4.2: a drawn mine tunnel for the thesis' simulated one; models learned in other tunnels, clean "

@@ -170,6 +170,7 @@ def test_everything_without_pictures(tmp_path):
     result = reproduce(plan, tmp_path)
     assert not result["failed"]
     assert len(result["rows"]) == 9
+    assert ["NO RECORDED PATHS" in row["title"] for row in result["rows"]] == [False] * 6 + [True] * 3
     assert len(result["sensitivity"]) == 6
     assert len(result["claims"]) == 9
     assert all(c["evidence"] for c in result["claims"])
