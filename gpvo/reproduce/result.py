@@ -89,7 +89,7 @@ def _notes(plan: Plan) -> list[str]:
         "The thesis' flights are not available; ours stand in for them. Compare ratios, not metres.",
         f"Flights of {length}, {plan.rate_hz:g} Hz. Seeds with images: {plan.seeds}; further seeds in "
         f"points-only mode: {plan.points_seeds} (landmark tracks without pictures), in rows of their own. "
-        f"They also train apart: on {plan.training['images']} flights with images, on {plan.training['points']} without.",
+        f"Each trains apart: on {plan.training['images']} flights with images, on {plan.training['points']} without.",
         "RMSE, final and predicted final error are roots of mean squares over the seeds; brackets are 95 % intervals "
         "of a bootstrap by seed. Predicted: root of the expected squared error, 1 sigma.",
         "Tables 4.1, 4.2: a drawn mine tunnel for the thesis' simulated one; models learned in other tunnels, clean "
