@@ -1,6 +1,6 @@
-"""Remake the trained models of this folder: ``python models/remake.py [FOLDER]`` (some minutes on two cores).
+"""Remake the trained model of this folder: ``python models/remake.py [FOLDER]`` (two minutes of one core).
 
-Each learns from six simulated flights of 30 s at 10 frames/s (stereo tracks and IMU, no pictures) and is judged by
+It learns from six simulated flights of 30 s at 10 frames/s (stereo tracks and IMU, no pictures) and is judged by
 leaving each flight out in turn; the scores are in the card beside the model.
 """
 
@@ -22,7 +22,6 @@ FLIGHTS = 6
 # File name to the scenarios that its flights are drawn from in turn.
 MODELS = {
     "tunnel": ("tunnel-bursts", "tunnel-bursts", "tunnel-clean", "tunnel-noise"),
-    "room-t265": ("room-t265",),
 }
 
 
