@@ -58,7 +58,7 @@ class StoredSets:
                 yield set_of_table(self._about[i], pa.Table.from_batches([batch]))
 
     def thinned(self, max_rows: int, chunk_rows: int = CHUNK_ROWS) -> list[TrainingSet]:
-        """At most about ``max_rows`` rows in blocks of consecutive ones, evenly over each sequence, sequences alike.
+        """At most ``max_rows`` rows (or one of each sequence), in blocks, evenly over each sequence, sequences alike.
 
         What is kept does not depend on ``chunk_rows``.
         """
@@ -74,7 +74,7 @@ def kept_rows(lengths: Sequence[int], max_rows: int) -> list[Any]:
     while left:
         share = room // len(left)
         i = int(left.pop(0))
-        quota[i] = min(lengths[i], max(share, min(BLOCK_ROWS, lengths[i])))
+        quota[i] = min(lengths[i], max(share, 1))
         room = max(room - quota[i], 0)
     out = []
     for i, n in enumerate(lengths):
