@@ -131,7 +131,18 @@ def _calibration(path: Path) -> dict[str, Any]:
 def _model(path: Path) -> dict[str, Any]:
     from gpvo.online.modelfile import read_header
 
-    return {"what": "model", "header": read_header(path)}
+    header = read_header(path)
+    scores = header.get("scores") or {}
+    return {
+        "what": "model",
+        **{key: header.get(key) for key in ("target", "frame", "rate_hz", "base_method", "camera", "features")},
+        "trained_on": [s["name"] for s in header.get("sequences") or []],
+        "nees_dof_left_out": {
+            name: (m.get("learned") or {}).get("nees_dof", {}).get("joint") for name, m in scores.items()
+        },
+        "versions": header.get("versions"),
+        "header": header,
+    }
 
 
 def _is_safetensors(path: Path) -> bool:

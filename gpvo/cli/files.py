@@ -31,6 +31,7 @@ def info(
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:
+        document.pop("header", None)  # of a model: hundreds of lines, for --json
         print("\n".join([str(path), *as_lines(document, "  ")]))
 
 

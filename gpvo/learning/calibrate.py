@@ -146,7 +146,7 @@ def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list
 
     Each group counts alike and a new one counts too, as an unknown: Y. Lee, R. Barber, R. Willett, "Distribution-free
     inference with hierarchical data" (2023), equation 5. Where G groups are too few for a level (level > G / (G + 1))
-    there is no finite guarantee: then the pooled quantile stands, marked so.
+    there is no finite guarantee: then the pooled quantile stands, marked so, and never below a lower level's.
     """
     labels, inverse, counts = np.unique(group, return_inverse=True, return_counts=True)
     order = np.argsort(score, kind="stable")
@@ -160,4 +160,4 @@ def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list
         at = min(int(np.searchsorted(reached, level - 1e-12)), len(score) - 1)
         widths.append(float(score[order][at]))
         sure.append(guaranteed)
-    return widths, sure
+    return np.maximum.accumulate(widths).tolist(), sure
