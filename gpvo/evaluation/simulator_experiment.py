@@ -160,7 +160,8 @@ def _episodes(flown: list[FlownRun]) -> tuple[Mapping[str, Array], Array, int]:
         t_all = (f.run.log.t_ns - document["t_start_ns"]) * 1e-9
         free = np.ones(len(t), bool)
         for e in document["episodes"]:
-            within = (t >= e["begin_s"]) & (t < e["end_s"])
+            # A motion counts if either of its frames does.
+            within = (t >= e["begin_s"]) & (t - f.errors.dt_s < e["end_s"])
             inside.setdefault(e["cause"], []).append(f.errors.xi[within])
             free &= ~within
             lost += sum(not r.usable for r, s in zip(f.run.log, t_all, strict=True) if e["begin_s"] <= s < e["end_s"])

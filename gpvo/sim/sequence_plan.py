@@ -18,6 +18,7 @@ from gpvo.sim.worlds import World
 from gpvo.types import Array
 
 _CHECK_HZ = 50
+_BARE, _RAMP_S = 0.92, 0.5  # share of the fine texture that a bare wall lacks; time it takes to come into view
 
 
 @dataclass(frozen=True)
@@ -109,13 +110,18 @@ def plan_frames(scenario: Scenario, episodes: tuple[Episode, ...], rng: np.rando
                 step=round(t * vehicles.RATE_HZ),
                 fate=fate,
                 noise_sigma=float(np.hypot(base, extra)),
-                light={"darkness": 0.015, "blackout": 0.0}.get(cause, 1.0),
-                dust=0.8 if cause == "dust" else 0.0,
-                exposure_s=0.6 / scenario.rate_hz if cause == "motion_blur" else scenario.exposure_s,
-                bare=0.97 if cause == "bare_wall" else 0.0,
+                light={"darkness": 0.013, "blackout": 0.0}.get(cause, 1.0),
+                dust=0.78 if cause == "dust" else 0.0,
+                exposure_s=1.0 / scenario.rate_hz if cause == "motion_blur" else scenario.exposure_s,
+                bare=_BARE * _ramp(t, episodes[inside]) if inside is not None and cause == "bare_wall" else 0.0,
             )
         )
     return out
+
+
+def _ramp(t_s: float, episode: Episode) -> float:
+    """0 to 1 and back: a wall comes into view and leaves it, it does not change at once."""
+    return min(1.0, max(0.0, min(t_s - episode.begin_s, episode.end_s - t_s) / _RAMP_S))
 
 
 def camera_poses(motion: Motion, step: int, exposure_s: float, T_body_left: Array) -> tuple[Array, Array | None]:
