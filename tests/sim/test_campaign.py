@@ -20,6 +20,20 @@ def test_points_campaign_is_the_same_on_two_jobs(tmp_path):
         assert a.path.read_bytes() == b.path.read_bytes()
 
 
+@pytest.mark.slow
+def test_a_dask_cluster_of_two_workers_makes_the_same_bytes(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra gpvo[dask]")
+    scenario = load_scenario("tunnel-clean", {"duration_s": 5.0})
+    here = campaign.fly_campaign(scenario, [0, 2], tmp_path / "here", points=True)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        there = campaign.fly_campaign(
+            scenario, [0, 2], tmp_path / "there", points=True, backend="dask", scheduler=cluster.scheduler_address
+        )
+    assert [f.error for f in there] == ["", ""]
+    for a, b in zip(here, there, strict=True):
+        assert a.path.read_bytes() == b.path.read_bytes()
+
+
 def test_one_failure_does_not_stop_the_others(tmp_path, monkeypatch):
     def flaky(scenario, seed, out):
         if seed == 1:

@@ -2,6 +2,9 @@
 
 import errno
 import hashlib
+import os
+import subprocess
+import sys
 from itertools import pairwise
 
 import numpy as np
@@ -180,6 +183,25 @@ def test_episodes_reach_the_frames():
     plans = sequence_plan.plan_frames(scenario, episodes, np.random.default_rng(3))
     bad = [p for p in plans if p.light < 1 or p.dust or p.noise_sigma or p.exposure_s or p.bare]
     assert 0.15 < len(bad) / len(plans) < 0.25
+
+
+@pytest.mark.slow
+def test_a_write_that_fails_is_one_line_and_leaves_nothing(tmp_path, tmp_path_factory):
+    """The kernel refuses files above 100 kB: the first long table or picture cannot be written whole."""
+    pytest.importorskip("numba")
+    resource = pytest.importorskip("resource")
+    done = subprocess.run(
+        [sys.executable, "-m", "gpvo.cli", "simulate", "tunnel-clean", "-o", str(tmp_path / "seq"), "--duration", "4"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)),
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))},
+    )
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "cannot be written" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
