@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -32,6 +34,16 @@ def _pairs_per_second(camera: CameraModel, baseline_m: float, count: int = 16) -
     return _CORES / float(np.median(costs[2:]))
 
 
+def _gl_peer() -> tuple[str, float | None]:
+    """MuJoCo's OpenGL renderer, where there is one: its name and pairs per second."""
+    for way in ("egl", "osmesa"):
+        words = [sys.executable, "-m", "bench.gl_peer", way]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=600)
+        if done.returncode == 0:
+            return f"MuJoCo by {way}, untextured", float(done.stdout.split()[-1])
+    return "no OpenGL on this machine", None
+
+
 def run() -> dict[str, dict]:
     """Measure on this machine."""
     cameras: dict[str, tuple[CameraModel, float]] = {
@@ -51,4 +63,12 @@ def run() -> dict[str, dict]:
             "peer_value": limit,
             "ratio": None if limit is None else value / limit,
         }
+    (peer, theirs), ours = _gl_peer(), out["render_pinhole_vga"]["value"]
+    out["render_pinhole_vga, beside OpenGL"] = {
+        "value": ours,
+        "unit": "pairs/s on 2 cores",
+        "peer": peer,
+        "peer_value": theirs,
+        "ratio": None if theirs is None else ours / theirs,
+    }
     return out
