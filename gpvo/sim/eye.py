@@ -42,13 +42,15 @@ class Eye:
         self._renderer = StereoRenderer(world, rig.left, rig.right, rig.T_right_left, threads=threads)
         self._sensor = SensorModel(SensorParams(**scenario.sensor), seed, threads=threads)
         self._motion, self._T_body_left, self._right_light = motion, rig.T_body_left, scenario.right_light
+        self.model, self.T_world_cam = rig.left, np.eye(4)
         self.depth_m: NDArray[np.float32] | None = None
 
     def see(self, index: int, plan: sequence_plan.FramePlan) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Left and right picture (H, W); ``depth_m`` then holds the left camera's depth, NaN where there is nothing."""
+        """Left and right picture (H, W). ``depth_m`` then holds the left camera's depth, NaN where there is nothing;
+        ``T_world_cam`` its pose."""
         pose, blur = sequence_plan.camera_poses(self._motion, plan.step, plan.exposure_s, self._T_body_left)
         left, right, depth = self._renderer.render(pose, motion=blur)
-        self.depth_m = depth
+        self.depth_m, self.T_world_cam = depth, pose
         if plan.bare:
             left, right = without_texture(left, plan.bare), without_texture(right, plan.bare)
         if self._right_light != 1.0:

@@ -36,9 +36,9 @@ class Scenario(BaseModel):
     the flight in which seeing goes wrong, by one of the ``causes`` each time. ``dark``: from, to. ``dropped, frozen,
     late, black``: shares of the frames; a late one is stamped ``late_s`` after it was taken. ``camera_pitch_deg``: how
     far the cameras look down. ``right_light``: light of the right camera over that of the left. ``depth``: write the
-    left camera's depth too. ``calibration``: standard deviations of how the rig that draws the pictures differs from
-    the written one; ``calibration_offset``: the fixed part of that difference. ``points``: values for flights without
-    images alone.
+    left camera's depth too; ``flow``: and where each of its pixels is in the next picture. ``calibration``: standard
+    deviations of how the rig that draws the pictures differs from the written one; ``calibration_offset``: the fixed
+    part of that difference. ``points``: values for flights without images alone.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -78,6 +78,7 @@ class Scenario(BaseModel):
     imu_rate_hz: float = Field(200.0, ge=50.0, le=1000.0)
     imu_offset_s: float = Field(0.0, ge=-0.1, le=0.1)
     depth: bool = False
+    flow: bool = False
     calibration: dict[CalibrationKey, float] = {}
     calibration_offset: dict[CalibrationKey, float] = {}
     points: dict[str, Any] = {}

@@ -22,6 +22,7 @@ from gpvo.io.toml import to_toml
 from gpvo.sim import imu, routes, sequence_files, sequence_plan, vehicles
 from gpvo.sim.episodes import Episode
 from gpvo.sim.eye import Eye
+from gpvo.sim.flow import optical_flow
 from gpvo.sim.imu import Motion
 from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
 from gpvo.sim.scenario import Scenario
@@ -203,7 +204,7 @@ def _write_images(
     for camera in ("cam0", "cam1"):
         (folder / "mav0" / camera / "data").mkdir(parents=True, exist_ok=True)
     stamps: list[int] = []
-    shown = None
+    shown = seen_before = None
     pending: list[Future[None]] = []
     with ThreadPoolExecutor(max(1, threads)) as pool:
         for k, plan in enumerate(frames):
@@ -216,7 +217,13 @@ def _write_images(
             stamp = START_NS + plan.step * round(1e9 / vehicles.RATE_HZ) + round(late * 1e9)
             stamps.append(stamp)
             if scenario.depth and eye.depth_m is not None:
-                pending.append(pool.submit(_save_depth, folder / "mav0" / "depth0" / f"{stamp}.npy", eye.depth_m))
+                pending.append(pool.submit(_save_array, folder / "mav0" / "depth0" / f"{stamp}.npy", eye.depth_m))
+            if scenario.flow and eye.depth_m is not None and plan.fate != "frozen":
+                if seen_before is not None:
+                    before, depth_m, T_world_cam = seen_before
+                    flow_px = optical_flow(eye.model, depth_m, eye.depth_m, T_world_cam, eye.T_world_cam)
+                    pending.append(pool.submit(_save_array, folder / "mav0" / "flow0" / f"{before}.npy", flow_px))
+                seen_before = (stamp, eye.depth_m, eye.T_world_cam)
             for camera, image in zip(("cam0", "cam1"), shown):
                 pending.append(pool.submit(_save, folder / "mav0" / camera / "data" / f"{stamp}.png", image))
             while len(pending) > _AHEAD:
@@ -232,9 +239,9 @@ def _save(path: Path, image: NDArray[np.uint8]) -> None:
     path.write_bytes(cv2.imencode(".png", image, _PNG)[1].tobytes())
 
 
-def _save_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
+def _save_array(path: Path, values: NDArray[np.float32]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, depth_m, allow_pickle=False)
+    np.save(path, values, allow_pickle=False)
 
 
 def _truth_file(folder: Path) -> Path:
