@@ -15,6 +15,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import Array
 from gpvo.io.run_read import Run
+from gpvo.online.base import RESIDUAL_COLUMN
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer
 from gpvo.online.slip import REASON, SlipDetector, flag_slips
@@ -97,10 +98,10 @@ def build(
 ) -> TrainingSet:
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
-    ``columns``: by default all of ``full``. Raises GpvoError where nothing is left to learn from.
+    ``columns``: by default all of ``full`` and the residual. Raises GpvoError where nothing is left to learn from.
     """
     check_target(target)
-    names = tuple(columns or resolve("full"))
+    names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
         raise GpvoError(
             "has no ground truth to learn from", where=name, cure="run a source that has it, or gpvo import --truth"

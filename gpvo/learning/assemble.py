@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.learning.calibrate import (
     LEVELS,
@@ -14,16 +15,16 @@ from gpvo.learning.calibrate import (
     choose_geometry_weight,
     conformal_quantiles,
     fit_joint_factor,
+    fit_outside_rate,
     fit_scale,
-    residual_correlation,
 )
 from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
-from gpvo.learning.parts import Parts, fit_parts
+from gpvo.learning.parts import Parts, fit_parts, part_correlations
 from gpvo.learning.rows import Rows
-from gpvo.online.base import BaseVariance
+from gpvo.online.base import TWIST_COLUMNS, BaseVariance
 from gpvo.online.basis import SharedBasis
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import ErrorModelArrays, divide, ln_faster
 from gpvo.online.guard import Domain
 from gpvo.types import Array
 
@@ -41,16 +42,23 @@ def assemble(
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     sigma = np.sqrt(variance * scale.factor)
     z = error / sigma
-    split = fit_parts(rows.chains(z), float(np.median(rows.dt_s)))
-    correlation = residual_correlation(z)
+    step_s = float(np.median(rows.dt_s))
+    v_mps = rows.select(TWIST_COLUMNS[:3])
+    ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
+    faster = ln_faster(v_mps, ln_speed)
+    split = fit_parts(rows.chains(error), rows.chains(sigma), rows.chains(faster), step_s)
+    correlation = part_correlations(rows.chains(z), split, step_s)
     geometry = rows.geometry(base.method)
-    weight = choose_geometry_weight(error, sigma, correlation, geometry, split.share)
+    share = divide(split.share, split.growth, 2.0 * np.log(sigma) - split.level, faster)
+    weight = choose_geometry_weight(error, sigma, correlation, geometry, share)
     X = rows.select(columns)
+    # Out of the domain no mean is taken off, so what is left of one says nothing of how wrong VO is there.
+    plain = np.ones(6, dtype=bool)
     if fitted is None:
         inputs, basis = (columns[0],), SharedBasis(no_mean(1, 6), None, np.zeros(6))
         high = np.zeros(6)
     else:
-        basis = fitted.basis
+        basis, plain = fitted.basis, ~fitted.use_mean if not fitted.use_mean.all() else plain
         high = np.quantile(fitted.oof_log_noise_var, 0.95, axis=0)
     at = np.array([columns.index(n) for n in inputs], dtype=np.int64)
     model = ErrorModelArrays(
@@ -60,25 +68,35 @@ def assemble(
         domain=Domain.learn(X),
         base=base,
         factor=scale.factor,
+        outside_rate=np.array(
+            [fit_outside_rate(_distance(X, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)]
+        ),
         high=high,
         correlation=correlation,
         geometry_weight=np.array([weight]),
         share=split.share,
+        growth=split.growth,
+        level=split.level,
+        ln_speed=ln_speed,
         bias_tau_s=split.tau_s,
         typical_ln_det=np.zeros(1),
-        dt_s=float(np.median(rows.dt_s)),
+        dt_s=step_s,
     )
-    whole = _covariance(model, sigma, geometry)
+    whole = model.split(sigma**2, faster, geometry).sum(axis=1)
     joint = fit_joint_factor(error, whole, rows.group)
     typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
-    model = replace(model, factor=scale.factor * joint, typical_ln_det=np.array([typical]))
+    level = model.level + np.log(joint)
+    model = replace(model, factor=scale.factor * joint, level=level, typical_ln_det=np.array([typical]))
     return model, _calibration(rows, scale, joint, split, weight, np.abs(z) / np.sqrt(joint))
 
 
-def _covariance(model: ErrorModelArrays, sigma: Array, geometry: Array | None) -> Array:
-    root = np.sqrt(model.share)
-    kept = sum(np.outer(r, r) for r in root)
-    return sigma[:, :, None] * model.correlations(len(sigma), geometry) * sigma[:, None, :] * kept
+def _distance(X: Array, group: NDArray[np.int64]) -> Array:
+    """(n,) how far each row lies from what the other groups know."""
+    out = np.zeros(len(X))
+    labels = np.unique(group)
+    for g in labels if len(labels) > 1 else ():
+        out[group == g] = Domain.learn(X[group != g]).locate(X[group == g]).distance
+    return out
 
 
 def _calibration(rows: Rows, scale: Scale, joint: float, split: Parts, weight: float, score: Array) -> dict[str, Any]:
@@ -93,5 +111,5 @@ def _calibration(rows: Rows, scale: Scale, joint: float, split: Parts, weight: f
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
         "interval_guaranteed": [sure for _, sure in axes],
-        "parts": {"spans_frames": split.spans, "measured": split.measured, "fitted": split.fitted},
+        "parts": {"spans_frames": split.spans, "seen_over_stated": split.ratio},
     }

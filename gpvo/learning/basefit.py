@@ -22,7 +22,13 @@ def t_negative_log_likelihood(square: Array, variance: Array, nu: float = NU) ->
 
 
 def fit_base(
-    columns: Array, dt_s: Array, error: Array, method: str | None, weight: Array | None = None
+    columns: Array,
+    dt_s: Array,
+    error: Array,
+    method: str | None,
+    weight: Array | None = None,
+    *,
+    residual: bool = False,
 ) -> BaseVariance:
     """Coefficients of each axis from errors (n, 6); ``columns`` as :func:`gpvo.online.base.base_columns` says.
 
@@ -31,13 +37,11 @@ def fit_base(
     count = np.ones(len(error)) if weight is None else weight
     terms = parts(columns, dt_s)
     theta = np.stack([_fit_axis(terms[:, j], error[:, j] ** 2, count) for j in range(6)])
-    if method is None:
-        theta[:, 0] = 0.0
-    return BaseVariance(theta, method)
+    return BaseVariance(theta, method, residual)
 
 
 def _fit_axis(terms: Array, square: Array, count: Array) -> Array:
-    """(4,) coefficients: minimises the t's negative log-likelihood over their logs, terms scaled to the mean square."""
+    """(5,) coefficients: minimises the t's negative log-likelihood over their logs, terms scaled to the mean square."""
     typical = np.maximum(np.average(terms, axis=0, weights=count), 1e-300)
     level = max(float(np.average(np.minimum(square, np.quantile(square, 0.99)), weights=count)), 1e-18)
     scaled = terms / typical * level

@@ -19,6 +19,8 @@ LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95)
 _NU_RANGE = (2.5, 200.0)
 # Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
+_OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
+_RATES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -88,6 +90,24 @@ def _with_prior(variance: float, groups: int) -> float:
     return (_PRIOR_GROUPS * _PRIOR_SPREAD**2 + (groups - 1) * variance) / (_PRIOR_GROUPS + groups - 1)
 
 
+def fit_outside_rate(distance: Array, square: Array, group: NDArray) -> float:
+    """By how much the variance grows per standard deviation of ``distance`` (n,) from what the other groups knew.
+
+    ``square`` (n,): mean over the axes of the squared normalised residuals. One is expected, within a factor of e; the
+    rows of a group outside count as five at most, as they go together.
+    """
+    outside = distance > _OUTSIDE
+    d, q, g = distance[outside], square[outside], group[outside]
+    count = np.minimum(_MOST_OUTSIDE / np.maximum([(g == of).sum() for of in g], 1), 1.0)
+
+    def loss(rate: float) -> float:
+        stated = 1.0 + rate * d
+        ratio = np.minimum(q / stated, 16.0)
+        return float(3.0 * count @ (np.log(stated) + ratio) + 0.5 * np.log(rate) ** 2)
+
+    return min(_RATES, key=loss)
+
+
 def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
     """One more factor, so that the NEES of all six axes together is right for a new group."""
     squared = nees(error, covariance) / error.shape[1]
@@ -119,7 +139,10 @@ def residual_correlation(z: Array, nu: float = 5.0) -> Array:
 def choose_geometry_weight(
     error: Array, sigma: Array, correlation: Array, geometry: Array | None, share: Array
 ) -> float:
-    """How much of the geometry's correlation to believe: the weight with the best likelihood."""
+    """How much of the geometry's correlation to believe of jitter and white: the weight with the best likelihood.
+
+    ``correlation`` (3, 6, 6) and ``share`` (n, 3, 6) of the parts.
+    """
     if geometry is None:
         return 0.0
     s = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
@@ -127,13 +150,13 @@ def choose_geometry_weight(
     known = np.isfinite(R).all(axis=(1, 2))
     if known.mean() < 0.5:
         return 0.0
-    root = np.sqrt(share)
-    kept = sum(np.outer(r, r) for r in root)
-    outer = sigma[known][:, :, None] * sigma[known][:, None, :] * kept
+    root = np.sqrt(share[known]) * sigma[known][:, None, :]
+    jitter, white, bias = np.moveaxis(root[..., :, None] * root[..., None, :], 1, 0)
 
     def loss(w: float) -> float:
-        mixed = (w * R[known] + (1 - w) * correlation) * (1 - 1e-6) + 1e-6 * np.eye(6)
-        C = outer * mixed
+        own = (1 - w) * (jitter * correlation[0] + white * correlation[1])
+        C = w * R[known] * (jitter + white) + own + bias * correlation[2]
+        C = C + 1e-6 * np.eye(6) * C
         # The scale is fitted afterwards: compare shapes at their own best scale.
         scale = robust_mean(nees(error[known], C) / 6.0)
         return float(np.mean(nll_per_dim(error[known], C * scale)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import GpvoError
+from gpvo.online.base import RESIDUAL_COLUMN
 from gpvo.online.features import GEOMETRIC_METHODS, resolve
 
 FAMILIES: dict[str, tuple[str, ...]] = {
@@ -78,7 +79,10 @@ def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tu
     return out
 
 
-def geometric_method(sets: Sequence[TrainingSet]) -> list[str]:
-    """Geometric covariances that every log knows in 95 of 100 rows."""
+def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:
+    """Bases to choose among, of the columns that every log knows in 95 of 100 rows: geometric covariances, at one pixel
+    and at the noise of the residuals, and the motion alone."""
     known = set.intersection(*(s.supported() for s in sets))
-    return [m for m in GEOMETRIC_METHODS if f"ln_var_{m}_x" in known]
+    methods = [m for m in GEOMETRIC_METHODS if f"ln_var_{m}_x" in known]
+    noise = (False, True) if RESIDUAL_COLUMN in known else (False,)
+    return [*((m, residual) for m in methods for residual in noise), (None, False)]

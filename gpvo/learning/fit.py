@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as t_distribution
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_base, t_negative_log_likelihood
-from gpvo.learning.config import TrainConfig, candidates, geometric_method
+from gpvo.learning.config import TrainConfig, base_candidates, candidates
+from gpvo.learning.meantest import helps_over_distance, helps_the_pose, surely_positive
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
-from gpvo.learning.parts import span_variances
 from gpvo.learning.rows import Rows
 from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
@@ -49,7 +48,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     rows = Rows.stack(sets)
     base, base_oof = choose_base(rows)
     name, inputs, fitted, trust, scores = choose_inputs(rows, base, base_oof, config)
-    columns = tuple(dict.fromkeys((*inputs, *base_columns(base.method))))
+    columns = tuple(dict.fromkeys((*inputs, *base.columns)))
     plain = fitted
     fitted, mean_gain = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
     fitted = None if fitted is None else shrink(fitted, trust)
@@ -63,7 +62,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
         without, _ = assemble(rows, base, columns, inputs, plain, *_out_of_fold(rows, base_oof, plain))
         arrays |= {f"{WITHOUT_MEAN}{name}": array for name, array in without.to_arrays().items()}
     choices = {
-        "base": base.method or "motion",
+        "base": _name_of(base),
         "inputs": name,
         "trust": trust,
         "inputs_nll": scores,
@@ -76,22 +75,22 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
 
 def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
     """The base variance, with geometry or without, that predicts left-out groups best; and the same out of fold."""
-    best: tuple[float, str | None, Array] | None = None
-    for method in (*geometric_method(rows.sets), None):
-        C = _base_inputs(rows, method)
+    best: tuple[float, tuple[str | None, bool], Array] | None = None
+    for method, residual in base_candidates(rows.sets):
+        C = _base_inputs(rows, base_columns(method, residual))
         oof = np.empty_like(rows.error)
         for g in np.unique(rows.group):
             out = rows.group == g
-            oof[out] = fit_base(C[~out], rows.dt_s[~out], rows.error[~out], method, rows.weight[~out])(
-                C[out], rows.dt_s[out]
-            )
+            oof[out] = fit_base(
+                C[~out], rows.dt_s[~out], rows.error[~out], method, rows.weight[~out], residual=residual
+            )(C[out], rows.dt_s[out])
         loss = _loss(rows, rows.error**2, oof)
         if best is None or loss < best[0]:
-            best = (loss, method, oof)
+            best = (loss, (method, residual), oof)
     assert best is not None
-    _, method, oof = best
-    C = _base_inputs(rows, method)
-    return fit_base(C, rows.dt_s, rows.error, method, rows.weight), oof
+    _, (method, residual), oof = best
+    C = _base_inputs(rows, base_columns(method, residual))
+    return fit_base(C, rows.dt_s, rows.error, method, rows.weight, residual=residual), oof
 
 
 def choose_inputs(
@@ -104,7 +103,7 @@ def choose_inputs(
     best: tuple[str, tuple[str, ...], HeteroscedasticFit | None, float] = (NONE, (), None, 0.0)
     scores = {NONE: _loss(rows, rows.error**2, base_oof)}
     for name, inputs in candidates(rows.sets, config).items():
-        columns = tuple(dict.fromkeys((*inputs, *base_columns(base.method))))
+        columns = tuple(dict.fromkeys((*inputs, *base.columns)))
         fitted = _fit_gp(rows, base, columns, inputs, np.zeros(6, dtype=bool), config)
         losses = {t: _loss(rows, rows.error**2, base_oof * np.exp(t * fitted.oof_log_noise_var)) for t in TRUSTS}
         trust = min(losses, key=losses.__getitem__)
@@ -119,8 +118,12 @@ def _loss(rows: Rows, square: Array, variance: Array) -> float:
     return float(rows.by_group(t_negative_log_likelihood(square, variance)).mean())
 
 
-def _base_inputs(rows: Rows, method: str | None) -> Array:
-    C = rows.select(base_columns(method))
+def _name_of(base: BaseVariance) -> str:
+    return f"{base.method or 'motion'}{' at the noise of the residuals' if base.residual else ''}"
+
+
+def _base_inputs(rows: Rows, columns: Sequence[str]) -> Array:
+    C = rows.select(columns)
     return np.where(np.isfinite(C), C, np.nanmedian(C, axis=0))
 
 
@@ -143,7 +146,7 @@ def _fit_gp(
     )
     # In the mean a motion of twice the usual duration drifts twice as far; of the noise the base knows the duration.
     longer = (rows.dt_s / np.median(rows.dt_s))[:, None]
-    log_base = np.log(base(_base_inputs(rows, base.method), rows.dt_s))
+    log_base = np.log(base(_base_inputs(rows, base.columns), rows.dt_s))
     fitted = fit_heteroscedastic(
         _gp_inputs(rows, columns, inputs),
         rows.error / longer,
@@ -194,28 +197,9 @@ def _with_mean(
     gain = rows.by_group(plain - t_negative_log_likelihood(corrected, v0 + with_mean.oof_epistemic_var))
     proven = surely_positive(gain) & helps_over_distance(rows, with_mean.oof_mean, np.sqrt(v0))
     gains = gain.mean(axis=0).tolist()
-    if not proven.any():
+    if not proven.any() or not helps_the_pose(rows, np.where(proven, with_mean.oof_mean, 0.0)):
         return fitted, gains
     return _fit_gp(rows, base, columns, inputs, proven, config), gains
-
-
-def helps_over_distance(rows: Rows, oof_mean: Array, sigma: Array) -> NDArray[np.bool_]:
-    """(6,) whether what the mean leaves is smaller than the error itself when summed over any number of motions.
-
-    A mean given VO's own motion holds what was usual in training: it draws each motion towards that, which makes the
-    single one better, but what it takes off of true motions adds up along the path.
-    """
-    plain, left = (span_variances(rows.chains(e / sigma)).mean_square for e in (rows.error, rows.error - oof_mean))
-    return np.asarray((left <= plain).all(axis=0))
-
-
-def surely_positive(gain: Array, risk: float = 0.05) -> NDArray[np.bool_]:
-    """(D,) whether the mean over groups of gain (G, D) is positive: one-sided t-test, risk shared among the D axes."""
-    groups, axes = gain.shape
-    if groups < 2:
-        return np.zeros(axes, dtype=bool)
-    statistic = gain.mean(axis=0) / np.maximum(gain.std(axis=0, ddof=1) / np.sqrt(groups), 1e-300)
-    return statistic > t_distribution.ppf(1.0 - risk / axes, groups - 1)
 
 
 def _out_of_fold(rows: Rows, base_oof: Array, fitted: HeteroscedasticFit | None) -> tuple[Array, Array]:

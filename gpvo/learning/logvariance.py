@@ -118,6 +118,7 @@ def _mode(
 
 def _score(g: Array, residuals: Residuals, nu: Array) -> Array:
     """Derivative of the log density of the residuals by g (n, D), the variance of the mean counted in."""
-    noise = np.exp(g + residuals.base)
+    # A step of the search may lie far off; it is drawn in again by the next.
+    noise = np.exp(np.clip(g + residuals.base, -600.0, 600.0))
     total = noise + residuals.mean_var
     return log_scale_score(residuals.square / total, nu) * (noise / total)

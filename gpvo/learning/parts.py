@@ -1,42 +1,64 @@
-"""How errors add up over a distance: jitter, white and bias, from the variance of sums over 1, 2, 5, ... frames.
+"""How errors add up over a distance: jitter, white and bias, from the errors summed over 1, 2, 5, ... frames.
 
-With unit variance per frame, the variance of the sum over m frames is ``a`` for jitter (n_k - n_(k-1)), ``w m`` for
-white noise and ``b (m + 2 sum_i (m - i) rho^i)`` for a first-order Gauss-Markov bias with correlation rho per frame
-(A. Gelb, "Applied Optimal Estimation" (1974), section 3.8).
+Of a motion's variance v a share is jitter (n_k - n_(k-1), that of the frames it joins), a share white, a share a
+first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). What adds up may grow with
+the speed, as it does so by landmarks that come and go along the path, while jitter is there at rest. The bias may grow
+faster than the noise: that of triangulated points goes with the variance of the noise, so its own variance with the
+square (G. Sibley, L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.signal import lfilter
 
+from gpvo.learning.calibrate import residual_correlation
 from gpvo.types import Array
 
+Chains = Sequence[Sequence[Array]]
+"""Per sequence its unbroken chains of motions, (n_i, D) each."""
+
 SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-_TAU_FRAMES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0, 2048.0, 4096.0)
-_MIN_WINDOWS = 3.0
+_TAU_FRAMES = (4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
+_NOISE_GROWTHS = (0.0, 0.5, 1.0)
+_SPEED_GROWTHS = (0.0, 1.0, 2.0)
+_WORTH = 20.0
+"""By so much the log-likelihood of a block must rise for what is not expected; the spans all count the same errors."""
+_BY_THE_METRE = 1.0
+_MIN_WINDOWS, _MOST_WINDOWS = 3.0, 1000
+_MOST_COUNT = 60.0
+"""A span counts by its windows, up to this: short spans have many, but say the same over and over."""
+_MOST_ROWS = 30_000
 _MIN_SHARE = 1e-6
-_REWEIGHTINGS = 8
+_REWEIGHTINGS, _REDIVISIONS = 6, 3
+_MOST_RATIO = 16.0
 _SAME_NS = 1000
 _MAX_DOUBT = 1.0
+_PRIOR = 3.0
+_LEAST_EIGENVALUE = 1e-3
 
 
 @dataclass(frozen=True)
 class Parts:
-    """``share`` (3, D): jitter, white, bias of each axis, summing to one. ``tau_s`` (D,): of the bias.
+    """``share`` (3, D): jitter, white, bias of each axis at the typical log variance ``level`` (D,), summing to one.
 
-    ``spans`` (S,) frames, ``measured`` and ``fitted`` (S, D): variance of the sum over so many frames.
+    ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.estimate.divide`).
+    ``tau_s`` (D,): of the bias. ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over
+    what is stated; ``doubt`` (S, D): see :class:`SpanVariances`.
     """
 
     share: Array
+    growth: Array
+    level: Array
     tau_s: Array
     spans: NDArray[np.int64]
-    measured: Array
-    fitted: Array
+    ratio: Array
+    doubt: Array
 
 
 @dataclass(frozen=True)
@@ -55,26 +77,153 @@ class SpanVariances:
         return self.mean_square * (1.0 + self.doubt)
 
 
-def fit_parts(z: Sequence[Sequence[Array]], step_s: float) -> Parts:
-    """From normalised residuals: per sequence its unbroken chains (n_i, D); ``step_s``: usual duration of a motion.
+@dataclass(frozen=True)
+class _Windows:
+    """Of one span and block of axes: squared sums (w, d), widened by their doubt; stated variances (w, m, d), their
+    logs above the typical level and those of the speed (w, m, 1); what a window counts."""
 
-    Translation and rotation (each three axes) have one time constant each; the shares are the axis' own.
+    square: Array
+    variance: Array
+    above: Array
+    faster: Array
+    count: float
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """What is chosen for a block of axes: see :class:`Parts`."""
+
+    by_speed: float
+    by_noise: float
+    tau: float
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """``share`` (3, d) of a shape, mean ratio of squared sums to what is stated (S, d), and the loss."""
+
+    loss: float
+    share: Array
+    ratio: Array
+
+
+def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float) -> Parts:
+    """From errors, their stated standard deviations, and the logs (n_i, 1) of the speed over the typical one.
+
+    ``step_s``: usual duration of a motion. Translation and rotation (each three axes) have one time constant and
+    growth each; the shares are the axis' own.
     """
-    found = span_variances(z)
-    spans, curve = found.spans, found.predictive / found.predictive[0]
-    windows = 2.0 / found.doubt
-    share, tau = np.empty((3, curve.shape[1])), np.empty(curve.shape[1])
-    for start in range(0, curve.shape[1], 3):
-        block = range(start, min(start + 3, curve.shape[1]))
-        fits = {t: [_fit_axis(spans, curve[:, j], windows[:, j], t) for j in block] for t in _TAU_FRAMES}
-        best = min(fits, key=lambda t: sum(loss for loss, _ in fits[t]))
-        for j, (_, chosen) in zip(block, fits[best]):
-            share[:, j], tau[j] = chosen, best
-    fitted = np.stack([curves(spans, tau[j]) @ share[:, j] for j in range(curve.shape[1])], axis=1)
-    return Parts(share, tau * step_s, spans, curve, fitted)
+    error, sigma, ln_speed = (_at_most(values, _MOST_ROWS) for values in (error, sigma, ln_speed))
+    found = span_variances([[e / s for e, s in zip(*pair)] for pair in zip(error, sigma)])
+    ln_var = [[2.0 * np.log(s) for s in chains] for chains in sigma]
+    level = np.median(np.concatenate([c for chains in ln_var for c in chains]), axis=0)
+    D = len(level)
+    share, growth, tau, ratio = np.empty((3, D)), np.empty((2, D)), np.empty(D), np.empty((len(found.spans), D))
+    for start in range(0, D, 3):
+        block = slice(start, min(start + 3, D))
+        windows = [
+            _windows(error, ln_var, ln_speed, m, block, level, 1.0 + doubt)
+            for m, doubt in zip(found.spans, found.doubt)
+        ]
+        shape, fit = _choose(windows)
+        share[:, block], ratio[:, block], tau[block] = fit.share, fit.ratio, shape.tau
+        growth[:, block] = [[shape.by_speed], [shape.by_noise]]
+    return Parts(share, growth, level, tau * step_s, found.spans, ratio / (1.0 + found.doubt), found.doubt)
 
 
-def span_variances(z: Sequence[Sequence[Array]]) -> SpanVariances:
+def _choose(windows: Sequence[_Windows]) -> tuple[_Shape, _Fit]:
+    """The best shape. Expected is that errors add up by the metre, and a bias that grows no faster than the noise."""
+    fits: dict[_Shape, _Fit] = {}
+
+    def best(shapes: Iterable[_Shape]) -> _Shape:
+        fits.update({s: _fit_shape(windows, s) for s in shapes if s not in fits})
+        return min(fits, key=lambda s: fits[s].loss + _WORTH * ((s.by_speed != _BY_THE_METRE) + (s.by_noise > 0)))
+
+    found = best(_Shape(_BY_THE_METRE, g, t) for g in _NOISE_GROWTHS for t in _TAU_FRAMES)
+    found = best(_Shape(v, found.by_noise, t) for v in _SPEED_GROWTHS for t in _TAU_FRAMES)
+    found = best(replace(found, tau=t) for t in (found.tau / 2.0, found.tau * 2.0))
+    return found, fits[found]
+
+
+def _at_most(values: Chains, limit: int) -> Chains:
+    """Whole sequences up to so many rows; the last one is cut."""
+    out = []
+    for chains in values:
+        kept = []
+        for chain in chains:
+            kept.append(chain[:limit])
+            limit -= len(kept[-1])
+        out.append(kept)
+        if limit <= 0:
+            break
+    return out
+
+
+def _windows(
+    error: Chains, ln_var: Chains, ln_speed: Chains, m: int, block: slice, level: Array, widen: Array
+) -> _Windows:
+    e, v, u = (
+        np.concatenate([c[: len(c) // m * m].reshape(-1, m, c.shape[1]) for chains in x for c in chains])
+        for x in (error, ln_var, ln_speed)
+    )
+    some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
+    e, v, u = e[some, :, block], v[some, :, block], u[some]
+    square = e.sum(axis=1) ** 2 * widen[block]
+    return _Windows(square, np.exp(v), v - level[block], u, min(len(e), _MOST_COUNT) / len(e))
+
+
+def _fit_shape(windows: Sequence[_Windows], shape: _Shape) -> _Fit:
+    """Shares for one shape, by the likelihood of squared sums.
+
+    A squared sum has the deviation of what is stated of it; so the fit is reweighted by its own statement, because
+    weights by what is seen would favour statements that are too small.
+    """
+    d = windows[0].square.shape[1]
+    share = np.repeat([[0.5], [0.4], [0.1]], d, axis=1)
+    count = np.concatenate([np.full(len(w.square), w.count) for w in windows])
+    square = np.concatenate([w.square for w in windows])
+    changes = shape.by_speed > 0 or shape.by_noise > 0
+    for k in range(_REWEIGHTINGS):
+        if k == 0 or (changes and k <= _REDIVISIONS):
+            A = np.concatenate([_terms(w, shape, share) for w in windows])
+        stated = np.einsum("wpd,pd->wd", A, share)
+        seen = np.minimum(square, _MOST_RATIO * stated)
+        share = np.stack([_solve(A[:, :, j], seen[:, j], count / stated[:, j] ** 2) for j in range(d)], axis=1)
+    stated = np.einsum("wpd,pd->wd", A, share)
+    ratio = np.minimum(square / stated, _MOST_RATIO)
+    loss = float((count[:, None] * (np.log(stated) + ratio)).sum())
+    edges = np.cumsum([len(w.square) for w in windows])[:-1]
+    return _Fit(loss, share, np.array([r.mean(axis=0) for r in np.split(ratio, edges)]))
+
+
+def _terms(w: _Windows, shape: _Shape, share: Array) -> Array:
+    """(w, 3, d) variance of the sum over each window of jitter, white and bias of unit share at the typical level.
+
+    The motions' variances are divided as :func:`gpvo.online.estimate.divide` does with ``share``.
+    """
+    each = white = bias = w.variance
+    if shape.by_speed or shape.by_noise:
+        gain = np.exp(shape.by_speed * w.faster)
+        more = gain * np.exp(shape.by_noise * w.above)
+        each = w.variance / (share[0] + share[1] * gain + share[2] * more)
+        white, bias = each * gain, each * more
+    amplitude, rho = np.sqrt(bias), np.exp(-1.0 / shape.tau)
+    before = lfilter([0.0, rho], [1.0, -rho], amplitude, axis=1)
+    jitter = 0.5 * (each[:, 0] + each[:, -1])
+    return np.stack([jitter, white.sum(axis=1), bias.sum(axis=1) + 2.0 * (amplitude * before).sum(axis=1)], axis=1)
+
+
+def _solve(A: Array, square: Array, weight: Array) -> Array:
+    """Shares (3,), not negative and of sum one, that explain squared sums (w,) best; white where nothing shows."""
+    M = A[:, [0, 2]] - A[:, 1:2]
+    gram = (M * weight[:, None]).T @ M + 1e-9 * (weight @ A[:, 1] ** 2) * np.eye(2)
+    L = np.linalg.cholesky(gram)
+    jitter, bias = nnls(L.T, np.linalg.solve(L, (M * weight[:, None]).T @ (square - A[:, 1])))[0]
+    share = np.maximum([jitter, 1.0 - jitter - bias, bias], _MIN_SHARE)
+    return share / share.sum()
+
+
+def span_variances(z: Chains) -> SpanVariances:
     """Of the sums over each of :data:`SPANS` that occurs three times at least; sequences count by their length."""
     spans, mean_square, doubt = [], [], []
     for m in SPANS:
@@ -114,20 +263,36 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
     return np.stack([np.ones_like(m), m, bias], axis=1)
 
 
-def _fit_axis(spans: NDArray[np.int64], measured: Array, windows: Array, tau_frames: float) -> tuple[float, Array]:
-    """Loss and shares (3,) for one time constant, by the likelihood of a chi-squared mean square.
+def part_correlations(z: Chains, split: Parts, step_s: float) -> Array:
+    """(3, 6, 6) correlations of jitter, white and bias, from those of the normalised residuals summed over each span.
 
-    Each mean square has a relative deviation of sqrt(2 / windows); the fit is reweighted by its own curve, because
-    weights by the measured values would favour curves that lie too low.
+    Of each pair of axes three numbers are sought whose mixture, by what each part contributes to the sum, is the
+    correlation seen over every span; all are drawn towards that of single motions, as few windows show little.
     """
-    C, curve = curves(spans, tau_frames), measured
-    for _ in range(_REWEIGHTINGS):
-        weight = np.sqrt(windows) / curve
-        coefficients = nnls(C * weight[:, None], measured * weight)[0]
-        share = np.maximum(coefficients / max(coefficients.sum(), 1e-300), _MIN_SHARE)
-        share = share / share.sum()
-        curve = C @ share
-    return float(windows @ (np.log(curve) + measured / curve)), share
+    part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
+    whole = part.sum(axis=2).T
+    measured = np.array([residual_correlation(_all_sums(z, m) / np.sqrt(v)) for m, v in zip(split.spans, whole)])
+    windows = 2.0 / split.doubt
+    out = np.tile(np.eye(6), (3, 1, 1))
+    for i, j in zip(*np.triu_indices(6, 1)):
+        mixture = np.sqrt(part[i] * part[j] / (whole[:, i] * whole[:, j])[:, None])
+        weight = np.sqrt(np.minimum(windows[:, i], windows[:, j]))
+        A = np.vstack([mixture * weight[:, None], _PRIOR * np.eye(3)])
+        b = np.concatenate([measured[:, i, j] * weight, np.full(3, _PRIOR * measured[0, i, j])])
+        out[:, i, j] = out[:, j, i] = np.linalg.lstsq(A, b, rcond=None)[0]
+    return np.array([_nearest_correlation(R) for R in out])
+
+
+def _all_sums(z: Chains, m: int) -> Array:
+    return np.concatenate([_sums(chain, m) for chains in z for chain in chains if len(chain) >= m])
+
+
+def _nearest_correlation(R: Array) -> Array:
+    """Positive definite, with a unit diagonal."""
+    values, vectors = np.linalg.eigh(R)
+    R = (vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
+    s = np.sqrt(np.diagonal(R))
+    return np.asarray(R / np.outer(s, s))
 
 
 def chains(t_ns: NDArray[np.int64], dt_s: Array) -> list[NDArray[np.int64]]:

@@ -1,8 +1,9 @@
 """The variance that is known before anything is learnt, per axis: a sum of physical parts.
 
-``v_j = a_j g_j + b_j + c_j |t|^2 + d_j |phi|^2``: the geometric variance g (pixel noise carried through the geometry),
-a floor, and parts that grow with the motion (S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics" (2005), section
-5.4).
+``v_j = a_j g_j + b_j + c_j |t|^2 + d_j |phi|^2 + e_j r^2 g_j``: the geometric variance g (noise of one pixel carried
+through the geometry), a floor, parts that grow with the motion (S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics"
+(2005), section 5.4), and the geometry at the noise r that the motion's own residuals show (the variance of unit weight
+of least squares: W. Foerstner, B. Wrobel, "Photogrammetric Computer Vision" (2016), equation 4.90).
 Coefficients are not negative, so it never shrinks when a part grows. The GP learns the log of the ratio to it.
 """
 
@@ -17,38 +18,46 @@ from gpvo.online.features import AXES
 from gpvo.types import Array
 
 TWIST_COLUMNS = ("v_x_mps", "v_y_mps", "v_z_mps", "w_x_radps", "w_y_radps", "w_z_radps")
+RESIDUAL_COLUMN = "ln_residual_px"
+N_PARTS = 5
 
 
-def base_columns(method: str | None) -> tuple[str, ...]:
+def base_columns(method: str | None, residual: bool = False) -> tuple[str, ...]:
     """Feature columns that the base variance needs; ``method`` None where there is no geometric covariance."""
-    return TWIST_COLUMNS + (() if method is None else tuple(f"ln_var_{method}_{a}" for a in AXES))
+    geometry = () if method is None else tuple(f"ln_var_{method}_{a}" for a in AXES)
+    return TWIST_COLUMNS + geometry + ((RESIDUAL_COLUMN,) if residual else ())
 
 
 @dataclass(frozen=True)
 class BaseVariance:
-    """``theta`` (6, 4): coefficients of geometry, floor, squared translation and squared rotation of the motion.
+    """``theta`` (6, 5): coefficients of geometry, floor, squared translation and rotation of the motion, and geometry
+    at the residuals' noise.
 
-    ``method``: name of the geometric covariance, None without one (its coefficient is then 0).
+    ``method``: name of the geometric covariance, None without one (its coefficients are then 0). ``residual``: whether
+    it looks at the residuals.
     """
 
     theta: Array
     method: str | None
+    residual: bool = False
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Feature columns that it needs, in order."""
+        return base_columns(self.method, self.residual)
 
     def __call__(self, columns: Array, dt_s: Array) -> Array:
-        """(n, 6) variance from the columns of :func:`base_columns` (n, c) and the durations of the motions (n,)."""
-        return np.einsum("jc,njc->nj", self.theta, self.parts(columns, dt_s))
-
-    def parts(self, columns: Array, dt_s: Array) -> Array:
-        """(n, 6, 4) the parts before they are weighted."""
-        return parts(columns, dt_s)
+        """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,)."""
+        return np.einsum("jc,njc->nj", self.theta, parts(columns, dt_s))
 
 
 def parts(columns: Array, dt_s: Array) -> Array:
-    """(n, 6, 4) geometry, one, squared translation [m^2], squared rotation [rad^2]."""
-    out = np.ones((len(columns), 6, 4))
+    """(n, 6, 5) geometry, one, squared translation [m^2], squared rotation [rad^2], geometry at r."""
+    out = np.ones((len(columns), 6, N_PARTS))
     out[:, :, 0] = np.exp(columns[:, 6:12]) if columns.shape[1] >= 12 else 0.0
     out[:, :, 2] = ((columns[:, :3] * dt_s[:, None]) ** 2).sum(1)[:, None]
     out[:, :, 3] = ((columns[:, 3:6] * dt_s[:, None]) ** 2).sum(1)[:, None]
+    out[:, :, 4] = out[:, :, 0] * np.exp(2.0 * columns[:, 12:13]) if columns.shape[1] > 12 else 0.0
     return out
 
 

@@ -8,16 +8,17 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
-from gpvo.online.base import BaseVariance, base_columns, positions
+from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, positions
 from gpvo.online.basis import SharedBasis
 from gpvo.online.guard import Domain, growth
 from gpvo.types import Array
 
 PARTS = ("jitter", "white", "bias")
 _EYE = np.eye(6)
+_LN_20 = float(np.log(20.0))
 WITHOUT_MEAN = "without_mean."
 """Prefix of the arrays of the same model fitted to the errors as they stand; there where the model uses a mean."""
 
@@ -62,9 +63,11 @@ class ErrorModelArrays:
     """Everything the arithmetic needs; axes in the order of the tangent vector.
 
     ``columns``: all features, in order; ``inputs``: positions of those the GP sees. ``factor`` (6,): calibration of the
-    variance. ``high`` (6,): log ratio to the base that few training rows exceeded. ``correlation`` (6, 6) of the
-    residuals, mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides into
-    jitter, white and bias; ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
+    variance; ``outside_rate`` (1,): its growth per standard deviation away from the training domain. ``high`` (6,): log
+    ratio to the base that few training rows exceeded. ``correlation`` (3, 6, 6) of jitter, white and bias, the first
+    two mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides among them at
+    the log variance ``level`` (6,) and the typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6) how
+    that changes (see :func:`divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
     """
 
     columns: tuple[str, ...]
@@ -73,10 +76,14 @@ class ErrorModelArrays:
     domain: Domain
     base: BaseVariance
     factor: Array
+    outside_rate: Array
     high: Array
     correlation: Array
     geometry_weight: Array
     share: Array
+    growth: Array
+    level: Array
+    ln_speed: Array
     bias_tau_s: Array
     typical_ln_det: Array
     dt_s: float
@@ -93,14 +100,18 @@ class ErrorModelArrays:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
         try:
             own = {name: arrays[name] for name in _OWN}
-            base = BaseVariance(arrays["theta"], method)
+            base = BaseVariance(arrays["theta"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
         shapes = {
             "factor": (6,),
+            "outside_rate": (1,),
             "high": (6,),
-            "correlation": (6, 6),
+            "correlation": (3, 6, 6),
             "share": (3, 6),
+            "growth": (2, 6),
+            "level": (6,),
+            "ln_speed": (1,),
             "bias_tau_s": (6,),
             "geometry_weight": (1,),
         }
@@ -108,7 +119,7 @@ class ErrorModelArrays:
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
         if (
             wrong
-            or base.theta.shape != (6, 4)
+            or base.theta.shape != (6, N_PARTS)
             or len(domain.centre) != len(columns)
             or basis.n_inputs != len(own["inputs"])
         ):
@@ -120,11 +131,9 @@ class ErrorModelArrays:
         place = self.domain.locate(X)
         aleatoric, total, mean, mean_var = self.variances(X, place.inside, place, dt_s)
         variance = (total + mean_var) * self.factor
-        correlation = self.correlations(len(X), geometry)
-        sigma = np.sqrt(variance)
-        whole = sigma[:, :, None] * correlation * sigma[:, None, :]
-        parts = {name: whole * kept for name, kept in zip(PARTS, self._root_share)}
-        covariance = parts["jitter"] + parts["white"] + parts["bias"]
+        each = self.split(variance, self.faster(X), geometry)
+        parts = {name: each[:, i] for i, name in enumerate(PARTS)}
+        covariance = each.sum(axis=1)
         _, ln_det = np.linalg.slogdet(covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
@@ -150,7 +159,7 @@ class ErrorModelArrays:
         known = said.log_noise_var - 0.5 * said.log_noise_spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = said.log_noise_var + outside * np.maximum(self.high - said.log_noise_var, 0.0)
-        grown = growth(place.distance)[:, None]
+        grown = growth(place.distance, self.outside_rate)[:, None]
         mean = drift * place.in_domain[:, None]
         mean_var = (said.epistemic_var * longer**2 + (drift - mean) ** 2) * grown
         return base * np.exp(known), base * np.exp(cautious) * grown, mean, mean_var
@@ -166,27 +175,54 @@ class ErrorModelArrays:
     @cached_property
     def _base_place(self) -> tuple[NDArray[np.int64], Array, Array]:
         """Where the base's columns are, their typical values, and the smallest geometric variances of the training."""
-        at = np.array(positions(self.columns, base_columns(self.base.method)), dtype=np.int64)
+        at = np.array(positions(self.columns, self.base.columns), dtype=np.int64)
         d = self.domain
         return at, d.centre[at], (d.centre + d.scale * d.low)[at][6:]
 
-    @cached_property
-    def _root_share(self) -> Array:
-        """(3, 6, 6) products of the square roots of the shares."""
-        root = np.sqrt(self.share)
-        return root[:, :, None] * root[:, None, :]
+    def faster(self, X: Array) -> Array:
+        """(n, 1) log of the speed over the typical one, between a twentieth and twenty times it."""
+        at = self._base_place[0][:3]
+        return ln_faster(X[:, at], self.ln_speed)
 
-    def correlations(self, n: int, geometry: Array | None) -> Array:
-        """(n, 6, 6) positive definite correlation matrices."""
-        out = np.repeat(self.correlation[None], n, axis=0)
+    def split(self, variance: Array, faster: Array, geometry: Array | None) -> Array:
+        """(n, 3, 6, 6) covariances of jitter, white and bias, from variances (n, 6) and :meth:`faster`.
+
+        Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own pattern.
+        """
+        out = np.repeat(self.correlation[None], len(variance), axis=0)
         w = float(self.geometry_weight[0])
         if geometry is not None and w > 0:
             sigma = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
             R = geometry / (sigma[:, :, None] * sigma[:, None, :])
             known = np.isfinite(R).all(axis=(1, 2))
-            out[known] = w * R[known] + (1.0 - w) * self.correlation
+            out[known, :2] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
-        return out * (1.0 - 1e-6) + 1e-6 * _EYE
+        share = divide(self.share, self.growth, np.log(variance) - self.level, faster)
+        sigma = np.sqrt(share * variance[:, None, :])
+        return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :]
+
+
+def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
+    """(n, 3, D) shares of jitter, white and bias, summing to one.
+
+    ``share`` (3, D) holds at the typical speed and variance. White and bias gain on the jitter by the power
+    ``growth[0]`` of the speed, whose log over the typical one is ``faster`` (n, 1), and the bias by the power
+    ``growth[1]`` of the variance, whose log over the typical one is ``above`` (n, D); ``growth`` (2, D).
+    """
+    out = np.empty((len(above), *share.shape))
+    by_speed = growth[0] * faster
+    out[:, 0] = share[0]
+    out[:, 1] = share[1] * np.exp(by_speed)
+    # The exponent is bounded where the bias is all there is, or nothing.
+    out[:, 2] = share[2] * np.exp(by_speed + np.clip(growth[1] * above, -60.0, 60.0))
+    return out / out.sum(axis=1, keepdims=True)
+
+
+def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
+    """(n, 1) log of the speed of (n, 3) over the typical one, no more than a factor of twenty; 0 where unknown."""
+    speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
+    ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical
+    return np.where(np.isfinite(ratio), np.clip(ratio, -_LN_20, _LN_20), 0.0)
 
 
 def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -201,4 +237,17 @@ def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray
     return {**{name: a for name, a in arrays.items() if not name.startswith(dropped)}, **plain}
 
 
-_OWN = ("inputs", "factor", "high", "correlation", "geometry_weight", "share", "bias_tau_s", "typical_ln_det")
+_OWN = (
+    "inputs",
+    "factor",
+    "outside_rate",
+    "high",
+    "correlation",
+    "geometry_weight",
+    "share",
+    "growth",
+    "level",
+    "ln_speed",
+    "bias_tau_s",
+    "typical_ln_det",
+)

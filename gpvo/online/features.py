@@ -201,6 +201,8 @@ BUILT_IN = (
         ),
         _Trend,
     ),
+    # In pixels, as the geometric covariance at one pixel is scaled by it.
+    FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (_ln(r.reproj_rms_px),))),
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.
     FeatureGroup(
         "imu",
@@ -237,11 +239,11 @@ def groups() -> dict[str, FeatureGroup]:
 def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
     """Column names of a selection: ``thesis``, ``full``, or names of groups and columns, as a list or comma-separated.
 
-    ``full`` is every group but ``imu_axes``. Raises GpvoError for an unknown name.
+    ``full`` is every group but ``imu_axes`` and ``residual``. Raises GpvoError for an unknown name.
     """
     if selection == "thesis":
         return THESIS
-    wanted = [w for w in groups() if w != "imu_axes"] if selection == "full" else selection
+    wanted = [w for w in groups() if w not in ("imu_axes", "residual")] if selection == "full" else selection
     if isinstance(wanted, str):
         wanted = [w.strip() for w in wanted.split(",") if w.strip()]
     columns = known_columns()

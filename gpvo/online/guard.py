@@ -94,6 +94,6 @@ class Domain:
             raise ModelError(f"the model file lacks the array {missing}") from None
 
 
-def growth(distance: Array) -> Array:
+def growth(distance: Array, rate: Array) -> Array:
     """Factor on the variance: linear in the distance from the domain, as a Brownian motion's away from data."""
-    return 1.0 + distance
+    return 1.0 + rate * distance

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.learning.basefit import fit_base
-from gpvo.learning.calibrate import conformal_quantiles, fit_scale, residual_correlation, robust_second_moment
+from gpvo.learning.calibrate import (
+    conformal_quantiles,
+    fit_outside_rate,
+    fit_scale,
+    residual_correlation,
+    robust_second_moment,
+)
 from gpvo.online.base import parts
 
 
@@ -34,6 +40,15 @@ def test_a_new_sequence_is_covered():
     assert 0.85 < np.mean(stated) < 1.15
 
 
+def test_growth_outside_is_as_seen_and_one_where_nothing_was_seen():
+    rng = np.random.default_rng(6)
+    distance, group = rng.uniform(0.0, 20.0, 400), np.repeat(np.arange(20), 20)
+    for rate in (0.25, 4.0):
+        square = (1.0 + rate * distance) * rng.chisquare(6, 400) / 6
+        assert fit_outside_rate(distance, square, group) == rate
+    assert fit_outside_rate(np.zeros(400), np.ones(400), group) == 1.0
+
+
 def test_conformal_intervals_cover_new_groups():
     rng = np.random.default_rng(3)
     inside = []
@@ -56,12 +71,13 @@ def test_correlation_of_heavy_tailed_residuals():
 def test_base_variance_finds_its_parts():
     rng = np.random.default_rng(5)
     n = 6000
-    columns = np.concatenate([rng.normal(size=(n, 6)) * [1, 1, 5, 0.1, 0.3, 0.1], rng.normal(size=(n, 6))], axis=1)
+    twist = rng.normal(size=(n, 6)) * [1, 1, 5, 0.1, 0.3, 0.1]
+    columns = np.concatenate([twist, rng.normal(size=(n, 6)), 0.5 * rng.normal(size=(n, 1))], axis=1)
     dt = np.full(n, 0.1)
     terms = parts(columns, dt)
-    theta = np.array([0.5, 0.0, 2.0, 0.0])
+    theta = np.array([0.1, 0.0, 2.0, 0.0, 0.5])
     error = np.sqrt(terms @ theta) * rng.standard_normal((n, 6))
-    base = fit_base(columns, dt, error, "any")
+    base = fit_base(columns, dt, error, "any", residual=True)
     ratio = np.log(base(columns, dt) / (terms @ theta))
     # The heavy-tailed likelihood finds the shape; its scale is set later, by calibration.
     assert np.abs(ratio - ratio.mean(axis=0)).mean() < 0.1

@@ -38,10 +38,10 @@ def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> Project
     )
 
 
-def some_model(*, method: str | None = "triangulation", noise: str = "own") -> ErrorModelArrays:
+def some_model(*, method: str | None = "triangulation", noise: str = "own", residual: bool = False) -> ErrorModelArrays:
     """A model of random but sensible numbers."""
     rng = np.random.default_rng(0)
-    columns = (*base_columns(method), "inliers", "sharpness")
+    columns = (*base_columns(method, residual), "inliers", "sharpness")
     X = rng.standard_normal((400, len(columns)))
     X[:, 6 : len(columns) - 2] -= 9.0
     X[::7, -1] = np.nan
@@ -53,20 +53,24 @@ def some_model(*, method: str | None = "triangulation", noise: str = "own") -> E
         second = replace(
             mean, weights=weights, reduction=900 * mean.reduction, signal_var=900 * mean.signal_var, offset=offset
         )
-    A = rng.standard_normal((6, 30))
-    correlation = np.corrcoef(A)
+    correlation = np.array([np.corrcoef(rng.standard_normal((6, 30))) for _ in range(3)])
+    theta = rng.uniform(1e-4, 1.0, (6, 5)) * [1.0 if method else 0.0, 1e-4, 1e-3, 1e-3, 1.0 if residual else 0.0]
     share = rng.uniform(0.1, 1.0, (3, 6))
     return ErrorModelArrays(
         columns=columns,
         inputs=inputs,
         basis=SharedBasis(mean, None if noise == "constant" else second, rng.standard_normal(6)),
         domain=Domain.learn(X),
-        base=BaseVariance(rng.uniform(1e-4, 1.0, (6, 4)) * [1.0 if method else 0.0, 1e-4, 1e-3, 1e-3], method),
+        base=BaseVariance(theta, method, residual),
         factor=rng.uniform(0.5, 2.0, 6),
+        outside_rate=np.array([0.6]),
         high=rng.uniform(0.0, 2.0, 6),
         correlation=correlation,
         geometry_weight=np.array([0.4 if method else 0.0]),
         share=share / share.sum(0),
+        growth=rng.uniform(0.0, 1.0, (2, 6)),
+        ln_speed=np.array([0.2]),
+        level=rng.uniform(-4.0, 0.0, 6),
         bias_tau_s=np.ones(6),
         typical_ln_det=np.array([-60.0]),
         dt_s=0.1,
@@ -78,6 +82,7 @@ CASES = {
     "shared kernel": some_model(noise="shared"),
     "constant noise": some_model(noise="constant"),
     "no geometry": some_model(method=None),
+    "noise of the residuals": some_model(residual=True),
 }
 
 

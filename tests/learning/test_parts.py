@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from gpvo.learning.parts import chains, fit_parts, span_variances
+from gpvo.learning.parts import chains, curves, fit_parts, part_correlations, span_variances
 
 
 def _times(parents: list[int], step_ns: int = 50_000_000) -> tuple[np.ndarray, np.ndarray]:
@@ -24,6 +24,14 @@ def test_a_chain_breaks_where_a_motion_is_missing():
     assert chains(t_ns[:0], dt_s[:0]) == []
 
 
+def _like(z: list, value: float, axes: int | None = None) -> list:
+    return [[np.full((len(c), axes or c.shape[1]), value) for c in cs] for cs in z]
+
+
+def _same_speed(z: list) -> list:
+    return _like(z, 0.0, 1)
+
+
 def test_a_held_reference_does_not_hide_long_spans():
     """A bias that lasts the whole flight is seen although the reference is held every few frames."""
     rng = np.random.default_rng(0)
@@ -34,9 +42,63 @@ def test_a_held_reference_does_not_hide_long_spans():
         noise = 0.8 * rng.standard_normal((1500, 3)) + 0.6 * rng.standard_normal(3)
         z.append([noise[c] for c in rows])
     assert span_variances(z).spans.max() >= 1000
-    parts = fit_parts(z, 0.05)
+    parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
     assert parts.tau_s.min() > 20.0
-    np.testing.assert_allclose(parts.fitted[parts.spans == 1000], 0.64 * 1e3 + 0.36 * 1e6, rtol=0.75)
+    fitted = curves(np.array([1000]), parts.tau_s[0] / 0.05) @ parts.share
+    np.testing.assert_allclose(fitted, 0.64 * 1e3 + 0.36 * 1e6, rtol=0.75)
+
+
+def _noisy_stretches(rng: np.random.Generator, growth: float) -> tuple[list, list]:
+    """Flights whose noise is nine times as large in a fifth of the time; white, and a bias of a growing share."""
+    error, sigma = [], []
+    for _ in range(12):
+        ln_var = np.where(np.arange(2000) // 100 % 5 == 0, 4.4, 0.0)[:, None] * np.ones(3)
+        white, bias = np.exp(0.5 * ln_var), 0.05 * np.exp(0.5 * (1 + growth) * ln_var)
+        slow = np.zeros((2000, 3))
+        for k in range(1, 2000):
+            slow[k] = np.exp(-1 / 40) * slow[k - 1] + np.sqrt(1 - np.exp(-1 / 20)) * rng.standard_normal(3)
+        error.append([white * rng.standard_normal((2000, 3)) + bias * slow])
+        sigma.append([np.sqrt(white**2 + bias**2)])
+    return error, sigma
+
+
+def test_a_bias_that_grows_faster_than_the_noise_is_told_from_one_that_does_not():
+    for growth in (0.0, 1.0):
+        error, sigma = _noisy_stretches(np.random.default_rng(2), growth)
+        parts = fit_parts(error, sigma, _same_speed(error), 0.05)
+        assert parts.growth.tolist() == [[1.0] * 3, [growth] * 3]
+        assert (np.abs(np.log(parts.ratio[parts.spans <= 100])) < 0.35).all()
+
+
+def test_what_adds_up_by_the_metre_is_told_from_what_adds_up_by_the_second():
+    """Jitter at any speed; white of a variance that goes with the speed, or not."""
+    rng = np.random.default_rng(4)
+    for growth in (0.0, 1.0):
+        error, sigma, faster = [], [], []
+        for _ in range(12):
+            ln_u = np.repeat(rng.uniform(-1.2, 1.2, (20, 1)), 100, axis=0)
+            n = rng.standard_normal((2001, 3))
+            white = 0.3 * np.exp(growth * ln_u)
+            error.append([np.diff(n, axis=0) * np.sqrt(0.5) + np.sqrt(white) * rng.standard_normal((2000, 3))])
+            sigma.append([np.sqrt(1.0 + white) * np.ones(3)])
+            faster.append([ln_u])
+        parts = fit_parts(error, sigma, faster, 0.05)
+        assert parts.growth[0].tolist() == [growth] * 3
+        np.testing.assert_allclose(parts.share[1], 0.3 / 1.3, atol=0.06)
+
+
+def test_each_part_has_its_own_correlation():
+    """A bias that ties two axes together which single motions show as independent."""
+    rng = np.random.default_rng(3)
+    z = []
+    for _ in range(10):
+        bias = np.repeat(rng.standard_normal((20, 1)), 100, axis=0) * np.array([0.2, 0.2, 0, 0, 0, 0])
+        z.append([bias + rng.standard_normal((2000, 6))])
+    parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
+    R = part_correlations(z, parts, 0.05)
+    assert R[2, 0, 1] > 0.6
+    assert np.abs(R[:2, 0, 1]).max() < 0.15
+    assert np.linalg.eigvalsh(R).min() > 0.0
 
 
 def test_what_is_stated_of_a_new_flight_is_right_on_average():

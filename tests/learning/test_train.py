@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError, ModelError
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.fit import helps_over_distance, surely_positive
+from gpvo.learning.meantest import helps_over_distance, helps_the_pose, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
@@ -16,6 +16,8 @@ from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, rows_path, save_model
 from gpvo.learning.train import train_sets
 from gpvo.learning.update import update
+from gpvo.online.base import TWIST_COLUMNS
+from gpvo.online.estimate import divide
 from gpvo.online.predictor import Predictor
 from gpvo.stats.consistency import nees
 from small_model import small_model, training_sets
@@ -42,7 +44,10 @@ def test_consistent_over_many_frames():
     """Sums over 1, 10 and 100 frames against what jitter, white and bias say of them."""
     predictor = small_model().predictor()
     flights = [(s, _said(predictor, s)) for s in training_sets(range(100, 112), n=300)]
-    share, tau = predictor.model.share, predictor.model.bias_tau_s / predictor.model.dt_s
+    tau = predictor.model.bias_tau_s / predictor.model.dt_s
+    variance = np.mean([(e.sigma**2).mean(axis=0) for _, e in flights], axis=0)
+    model = predictor.model
+    share = divide(model.share, model.growth, np.log(variance)[None] - model.level, np.zeros((1, 1)))[0]
     for m in (1, 10, 100):
         ratio = []
         for s, e in flights:
@@ -52,6 +57,10 @@ def test_consistent_over_many_frames():
         i = np.arange(1, m)[:, None]
         stated = share[0] + share[1] * m + share[2] * (m + 2 * ((m - i) * rho**i).sum(axis=0))
         assert 0.7 <= np.mean(np.mean(ratio, axis=0) / stated) <= 1.5, m
+
+
+def _no_change(chain: np.ndarray) -> np.ndarray:
+    return np.zeros((len(chain), 1))
 
 
 def test_parts_of_a_known_mixture():
@@ -65,7 +74,7 @@ def test_parts_of_a_known_mixture():
         out.append(
             np.sqrt(0.3) * (n[1:] - n[:-1]) + np.sqrt(0.3) * rng.standard_normal((1000, 3)) + np.sqrt(0.1) * bias
         )
-    parts = fit_parts([[chain] for chain in out], 0.1)
+    parts = fit_parts(*([[f(chain)] for chain in out] for f in (np.array, np.ones_like, _no_change)), 0.1)
     np.testing.assert_allclose(parts.share.mean(axis=1), [0.6, 0.3, 0.1], atol=0.06)
     assert 1.0 < parts.tau_s.mean() < 8.0
 
@@ -81,6 +90,21 @@ def test_a_mean_that_adds_up_is_no_help():
     assert ((white - drawn) ** 2).mean() < (white**2).mean()
     assert helps_over_distance(rows, good, sigma).all()
     assert helps_over_distance(rows, drawn, sigma).tolist() == [False] * 3 + [True] * 3
+
+
+def test_a_mean_that_parts_what_belongs_together_is_no_help():
+    """A turn and the sideways error that undoes it on the way: off with both, or with neither."""
+    rows = Rows.stack(training_sets(range(4), n=300))
+    v_mps = np.linalg.norm(rows.select(TWIST_COLUMNS[:3]), axis=1)
+    along = rows.select(TWIST_COLUMNS[:3]) / v_mps[:, None]
+    turn = 1e-3 * np.random.default_rng(0).standard_normal((len(v_mps), 3))
+    # Over the next second the turn moves the position as far as the error has moved it back.
+    error = np.hstack([-0.5 * v_mps[:, None] * np.cross(turn, along), turn])
+    rows = replace(rows, error=error)
+    assert helps_the_pose(rows, 0.5 * error)
+    assert not helps_the_pose(rows, -error)
+    sideways = np.where(np.arange(6) < 3, 0.9, 0.0)
+    assert not helps_the_pose(rows, sideways * error)
 
 
 def test_same_data_and_seed_give_the_same_bytes(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpvo.online.base import base_columns, positions
+from gpvo.online.base import positions
 from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.rowplan import StackedBasis, stack
 
@@ -63,7 +63,7 @@ def _preamble(model: ErrorModelArrays, units: tuple[str, ...], note: str) -> lis
 
 def _constants(model: ErrorModelArrays) -> list[str]:
     stacked, domain, d = stack(model.basis), model.domain, len(model.columns)
-    columns = positions(model.columns, base_columns(model.base.method))
+    columns = positions(model.columns, model.base.columns)
     sizes = {
         "N_FEATURES": d,
         "N_INPUTS": len(model.inputs),
@@ -77,6 +77,8 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         "DT_S": _number(model.dt_s),
         "GEOMETRY_WEIGHT": _number(model.geometry_weight[0]),
         "TYPICAL_LN_DET": _number(model.typical_ln_det[0]),
+        "OUTSIDE_RATE": _number(model.outside_rate[0]),
+        "LN_SPEED": _number(model.ln_speed[0]),
     }
     return [
         *(f"#define GPVO_{key} {value}" for key, value in sizes.items()),
@@ -94,6 +96,8 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("high", model.high),
         *_array("correlation", model.correlation),
         *_array("share", model.share),
+        *_array("growth", model.growth),
+        *_array("level", model.level),
         *_basis_arrays(stacked),
         "",
     ]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
-from gpvo.online.base import base_columns, positions
+from gpvo.online.base import positions
 from gpvo.online.estimate import PARTS, ErrorModelArrays
 from gpvo.online.rowplan import stack
 
@@ -110,7 +110,7 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     mean, mean_var = g("Mul", rate, longer), g("Mul", rate_var, g("Mul", longer, longer))
     base = _base(g, model)
     near = g.expand(in_domain, 1)
-    growth = g.expand(g("Add", distance, 1.0), 1)
+    growth = g.expand(g("Add", g("Mul", distance, float(model.outside_rate[0])), 1.0), 1)
     known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
     short = g("Max", g("Sub", g.constant(model.high), log_noise), 0.0)
     cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
@@ -121,9 +121,9 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     factor = g.constant(model.factor)
     variance = g("Mul", total, factor)
     g("Sub", variance, g("Mul", known, factor), out="epistemic")
-    whole = g("Mul", g.outer(g("Sqrt", variance)), _correlations(g, model))
-    root = np.sqrt(model.share)
-    parts = [g("Mul", whole, g.constant(np.outer(root[i], root[i])), out=name) for i, name in enumerate(PARTS)]
+    sigmas = [g("Sqrt", g("Mul", variance, share)) for share in _shares(g, model, variance)]
+    each = zip(PARTS, sigmas, _correlations(g, model), strict=True)
+    parts = [g("Mul", g.outer(sigma), R, out=name) for name, sigma, R in each]
     covariance = g.add(*parts, out="covariance")
     precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), _log_det(g, covariance)), 12.0))
     g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
@@ -171,7 +171,7 @@ def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, s
 
 def _base(g: _Graph, model: ErrorModelArrays) -> str:
     domain, theta = model.domain, model.base.theta
-    at = positions(model.columns, base_columns(model.base.method))
+    at = positions(model.columns, model.base.columns)
     columns = g.take("features", at, axis=1)
     columns = g("Where", g.finite(columns), columns, g.constant(domain.centre[at]))
     dt = g.expand("dt_s", 1)
@@ -179,21 +179,50 @@ def _base(g: _Graph, model: ErrorModelArrays) -> str:
     squared = [g.expand(g.sum(g("Mul", part, part), 1), 1) for part in moved]
     terms = [g("Mul", squared[i], g.constant(theta[:, 2 + i])) for i in range(2)]
     if len(at) >= 12:
-        least = (domain.centre + domain.scale * domain.low)[at][6:]
-        geometry = g("Exp", g("Max", g.take(columns, np.arange(6, 12), axis=1), g.constant(least[:6])))
+        least = g.constant((domain.centre + domain.scale * domain.low)[at][6:])
+        known = g("Exp", g("Max", g.take(columns, np.arange(6, len(at)), axis=1), least))
+        geometry = g.take(known, np.arange(6), axis=1)
         terms.append(g("Mul", geometry, g.constant(theta[:, 0])))
+        if len(at) > 12:
+            noise = g.take(known, [6], axis=1)
+            at_residual = g("Mul", geometry, g("Mul", noise, noise))
+            terms.append(g("Mul", at_residual, g.constant(theta[:, 4])))
     return g.add(*terms, g.constant(theta[:, 1]))
 
 
-def _correlations(g: _Graph, model: ErrorModelArrays) -> str:
-    weight, typical = float(model.geometry_weight[0]), g.constant(model.correlation)
+def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
+    """Of each part (N, 6, 6)."""
+    weight = float(model.geometry_weight[0])
     flat = g("Reshape", "geometry", g.constant([-1, 36], np.int64))
     own = g("Div", "geometry", g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
     finite = g.finite(own)
     known = g("Equal", g("ReduceMin", g("Cast", finite, to=_INT64), axes=[1, 2]), g.constant(1, np.int64))
-    mixed = g("Add", g("Mul", g("Where", finite, own, 0.0), weight), g("Mul", typical, 1.0 - weight))
-    chosen = g("Where", known, mixed, typical) if weight > 0 else g("Where", known, typical, typical)
-    return g("Add", g("Mul", chosen, 1.0 - 1e-6), g.constant(1e-6 * np.eye(6)))
+    own = g("Mul", g("Where", finite, own, 0.0), weight)
+    out = []
+    for i, R in enumerate(model.correlation):
+        typical = g.constant(R)
+        mixed = g("Add", own, g.constant(R * (1.0 - weight))) if weight > 0 and i < 2 else typical
+        chosen = g("Mul", g("Where", known, mixed, typical), 1.0 - 1e-6)
+        out.append(g("Add", chosen, g.constant(1e-6 * np.eye(6))))
+    return out
+
+
+def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:
+    """Of jitter, white and bias (N, 6); line by line ``gpvo.online.estimate.divide`` and ``ln_faster``."""
+    v = g.take("features", positions(model.columns, model.base.columns)[:3], axis=1)
+    known = g.finite(g.expand(g.sum(v, 1), 1))
+    v = g("Where", g.finite(v), v, 0.0)
+    speed = g("Sqrt", g.expand(g.sum(g("Mul", v, v), 1), 1))
+    ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), g.constant(model.ln_speed))
+    faster = g("Where", known, g("Max", g("Min", ratio, np.log(20.0)), -np.log(20.0)), 0.0)
+    by_speed = g("Mul", faster, g.constant(model.growth[0]))
+    above = g("Mul", g("Sub", g("Log", variance), g.constant(model.level)), g.constant(model.growth[1]))
+    by_noise = g("Max", g("Min", above, 60.0), -60.0)
+    jitter = g.constant(model.share[0])
+    white = g("Mul", g("Exp", by_speed), g.constant(model.share[1]))
+    bias = g("Mul", g("Exp", g("Add", by_speed, by_noise)), g.constant(model.share[2]))
+    whole = g.add(jitter, white, bias)
+    return [g("Div", part, whole) for part in (jitter, white, bias)]
 
 
 def _log_det(g: _Graph, covariance: str) -> str:

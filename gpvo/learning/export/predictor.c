@@ -92,26 +92,49 @@ static void gpvo_base(const double *features, double dt_s, double base[6]) {
         rotation += column[3 + i] * dt_s * column[3 + i] * dt_s;
     }
     for (j = 0; j < 6; ++j) {
-        const double *theta = gpvo_theta + 4 * j;
+        const double *theta = gpvo_theta + 5 * j;
         double geometry = GPVO_N_BASE >= 12 ? exp(column[(6 + j) % GPVO_N_BASE]) : 0.0;
-        base[j] = theta[0] * geometry + theta[1] + theta[2] * translation + theta[3] * rotation;
+        double noise = GPVO_N_BASE > 12 ? exp(2.0 * column[12 % GPVO_N_BASE]) : 0.0;
+        base[j] = (theta[0] + theta[4] * noise) * geometry + theta[1] + theta[2] * translation + theta[3] * rotation;
     }
 }
 
-/* Correlations of the residuals, mixed with those of the geometric covariance where there is one. */
-static void gpvo_correlations(const double *geometry, double R[36]) {
-    int i, j, known = geometry != 0 && GPVO_GEOMETRY_WEIGHT > 0.0;
+/* Correlations of jitter, white and bias; the first two mixed with those of the geometric covariance where there is one. */
+static void gpvo_correlations(const double *geometry, double R[3][36]) {
+    int i, j, p, known = geometry != 0 && GPVO_GEOMETRY_WEIGHT > 0.0;
     double own[36];
     for (i = 0; i < 6 && known; ++i)
         for (j = 0; j < 6; ++j) {
             own[i * 6 + j] = geometry[i * 6 + j] / (sqrt(geometry[i * 7]) * sqrt(geometry[j * 7]));
             if (!isfinite(own[i * 6 + j])) known = 0;
         }
-    for (i = 0; i < 36; ++i) {
-        R[i] = gpvo_correlation[i];
-        if (known) R[i] = GPVO_GEOMETRY_WEIGHT * own[i] + (1.0 - GPVO_GEOMETRY_WEIGHT) * R[i];
-        R[i] = R[i] * (1.0 - 1e-6) + (i % 7 == 0 ? 1e-6 : 0.0);
-    }
+    for (p = 0; p < 3; ++p)
+        for (i = 0; i < 36; ++i) {
+            R[p][i] = gpvo_correlation[36 * p + i];
+            if (known && p < 2) R[p][i] = GPVO_GEOMETRY_WEIGHT * own[i] + (1.0 - GPVO_GEOMETRY_WEIGHT) * R[p][i];
+            R[p][i] = R[p][i] * (1.0 - 1e-6) + (i % 7 == 0 ? 1e-6 : 0.0);
+        }
+}
+
+/* Log of the speed over the typical one; 0 where unknown. */
+static double gpvo_faster(const double *features) {
+    double v2 = 0.0, ratio;
+    int i;
+    for (i = 0; i < 3; ++i) v2 += features[gpvo_base_column[i]] * features[gpvo_base_column[i]];
+    ratio = log(sqrt(v2) > 1e-9 ? sqrt(v2) : 1e-9) - GPVO_LN_SPEED;
+    return isfinite(v2) ? gpvo_clip(ratio, -log(20.0), log(20.0)) : 0.0;
+}
+
+/* Standard deviations of jitter, white and bias on axis j: what adds up gains on the jitter as the speed grows, the bias
+ * on the noise as the variance grows. */
+static void gpvo_divide(int j, double variance, double faster, double part[3][6]) {
+    double gain = gpvo_growth[j] * faster, above = gpvo_growth[6 + j] * (log(variance) - gpvo_level[j]);
+    double white = gpvo_share[6 + j] * exp(gain);
+    double bias = gpvo_share[12 + j] * exp(gain + gpvo_clip(above, -60.0, 60.0));
+    double whole = gpvo_share[j] + white + bias;
+    part[0][j] = sqrt(variance * gpvo_share[j] / whole);
+    part[1][j] = sqrt(variance * white / whole);
+    part[2][j] = sqrt(variance * bias / whole);
 }
 
 /* Log-determinant of a symmetric positive definite 6x6 matrix, by Cholesky. */
@@ -132,8 +155,8 @@ static double gpvo_log_det(const double C[36]) {
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], R[36], sigma[6], distance, outside, growth;
-    double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, longer = duration / GPVO_DT_S;
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], R[3][36], part[3][6], distance, outside, growth;
+    double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, longer = duration / GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     distance = gpvo_locate(features, inside);
     for (i = 0; i < GPVO_N_INPUTS; ++i) inputs[i] = inside[gpvo_input[i]];
@@ -143,7 +166,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     out->distance = distance;
     out->in_domain = exp(-0.5 * distance * distance);
     outside = 1.0 - out->in_domain;
-    growth = 1.0 + distance;
+    growth = 1.0 + GPVO_OUTSIDE_RATE * distance;
     for (j = 0; j < 6; ++j) {
         double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
@@ -152,14 +175,14 @@ static void gpvo_predict(const double *features, const double *geometry, double 
         lost = drift - out->mean[j];
         variance = (base[j] * exp(cautious) * growth + (drift_var + lost * lost) * growth) * gpvo_factor[j];
         out->epistemic[j] = variance - known * gpvo_factor[j];
-        sigma[j] = sqrt(variance);
+        gpvo_divide(j, variance, faster, part);
     }
     for (i = 0; i < 6; ++i)
         for (j = 0; j < 6; ++j) {
-            double whole = sigma[i] * R[i * 6 + j] * sigma[j];
-            out->jitter[i * 6 + j] = whole * sqrt(gpvo_share[i]) * sqrt(gpvo_share[j]);
-            out->white[i * 6 + j] = whole * sqrt(gpvo_share[6 + i]) * sqrt(gpvo_share[6 + j]);
-            out->bias[i * 6 + j] = whole * sqrt(gpvo_share[12 + i]) * sqrt(gpvo_share[12 + j]);
+            int at = i * 6 + j;
+            out->jitter[at] = R[0][at] * part[0][i] * part[0][j];
+            out->white[at] = R[1][at] * part[1][i] * part[1][j];
+            out->bias[at] = R[2][at] * part[2][i] * part[2][j];
             out->covariance[i * 6 + j] = out->jitter[i * 6 + j] + out->white[i * 6 + j] + out->bias[i * 6 + j];
         }
     out->confidence = exp((GPVO_TYPICAL_LN_DET - gpvo_log_det(out->covariance)) / 12.0);
