@@ -74,23 +74,35 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
 
 
 def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
-    """The base variance, with geometry or without, that predicts left-out groups best; and the same out of fold."""
-    best: tuple[float, tuple[str | None, bool], Array] | None = None
-    for method, residual in base_candidates(rows.sets):
-        C = _base_inputs(rows, base_columns(method, residual))
-        oof = np.empty_like(rows.error)
-        for g in np.unique(rows.group):
-            out = rows.group == g
-            oof[out] = fit_base(
-                C[~out], rows.dt_s[~out], rows.error[~out], method, rows.weight[~out], residual=residual
-            )(C[out], rows.dt_s[out])
-        loss = _loss(rows, rows.error**2, oof)
-        if best is None or loss < best[0]:
-            best = (loss, (method, residual), oof)
-    assert best is not None
-    _, (method, residual), oof = best
+    """The base variance, with geometry or without, that predicts left-out groups best; and the same out of fold.
+
+    One that trusts the residuals must beat the best that does not by more than the standard error of its gain over the
+    groups (L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3): where a moving object is
+    all there is to see, residuals are small and the motion wrong.
+    """
+    tried = {choice: _base_out_of_fold(rows, *choice) for choice in base_candidates(rows.sets)}
+    losses = {choice: _losses(rows, rows.error**2, oof) for choice, oof in tried.items()}
+    simple, trusting = ([c for c in tried if c[1] == residual] for residual in (False, True))
+    best = min(simple, key=lambda c: losses[c].mean())
+    if trusting:
+        rival = min(trusting, key=lambda c: losses[c].mean())
+        gain = losses[best] - losses[rival]
+        if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
+            best = rival
+    method, residual = best
     C = _base_inputs(rows, base_columns(method, residual))
-    return fit_base(C, rows.dt_s, rows.error, method, rows.weight, residual=residual), oof
+    return fit_base(C, rows.dt_s, rows.error, method, rows.weight, residual=residual), tried[best]
+
+
+def _base_out_of_fold(rows: Rows, method: str | None, residual: bool) -> Array:
+    """(n, 6) of each group from the others."""
+    C = _base_inputs(rows, base_columns(method, residual))
+    oof = np.empty_like(rows.error)
+    for g in np.unique(rows.group):
+        out = rows.group == g
+        base = fit_base(C[~out], rows.dt_s[~out], rows.error[~out], method, rows.weight[~out], residual=residual)
+        oof[out] = base(C[out], rows.dt_s[out])
+    return oof
 
 
 def choose_inputs(
@@ -113,9 +125,14 @@ def choose_inputs(
     return *best, scores
 
 
+def _losses(rows: Rows, square: Array, variance: Array) -> Array:
+    """(G,) heavy-tailed negative log-likelihood per axis of each group."""
+    return rows.by_group(t_negative_log_likelihood(square, variance)).mean(axis=1)
+
+
 def _loss(rows: Rows, square: Array, variance: Array) -> float:
-    """Heavy-tailed negative log-likelihood per axis, each group at its mean, groups alike."""
-    return float(rows.by_group(t_negative_log_likelihood(square, variance)).mean())
+    """The same, groups alike."""
+    return float(_losses(rows, square, variance).mean())
 
 
 def _name_of(base: BaseVariance) -> str:
