@@ -35,7 +35,4 @@ def test_the_learned_covariance_is_true_on_flights_not_seen(name, tmp_path):
     assert 0.8**2 < frame < 1.25**2
     assert 0.7**2 < one < 1.5**2
     assert scores["learned"].nll.mean() < scores["constant"].nll.mean()
-    if name == "lunar-straight" and ten <= 0.7**2:
-        # Height and pitch are more alike over a distance than in one motion; the model has one correlation for both.
-        pytest.xfail(f"too cautious over 10 m: NEES per degree of freedom {ten:.2f}")
     assert 0.7**2 < ten < 1.5**2
