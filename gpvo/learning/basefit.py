@@ -35,9 +35,13 @@ def fit_base(
     ``weight`` (n,): how much a row counts.
     """
     count = np.ones(len(error)) if weight is None else weight
-    terms = parts(columns, dt_s)
-    theta = np.stack([_fit_axis(terms[:, j], error[:, j] ** 2, count) for j in range(6)])
-    return BaseVariance(theta, method, residual)
+    theta = _fit_axes(parts(columns, dt_s), error, count)
+    plain = _fit_axes(parts(columns[:, :6], dt_s), error, count)
+    return BaseVariance(theta, plain, method, residual)
+
+
+def _fit_axes(terms: Array, error: Array, count: Array) -> Array:
+    return np.stack([_fit_axis(terms[:, j], error[:, j] ** 2, count) for j in range(6)])
 
 
 def _fit_axis(terms: Array, square: Array, count: Array) -> Array:

@@ -20,7 +20,7 @@ _NU_RANGE = (2.5, 200.0)
 # Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
 _OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
-_RATES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+_RATES = (1.0, 2.0, 4.0, 8.0)
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -93,8 +93,9 @@ def _with_prior(variance: float, groups: int) -> float:
 def fit_outside_rate(distance: Array, square: Array, group: NDArray) -> float:
     """By how much the variance grows per standard deviation of ``distance`` (n,) from what the other groups knew.
 
-    ``square`` (n,): mean over the axes of the squared normalised residuals. One is expected, within a factor of e; the
-    rows of a group outside count as five at most, as they go together.
+    ``square`` (n,): mean over the axes of the squared normalised residuals. One is expected, and never less is taken:
+    other surroundings differ in more than flights of one kind can show. The rows of a group outside count as five at
+    most, as they go together.
     """
     outside = distance > _OUTSIDE
     d, q, g = distance[outside], square[outside], group[outside]

@@ -79,6 +79,12 @@ def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tu
     return out
 
 
+def guarded(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[str, ...]:
+    """Columns by which a model tells whether it knows a place, also where no GP needs them: other surroundings show in
+    them first. None beside those that were asked for by name."""
+    return supported_columns(sets, resolve(FAMILIES["compact"])) if config.features == "auto" else ()
+
+
 def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:
     """Bases to choose among, of the columns that every log knows in 95 of 100 rows: geometric covariances, at one pixel
     and at the noise of the residuals, and the motion alone."""

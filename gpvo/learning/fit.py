@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_base, t_negative_log_likelihood
-from gpvo.learning.config import TrainConfig, base_candidates, candidates
+from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
 from gpvo.learning.meantest import helps_over_distance, helps_the_pose, surely_positive
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
 from gpvo.learning.rows import Rows
@@ -48,7 +48,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     rows = Rows.stack(sets)
     base, base_oof = choose_base(rows)
     name, inputs, fitted, trust, scores = choose_inputs(rows, base, base_oof, config)
-    columns = tuple(dict.fromkeys((*inputs, *base.columns)))
+    columns = tuple(dict.fromkeys((*inputs, *base.columns, *guarded(rows.sets, config))))
     plain = fitted
     fitted, mean_gain = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
     fitted = None if fitted is None else shrink(fitted, trust)

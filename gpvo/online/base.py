@@ -33,11 +33,13 @@ class BaseVariance:
     """``theta`` (6, 5): coefficients of geometry, floor, squared translation and rotation of the motion, and geometry
     at the residuals' noise.
 
-    ``method``: name of the geometric covariance, None without one (its coefficients are then 0). ``residual``: whether
-    it looks at the residuals.
+    ``plain`` (6, 5): the same fitted to the motion alone, as what odometry says of itself means what it meant in
+    training only where the surroundings are alike. ``method``: name of the geometric covariance, None without one (its
+    coefficients are then 0). ``residual``: whether it looks at the residuals.
     """
 
     theta: Array
+    plain: Array
     method: str | None
     residual: bool = False
 
@@ -46,9 +48,17 @@ class BaseVariance:
         """Feature columns that it needs, in order."""
         return base_columns(self.method, self.residual)
 
-    def __call__(self, columns: Array, dt_s: Array) -> Array:
-        """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,)."""
-        return np.einsum("jc,njc->nj", self.theta, parts(columns, dt_s))
+    def __call__(self, columns: Array, dt_s: Array, outside: Array | None = None) -> Array:
+        """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,).
+
+        ``outside`` (n, 1) in [0, 1]: how far to take the plain variance where that is larger.
+        """
+        terms = parts(columns, dt_s)
+        base = np.einsum("jc,njc->nj", self.theta, terms)
+        if outside is None:
+            return base
+        plain = np.einsum("jc,njc->nj", self.plain, terms)
+        return np.asarray(base + outside * np.maximum(plain - base, 0.0))
 
 
 def parts(columns: Array, dt_s: Array) -> Array:

@@ -91,7 +91,13 @@ class ErrorModelArrays:
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file."""
         own = {name: np.asarray(getattr(self, name)) for name in _OWN}
-        return {**own, "theta": self.base.theta, **self.basis.to_arrays("basis."), **self.domain.to_arrays("domain.")}
+        return {
+            **own,
+            "theta": self.base.theta,
+            "theta_plain": self.base.plain,
+            **self.basis.to_arrays("basis."),
+            **self.domain.to_arrays("domain."),
+        }
 
     @classmethod
     def from_arrays(
@@ -100,7 +106,7 @@ class ErrorModelArrays:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
         try:
             own = {name: arrays[name] for name in _OWN}
-            base = BaseVariance(arrays["theta"], method, RESIDUAL_COLUMN in columns)
+            base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
         shapes = {
@@ -119,7 +125,7 @@ class ErrorModelArrays:
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
         if (
             wrong
-            or base.theta.shape != (6, N_PARTS)
+            or {base.theta.shape, base.plain.shape} != {(6, N_PARTS)}
             or len(domain.centre) != len(columns)
             or basis.n_inputs != len(own["inputs"])
         ):
@@ -151,18 +157,18 @@ class ErrorModelArrays:
         """Aleatoric, aleatoric with ignorance, mean, and the mean's variance: each (n, 6), before calibration."""
         said = self.basis.predict(inside[:, self.inputs])
         duration = np.full(len(X), self.dt_s) if dt_s is None else dt_s
-        base = self.base(self._base_columns(X), duration)
+        columns, outside = self._base_columns(X), (1.0 - place.in_domain)[:, None]
+        base = self.base(columns, duration)
         # What VO is wrong by on average is a drift: as much larger as the motion is longer.
         longer = (duration / self.dt_s)[:, None]
         drift = said.mean * longer
-        outside = (1.0 - place.in_domain)[:, None]
         known = said.log_noise_var - 0.5 * said.log_noise_spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = said.log_noise_var + outside * np.maximum(self.high - said.log_noise_var, 0.0)
         grown = growth(place.distance, self.outside_rate)[:, None]
         mean = drift * place.in_domain[:, None]
         mean_var = (said.epistemic_var * longer**2 + (drift - mean) ** 2) * grown
-        return base * np.exp(known), base * np.exp(cautious) * grown, mean, mean_var
+        return base * np.exp(known), self.base(columns, duration, outside) * np.exp(cautious) * grown, mean, mean_var
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones typical, geometric variances never below the training's smallest."""

@@ -15,6 +15,8 @@ from gpvo.types import Array
 
 __all__ = ["Domain", "SlipDetector", "Whereabouts", "flag_slips"]
 
+_LEAST = 0.0002
+
 DEGRADED_BELOW = 0.5
 """``in_domain`` under which a prediction is called ``degraded``."""
 
@@ -50,7 +52,7 @@ class Domain:
     def learn(cls, X: Array, *, margin: float = 0.02) -> Domain:
         """From training rows (n, d), NaN where a value is missing.
 
-        The range leaves out one row in a thousand at either end and adds ``margin`` of its width.
+        The range leaves out one row in five thousand at either end and adds ``margin`` of its width.
         """
         centre = np.nanmedian(X, axis=0)
         q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
@@ -59,14 +61,14 @@ class Domain:
         scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
         scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, 1.0)
         U = (X - centre) / scale
-        low, high = np.nanquantile(U, [0.001, 0.999], axis=0)
+        low, high = np.nanquantile(U, [_LEAST, 1.0 - _LEAST], axis=0)
         pad = margin * (high - low)
         U = np.clip(np.nan_to_num(U), low - pad, high + pad)
         C = np.cov(U, rowvar=False).reshape(X.shape[1], -1)
         # Shrunk towards its diagonal, so that collinear features do not make a razor-thin domain.
         C = 0.9 * C + 0.1 * np.diag(np.diagonal(C)) + 1e-6 * np.eye(len(C))
         whitening = np.linalg.inv(np.linalg.cholesky(C)).T
-        radius = np.quantile(np.linalg.norm((U - U.mean(0)) @ whitening, axis=1), 0.999, keepdims=True)
+        radius = np.quantile(np.linalg.norm((U - U.mean(0)) @ whitening, axis=1), 1.0 - _LEAST, keepdims=True)
         shift = np.linalg.norm(U.mean(0) @ whitening)
         return cls(centre, scale, low - pad, high + pad, whitening, radius + shift, np.asarray(np.isnan(X).any(axis=0)))
 

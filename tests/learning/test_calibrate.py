@@ -43,9 +43,9 @@ def test_a_new_sequence_is_covered():
 def test_growth_outside_is_as_seen_and_one_where_nothing_was_seen():
     rng = np.random.default_rng(6)
     distance, group = rng.uniform(0.0, 20.0, 400), np.repeat(np.arange(20), 20)
-    for rate in (0.25, 4.0):
+    for rate in (0.25, 1.0, 4.0):
         square = (1.0 + rate * distance) * rng.chisquare(6, 400) / 6
-        assert fit_outside_rate(distance, square, group) == rate
+        assert fit_outside_rate(distance, square, group) == max(rate, 1.0)
     assert fit_outside_rate(np.zeros(400), np.ones(400), group) == 1.0
 
 

@@ -61,7 +61,7 @@ def some_model(*, method: str | None = "triangulation", noise: str = "own", resi
         inputs=inputs,
         basis=SharedBasis(mean, None if noise == "constant" else second, rng.standard_normal(6)),
         domain=Domain.learn(X),
-        base=BaseVariance(theta, method, residual),
+        base=BaseVariance(theta, theta[::-1] * [1.0, 1.0, 1.0, 1.0, 0.0], method, residual),
         factor=rng.uniform(0.5, 2.0, 6),
         outside_rate=np.array([0.6]),
         high=rng.uniform(0.0, 2.0, 6),

@@ -92,6 +92,7 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("input", model.inputs, "int"),
         *_array("base_column", columns, "int"),
         *_array("theta", model.base.theta),
+        *_array("theta_plain", model.base.plain),
         *_array("factor", model.factor),
         *_array("high", model.high),
         *_array("correlation", model.correlation),

@@ -13,6 +13,7 @@ from gpvo.errors import MissingExtraError
 from gpvo.online.base import positions
 from gpvo.online.estimate import PARTS, ErrorModelArrays
 from gpvo.online.rowplan import stack
+from gpvo.types import Array
 
 OPSET = 17
 _INT64 = 7  # TensorProto.INT64
@@ -108,7 +109,7 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     rate, rate_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
     longer = g.expand(g("Div", "dt_s", model.dt_s), 1)
     mean, mean_var = g("Mul", rate, longer), g("Mul", rate_var, g("Mul", longer, longer))
-    base = _base(g, model)
+    base, plain = (_base(g, model, theta) for theta in (model.base.theta, model.base.plain))
     near = g.expand(in_domain, 1)
     growth = g.expand(g("Add", g("Mul", distance, float(model.outside_rate[0])), 1.0), 1)
     known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
@@ -116,7 +117,8 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
     trusted = g("Mul", mean, near, out="mean")
     lost = g("Sub", mean, trusted)
-    noise = g("Mul", base, g("Exp", cautious))
+    more = g("Mul", g("Sub", 1.0, near), g("Max", g("Sub", plain, base), 0.0))
+    noise = g("Mul", g("Add", base, more), g("Exp", cautious))
     total = g("Mul", g.add(noise, mean_var, g("Mul", lost, lost)), growth)
     factor = g.constant(model.factor)
     variance = g("Mul", total, factor)
@@ -169,8 +171,8 @@ def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, s
     )
 
 
-def _base(g: _Graph, model: ErrorModelArrays) -> str:
-    domain, theta = model.domain, model.base.theta
+def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:
+    domain = model.domain
     at = positions(model.columns, model.base.columns)
     columns = g.take("features", at, axis=1)
     columns = g("Where", g.finite(columns), columns, g.constant(domain.centre[at]))

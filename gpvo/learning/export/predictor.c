@@ -78,7 +78,7 @@ static void gpvo_basis(const double *inputs, double out[4][6]) {
 }
 
 /* Variance that is known before anything is learnt: geometry, floor, parts that grow with the motion. */
-static void gpvo_base(const double *features, double dt_s, double base[6]) {
+static void gpvo_base(const double *features, double dt_s, double base[6], double plain[6]) {
     double column[GPVO_N_BASE], translation = 0.0, rotation = 0.0;
     int i, j;
     for (i = 0; i < GPVO_N_BASE; ++i) {
@@ -92,10 +92,11 @@ static void gpvo_base(const double *features, double dt_s, double base[6]) {
         rotation += column[3 + i] * dt_s * column[3 + i] * dt_s;
     }
     for (j = 0; j < 6; ++j) {
-        const double *theta = gpvo_theta + 5 * j;
+        const double *theta = gpvo_theta + 5 * j, *without = gpvo_theta_plain + 5 * j;
         double geometry = GPVO_N_BASE >= 12 ? exp(column[(6 + j) % GPVO_N_BASE]) : 0.0;
         double noise = GPVO_N_BASE > 12 ? exp(2.0 * column[12 % GPVO_N_BASE]) : 0.0;
         base[j] = (theta[0] + theta[4] * noise) * geometry + theta[1] + theta[2] * translation + theta[3] * rotation;
+        plain[j] = (without[0] + without[4] * noise) * geometry + without[1] + without[2] * translation + without[3] * rotation;
     }
 }
 
@@ -155,13 +156,13 @@ static double gpvo_log_det(const double C[36]) {
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], R[3][36], part[3][6], distance, outside, growth;
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], part[3][6], distance, outside, growth;
     double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, longer = duration / GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     distance = gpvo_locate(features, inside);
     for (i = 0; i < GPVO_N_INPUTS; ++i) inputs[i] = inside[gpvo_input[i]];
     gpvo_basis(inputs, said);
-    gpvo_base(features, duration, base);
+    gpvo_base(features, duration, base, plain);
     gpvo_correlations(geometry, R);
     out->distance = distance;
     out->in_domain = exp(-0.5 * distance * distance);
@@ -173,7 +174,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
         double drift = said[0][j] * longer, drift_var = said[1][j] * longer * longer;
         out->mean[j] = drift * out->in_domain;
         lost = drift - out->mean[j];
-        variance = (base[j] * exp(cautious) * growth + (drift_var + lost * lost) * growth) * gpvo_factor[j];
+        variance = ((base[j] + outside * (plain[j] > base[j] ? plain[j] - base[j] : 0.0)) * exp(cautious) * growth + (drift_var + lost * lost) * growth) * gpvo_factor[j];
         out->epistemic[j] = variance - known * gpvo_factor[j];
         gpvo_divide(j, variance, faster, part);
     }
