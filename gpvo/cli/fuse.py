@@ -22,8 +22,9 @@ def fuse(
     init: Annotated[str, typer.Option(help="Start from truth, or from rest (static).")] = "truth",
     gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
     mean: Annotated[
-        str, typer.Option(help="The predicted mean: absorb (left in the covariance) or subtract (taken off).")
-    ] = "absorb",
+        str,
+        typer.Option(help="The predicted mean: absorb (left in the covariance), subtract (taken off), or auto."),
+    ] = "auto",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
@@ -37,7 +38,7 @@ def fuse(
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
-    from gpvo.filters.policies import LEARNED, POLICIES
+    from gpvo.filters.policies import LEARNED, POLICIES, MeanUse
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
@@ -45,15 +46,16 @@ def fuse(
         raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
     if gate not in ("discard", "inflate"):
         raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
-    if mean not in ("absorb", "subtract"):
-        raise GpvoError(f"--mean is '{mean}'", cure="choose absorb or subtract")
+    uses: dict[str, MeanUse | None] = {"auto": None, "absorb": "absorb", "subtract": "subtract"}
+    if mean not in uses:
+        raise GpvoError(f"--mean is '{mean}'", cure=f"choose {', '.join(uses)}")
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
     settings = FusionSettings(
         policies=wanted,
         model=model,
         training=tuple(train or ()),
         use_imu=not no_imu,
-        mean="subtract" if mean == "subtract" else "absorb",
+        mean=uses[mean],
         options=FuseOptions(
             init="static" if init == "static" else "truth",
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),

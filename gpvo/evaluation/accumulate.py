@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import symmetrise
+from gpvo.geometry.covariance import scaled_root, symmetrise
 from gpvo.types import Array, Prediction
 
 
@@ -76,7 +76,7 @@ class PoseError:
             self._P[12:, 12:] = np.eye(6)
             self._begun = True
         phi = np.exp(-step.dt_s / np.maximum(step.bias_tau_s, 1e-6))
-        L = _root(step.bias)
+        L = scaled_root(step.bias)
         A = np.zeros((18, 18))
         A[:6, :6] = moved
         A[:6, 6:12] = -moved
@@ -94,12 +94,6 @@ class PoseError:
         P[12:, 12:] += Q_u
         self._P = P
         return self.covariance
-
-
-def _root(C: Array) -> Array:
-    """Symmetric square root (6, 6) of a positive semi-definite matrix."""
-    values, vectors = np.linalg.eigh(symmetrise(C))
-    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 def along(steps: Sequence[Step], parent: Iterable[int]) -> Array:

@@ -40,16 +40,21 @@ def predictions_of(predictor: Predictor, run: Run) -> dict[int, Prediction]:
     return {t: p for t, p in stepped if p is not None}
 
 
-def load_predictor(path: str | Path, mean: MeanUse = "absorb") -> Predictor:
-    """A model that filters can use: one that predicts the error of single motions, its mean only to be subtracted."""
-    predictor = Predictor.load(path, with_mean=mean == "subtract")
+def load_predictor(path: str | Path, mean: MeanUse | None = None) -> tuple[Predictor, MeanUse]:
+    """A model that filters can use, one that predicts the error of single motions, and what to do with its mean.
+
+    By default a mean that knows the conditions alone is taken off; of one that sees VO's own motion the model fitted
+    without it is used instead.
+    """
+    predictor = Predictor.load(path)
     if predictor.target != "frame":
         raise ModelError(
             f"predicts the error over {predictor.target}, a filter needs that of each motion",
             where=path,
             cure="train with --target frame",
         )
-    return predictor
+    chosen: MeanUse = mean or ("absorb" if predictor.mean_sees_motion else "subtract")
+    return (predictor if chosen == "subtract" else Predictor.load(path, with_mean=False)), chosen
 
 
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
@@ -124,13 +129,13 @@ def constants_in(predictor: Predictor) -> Constants | None:
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """What ``gpvo fuse`` was asked for."""
+    """What ``gpvo fuse`` was asked for. ``mean`` None: as :func:`load_predictor` says."""
 
     policies: tuple[str, ...] = POLICIES
     model: Path | None = None
     training: tuple[Path, ...] = ()
     use_imu: bool = True
-    mean: MeanUse = "absorb"
+    mean: MeanUse | None = None
     options: FuseOptions = field(default_factory=FuseOptions)
 
 
@@ -169,7 +174,9 @@ def fuse_runs(
     unknown = [p for p in settings.policies if p not in POLICIES]
     if unknown:
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
-    predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
+    predictor, mean = None, settings.mean or "absorb"
+    if settings.model is not None:
+        predictor, mean = load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
@@ -179,7 +186,7 @@ def fuse_runs(
         flights.append(flight)
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
-    policies = make_policies(constants, names=settings.policies, learned=learned, mean=settings.mean)
+    policies = make_policies(constants, names=settings.policies, learned=learned, mean=mean)
     traces: list[Trace] = []
 
     def keep(flight: Flight, fused: FusedRun) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.filters.measurement import MotionNoise
-from gpvo.geometry.covariance import is_positive_definite
+from gpvo.geometry.covariance import is_positive_definite, scaled_root
 from gpvo.types import Prediction, VoRecord
 
 Array = NDArray[np.float64]
@@ -75,9 +75,9 @@ class LearnedPolicy:
     """The predicted error: its covariance in the parts by which it accumulates, and its mean.
 
     ``mean``: ``absorb`` leaves the measurement alone and adds the mean's square to the covariance; ``subtract`` takes
-    it off the measurement. A mean that depends on VO's own motion pulls it towards the motions seen in training, a
-    prior that a filter with its own motion model would count twice. A model fitted without a mean
-    (``Predictor.load(path, with_mean=False)``) has nothing to absorb and is better than either. ``use_parts`` False
+    it off the measurement. A mean that depends on VO's own motion (``Predictor.mean_sees_motion``) pulls it towards the
+    motions seen in training, a prior that a filter with its own motion model would count twice; a model fitted without
+    a mean (``Predictor.load(path, with_mean=False)``) is then better than either. ``use_parts`` False
     treats the total as independent from motion to motion, to show what the parts are worth.
     """
 
@@ -113,18 +113,9 @@ def split_noise(mean: Array, covariance: Array, parts: Mapping[str, Array], bias
         mean,
         0.5 * (white + white.T)[None],
         jitter[None] if jitter.any() else None,
-        _symmetric_root(bias)[None] if bias.any() else None,
+        scaled_root(bias)[None] if bias.any() else None,
         tau if bias.any() else None,
     )
-
-
-def _symmetric_root(C: Array) -> Array:
-    """Root of a positive semidefinite matrix that changes little when the matrix does."""
-    diagonal = np.diagonal(C)
-    if np.count_nonzero(C) == np.count_nonzero(diagonal):
-        return np.diag(np.sqrt(np.maximum(diagonal, 0.0)))
-    values, vectors = np.linalg.eigh(C)
-    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 def constant_from_errors(xi: Array) -> Array:

@@ -26,6 +26,19 @@ def is_positive_definite(C: Array) -> bool:
     return True
 
 
+def scaled_root(C: Array) -> Array:
+    """L (n, n) with ``L L^T = C``, of a positive semi-definite C: the symmetric root of the correlation, times sigma.
+
+    Where the variances change and the correlation does not, so does L: what drives an axis stays the same, whatever
+    the axes' units.
+    """
+    C = symmetrise(C)
+    sigma = np.sqrt(np.maximum(np.diagonal(C), 0.0))
+    unit = np.where(sigma > 0.0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(C / (unit[:, None] * unit))
+    return np.asarray(sigma[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
+
+
 def of_inverse(T_a_b: Array, cov_a_b: Array) -> Array:
     """Covariance of ``T_b_a`` from ``T_a_b`` and its covariance: ``(T Exp(xi))^-1 = T^-1 Exp(-Ad(T) xi)``."""
     A = se3.adjoint(T_a_b)

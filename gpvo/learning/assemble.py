@@ -15,14 +15,15 @@ from gpvo.learning.calibrate import (
     choose_geometry_weight,
     conformal_quantiles,
     fit_joint_factor,
-    fit_outside_rate,
+    fit_outside_power,
     fit_scale,
 )
 from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
-from gpvo.learning.parts import Parts, fit_parts, part_correlations
+from gpvo.learning.partcorrelation import part_correlations
+from gpvo.learning.parts import Parts, fit_parts
 from gpvo.learning.rows import Rows
-from gpvo.online.base import TWIST_COLUMNS, BaseVariance
+from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import SharedBasis
 from gpvo.online.estimate import ErrorModelArrays, divide, ln_faster
 from gpvo.online.guard import Domain
@@ -37,6 +38,8 @@ def assemble(
     fitted: HeteroscedasticFit | None,
     error: Array,
     variance: Array,
+    *,
+    mean_in_sigma: bool = True,
 ) -> tuple[ErrorModelArrays, dict[str, Any]]:
     """Parts, correlation and calibration from the out-of-fold residuals; then everything in one place."""
     scale = fit_scale(error / np.sqrt(variance), rows.group)
@@ -52,6 +55,7 @@ def assemble(
     share = divide(split.share, split.growth, 2.0 * np.log(sigma) - split.level, faster)
     weight = choose_geometry_weight(error, sigma, correlation, geometry, share)
     X = rows.select(columns)
+    noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     # Out of the domain no mean is taken off, so what is left of one says nothing of how wrong VO is there.
     plain = np.ones(6, dtype=bool)
     if fitted is None:
@@ -68,8 +72,8 @@ def assemble(
         domain=Domain.learn(X),
         base=base,
         factor=scale.factor,
-        outside_rate=np.array(
-            [fit_outside_rate(_distance(X, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)]
+        outside_power=np.array(
+            [fit_outside_power(_distance(X, noise, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)]
         ),
         high=high,
         correlation=correlation,
@@ -80,6 +84,8 @@ def assemble(
         ln_speed=ln_speed,
         bias_tau_s=split.tau_s,
         typical_ln_det=np.zeros(1),
+        usual_rate_var=np.maximum(np.nanmean(rows.weight[:, None] * rows.select(TWIST_COLUMNS) ** 2, axis=0), 1e-6),
+        mean_in_sigma=np.array([mean_in_sigma]),
         dt_s=step_s,
     )
     whole = model.split(sigma**2, faster, geometry).sum(axis=1)
@@ -90,12 +96,12 @@ def assemble(
     return model, _calibration(rows, scale, joint, split, weight, np.abs(z) / np.sqrt(joint))
 
 
-def _distance(X: Array, group: NDArray[np.int64]) -> Array:
-    """(n,) how far each row lies from what the other groups know."""
+def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
+    """(n,) how far each row, with the noise of its features, lies from what the other groups know."""
     out = np.zeros(len(X))
     labels = np.unique(group)
     for g in labels if len(labels) > 1 else ():
-        out[group == g] = Domain.learn(X[group != g]).locate(X[group == g]).distance
+        out[group == g] = Domain.learn(X[group != g]).locate(X[group == g], noise[group == g]).distance
     return out
 
 

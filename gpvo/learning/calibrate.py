@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gpvo.learning.basefit import t_negative_log_likelihood
+from gpvo.online.guard import growth
 from gpvo.stats.consistency import nees, nll_per_dim
 from gpvo.types import Array
 
@@ -20,7 +21,7 @@ _NU_RANGE = (2.5, 200.0)
 # Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
 _OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
-_RATES = (1.0, 2.0, 4.0, 8.0)
+_POWERS = (0.5, 0.75, 1.0, 1.5, 2.0)
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -90,23 +91,23 @@ def _with_prior(variance: float, groups: int) -> float:
     return (_PRIOR_GROUPS * _PRIOR_SPREAD**2 + (groups - 1) * variance) / (_PRIOR_GROUPS + groups - 1)
 
 
-def fit_outside_rate(distance: Array, square: Array, group: NDArray) -> float:
-    """By how much the variance grows per standard deviation of ``distance`` (n,) from what the other groups knew.
+def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
+    """Power of the growth (see ``guard.growth``) with the ``distance`` (n,) from what the other groups knew.
 
-    ``square`` (n,): mean over the axes of the squared normalised residuals. One is expected, and never less is taken:
-    other surroundings differ in more than flights of one kind can show. The rows of a group outside count as five at
-    most, as they go together.
+    ``square`` (n,): mean over the axes of the squared normalised residuals. A half is expected, and never less is
+    taken: other surroundings differ in more than flights of one kind can show. The rows of a group outside count as
+    five at most, as they go together.
     """
     outside = distance > _OUTSIDE
     d, q, g = distance[outside], square[outside], group[outside]
     count = np.minimum(_MOST_OUTSIDE / np.maximum([(g == of).sum() for of in g], 1), 1.0)
 
-    def loss(rate: float) -> float:
-        stated = 1.0 + rate * d
+    def loss(power: float) -> float:
+        stated = growth(d, power)
         ratio = np.minimum(q / stated, 16.0)
-        return float(3.0 * count @ (np.log(stated) + ratio) + 0.5 * np.log(rate) ** 2)
+        return float(3.0 * count @ (np.log(stated) + ratio) + 0.5 * np.log(power / _POWERS[0]) ** 2)
 
-    return min(_RATES, key=loss)
+    return min(_POWERS, key=loss)
 
 
 def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:

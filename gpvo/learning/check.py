@@ -44,7 +44,7 @@ def check(predictor: Predictor, run: Run) -> Check:
     if missing:
         problems.append(f"the run lacks features the model needs: {', '.join(missing)}")
     domain = predictor.model.domain
-    place = domain.locate(X[usable])
+    place = predictor.model.locate(X[usable], np.array([r.dt_s for r in records])[usable])
     inside = float((place.in_domain > 0.5).mean()) if usable.any() else 0.0
     U = np.nan_to_num((X[usable] - domain.centre) / domain.scale)
     beyond = (

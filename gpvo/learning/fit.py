@@ -17,10 +17,10 @@ from gpvo.dataset.build import TrainingSet
 from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_base, t_negative_log_likelihood
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
-from gpvo.learning.meantest import helps_over_distance, helps_the_pose, surely_positive
+from gpvo.learning.meantest import helps_over_distance, pose_gain
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
 from gpvo.learning.rows import Rows
-from gpvo.online.base import BaseVariance, base_columns
+from gpvo.online.base import OWN_MOTION, BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
 from gpvo.online.estimate import WITHOUT_MEAN, ErrorModelArrays
 from gpvo.online.guard import Domain
@@ -30,16 +30,23 @@ TRUSTS = (0.25, 0.5, 0.75, 1.0)
 """How much of the GP's log ratio to keep, chosen by cross-validation: a GP of few sequences says too much."""
 
 NONE = "none"
-"""The choice of no inputs: the base variance alone."""
+"""The choice of no inputs: the base variance alone, or no mean."""
+
+CONDITIONS, ALL = "conditions", "all"
+"""What a mean may see: the inputs that are not VO's own motion, in units of the base's standard deviation; or all."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A fitted model in memory: what goes into the file, and how each choice was made (``choices``)."""
+    """A fitted model in memory: what goes into the file, and how each choice was made (``choices``).
+
+    ``mean_inputs``: places, among the model's inputs, of those that its mean sees.
+    """
 
     model: ErrorModelArrays
     arrays: Mapping[str, NDArray[Any]]
     choices: dict[str, Any]
+    mean_inputs: NDArray[np.int64]
     calibration: dict[str, Any] = field(default_factory=dict)
 
 
@@ -50,12 +57,12 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     name, inputs, fitted, trust, scores = choose_inputs(rows, base, base_oof, config)
     columns = tuple(dict.fromkeys((*inputs, *base.columns, *guarded(rows.sets, config))))
     plain = fitted
-    fitted, mean_gain = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
+    fitted, mean = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
     fitted = None if fitted is None else shrink(fitted, trust)
     error, variance = _out_of_fold(rows, base_oof, fitted)
-    model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance)
-    lost = np.mean([(s.select(base_columns(None)) ** 2).mean(axis=0) for s in sets], axis=0)
-    arrays = {**model.to_arrays(), "lost_rate_var": np.maximum(lost, 1e-6)}
+    in_sigma = mean.name != ALL
+    model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
+    arrays = model.to_arrays()
     use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
     if plain is not None and any(use_mean):
         plain = shrink(plain, trust)
@@ -67,10 +74,11 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
         "trust": trust,
         "inputs_nll": scores,
         "use_mean": use_mean,
-        "mean_gain_nats": mean_gain,
+        "mean_inputs": mean.name,
+        "mean_gain_nats": mean.gains,
         "grouped_by": rows.grouped_by,
     }
-    return Learned(model, arrays, choices, calibration)
+    return Learned(model, arrays, choices, mean.inputs, calibration)
 
 
 def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
@@ -150,6 +158,18 @@ def _gp_inputs(rows: Rows, columns: Sequence[str], inputs: Sequence[str]) -> Arr
     return domain.locate(rows.select(columns)).inside[:, at]
 
 
+@dataclass(frozen=True)
+class _Mean:
+    """What the mean sees, by name and place among the inputs; ``gains`` [nats] per axis of a motion's likelihood."""
+
+    name: str
+    inputs: NDArray[np.int64]
+    gains: list[float] = field(default_factory=lambda: [0.0] * 6)
+
+
+_NO_MEAN = _Mean(NONE, np.arange(0))
+
+
 def _fit_gp(
     rows: Rows,
     base: BaseVariance,
@@ -157,23 +177,26 @@ def _fit_gp(
     inputs: Sequence[str],
     use_mean: NDArray[np.bool_],
     config: TrainConfig,
+    seen: _Mean | None = None,
 ) -> HeteroscedasticFit:
     options = HeteroscedasticOptions(
         regressor=config.regressor, inducing=config.inducing, noise_inducing=config.noise_inducing, seed=config.seed
     )
-    # In the mean a motion of twice the usual duration drifts twice as far; of the noise the base knows the duration.
-    longer = (rows.dt_s / np.median(rows.dt_s))[:, None]
     log_base = np.log(base(_base_inputs(rows, base.columns), rows.dt_s))
+    # A bias of noise goes with the noise. What VO is wrong by on average of its motion, with the motion's duration.
+    longer = np.repeat((rows.dt_s / np.median(rows.dt_s))[:, None], 6, axis=1)
+    unit = np.exp(0.5 * log_base) if seen is None or seen.name != ALL else longer
     fitted = fit_heteroscedastic(
         _gp_inputs(rows, columns, inputs),
-        rows.error / longer,
+        rows.error / unit,
         rows.group,
-        base_log_var=log_base - 2.0 * np.log(longer),
+        base_log_var=log_base - 2.0 * np.log(unit),
         use_mean=use_mean,
+        mean_inputs=None if seen is None else seen.inputs,
         sample_weight=rows.weight,
         options=options,
     )
-    return replace(fitted, oof_mean=fitted.oof_mean * longer, oof_epistemic_var=fitted.oof_epistemic_var * longer**2)
+    return replace(fitted, oof_mean=fitted.oof_mean * unit, oof_epistemic_var=fitted.oof_epistemic_var * unit**2)
 
 
 def shrink(fitted: HeteroscedasticFit, trust: float) -> HeteroscedasticFit:
@@ -200,23 +223,35 @@ def _with_mean(
     fitted: HeteroscedasticFit | None,
     trust: float,
     config: TrainConfig,
-) -> tuple[HeteroscedasticFit | None, list[float]]:
-    """Add the mean on the axes where it makes left-out groups more likely, beyond what groups differ by chance, and
-    the error over a distance no larger."""
+) -> tuple[HeteroscedasticFit | None, _Mean]:
+    """Add the mean that makes the path best, on the axes where it makes the errors of left-out groups smaller over any
+    distance; none where that may be chance.
+
+    One given the conditions alone is tried beside one that sees VO's own motion, and so what was usual in training.
+    """
     if fitted is None:
-        return None, [0.0] * 6
+        return None, _NO_MEAN
     # The question is put with few inducing points; only a mean that proves itself is fitted as asked.
     quick = replace(config, regressor="sparse", inducing=min(config.inducing, 64))
-    with_mean = _fit_gp(rows, base, columns, inputs, np.ones(6, dtype=bool), quick)
     v0 = base_oof * np.exp(trust * fitted.oof_log_noise_var)
-    corrected = (rows.error - with_mean.oof_mean) ** 2
     plain = t_negative_log_likelihood(rows.error**2, v0)
-    gain = rows.by_group(plain - t_negative_log_likelihood(corrected, v0 + with_mean.oof_epistemic_var))
-    proven = surely_positive(gain) & helps_over_distance(rows, with_mean.oof_mean, np.sqrt(v0))
-    gains = gain.mean(axis=0).tolist()
-    if not proven.any() or not helps_the_pose(rows, np.where(proven, with_mean.oof_mean, 0.0)):
-        return fitted, gains
-    return _fit_gp(rows, base, columns, inputs, proven, config), gains
+    best, use, most = _NO_MEAN, np.zeros(6, dtype=bool), 0.0
+    for seen in _means(inputs):
+        tried = _fit_gp(rows, base, columns, inputs, np.ones(6, dtype=bool), quick, seen)
+        left = t_negative_log_likelihood((rows.error - tried.oof_mean) ** 2, v0 + tried.oof_epistemic_var)
+        gains = rows.by_group(plain - left).mean(axis=0)
+        axes = (gains > 0) & helps_over_distance(rows, tried.oof_mean, np.sqrt(v0))
+        gain = pose_gain(rows, np.where(axes, tried.oof_mean, 0.0)) if axes.any() else 0.0
+        if gain > most:
+            best, use, most = replace(seen, gains=gains.tolist()), axes, gain
+    return (_fit_gp(rows, base, columns, inputs, use, config, best) if use.any() else fitted), best
+
+
+def _means(inputs: Sequence[str]) -> list[_Mean]:
+    """The means to try: of the conditions alone, and of all inputs where VO's own motion is among them."""
+    conditions = np.array([i for i, name in enumerate(inputs) if name not in OWN_MOTION], dtype=np.int64)
+    out = [_Mean(CONDITIONS, conditions)] if len(conditions) else []
+    return out if len(conditions) == len(inputs) else [*out, _Mean(ALL, np.arange(len(inputs)))]
 
 
 def _out_of_fold(rows: Rows, base_oof: Array, fitted: HeteroscedasticFit | None) -> tuple[Array, Array]:

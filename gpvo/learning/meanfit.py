@@ -11,7 +11,7 @@ from gpvo.learning.regressors.base import FittedGP, Hyperparameters
 from gpvo.learning.regressors.collapsed import Eigenbasis, Sums, accumulate, chunks
 from gpvo.learning.regressors.inducing import greedy_points
 from gpvo.learning.regressors.numerics import Scaling
-from gpvo.online.basis import ProjectedGP
+from gpvo.online.basis import NEVER, ProjectedGP
 
 Array = NDArray[np.float64]
 
@@ -135,3 +135,10 @@ def only_outputs(gp: ProjectedGP, use: NDArray[np.bool_]) -> ProjectedGP:
     projection = gp.projection if gp.projection.ndim == 2 else spread(gp.projection)
     named = {name: spread(getattr(gp, name)) for name in ("weights", "reduction", "signal_var", "offset")}
     return replace(gp, projection=projection, **named)
+
+
+def only_inputs(gp: ProjectedGP, seen: NDArray[np.int64], d: int) -> ProjectedGP:
+    """A GP of some of d inputs, their places ``seen``, as one of all of them: the others change nothing."""
+    centre, lengthscale, points = np.zeros(d), np.full(d, NEVER), np.zeros((len(gp.points), d))
+    centre[seen], lengthscale[seen], points[:, seen] = gp.centre, gp.lengthscale, gp.points
+    return replace(gp, centre=centre, lengthscale=lengthscale, points=points)

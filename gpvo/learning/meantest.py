@@ -36,9 +36,9 @@ def helps_over_distance(rows: Rows, oof_mean: Array, sigma: Array) -> NDArray[np
     return np.asarray((left <= plain).all(axis=0))
 
 
-def helps_the_pose(rows: Rows, oof_mean: Array) -> bool:
-    """Whether the mean makes the position better over many motions, beyond what sequences differ by chance, and the
-    attitude no worse.
+def pose_gain(rows: Rows, oof_mean: Array) -> float:
+    """By how much the mean makes the pose better over many motions: log ratios of the mean squared errors of position
+    and attitude, added. 0 unless one of them surely gains, beyond what sequences differ by chance, and none loses.
 
     Errors of axes belong together: a sideways error goes with a turn that undoes it on the way. A mean that takes off
     the one alone makes every motion better and the path worse.
@@ -48,9 +48,10 @@ def helps_the_pose(rows: Rows, oof_mean: Array) -> bool:
     plain, left = (rows.chains(e) for e in (rows.error, rows.error - oof_mean))
     gains = [g for s in zip(motion, plain, left) if (g := _log_gain(*s)) is not None]
     if not gains:
-        return False
+        return 0.0
     gain = np.array(gains)
-    return bool(surely_positive(gain[:, :1]).all() and gain[:, 1].mean() > -1e-9)
+    mean = gain.mean(axis=0)
+    return float(mean.sum()) if surely_positive(gain).any() and (mean > -1e-9).all() else 0.0
 
 
 def _log_gain(motion: Sequence[Array], plain: Sequence[Array], left: Sequence[Array]) -> Array | None:

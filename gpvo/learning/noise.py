@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gpvo.learning.folds import group_folds
 from gpvo.learning.logvariance import Residuals, score_log_variance
-from gpvo.learning.meanfit import FoldedMean, fit_folded_mean, no_mean, only_outputs
+from gpvo.learning.meanfit import FoldedMean, fit_folded_mean, no_mean, only_inputs, only_outputs
 from gpvo.learning.regressors import FittedGP, Regressor, get_regressor
 from gpvo.learning.regressors.numerics import checked, fixed_threads
 from gpvo.learning.regressors.sparse import SparseRegressor
@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 _TAIL_ROUNDS = 3
 _PRECISION_RANGE = 1e4
+_FAR_ASTRAY = 30.0
+"""No ratio of variances is as far from one as exp of this: a GP that says so loses the comparison, without overflow."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ def fit_heteroscedastic(
     *,
     base_log_var: Array | None = None,
     use_mean: NDArray[np.bool_] | None = None,
+    mean_inputs: NDArray[np.int64] | None = None,
     sample_weight: Array | None = None,
     options: HeteroscedasticOptions | None = None,
 ) -> HeteroscedasticFit:
@@ -104,7 +107,8 @@ def fit_heteroscedastic(
     X (n, d), Y (n, D) finite; ``groups`` (n,) labels (sequence of each row): a row's residual is always taken from a
     fit without its group; with fewer than two groups, without its block of consecutive rows. ``base_log_var`` (n, D):
     log of a variance known per row (the geometric covariance); g is then the log of the ratio to it. ``use_mean``
-    (D,): False fixes f_j to zero. ``sample_weight`` (n,): how often a row counts.
+    (D,): False fixes f_j to zero. ``mean_inputs``: the columns of X that f sees, by default all. ``sample_weight``
+    (n,): how often a row counts.
 
     Options: ``regressor`` of the mean (name or object); ``heavy_tails`` False for Gaussian residuals; ``isotropic``
     kernels; at most ``inducing`` points for the mean and ``noise_inducing`` for the noise; ``profile`` "common"
@@ -119,7 +123,8 @@ def fit_heteroscedastic(
         shapes = f"base_log_var {base.shape}, use_mean {use.shape}, {len(groups)} groups"
         raise ValueError(f"X {X.shape} and Y {Y.shape} do not go with {shapes}")
     with fixed_threads(options.threads):
-        return _fit(X, Y, group_folds(groups, options.max_folds), base, use, count, options)
+        seen = np.arange(X.shape[1]) if mean_inputs is None else np.asarray(mean_inputs)
+        return _fit(X, Y, group_folds(groups, options.max_folds), base, use, seen, count, options)
 
 
 def _fit(
@@ -128,6 +133,7 @@ def _fit(
     fold: NDArray[np.int64],
     base: Array,
     use: NDArray[np.bool_],
+    seen: NDArray[np.int64],
     count: Array,
     options: HeteroscedasticOptions,
 ) -> HeteroscedasticFit:
@@ -136,16 +142,18 @@ def _fit(
     for _ in range(max(options.rounds, 1) if use.any() else 1):
         if use.any():
             precision = _precision((np.log(robust) - log_var)[:, use], options.profile)
-            fitted = _regress(X, Y[:, use], precision, count, fitted, options)
+            fitted = _regress(X[:, seen], Y[:, use], precision, count, fitted, options)
             mean = _spread(
-                fit_folded_mean(fitted, X, Y[:, use], precision, count, fold, options.inducing, options.seed), use
+                fit_folded_mean(fitted, X[:, seen], Y[:, use], precision, count, fold, options.inducing, options.seed),
+                use,
             )
         residuals = Residuals((Y - mean.oof_mean) ** 2, base, mean.oof_var, count)
         noise = fit_noise(X, residuals, fold, options, start=noise.start if noise else None)
         log_var = np.log(noise.oof_scale) + base
         robust = row_weight(residuals.square / (np.exp(log_var) + mean.oof_var), noise.nu)
     assert noise is not None
-    basis = SharedBasis(mean.gp, noise.gp, noise.offset)
+    gp = only_inputs(mean.gp, seen, X.shape[1]) if use.any() else mean.gp
+    basis = SharedBasis(gp, noise.gp, noise.offset)
     return HeteroscedasticFit(basis, fitted, use, noise.nu, mean.oof_mean, mean.oof_var, noise.oof_log_var, fold)
 
 
@@ -230,4 +238,4 @@ def _out_of_fold(without: dict[int, ProjectedGP], X: Array, fold: NDArray[np.int
     for f, gp in without.items():
         mine = fold == f
         g[mine], spread[mine] = gp.evaluate(X[mine])
-    return g, spread
+    return np.clip(g, -_FAR_ASTRAY, _FAR_ASTRAY), np.minimum(spread, _FAR_ASTRAY)

@@ -9,15 +9,14 @@ square (G. Sibley, L. Matthies, G. Sukhatme, "Bias reduction and filter converge
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-from gpvo.learning.calibrate import residual_correlation
 from gpvo.types import Array
 
 Chains = Sequence[Sequence[Array]]
@@ -39,8 +38,6 @@ _REWEIGHTINGS, _REDIVISIONS = 6, 3
 _MOST_RATIO = 16.0
 _SAME_NS = 1000
 _MAX_DOUBT = 1.0
-_PRIOR = 3.0
-_LEAST_EIGENVALUE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -64,17 +61,13 @@ class Parts:
 @dataclass(frozen=True)
 class SpanVariances:
     """``spans`` (S,) that occur; ``mean_square`` (S, D) of sums over each; ``doubt`` (S, D): squared relative standard
-    error of that, by which sequences differ or, where they are few, by the number of separate windows."""
+    error of that, by which sequences differ or, where they are few, by the number of separate windows. What is squared
+    over an uncertain variance ``v`` is, on average, too large by ``1 + var(v) / v^2``: so much more is to be stated of
+    a sequence not seen."""
 
     spans: NDArray[np.int64]
     mean_square: Array
     doubt: Array
-
-    @property
-    def predictive(self) -> Array:
-        """(S, D) variance to state of a sequence not seen: what is squared over an uncertain variance ``v`` is, on
-        average, too large by ``1 + var(v) / v^2``."""
-        return self.mean_square * (1.0 + self.doubt)
 
 
 @dataclass(frozen=True)
@@ -110,39 +103,58 @@ class _Fit:
 def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float) -> Parts:
     """From errors, their stated standard deviations, and the logs (n_i, 1) of the speed over the typical one.
 
-    ``step_s``: usual duration of a motion. Translation and rotation (each three axes) have one time constant and
-    growth each; the shares are the axis' own.
+    ``step_s``: usual duration of a motion. All axes have one time constant, translation and rotation (each three axes)
+    a growth each; the shares are the axis' own.
     """
     error, sigma, ln_speed = (_at_most(values, _MOST_ROWS) for values in (error, sigma, ln_speed))
     found = span_variances([[e / s for e, s in zip(*pair)] for pair in zip(error, sigma)])
     ln_var = [[2.0 * np.log(s) for s in chains] for chains in sigma]
     level = np.median(np.concatenate([c for chains in ln_var for c in chains]), axis=0)
     D = len(level)
-    share, growth, tau, ratio = np.empty((3, D)), np.empty((2, D)), np.empty(D), np.empty((len(found.spans), D))
-    for start in range(0, D, 3):
-        block = slice(start, min(start + 3, D))
-        windows = [
-            _windows(error, ln_var, ln_speed, m, block, level, 1.0 + doubt)
-            for m, doubt in zip(found.spans, found.doubt)
-        ]
-        shape, fit = _choose(windows)
-        share[:, block], ratio[:, block], tau[block] = fit.share, fit.ratio, shape.tau
+    share, growth, ratio = np.empty((3, D)), np.empty((2, D)), np.empty((len(found.spans), D))
+    blocks = [slice(start, min(start + 3, D)) for start in range(0, D, 3)]
+    windows = [
+        [_windows(error, ln_var, ln_speed, m, block, level, 1.0 + doubt) for m, doubt in zip(found.spans, found.doubt)]
+        for block in blocks
+    ]
+    tau, chosen = _choose(windows)
+    for block, (shape, fit) in zip(blocks, chosen):
+        share[:, block], ratio[:, block] = fit.share, fit.ratio
         growth[:, block] = [[shape.by_speed], [shape.by_noise]]
-    return Parts(share, growth, level, tau * step_s, found.spans, ratio / (1.0 + found.doubt), found.doubt)
+    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio / (1.0 + found.doubt), found.doubt)
 
 
-def _choose(windows: Sequence[_Windows]) -> tuple[_Shape, _Fit]:
-    """The best shape. Expected is that errors add up by the metre, and a bias that grows no faster than the noise."""
-    fits: dict[_Shape, _Fit] = {}
+_Choice = tuple[_Shape, _Fit]
 
-    def best(shapes: Iterable[_Shape]) -> _Shape:
-        fits.update({s: _fit_shape(windows, s) for s in shapes if s not in fits})
-        return min(fits, key=lambda s: fits[s].loss + _WORTH * ((s.by_speed != _BY_THE_METRE) + (s.by_noise > 0)))
 
-    found = best(_Shape(_BY_THE_METRE, g, t) for g in _NOISE_GROWTHS for t in _TAU_FRAMES)
-    found = best(_Shape(v, found.by_noise, t) for v in _SPEED_GROWTHS for t in _TAU_FRAMES)
-    found = best(replace(found, tau=t) for t in (found.tau / 2.0, found.tau * 2.0))
-    return found, fits[found]
+def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Choice]]:
+    """The time constant [frames] of all blocks, and the shape and fit of each.
+
+    Sideways errors go with the turns that undo them; with time constants of their own they would part on the way.
+    """
+    tried: dict[float, list[_Choice]] = {}
+
+    def loss(tau: float) -> float:
+        tried.setdefault(tau, [_best(block, tau) for block in windows])
+        return sum(_loss(choice) for choice in tried[tau])
+
+    found = min(_TAU_FRAMES, key=loss)
+    found = min((found, found / 2.0, found * 2.0), key=loss)
+    return found, tried[found]
+
+
+def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
+    """The best shape of a block. Expected is that errors add up by the metre, and a bias that grows no faster than the
+    noise."""
+    tried = [(s, _fit_shape(windows, s)) for s in (_Shape(_BY_THE_METRE, g, tau) for g in _NOISE_GROWTHS)]
+    by_noise = min(tried, key=_loss)[0].by_noise
+    others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS if v != _BY_THE_METRE)
+    return min([*tried, *((s, _fit_shape(windows, s)) for s in others)], key=_loss)
+
+
+def _loss(choice: _Choice) -> float:
+    shape, fit = choice
+    return fit.loss + _WORTH * ((shape.by_speed != _BY_THE_METRE) + (shape.by_noise > 0))
 
 
 def _at_most(values: Chains, limit: int) -> Chains:
@@ -228,7 +240,7 @@ def span_variances(z: Chains) -> SpanVariances:
     spans, mean_square, doubt = [], [], []
     for m in SPANS:
         long = [[chain for chain in chains if len(chain) >= m] for chains in z]
-        squares = np.array([np.concatenate([_sums(c, m) ** 2 for c in some]).mean(axis=0) for some in long if some])
+        squares = np.array([np.concatenate([sums(c, m) ** 2 for c in some]).mean(axis=0) for some in long if some])
         windows = np.array([sum(len(c) for c in some) / m for some in long if some])
         if windows.sum() >= _MIN_WINDOWS:
             weight = windows / windows.sum()
@@ -250,49 +262,9 @@ def _by_block(values: Array) -> Array:
     return out
 
 
-def _sums(z: Array, m: int) -> Array:
+def sums(z: Array, m: int) -> Array:
     total = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
     return total[m:] - total[:-m]
-
-
-def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
-    """(S, 3) variance of the sum over m frames of jitter, white and bias of unit variance."""
-    rho = np.exp(-1.0 / tau_frames)
-    m = spans.astype(np.float64)
-    bias = m + 2.0 * (rho * (m * (1.0 - rho) - 1.0 + rho**m)) / (1.0 - rho) ** 2
-    return np.stack([np.ones_like(m), m, bias], axis=1)
-
-
-def part_correlations(z: Chains, split: Parts, step_s: float) -> Array:
-    """(3, 6, 6) correlations of jitter, white and bias, from those of the normalised residuals summed over each span.
-
-    Of each pair of axes three numbers are sought whose mixture, by what each part contributes to the sum, is the
-    correlation seen over every span; all are drawn towards that of single motions, as few windows show little.
-    """
-    part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
-    whole = part.sum(axis=2).T
-    measured = np.array([residual_correlation(_all_sums(z, m) / np.sqrt(v)) for m, v in zip(split.spans, whole)])
-    windows = 2.0 / split.doubt
-    out = np.tile(np.eye(6), (3, 1, 1))
-    for i, j in zip(*np.triu_indices(6, 1)):
-        mixture = np.sqrt(part[i] * part[j] / (whole[:, i] * whole[:, j])[:, None])
-        weight = np.sqrt(np.minimum(windows[:, i], windows[:, j]))
-        A = np.vstack([mixture * weight[:, None], _PRIOR * np.eye(3)])
-        b = np.concatenate([measured[:, i, j] * weight, np.full(3, _PRIOR * measured[0, i, j])])
-        out[:, i, j] = out[:, j, i] = np.linalg.lstsq(A, b, rcond=None)[0]
-    return np.array([_nearest_correlation(R) for R in out])
-
-
-def _all_sums(z: Chains, m: int) -> Array:
-    return np.concatenate([_sums(chain, m) for chains in z for chain in chains if len(chain) >= m])
-
-
-def _nearest_correlation(R: Array) -> Array:
-    """Positive definite, with a unit diagonal."""
-    values, vectors = np.linalg.eigh(R)
-    R = (vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
-    s = np.sqrt(np.diagonal(R))
-    return np.asarray(R / np.outer(s, s))
 
 
 def chains(t_ns: NDArray[np.int64], dt_s: Array) -> list[NDArray[np.int64]]:

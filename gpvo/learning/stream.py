@@ -19,7 +19,7 @@ from gpvo.dataset.stored import CHUNK_ROWS, StoredSets
 from gpvo.errors import GpvoError
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned
-from gpvo.learning.meanfit import only_outputs
+from gpvo.learning.meanfit import only_inputs, only_outputs
 from gpvo.learning.regressors.rows import RawChunk
 from gpvo.learning.regressors.sparse import SparseRegressor
 from gpvo.learning.regressors.svgp import SvgpRegressor
@@ -61,7 +61,8 @@ def with_streamed_mean(
     kind = SvgpRegressor if config.regressor == "svgp" else SparseRegressor
     fitted = kind(inducing=config.inducing).fit_rows(_Rows(stored, learned, use, chunk_rows), seed=config.seed)
     model, old = learned.model, learned.model.basis
-    basis = SharedBasis(only_outputs(fitted.gp, use), old.noise, old.log_noise_offset)
+    gp = only_inputs(only_outputs(fitted.gp, use), learned.mean_inputs, len(model.inputs))
+    basis = SharedBasis(gp, old.noise, old.log_noise_offset)
     model = replace(model, basis=basis)
     return replace(learned, model=model, arrays={**learned.arrays, **model.to_arrays()})
 
@@ -97,13 +98,13 @@ class _Rows:
         """Inputs drawn into the domain, errors, precision by the noise learnt so far; sequences count alike."""
         model = self.learned.model
         X = s.select(model.columns)
-        place = model.domain.locate(X)
-        _, variance, _, _ = model.variances(X, place.inside, place, s.dt_s)
+        v = model.variances(X, s.dt_s)
         # The scale of a precision is arbitrary; relative to the typical row it keeps its range.
-        precision = np.exp(model.typical_ln_det[0] / 6.0 - np.log(variance).mean(axis=1))
+        typical = 0.0 if model.mean_in_sigma[0] else model.level.mean()
+        precision = np.exp(typical - np.log(v.total / v.unit**2).mean(axis=1))
         return (
-            place.inside[:, model.inputs],
-            s.Y[:, self.use],
+            v.place.inside[:, model.inputs[self.learned.mean_inputs]],
+            (s.Y / v.unit)[:, self.use],
             np.clip(precision, 1.0 / _PRECISION_RANGE, _PRECISION_RANGE),
             np.full(len(X), count),
         )

@@ -137,7 +137,7 @@ def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array
     length, lost_length = (np.linalg.norm(xi[:, :3], axis=1) for xi in (s.Y, s.lost_xi))
     gross = length > SLIP_MEDIANS * np.median(length)
     gross_lost = lost_length > SLIP_MEDIANS * np.median(length)
-    usual = learned.arrays["lost_rate_var"] * learned.model.dt_s**2
+    usual = learned.model.usual_rate_var * learned.model.dt_s**2
     jump2 = s.lost_jump**2
     lost_var = np.maximum(usual, np.repeat(np.stack([jump2[:, :3].sum(1), jump2[:, 3:].sum(1)], 1), 3, axis=1))
     learned_all = np.concatenate(

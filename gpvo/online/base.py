@@ -18,6 +18,9 @@ from gpvo.online.features import AXES
 from gpvo.types import Array
 
 TWIST_COLUMNS = ("v_x_mps", "v_y_mps", "v_z_mps", "w_x_radps", "w_y_radps", "w_z_radps")
+ACCELERATION_COLUMNS = ("acceleration_mps2", "angular_acceleration_radps2")
+OWN_MOTION = (*TWIST_COLUMNS, *ACCELERATION_COLUMNS)
+"""Features that are VO's own motion."""
 RESIDUAL_COLUMN = "ln_residual_px"
 N_PARTS = 5
 
@@ -75,3 +78,26 @@ def positions(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Where each wanted column is among ``names``."""
     place = {n: i for i, n in enumerate(names)}
     return [place[w] for w in wanted]
+
+
+def motion_noise(names: Sequence[str]) -> tuple[Array, Array]:
+    """(6, d) each: for which features ``names`` the variance of the motion, over dt^2 and dt^4, is their own.
+
+    They are VO's velocities and accelerations; an acceleration is the difference of two velocities, taken to be equally
+    uncertain.
+    """
+    by_velocity, by_acceleration = np.zeros((6, len(names))), np.zeros((6, len(names)))
+    for i, name in enumerate(names):
+        if name in TWIST_COLUMNS:
+            by_velocity[TWIST_COLUMNS.index(name), i] = 1.0
+        if name in ACCELERATION_COLUMNS:
+            block = ACCELERATION_COLUMNS.index(name)
+            by_acceleration[3 * block : 3 * block + 3, i] = 2.0
+    return by_velocity, by_acceleration
+
+
+def feature_noise(carry: tuple[Array, Array], variance: Array, dt_s: Array) -> Array:
+    """(n, d) variance of the features, by :func:`motion_noise`, of motions of a variance (n, 6) and duration (n,)."""
+    by_velocity, by_acceleration = carry
+    squared = dt_s[:, None] ** 2
+    return np.asarray((variance @ by_velocity + variance @ by_acceleration / squared) / squared)

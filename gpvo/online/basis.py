@@ -26,6 +26,9 @@ from gpvo.online.rowplan import RowPlan, stack
 
 Array = NDArray[np.float64]
 
+NEVER = 1e12
+"""Length scale of an input that plays no part."""
+
 _CHUNK_ROWS = 4096
 _GP_FIELDS = ("centre", "lengthscale", "points", "projection", "weights", "reduction", "signal_var", "offset")
 _SHARED_FIELDS = ("weights", "reduction", "signal_var", "offset")

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
-from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, positions
+from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
-from gpvo.online.guard import Domain, growth
+from gpvo.online.guard import Domain, Whereabouts, growth
 from gpvo.types import Array
 
 PARTS = ("jitter", "white", "bias")
@@ -59,15 +59,31 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Variances:
+    """Of n rows, before calibration: ``place``, where they lie; (n, 6) each: ``unit`` of the mean, ``known`` aleatoric
+    variance, ``total`` with ignorance of it, ``mean`` and its ``mean_var``; ``limit``, as wrong as a motion can be."""
+
+    place: Whereabouts
+    unit: Array
+    known: Array
+    total: Array
+    mean: Array
+    mean_var: Array
+    limit: Array
+
+
+@dataclass(frozen=True)
 class ErrorModelArrays:
     """Everything the arithmetic needs; axes in the order of the tangent vector.
 
     ``columns``: all features, in order; ``inputs``: positions of those the GP sees. ``factor`` (6,): calibration of the
-    variance; ``outside_rate`` (1,): its growth per standard deviation away from the training domain. ``high`` (6,): log
+    variance; ``outside_power`` (1,): its growth away from the training domain. ``high`` (6,): log
     ratio to the base that few training rows exceeded. ``correlation`` (3, 6, 6) of jitter, white and bias, the first
     two mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides among them at
     the log variance ``level`` (6,) and the typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6) how
     that changes (see :func:`divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
+    ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]. ``mean_in_sigma`` (1,): whether the
+    GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
     """
 
     columns: tuple[str, ...]
@@ -76,7 +92,7 @@ class ErrorModelArrays:
     domain: Domain
     base: BaseVariance
     factor: Array
-    outside_rate: Array
+    outside_power: Array
     high: Array
     correlation: Array
     geometry_weight: Array
@@ -86,6 +102,8 @@ class ErrorModelArrays:
     ln_speed: Array
     bias_tau_s: Array
     typical_ln_det: Array
+    usual_rate_var: Array
+    mean_in_sigma: NDArray[np.bool_]
     dt_s: float
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -111,7 +129,7 @@ class ErrorModelArrays:
             raise ModelError(f"the model file lacks the array {missing}") from None
         shapes = {
             "factor": (6,),
-            "outside_rate": (1,),
+            "outside_power": (1,),
             "high": (6,),
             "correlation": (3, 6, 6),
             "share": (3, 6),
@@ -119,6 +137,8 @@ class ErrorModelArrays:
             "level": (6,),
             "ln_speed": (1,),
             "bias_tau_s": (6,),
+            "usual_rate_var": (6,),
+            "mean_in_sigma": (1,),
             "geometry_weight": (1,),
         }
         wrong = [n for n, s in shapes.items() if own[n].shape != s]
@@ -134,9 +154,10 @@ class ErrorModelArrays:
 
     def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Estimate:
         """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown."""
-        place = self.domain.locate(X)
-        aleatoric, total, mean, mean_var = self.variances(X, place.inside, place, dt_s)
-        variance = (total + mean_var) * self.factor
+        v = self.variances(X, dt_s)
+        place = v.place
+        unlimited = v.total + v.mean_var
+        variance = within(unlimited * self.factor, v.limit)
         each = self.split(variance, self.faster(X), geometry)
         parts = {name: each[:, i] for i, name in enumerate(PARTS)}
         covariance = each.sum(axis=1)
@@ -144,31 +165,51 @@ class ErrorModelArrays:
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
         return Estimate(
-            mean,
+            v.mean,
             covariance,
             parts,
-            variance - aleatoric * self.factor,
+            variance * (1.0 - v.known / unlimited),
             place.in_domain,
             place.in_domain * precision,
             place.distance,
         )
 
-    def variances(self, X: Array, inside: Array, place: Any, dt_s: Array | None) -> tuple[Array, Array, Array, Array]:
-        """Aleatoric, aleatoric with ignorance, mean, and the mean's variance: each (n, 6), before calibration."""
-        said = self.basis.predict(inside[:, self.inputs])
-        duration = np.full(len(X), self.dt_s) if dt_s is None else dt_s
-        columns, outside = self._base_columns(X), (1.0 - place.in_domain)[:, None]
+    def locate(self, X: Array, dt_s: Array | None = None) -> Whereabouts:
+        """Where rows X (n, d) lie, given how well their motions are known."""
+        duration = self._duration(X, dt_s)
+        return self._locate(X, self.base(self._base_columns(X), duration), duration)
+
+    def _locate(self, X: Array, base: Array, duration: Array) -> Whereabouts:
+        return self.domain.locate(X, feature_noise(self._motion_noise, base, duration))
+
+    @cached_property
+    def _motion_noise(self) -> tuple[Array, Array]:
+        return motion_noise(self.columns)
+
+    def _duration(self, X: Array, dt_s: Array | None) -> Array:
+        return np.full(len(X), self.dt_s) if dt_s is None else dt_s
+
+    def variances(self, X: Array, dt_s: Array | None) -> Variances:
+        """Variances of rows X (n, d), before calibration."""
+        duration, columns = self._duration(X, dt_s), self._base_columns(X)
         base = self.base(columns, duration)
-        # What VO is wrong by on average is a drift: as much larger as the motion is longer.
-        longer = (duration / self.dt_s)[:, None]
-        drift = said.mean * longer
+        place = self._locate(X, base, duration)
+        said = self.basis.predict(place.inside[:, self.inputs])
+        outside = (1.0 - place.in_domain)[:, None]
+        # A bias of noise goes with the noise; what VO is wrong by on average of its motion, with the motion's duration.
+        unit = np.sqrt(base) if self.mean_in_sigma[0] else np.repeat((duration / self.dt_s)[:, None], 6, axis=1)
+        usual = said.mean * unit
         known = said.log_noise_var - 0.5 * said.log_noise_spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = said.log_noise_var + outside * np.maximum(self.high - said.log_noise_var, 0.0)
-        grown = growth(place.distance, self.outside_rate)[:, None]
-        mean = drift * place.in_domain[:, None]
-        mean_var = (said.epistemic_var * longer**2 + (drift - mean) ** 2) * grown
-        return base * np.exp(known), self.base(columns, duration, outside) * np.exp(cautious) * grown, mean, mean_var
+        grown = growth(place.distance, self.outside_power)[:, None]
+        mean = usual * place.in_domain[:, None]
+        mean_var = (said.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
+        total = self.base(columns, duration, outside) * np.exp(cautious) * grown
+        # VO's motion less the true one is no longer than both together, whatever is said of its variance.
+        moved = (columns[:, :6] ** 2 + self.usual_rate_var) * duration[:, None] ** 2
+        limit = np.repeat(moved.reshape(-1, 2, 3).sum(axis=2), 3, axis=1)
+        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit)
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones typical, geometric variances never below the training's smallest."""
@@ -206,6 +247,11 @@ class ErrorModelArrays:
         share = divide(self.share, self.growth, np.log(variance) - self.level, faster)
         sigma = np.sqrt(share * variance[:, None, :])
         return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :]
+
+
+def within(variance: Array, limit: Array) -> Array:
+    """The variance where it is small against the limit, the limit where it is far above; it grows all the way."""
+    return variance / np.sqrt(1.0 + (variance / limit) ** 2)
 
 
 def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
@@ -246,7 +292,7 @@ def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray
 _OWN = (
     "inputs",
     "factor",
-    "outside_rate",
+    "outside_power",
     "high",
     "correlation",
     "geometry_weight",
@@ -256,4 +302,6 @@ _OWN = (
     "ln_speed",
     "bias_tau_s",
     "typical_ln_det",
+    "usual_rate_var",
+    "mean_in_sigma",
 )

@@ -72,13 +72,18 @@ class Domain:
         shift = np.linalg.norm(U.mean(0) @ whitening)
         return cls(centre, scale, low - pad, high + pad, whitening, radius + shift, np.asarray(np.isnan(X).any(axis=0)))
 
-    def locate(self, X: Array) -> Whereabouts:
-        """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it."""
+    def locate(self, X: Array, noise: Array | float = 0.0) -> Whereabouts:
+        """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it.
+
+        ``noise`` (n, d): variance with which the features themselves are known. A value that this explains is no sign
+        of another place: how far it lies outside counts in training deviations and this one together.
+        """
         U = (X - self.centre) / self.scale
         missing = ~np.isfinite(U)
         U = np.where(missing, 0.0, U)
         inside = np.clip(U, self.low, self.high)
-        beyond = ((U - inside) ** 2).sum(1) + (missing & ~self.may_miss).sum(1)
+        away = (U - inside) ** 2 / (1.0 + noise / self.scale**2)
+        beyond = away.sum(1) + (missing & ~self.may_miss).sum(1)
         joint = np.maximum(np.linalg.norm(inside @ self.whitening, axis=1) - self.radius[0], 0.0)
         distance = np.sqrt(beyond + joint**2)
         return Whereabouts(inside, distance, np.exp(-0.5 * distance**2))
@@ -96,6 +101,10 @@ class Domain:
             raise ModelError(f"the model file lacks the array {missing}") from None
 
 
-def growth(distance: Array, rate: Array) -> Array:
-    """Factor on the variance: linear in the distance from the domain, as a Brownian motion's away from data."""
-    return 1.0 + rate * distance
+def growth(distance: Array, power: Array | float) -> Array:
+    """Factor on the variance: a power of one plus the distance from the domain.
+
+    Ten times as far away is seldom ten times as bad: between simulated scenarios and real drives, 2 to 5000 away, the
+    variance was off by a factor of 0.01 to 50.
+    """
+    return (1.0 + distance) ** power

@@ -10,9 +10,9 @@ files lack what is marked optional:
 * ``basis.*``: GPs of the mean and of the log noise variance, see :class:`gpvo.online.basis.SharedBasis`;
 * ``domain.*``: the training domain, see :class:`gpvo.online.guard.Domain`;
 * ``theta``, ``theta_plain`` (6, 5): the base variance, see :class:`gpvo.online.base.BaseVariance`;
-* ``inputs``, ``factor``, ``outside_rate``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``growth``,
-  ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``: see :class:`gpvo.online.estimate.ErrorModelArrays`;
-* ``lost_rate_var`` (6,): mean square velocity [m^2/s^2, rad^2/s^2];
+* ``inputs``, ``factor``, ``outside_power``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``growth``,
+  ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``, ``usual_rate_var``,
+  ``mean_in_sigma``: see :class:`gpvo.online.estimate.ErrorModelArrays`;
 * ``without_mean.*`` (optional): ``basis.*`` and others of the same model fitted without a mean;
 * ``method.constant`` (6, 6), ``method.<geometric>.scale`` (6,): the simple methods that ``evaluate`` compares with;
 * ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`;

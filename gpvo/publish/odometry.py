@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite, symmetrise
+from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise
 from gpvo.geometry.frames import R_FLU_OPTICAL, rotate_covariance
 from gpvo.types import Prediction, Status, VoRecord
 
@@ -134,7 +134,7 @@ class OdometryBuilder:
             white = prediction.covariance - jitter - bias
             if not self.correct_twist:  # what is not taken off remains part of the error
                 white = white + np.outer(prediction.mean, prediction.mean)
-            return white, jitter, _root(bias), prediction.bias_tau_s
+            return white, jitter, scaled_root(bias), prediction.bias_tau_s
         covariance = record.covariances.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
             raise GpvoError(
@@ -226,12 +226,6 @@ def _extend(base: _Chain, record: VoRecord, white: Array, root: Array, tau_s: Ar
     persistent = cross @ root.T
     walked = A @ base.walked @ A.T + white + root @ root.T + persistent + persistent.T
     return _Chain(base.T_first_cam @ record.T_prev_cur, symmetrise(walked), cross + root, record.t_ns)
-
-
-def _root(C: Array) -> Array:
-    """(6, 6) symmetric root of a positive semidefinite covariance."""
-    values, vectors = np.linalg.eigh(C)
-    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 def _severity(status: Status) -> int:

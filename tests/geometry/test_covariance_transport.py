@@ -86,3 +86,13 @@ def test_accumulate_is_repeated_compounding_and_follows_parents():
 )
 def test_is_positive_definite(C, expected):
     assert cov.is_positive_definite(C) is expected
+
+
+def test_the_scaled_root_follows_the_units():
+    """L L^T = C, also for a singular C; in other units the root is in other units, nothing else."""
+    A = np.random.default_rng(5).standard_normal((6, 4))
+    C, units = A @ A.T, np.array([1.0, 10.0, 0.1, 1e-3, 1e-2, 1e3])
+    L = cov.scaled_root(C)
+    np.testing.assert_allclose(L @ L.T, C, atol=1e-12)
+    np.testing.assert_allclose(cov.scaled_root(C * units[:, None] * units), units[:, None] * L, rtol=1e-6, atol=1e-9)
+    assert not cov.scaled_root(np.zeros((6, 6))).any()

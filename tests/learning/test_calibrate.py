@@ -7,12 +7,13 @@ import pytest
 from gpvo.learning.basefit import fit_base
 from gpvo.learning.calibrate import (
     conformal_quantiles,
-    fit_outside_rate,
+    fit_outside_power,
     fit_scale,
     residual_correlation,
     robust_second_moment,
 )
 from gpvo.online.base import parts
+from gpvo.online.guard import growth
 
 
 def test_second_moment_of_a_gaussian_and_of_a_t():
@@ -40,13 +41,13 @@ def test_a_new_sequence_is_covered():
     assert 0.85 < np.mean(stated) < 1.15
 
 
-def test_growth_outside_is_as_seen_and_one_where_nothing_was_seen():
+def test_growth_outside_is_as_seen_and_as_expected_where_nothing_was_seen():
     rng = np.random.default_rng(6)
     distance, group = rng.uniform(0.0, 20.0, 400), np.repeat(np.arange(20), 20)
-    for rate in (0.25, 1.0, 4.0):
-        square = (1.0 + rate * distance) * rng.chisquare(6, 400) / 6
-        assert fit_outside_rate(distance, square, group) == max(rate, 1.0)
-    assert fit_outside_rate(np.zeros(400), np.ones(400), group) == 1.0
+    for power in (0.25, 1.0, 1.5):
+        square = growth(distance, power) * rng.chisquare(6, 400) / 6
+        assert fit_outside_power(distance, square, group) == max(power, 0.5)
+    assert fit_outside_power(np.zeros(400), np.ones(400), group) == 0.5
 
 
 def test_conformal_intervals_cover_new_groups():

@@ -38,12 +38,14 @@ def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> Project
     )
 
 
-def some_model(*, method: str | None = "triangulation", noise: str = "own", residual: bool = False) -> ErrorModelArrays:
+def some_model(
+    *, method: str | None = "triangulation", noise: str = "own", residual: bool = False, in_sigma: bool = True
+) -> ErrorModelArrays:
     """A model of random but sensible numbers."""
     rng = np.random.default_rng(0)
-    columns = (*base_columns(method, residual), "inliers", "sharpness")
+    columns = (*base_columns(method, residual), "acceleration_mps2", "inliers", "sharpness")
     X = rng.standard_normal((400, len(columns)))
-    X[:, 6 : len(columns) - 2] -= 9.0
+    X[:, 6 : len(columns) - 3] -= 9.0
     X[::7, -1] = np.nan
     inputs = np.array([0, 2, 5, len(columns) - 2])
     mean = random_gp(rng, 4, 30, 0.01)
@@ -63,7 +65,7 @@ def some_model(*, method: str | None = "triangulation", noise: str = "own", resi
         domain=Domain.learn(X),
         base=BaseVariance(theta, theta[::-1] * [1.0, 1.0, 1.0, 1.0, 0.0], method, residual),
         factor=rng.uniform(0.5, 2.0, 6),
-        outside_rate=np.array([0.6]),
+        outside_power=np.array([0.6]),
         high=rng.uniform(0.0, 2.0, 6),
         correlation=correlation,
         geometry_weight=np.array([0.4 if method else 0.0]),
@@ -73,6 +75,8 @@ def some_model(*, method: str | None = "triangulation", noise: str = "own", resi
         level=rng.uniform(-4.0, 0.0, 6),
         bias_tau_s=np.ones(6),
         typical_ln_det=np.array([-60.0]),
+        usual_rate_var=rng.uniform(0.5, 2.0, 6),
+        mean_in_sigma=np.array([in_sigma]),
         dt_s=0.1,
     )
 
@@ -83,6 +87,7 @@ CASES = {
     "constant noise": some_model(noise="constant"),
     "no geometry": some_model(method=None),
     "noise of the residuals": some_model(residual=True),
+    "a mean of its own": some_model(in_sigma=False),
 }
 
 
@@ -198,13 +203,25 @@ def test_unknown_formats_are_refused(tmp_path: Path) -> None:
         export_model(tmp_path / "model", tmp_path / "out", "fortran")
 
 
-def test_the_mean_is_a_drift():
-    """A motion of twice the duration drifts twice as far, and its drift is twice as uncertain."""
+def test_the_mean_is_in_units_of_the_base():
+    """Where the base variance is four times as large, the mean is twice as large, its variance four times."""
     model = some_model()
-    X = np.random.default_rng(3).standard_normal((5, len(model.columns)))
+    twice = replace(model.base, theta=4.0 * model.base.theta, plain=4.0 * model.base.plain)
+    # Inside the domain; outside, how far away a motion is depends on how well its velocity is known.
+    X = 0.3 * np.random.default_rng(3).standard_normal((5, len(model.columns)))
     X[:, 6:12] -= 9.0
-    usual = np.full(5, model.dt_s)
-    once, twice = (model.estimate(X, None, usual * k) for k in (1.0, 2.0))
+    once, other = (m.variances(X, None) for m in (model, replace(model, base=twice)))
+    assert np.abs(once.mean).max() > 0
+    np.testing.assert_allclose(other.mean, 2.0 * once.mean, rtol=1e-12)
+    np.testing.assert_allclose(other.mean_var, 4.0 * once.mean_var, rtol=1e-12)
+
+
+def test_a_mean_of_the_motion_goes_with_its_duration():
+    """A motion of twice the duration drifts twice as far, and its drift is twice as uncertain."""
+    model = some_model(in_sigma=False)
+    X = 0.3 * np.random.default_rng(3).standard_normal((5, len(model.columns)))
+    X[:, 6:12] -= 9.0
+    once, twice = (model.variances(X, np.full(5, k * model.dt_s)) for k in (1.0, 2.0))
     assert np.abs(once.mean).max() > 0
     np.testing.assert_allclose(twice.mean, 2.0 * once.mean, rtol=1e-12)
-    assert (twice.epistemic > once.epistemic).all()
+    np.testing.assert_allclose(twice.mean_var, 4.0 * once.mean_var, rtol=1e-12)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from gpvo.learning.parts import chains, curves, fit_parts, part_correlations, span_variances
+from gpvo.evaluation.accumulate import PoseError, Step
+from gpvo.learning.partcorrelation import curves, part_correlations
+from gpvo.learning.parts import chains, fit_parts, span_variances
+from scipy.signal import lfilter
 
 
 def _times(parents: list[int], step_ns: int = 50_000_000) -> tuple[np.ndarray, np.ndarray]:
@@ -109,6 +112,26 @@ def test_what_is_stated_of_a_new_flight_is_right_on_average():
         bias = rng.standard_normal((9, 3))
         z = [[np.tile(b, (400, 1)) + rng.standard_normal((400, 3))] for b in bias]
         found = span_variances(z[:8])
-        stated = found.predictive[found.spans == 200][0]
+        stated = (found.mean_square * (1.0 + found.doubt))[found.spans == 200][0]
         ratio.append((z[8][0][:200].sum(axis=0) ** 2 / stated).mean())
     assert 0.8 < np.mean(ratio) < 1.25
+
+
+def test_what_is_stated_along_a_path_is_what_was_fitted():
+    """Two axes of unlike units that nearly cancel, biases of unlike persistence: each sum has the fitted variance."""
+    rng = np.random.default_rng(3)
+    sigma, z = np.repeat([0.01, 0.001], 3), []
+    for _ in range(10):
+        rho = np.exp(-1.0 / np.repeat([8.0, 100.0], 3))
+        steps = rng.standard_normal((4000, 6))
+        steps[:, 4] = 0.1 * steps[:, 4] - 0.99 * steps[:, 0]
+        bias = np.array([lfilter([np.sqrt(1.0 - r**2)], [1.0, -r], column) for r, column in zip(rho, steps.T)]).T
+        z.append([0.5 * bias + rng.standard_normal((4000, 6))])
+    parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
+    R = part_correlations(z, parts, 0.05)
+    jitter, white, bias = R * (np.sqrt(parts.share) * sigma)[:, :, None] * (np.sqrt(parts.share) * sigma)[:, None, :]
+    error = PoseError()
+    for _ in range(200):
+        error.add(Step(np.eye(4), jitter, white, bias, parts.tau_s, 0.05))
+    fitted = [curves(np.array([200]), tau / 0.05)[0] @ s for tau, s in zip(parts.tau_s, parts.share.T)]
+    np.testing.assert_allclose(np.diagonal(error.covariance), sigma**2 * fitted, rtol=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError, ModelError
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.meantest import helps_over_distance, helps_the_pose, surely_positive
+from gpvo.learning.meantest import helps_over_distance, pose_gain, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
@@ -101,10 +101,10 @@ def test_a_mean_that_parts_what_belongs_together_is_no_help():
     # Over the next second the turn moves the position as far as the error has moved it back.
     error = np.hstack([-0.5 * v_mps[:, None] * np.cross(turn, along), turn])
     rows = replace(rows, error=error)
-    assert helps_the_pose(rows, 0.5 * error)
-    assert not helps_the_pose(rows, -error)
+    assert pose_gain(rows, 0.5 * error) == pytest.approx(4.0 * np.log(2.0))
+    assert pose_gain(rows, -error) == 0.0
     sideways = np.where(np.arange(6) < 3, 0.9, 0.0)
-    assert not helps_the_pose(rows, sideways * error)
+    assert pose_gain(rows, sideways * error) == 0.0
 
 
 def test_same_data_and_seed_give_the_same_bytes(tmp_path):

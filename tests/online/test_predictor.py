@@ -79,6 +79,27 @@ def test_never_a_small_covariance_outside(predictor, flight):
     assert (predictor.predict(far).sigma > usual).all()
 
 
+def test_a_jump_that_its_own_noise_explains_is_no_other_place(predictor, flight):
+    """Twenty deviations off in speed: far away where the motion is well known, near where its geometry is poor."""
+    log, truth = flight
+    s = build(log, truth, name="x", columns=predictor.features)
+    names, domain = list(predictor.features), predictor.model.domain
+    sure = s.X[10].copy()
+    jump_mps = 20.0 * domain.scale[names.index("v_y_mps")]
+    sure[names.index("v_y_mps")] += jump_mps
+    poor = sure.copy()
+    geometric = [names.index(c) for c in predictor.model.base.columns[6:12]]
+    poor[geometric] += 2.0 * np.log(jump_mps * predictor.model.dt_s) - poor[geometric[1]]
+    still = poor.copy()
+    still[names.index("v_y_mps")] = s.X[10, names.index("v_y_mps")]
+    place = predictor.model.locate(np.array([sure, poor, still]))
+    by_geometry = predictor.model.domain.locate(still[None]).distance[0]
+    assert place.distance[0] > 10.0
+    assert place.distance[1] < by_geometry + 2.0
+    assert place.distance[2] <= by_geometry
+    assert predictor.predict(poor).sigma[1] > jump_mps * predictor.model.dt_s
+
+
 def test_what_is_missing_or_absurd_stays_finite(predictor, flight):
     record = flight[0].records[5]
     bad = [
@@ -115,7 +136,7 @@ def test_a_lost_motion_may_be_as_wrong_as_the_vehicle_is_fast_and_no_more(predic
     vague = np.diag([0.1**2] * 3 + [0.05**2] * 3)
     records[80] = replace(records[80], status=Status.LOST, covariances=dict.fromkeys(records[80].covariances, vague))
     said = [predictor.step(r) for r in records[:81]][-1]
-    usual = predictor.arrays["lost_rate_var"] * records[80].dt_s ** 2
+    usual = predictor.model.usual_rate_var * records[80].dt_s ** 2
     assert (said.sigma >= np.sqrt(usual) * (1 - 1e-9)).all()
     assert (said.sigma < 3 * np.sqrt(usual) + 0.01).all()
     assert not said.mean.any()

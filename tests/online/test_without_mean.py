@@ -13,7 +13,7 @@ def test_the_other_model_speaks_where_no_mean_is_taken_off() -> None:
     trained = small_model()
     plain = arrays_without_mean(trained.arrays)
     other = {f"{WITHOUT_MEAN}{name}": array for name, array in plain.items() if name.startswith("basis.")}
-    other[f"{WITHOUT_MEAN}factor"] = 4.0 * plain["factor"]
+    other[f"{WITHOUT_MEAN}factor"] = 1.01 * plain["factor"]
     arrays = {**trained.arrays, **other}
     one = Predictor(plain, trained.header)
     two = Predictor(arrays, trained.header, with_mean=False)
@@ -21,7 +21,7 @@ def test_the_other_model_speaks_where_no_mean_is_taken_off() -> None:
         a, b = one.step(record), two.step(record)
         assert a is not None
         assert b is not None
-        np.testing.assert_allclose(b.covariance, 4.0 * a.covariance, rtol=1e-9)
+        np.testing.assert_allclose(b.covariance, 1.01 * a.covariance, rtol=1e-4)
         np.testing.assert_allclose(b.mean, a.mean, atol=1e-15)
 
 

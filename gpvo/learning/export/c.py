@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpvo.online.base import positions
+from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.rowplan import StackedBasis, stack
 
@@ -64,6 +64,7 @@ def _preamble(model: ErrorModelArrays, units: tuple[str, ...], note: str) -> lis
 def _constants(model: ErrorModelArrays) -> list[str]:
     stacked, domain, d = stack(model.basis), model.domain, len(model.columns)
     columns = positions(model.columns, model.base.columns)
+    by_velocity, by_acceleration = motion_noise(model.columns)
     sizes = {
         "N_FEATURES": d,
         "N_INPUTS": len(model.inputs),
@@ -77,8 +78,9 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         "DT_S": _number(model.dt_s),
         "GEOMETRY_WEIGHT": _number(model.geometry_weight[0]),
         "TYPICAL_LN_DET": _number(model.typical_ln_det[0]),
-        "OUTSIDE_RATE": _number(model.outside_rate[0]),
+        "OUTSIDE_POWER": _number(model.outside_power[0]),
         "LN_SPEED": _number(model.ln_speed[0]),
+        "MEAN_IN_SIGMA": int(model.mean_in_sigma[0]),
     }
     return [
         *(f"#define GPVO_{key} {value}" for key, value in sizes.items()),
@@ -91,8 +93,11 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("may_miss", domain.may_miss, "int"),
         *_array("input", model.inputs, "int"),
         *_array("base_column", columns, "int"),
+        *_array("by_velocity", by_velocity),
+        *_array("by_acceleration", by_acceleration),
         *_array("theta", model.base.theta),
         *_array("theta_plain", model.base.plain),
+        *_array("usual_rate_var", model.usual_rate_var),
         *_array("factor", model.factor),
         *_array("high", model.high),
         *_array("correlation", model.correlation),

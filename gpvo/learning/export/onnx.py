@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
-from gpvo.online.base import positions
+from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import PARTS, ErrorModelArrays
 from gpvo.online.rowplan import stack
 from gpvo.types import Array
@@ -105,13 +105,13 @@ class _Graph:
 
 def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     """The whole graph; line by line ``ErrorModelArrays.estimate``."""
-    inside, distance, in_domain = _locate(g, model)
-    rate, rate_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
-    longer = g.expand(g("Div", "dt_s", model.dt_s), 1)
-    mean, mean_var = g("Mul", rate, longer), g("Mul", rate_var, g("Mul", longer, longer))
     base, plain = (_base(g, model, theta) for theta in (model.base.theta, model.base.plain))
+    inside, distance, in_domain = _locate(g, model, base)
+    ratio, ratio_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
+    unit = g("Sqrt", base) if model.mean_in_sigma[0] else g.expand(g("Div", "dt_s", model.dt_s), 1)
+    mean, mean_var = g("Mul", ratio, unit), g("Mul", ratio_var, g("Mul", unit, unit))
     near = g.expand(in_domain, 1)
-    growth = g.expand(g("Add", g("Mul", distance, float(model.outside_rate[0])), 1.0), 1)
+    growth = g.expand(g("Pow", g("Add", distance, 1.0), float(model.outside_power[0])), 1)
     known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
     short = g("Max", g("Sub", g.constant(model.high), log_noise), 0.0)
     cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
@@ -121,8 +121,8 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     noise = g("Mul", g("Add", base, more), g("Exp", cautious))
     total = g("Mul", g.add(noise, mean_var, g("Mul", lost, lost)), growth)
     factor = g.constant(model.factor)
-    variance = g("Mul", total, factor)
-    g("Sub", variance, g("Mul", known, factor), out="epistemic")
+    variance = _within(g, g("Mul", total, factor), _limit(g, model))
+    g("Mul", variance, g("Sub", 1.0, g("Div", known, total)), out="epistemic")
     sigmas = [g("Sqrt", g("Mul", variance, share)) for share in _shares(g, model, variance)]
     each = zip(PARTS, sigmas, _correlations(g, model), strict=True)
     parts = [g("Mul", g.outer(sigma), R, out=name) for name, sigma, R in each]
@@ -131,15 +131,19 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
 
 
-def _locate(g: _Graph, model: ErrorModelArrays) -> tuple[str, str, str]:
+def _locate(g: _Graph, model: ErrorModelArrays, base: str) -> tuple[str, str, str]:
     domain = model.domain
+    by_velocity, by_acceleration = (g.constant(m / domain.scale**2) for m in motion_noise(model.columns))
+    squared_dt = g.expand(g("Mul", "dt_s", "dt_s"), 1)
+    noise = g.add(g("MatMul", base, by_velocity), g("Div", g("MatMul", base, by_acceleration), squared_dt))
+    known = g.add(g("Div", noise, squared_dt), 1.0)
     u = g("Div", g("Sub", "features", g.constant(domain.centre)), g.constant(domain.scale))
     present = g.finite(u)
     u = g("Where", present, u, 0.0)
     inside = g("Min", g("Max", u, g.constant(domain.low)), g.constant(domain.high))
     away = g("Sub", u, inside)
     charged = g("Where", present, 0.0, g.constant((~domain.may_miss).astype(np.float64)))
-    beyond = g.sum(g("Add", g("Mul", away, away), charged), 1)
+    beyond = g.sum(g("Add", g("Div", g("Mul", away, away), known), charged), 1)
     white = g("MatMul", inside, g.constant(domain.whitening))
     joint = g("Max", g("Sub", g("Sqrt", g.sum(g("Mul", white, white), 1)), float(domain.radius[0])), 0.0)
     squared = g("Add", beyond, g("Mul", joint, joint))
@@ -169,6 +173,21 @@ def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, s
         g.add(log_noise, more, offset[2]),
         g("Max", g("Add", spread, offset[3]), 0.0),
     )
+
+
+def _limit(g: _Graph, model: ErrorModelArrays) -> str:
+    """(N, 6): no motion is more wrong than VO's and the usual one are long."""
+    at = positions(model.columns, model.base.columns)[:6]
+    rate = g.take("features", at, axis=1)
+    rate = g("Where", g.finite(rate), rate, g.constant(model.domain.centre[at]))
+    dt = g.expand("dt_s", 1)
+    moved = g("Mul", g("Add", g("Mul", rate, rate), g.constant(model.usual_rate_var)), g("Mul", dt, dt))
+    return g("MatMul", moved, g.constant(np.kron(np.eye(2), np.ones((3, 3)))))
+
+
+def _within(g: _Graph, variance: str, limit: str) -> str:
+    ratio = g("Div", variance, limit)
+    return g("Div", variance, g("Sqrt", g("Add", g("Mul", ratio, ratio), 1.0)))
 
 
 def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:

@@ -14,19 +14,25 @@ typedef struct {
 
 static double gpvo_clip(double v, double low, double high) { return v < low ? low : v > high ? high : v; }
 
-/* Draws the standardised features into the training domain; returns how far outside they were. */
-static double gpvo_locate(const double *features, double *inside) {
+/* Draws the standardised features into the training domain; returns how far outside they were, given the variance of
+ * the motion. */
+static double gpvo_locate(const double *features, const double *base, double dt_s, double *inside) {
     double beyond = 0.0, joint = 0.0;
     int i, j;
     for (i = 0; i < GPVO_N_FEATURES; ++i) {
         double u = (features[i] - gpvo_centre[i]) / gpvo_scale[i];
+        double noise = 0.0, dt2 = dt_s * dt_s;
         int missing = !isfinite(u);
+        for (j = 0; j < 6; ++j) {
+            int at = j * GPVO_N_FEATURES + i;
+            noise += base[j] * (gpvo_by_velocity[at] + gpvo_by_acceleration[at] / dt2) / dt2;
+        }
         if (missing) {
             u = 0.0;
             beyond += gpvo_may_miss[i] ? 0.0 : 1.0;
         }
         inside[i] = gpvo_clip(u, gpvo_low[i], gpvo_high_edge[i]);
-        beyond += (u - inside[i]) * (u - inside[i]);
+        beyond += (u - inside[i]) * (u - inside[i]) / (1.0 + noise / (gpvo_scale[i] * gpvo_scale[i]));
     }
     for (j = 0; j < GPVO_N_FEATURES; ++j) {
         double w = 0.0;
@@ -100,6 +106,22 @@ static void gpvo_base(const double *features, double dt_s, double base[6], doubl
     }
 }
 
+/* As wrong as a motion can be, translation and rotation: no more than VO's and the usual one are long. */
+static void gpvo_limits(const double *features, double dt_s, double limit[2]) {
+    int i;
+    limit[0] = limit[1] = 0.0;
+    for (i = 0; i < 6; ++i) {
+        int at = gpvo_base_column[i];
+        double rate = isfinite(features[at]) ? features[at] : gpvo_centre[at];
+        limit[i / 3] += (rate * rate + gpvo_usual_rate_var[i]) * dt_s * dt_s;
+    }
+}
+
+static double gpvo_within(double variance, double limit) {
+    double ratio = variance / limit;
+    return variance / sqrt(1.0 + ratio * ratio);
+}
+
 /* Correlations of jitter, white and bias; the first two mixed with those of the geometric covariance where there is one. */
 static void gpvo_correlations(const double *geometry, double R[3][36]) {
     int i, j, p, known = geometry != 0 && GPVO_GEOMETRY_WEIGHT > 0.0;
@@ -156,26 +178,29 @@ static double gpvo_log_det(const double C[36]) {
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], part[3][6], distance, outside, growth;
-    double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, longer = duration / GPVO_DT_S, faster = gpvo_faster(features);
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], part[3][6], limit[2], distance, outside, growth;
+    double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
-    distance = gpvo_locate(features, inside);
+    gpvo_base(features, duration, base, plain);
+    distance = gpvo_locate(features, base, duration, inside);
     for (i = 0; i < GPVO_N_INPUTS; ++i) inputs[i] = inside[gpvo_input[i]];
     gpvo_basis(inputs, said);
-    gpvo_base(features, duration, base, plain);
     gpvo_correlations(geometry, R);
+    gpvo_limits(features, duration, limit);
     out->distance = distance;
     out->in_domain = exp(-0.5 * distance * distance);
     outside = 1.0 - out->in_domain;
-    growth = 1.0 + GPVO_OUTSIDE_RATE * distance;
+    growth = pow(1.0 + distance, GPVO_OUTSIDE_POWER);
     for (j = 0; j < 6; ++j) {
-        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, variance;
+        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
-        double drift = said[0][j] * longer, drift_var = said[1][j] * longer * longer;
-        out->mean[j] = drift * out->in_domain;
-        lost = drift - out->mean[j];
-        variance = ((base[j] + outside * (plain[j] > base[j] ? plain[j] - base[j] : 0.0)) * exp(cautious) * growth + (drift_var + lost * lost) * growth) * gpvo_factor[j];
-        out->epistemic[j] = variance - known * gpvo_factor[j];
+        double unit = GPVO_MEAN_IN_SIGMA ? sqrt(base[j]) : duration / GPVO_DT_S, usual = said[0][j] * unit;
+        out->mean[j] = usual * out->in_domain;
+        lost = usual - out->mean[j];
+        total = (base[j] + outside * (plain[j] > base[j] ? plain[j] - base[j] : 0.0)) * exp(cautious) * growth;
+        total += (said[1][j] * unit * unit + lost * lost) * growth;
+        variance = gpvo_within(total * gpvo_factor[j], limit[j / 3]);
+        out->epistemic[j] = variance * (1.0 - known / total);
         gpvo_divide(j, variance, faster, part);
     }
     for (i = 0; i < 6; ++i)
