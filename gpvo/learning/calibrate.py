@@ -21,7 +21,7 @@ _NU_RANGE = (2.5, 200.0)
 # Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
 _OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
-_POWERS = (0.5, 0.75, 1.0, 1.5, 2.0)
+_POWERS = (1.0, 1.25, 1.5, 2.0)
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -94,7 +94,7 @@ def _with_prior(variance: float, groups: int) -> float:
 def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
     """Power of the growth (see ``guard.growth``) with the ``distance`` (n,) from what the other groups knew.
 
-    ``square`` (n,): mean over the axes of the squared normalised residuals. A half is expected, and never less is
+    ``square`` (n,): mean over the axes of the squared normalised residuals. One is expected, and never less is
     taken: other surroundings differ in more than flights of one kind can show. The rows of a group outside count as
     five at most, as they go together.
     """

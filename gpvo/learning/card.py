@@ -25,7 +25,8 @@ def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -
 
 def _intro(h: Mapping[str, Any], name: str) -> str:
     choices = h["choices"]
-    mean = [a for a, used in zip(AXES, choices["use_mean"]) if used]
+    axes = ", ".join(a for a, used in zip(AXES, choices["use_mean"]) if used)
+    mean = f"{axes} (given: {choices['mean_inputs']})" if axes else "no axis; none helped left-out sequences for sure"
     inputs = (
         ", ".join(f"`{i}`" for i in h["inputs"]) or "none: the base variance alone predicts left-out sequences best"
     )
@@ -38,7 +39,7 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}, trust {choices['trust']:g}): {inputs}",
-            f"* mean corrected on: {', '.join(mean) or 'no axis; no mean was proven to help on left-out sequences'}",
+            f"* mean corrected on: {mean}",
         ]
     )
 

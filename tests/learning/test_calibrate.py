@@ -44,10 +44,10 @@ def test_a_new_sequence_is_covered():
 def test_growth_outside_is_as_seen_and_as_expected_where_nothing_was_seen():
     rng = np.random.default_rng(6)
     distance, group = rng.uniform(0.0, 20.0, 400), np.repeat(np.arange(20), 20)
-    for power in (0.25, 1.0, 1.5):
+    for power in (0.25, 1.5, 2.0):
         square = growth(distance, power) * rng.chisquare(6, 400) / 6
-        assert fit_outside_power(distance, square, group) == max(power, 0.5)
-    assert fit_outside_power(np.zeros(400), np.ones(400), group) == 0.5
+        assert fit_outside_power(distance, square, group) == max(power, 1.0)
+    assert fit_outside_power(np.zeros(400), np.ones(400), group) == 1.0
 
 
 def test_conformal_intervals_cover_new_groups():
