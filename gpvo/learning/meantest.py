@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ def _pose_errors(motion: Sequence[Array], error: Sequence[Array]) -> Array:
     """(S, 2) mean squares of the pose's error [m^2, rad^2] after each long span that occurs in the chains."""
     found: dict[int, list[Array]] = {}
     for Ts, xis in zip(motion, error):
-        poses = np.array(_compose(Ts))
+        poses = np.array(list(accumulate(Ts, np.matmul, initial=np.eye(4))))
         # To first order: every motion's error carried to the first frame, summed, and carried to the last one.
         carried = (se3.adjoint(poses[1:]) @ xis[:, :, None])[:, :, 0]
         total = np.cumsum(np.vstack([np.zeros(6), carried]), axis=0)
@@ -75,10 +76,3 @@ def _pose_errors(motion: Sequence[Array], error: Sequence[Array]) -> Array:
             found.setdefault(m, []).append(at_end**2)
     squares = [np.concatenate(found[m]).mean(axis=0) for m in sorted(found)]
     return np.array([[s[:3].sum(), s[3:].sum()] for s in squares])
-
-
-def _compose(motions: Array) -> list[Array]:
-    poses = [np.eye(4)]
-    for T in motions:
-        poses.append(poses[-1] @ T)
-    return poses

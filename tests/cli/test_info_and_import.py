@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -246,3 +248,8 @@ def test_simulated_log_with_turned_truth_is_put_right(gpvo, tmp_path):
     a, b = (motion_errors(r.log, r.truth).xi for r in (own, found))
     rms = [np.sqrt((x[:, :3] ** 2).sum(axis=1).mean()) for x in (a, b)]
     assert rms[1] < 2 * rms[0]
+
+
+def test_python_m_gpvo_is_the_command_line():
+    done = subprocess.run([sys.executable, "-m", "gpvo", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("gpvo ")

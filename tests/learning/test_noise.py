@@ -173,3 +173,19 @@ def test_shapes_are_checked() -> None:
         fit_heteroscedastic(problem.X, problem.Y, problem.run, base_log_var=np.zeros((100, 2)))
     with pytest.raises(ValueError, match="profile"):
         fit_heteroscedastic(problem.X, problem.Y, problem.run, options=HeteroscedasticOptions(profile="none"))
+
+
+def test_a_mean_sees_the_inputs_it_was_given_alone():
+    """Noise of one input, mean of another: the mean is found, and the first changes nothing of it."""
+    rng = np.random.default_rng(8)
+    X = rng.uniform(-2.0, 2.0, (1500, 2))
+    truth = np.sin(2.0 * X[:, 1:])
+    Y = np.hstack([truth, -truth]) + np.exp(0.8 * X[:, :1]) * 0.1 * rng.standard_normal((1500, 2))
+    options = HeteroscedasticOptions(regressor="sparse", inducing=64)
+    fitted = fit_heteroscedastic(X, Y, np.repeat(np.arange(5), 300), mean_inputs=np.array([1]), options=options)
+    probe = np.stack([np.full(9, -1.5), np.linspace(-1.8, 1.8, 9)], axis=1)
+    other = probe + [3.0, 0.0]
+    mean, noise = fitted.basis.predict(probe).mean, fitted.basis.predict(probe).log_noise_var
+    np.testing.assert_allclose(fitted.basis.predict(other).mean, mean, rtol=1e-9)
+    assert np.abs(mean[:, 0] - np.sin(2.0 * probe[:, 1])).max() < 0.05
+    assert np.abs(fitted.basis.predict(other).log_noise_var - noise - 4.8).max() < 1.2

@@ -92,6 +92,21 @@ def test_a_mean_that_adds_up_is_no_help():
     assert helps_over_distance(rows, drawn, sigma).tolist() == [False] * 3 + [True] * 3
 
 
+def test_a_mean_sees_the_motion_where_the_error_is_one_of_motion():
+    """Too far by a hundredth of what is faster than usual: no condition knows that, and the predictor says so."""
+    config = TrainConfig(features="velocity,n_inliers", noise_inducing=16, inducing=32, regressor="sparse")
+    sets = []
+    for s in training_sets(range(6), n=600):
+        Y = s.Y * np.exp(3.0 * s.select(["v_x_mps"]))
+        Y[:, 2] += 0.01 * (s.select(["v_z_mps"])[:, 0] - 1.0)
+        sets.append(replace(s, Y=Y))
+    trained = train_sets(sets, config, judge=False)
+    assert trained.header["choices"]["mean_inputs"] == "all"
+    assert trained.predictor().mean_sees_motion
+    plain = small_model().predictor()
+    assert not plain.mean_sees_motion
+
+
 def test_a_mean_that_parts_what_belongs_together_is_no_help():
     """A turn and the sideways error that undoes it on the way: off with both, or with neither."""
     rows = Rows.stack(training_sets(range(4), n=300))
