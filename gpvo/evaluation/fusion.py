@@ -54,7 +54,9 @@ def load_predictor(path: str | Path, mean: MeanUse | None = None) -> tuple[Predi
             cure="train with --target frame",
         )
     chosen: MeanUse = mean or ("absorb" if predictor.mean_sees_motion else "subtract")
-    return (predictor if chosen == "subtract" else Predictor.load(path, with_mean=False)), chosen
+    if chosen == "absorb":
+        predictor = Predictor(predictor.arrays, predictor.header, predictor.digest, with_mean=False)
+    return predictor, chosen
 
 
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:

@@ -51,17 +51,14 @@ class BaseVariance:
         """Feature columns that it needs, in order."""
         return base_columns(self.method, self.residual)
 
-    def __call__(self, columns: Array, dt_s: Array, outside: Array | None = None) -> Array:
-        """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,).
+    def __call__(self, columns: Array, dt_s: Array) -> Array:
+        """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,)."""
+        return np.einsum("jc,njc->nj", self.theta, parts(columns, dt_s))
 
-        ``outside`` (n, 1) in [0, 1]: how far to take the plain variance where that is larger.
-        """
+    def both(self, columns: Array, dt_s: Array) -> tuple[Array, Array]:
+        """The same, and the plain variance, (n, 6) each."""
         terms = parts(columns, dt_s)
-        base = np.einsum("jc,njc->nj", self.theta, terms)
-        if outside is None:
-            return base
-        plain = np.einsum("jc,njc->nj", self.plain, terms)
-        return np.asarray(base + outside * np.maximum(plain - base, 0.0))
+        return np.einsum("jc,njc->nj", self.theta, terms), np.einsum("jc,njc->nj", self.plain, terms)
 
 
 def parts(columns: Array, dt_s: Array) -> Array:

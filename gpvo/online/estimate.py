@@ -192,7 +192,7 @@ class ErrorModelArrays:
     def variances(self, X: Array, dt_s: Array | None) -> Variances:
         """Variances of rows X (n, d), before calibration."""
         duration, columns = self._duration(X, dt_s), self._base_columns(X)
-        base = self.base(columns, duration)
+        base, plain = self.base.both(columns, duration)
         place = self._locate(X, base, duration)
         said = self.basis.predict(place.inside[:, self.inputs])
         outside = (1.0 - place.in_domain)[:, None]
@@ -205,7 +205,8 @@ class ErrorModelArrays:
         grown = growth(place.distance, self.outside_power)[:, None]
         mean = usual * place.in_domain[:, None]
         mean_var = (said.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
-        total = self.base(columns, duration, outside) * np.exp(cautious) * grown
+        # What odometry says of itself means what it meant in training only where the surroundings are alike.
+        total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
         # VO's motion less the true one is no longer than both together, whatever is said of its variance.
         moved = (columns[:, :6] ** 2 + self.usual_rate_var) * duration[:, None] ** 2
         limit = np.repeat(moved.reshape(-1, 2, 3).sum(axis=2), 3, axis=1)
