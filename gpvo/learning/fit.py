@@ -55,22 +55,21 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     rows = Rows.stack(sets)
     base, base_oof = choose_base(rows)
     name, inputs, fitted, trust, scores = choose_inputs(rows, base, base_oof, config)
-    columns = tuple(dict.fromkeys((*inputs, *base.columns, *guarded(rows.sets, config))))
-    plain = fitted
-    fitted, mean = _with_mean(rows, base, base_oof, columns, inputs, fitted, trust, config)
+    plain = None if fitted is None or trust == 0.0 else shrink(fitted, trust)
+    inputs, fitted, mean = _with_mean(rows, base, base_oof, inputs, fitted, trust, config)
     fitted = None if fitted is None else shrink(fitted, trust)
+    columns = tuple(dict.fromkeys((*inputs, *base.columns, *guarded(rows.sets, config))))
+    use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
     error, variance = _out_of_fold(rows, base_oof, fitted)
     in_sigma = mean.name != ALL
     model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
     arrays = model.to_arrays()
-    use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
-    if plain is not None and any(use_mean):
-        plain = shrink(plain, trust)
+    if any(use_mean):
         without, _ = assemble(rows, base, columns, inputs, plain, *_out_of_fold(rows, base_oof, plain))
         arrays |= {f"{WITHOUT_MEAN}{name}": array for name, array in without.to_arrays().items()}
     choices = {
         "base": _name_of(base),
-        "inputs": name,
+        "inputs": name if inputs else NONE,
         "trust": trust,
         "inputs_nll": scores,
         "use_mean": use_mean,
@@ -118,19 +117,20 @@ def choose_inputs(
 ) -> tuple[str, tuple[str, ...], HeteroscedasticFit | None, float, dict[str, float]]:
     """The inputs and the trust in their log-variance GP that predict left-out groups best.
 
-    The GP's log ratio to the base is shrunk by a trust in (0, 1]; nothing is left of it where no GP beats the base.
+    The GP's log ratio to the base is shrunk by a trust in (0, 1], and 0 where no GP beats the base: then the inputs
+    are the best of those, as a mean may need them.
     """
     best: tuple[str, tuple[str, ...], HeteroscedasticFit | None, float] = (NONE, (), None, 0.0)
-    scores = {NONE: _loss(rows, rows.error**2, base_oof)}
+    scores: dict[str, float] = {}
+    alone = _loss(rows, rows.error**2, base_oof)
     for name, inputs in candidates(rows.sets, config).items():
-        columns = tuple(dict.fromkeys((*inputs, *base.columns)))
-        fitted = _fit_gp(rows, base, columns, inputs, np.zeros(6, dtype=bool), config)
+        fitted = _fit_gp(rows, base, inputs, np.zeros(6, dtype=bool), config)
         losses = {t: _loss(rows, rows.error**2, base_oof * np.exp(t * fitted.oof_log_noise_var)) for t in TRUSTS}
         trust = min(losses, key=losses.__getitem__)
-        if losses[trust] < min(scores.values()):
-            best = (name, inputs, fitted, trust)
+        if losses[trust] < min(scores.values(), default=np.inf):
+            best = (name, inputs, fitted, trust if losses[trust] < alone else 0.0)
         scores[name] = losses[trust]
-    return *best, scores
+    return *best, {NONE: alone, **scores}
 
 
 def _losses(rows: Rows, square: Array, variance: Array) -> Array:
@@ -152,10 +152,9 @@ def _base_inputs(rows: Rows, columns: Sequence[str]) -> Array:
     return np.where(np.isfinite(C), C, np.nanmedian(C, axis=0))
 
 
-def _gp_inputs(rows: Rows, columns: Sequence[str], inputs: Sequence[str]) -> Array:
-    domain = Domain.learn(rows.select(columns))
-    at = [list(columns).index(n) for n in inputs]
-    return domain.locate(rows.select(columns)).inside[:, at]
+def _gp_inputs(rows: Rows, inputs: Sequence[str]) -> Array:
+    X = rows.select(inputs)
+    return Domain.learn(X).locate(X).inside
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,6 @@ _NO_MEAN = _Mean(NONE, np.arange(0))
 def _fit_gp(
     rows: Rows,
     base: BaseVariance,
-    columns: Sequence[str],
     inputs: Sequence[str],
     use_mean: NDArray[np.bool_],
     config: TrainConfig,
@@ -187,7 +185,7 @@ def _fit_gp(
     longer = np.repeat((rows.dt_s / np.median(rows.dt_s))[:, None], 6, axis=1)
     unit = np.exp(0.5 * log_base) if seen is None or seen.name != ALL else longer
     fitted = fit_heteroscedastic(
-        _gp_inputs(rows, columns, inputs),
+        _gp_inputs(rows, inputs),
         rows.error / unit,
         rows.group,
         base_log_var=log_base - 2.0 * np.log(unit),
@@ -201,7 +199,7 @@ def _fit_gp(
 
 def shrink(fitted: HeteroscedasticFit, trust: float) -> HeteroscedasticFit:
     """The fit with its log ratio times ``trust``: mean by the factor, variance by its square."""
-    noise = fitted.basis.noise
+    noise = fitted.basis.noise if trust else None
     if noise is not None:
         noise = replace(
             noise,
@@ -218,33 +216,37 @@ def _with_mean(
     rows: Rows,
     base: BaseVariance,
     base_oof: Array,
-    columns: Sequence[str],
-    inputs: Sequence[str],
+    inputs: tuple[str, ...],
     fitted: HeteroscedasticFit | None,
     trust: float,
     config: TrainConfig,
-) -> tuple[HeteroscedasticFit | None, _Mean]:
+) -> tuple[tuple[str, ...], HeteroscedasticFit | None, _Mean]:
     """Add the mean that makes the path best, on the axes where it makes the errors of left-out groups smaller over any
-    distance; none where that may be chance.
+    distance; none where that may be chance. Returned with the inputs that are still needed.
 
     One given the conditions alone is tried beside one that sees VO's own motion, and so what was usual in training.
     """
     if fitted is None:
-        return None, _NO_MEAN
+        return (), None, _NO_MEAN
     # The question is put with few inducing points; only a mean that proves itself is fitted as asked.
     quick = replace(config, regressor="sparse", inducing=min(config.inducing, 64))
     v0 = base_oof * np.exp(trust * fitted.oof_log_noise_var)
     plain = t_negative_log_likelihood(rows.error**2, v0)
     best, use, most = _NO_MEAN, np.zeros(6, dtype=bool), 0.0
     for seen in _means(inputs):
-        tried = _fit_gp(rows, base, columns, inputs, np.ones(6, dtype=bool), quick, seen)
+        tried = _fit_gp(rows, base, inputs, np.ones(6, dtype=bool), quick, seen)
         left = t_negative_log_likelihood((rows.error - tried.oof_mean) ** 2, v0 + tried.oof_epistemic_var)
         gains = rows.by_group(plain - left).mean(axis=0)
         axes = (gains > 0) & helps_over_distance(rows, tried.oof_mean, np.sqrt(v0))
         gain = pose_gain(rows, np.where(axes, tried.oof_mean, 0.0)) if axes.any() else 0.0
         if gain > most:
             best, use, most = replace(seen, gains=gains.tolist()), axes, gain
-    return (_fit_gp(rows, base, columns, inputs, use, config, best) if use.any() else fitted), best
+    if trust == 0.0:
+        inputs = tuple(inputs[i] for i in best.inputs)
+        best = replace(best, inputs=np.arange(len(inputs)))
+    if use.any():
+        fitted = _fit_gp(rows, base, inputs, use, config, best)
+    return inputs, fitted if inputs else None, best
 
 
 def _means(inputs: Sequence[str]) -> list[_Mean]:

@@ -16,7 +16,7 @@ from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.fit import Learned, fit_model
+from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_gp
 from gpvo.learning.parallel import map_jobs
 from gpvo.learning.sample import draw_sample
@@ -192,7 +192,7 @@ def _header(
         "horizon": "one motion" if config.target == "frame" else config.target,
         "features": list(model.columns),
         "units": list(units(model.columns)),
-        "inputs": [model.columns[i] for i in model.inputs] if learned.choices["trust"] else [],
+        "inputs": [] if learned.choices["inputs"] == NONE else [model.columns[i] for i in model.inputs],
         "base_method": model.base.method,
         "training_domain": {n: [lo, hi] for n, lo, hi in zip(model.columns, low.tolist(), high.tolist())},
         "dt_s": step,

@@ -107,6 +107,26 @@ def test_a_mean_sees_the_motion_where_the_error_is_one_of_motion():
     assert not plain.mean_sees_motion
 
 
+def test_a_mean_is_found_where_the_noise_needs_no_gp():
+    """The geometric covariance is all there is to know of the noise, but x is wrong by 0.7 sigma, by the turn rate."""
+    config = TrainConfig(features="velocity,rotation,n_inliers", noise_inducing=16, inducing=32, regressor="sparse")
+    rng = np.random.default_rng(0)
+    sets = []
+    for s in training_sets(range(6), n=400):
+        sigma = np.sqrt(np.diagonal(s.covariances["pointing_matching"], axis1=1, axis2=2))
+        bias = np.where(np.arange(6) == 0, 0.7, 0.0) * np.tanh(np.log(s.select(["n_inliers"]) / 100.0))
+        sets.append(replace(s, Y=sigma * (rng.standard_normal(s.Y.shape) + bias)))
+    trained = train_sets(sets, config, judge=False)
+    choices = trained.header["choices"]
+    assert choices["trust"] == 0.0
+    assert choices["use_mean"][0]
+    assert trained.header["inputs"] == ["n_inliers"]
+    s = sets[0]
+    e = _said(trained.predictor(), s)
+    bias = 0.7 * np.tanh(np.log(s.select(["n_inliers"])[:, 0] / 100.0)) * e.sigma[:, 0]
+    assert np.corrcoef(e.mean[:, 0], bias)[0, 1] > 0.95
+
+
 def test_a_mean_that_parts_what_belongs_together_is_no_help():
     """A turn and the sideways error that undoes it on the way: off with both, or with neither."""
     rows = Rows.stack(training_sets(range(4), n=300))
