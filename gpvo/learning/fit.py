@@ -224,7 +224,8 @@ def _with_mean(
     """Add the mean that makes the path best, on the axes where it makes the errors of left-out groups smaller over any
     distance; none where that may be chance. Returned with the inputs that are still needed.
 
-    One given the conditions alone is tried beside one that sees VO's own motion, and so what was usual in training.
+    One given the conditions alone is tried beside one that sees VO's own motion, and so what was usual in training;
+    the latter not where the inputs do not even tell the noise (no ``trust``).
     """
     if fitted is None:
         return (), None, _NO_MEAN
@@ -233,7 +234,7 @@ def _with_mean(
     v0 = base_oof * np.exp(trust * fitted.oof_log_noise_var)
     plain = t_negative_log_likelihood(rows.error**2, v0)
     best, use, most = _NO_MEAN, np.zeros(6, dtype=bool), 0.0
-    for seen in _means(inputs):
+    for seen in (m for m in _means(inputs) if trust or m.name == CONDITIONS):
         tried = _fit_gp(rows, base, inputs, np.ones(6, dtype=bool), quick, seen)
         left = t_negative_log_likelihood((rows.error - tried.oof_mean) ** 2, v0 + tried.oof_epistemic_var)
         gains = rows.by_group(plain - left).mean(axis=0)
