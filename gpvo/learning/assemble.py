@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,15 +45,8 @@ def assemble(
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     sigma = np.sqrt(variance * scale.factor)
     z = error / sigma
-    step_s = float(np.median(rows.dt_s))
-    v_mps = rows.select(TWIST_COLUMNS[:3])
-    ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
-    faster = ln_faster(v_mps, ln_speed)
-    split = fit_parts(rows.chains(error), rows.chains(sigma), rows.chains(faster), step_s)
-    correlation = part_correlations(rows.chains(z), split, step_s)
     geometry = rows.geometry(base.method)
-    share = divide(split.share, split.growth, 2.0 * np.log(sigma) - split.level, faster)
-    weight = choose_geometry_weight(error, sigma, correlation, geometry, share)
+    sums = _sums_of(rows, error, sigma, geometry)
     X = rows.select(columns)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     # Out of the domain no mean is taken off, so what is left of one says nothing of how wrong VO is there.
@@ -64,36 +57,58 @@ def assemble(
     else:
         basis, plain = fitted.basis, ~fitted.use_mean if not fitted.use_mean.all() else plain
         high = np.quantile(fitted.oof_log_noise_var, 0.95, axis=0)
-    at = np.array([columns.index(n) for n in inputs], dtype=np.int64)
+    outside_power = fit_outside_power(_distance(X, noise, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)
     model = ErrorModelArrays(
         columns=columns,
-        inputs=at,
+        inputs=np.array([columns.index(n) for n in inputs], dtype=np.int64),
         basis=basis,
         domain=Domain.learn(X),
         base=base,
         factor=scale.factor,
-        outside_power=np.array(
-            [fit_outside_power(_distance(X, noise, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)]
-        ),
+        outside_power=np.array([outside_power]),
         high=high,
-        correlation=correlation,
-        geometry_weight=np.array([weight]),
-        share=split.share,
-        growth=split.growth,
-        level=split.level,
-        ln_speed=ln_speed,
-        bias_tau_s=split.tau_s,
+        correlation=sums.correlation,
+        geometry_weight=np.array([sums.geometry_weight]),
+        share=sums.parts.share,
+        growth=sums.parts.growth,
+        level=sums.parts.level,
+        ln_speed=sums.ln_speed,
+        bias_tau_s=sums.parts.tau_s,
         typical_ln_det=np.zeros(1),
         usual_rate_var=np.maximum(np.nanmean(rows.weight[:, None] * rows.select(TWIST_COLUMNS) ** 2, axis=0), 1e-6),
         mean_in_sigma=np.array([mean_in_sigma]),
-        dt_s=step_s,
+        dt_s=float(np.median(rows.dt_s)),
     )
-    whole = model.split(sigma**2, faster, geometry).sum(axis=1)
+    whole = model.split(sigma**2, sums.faster, geometry).sum(axis=1)
     joint = fit_joint_factor(error, whole, rows.group)
     typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
     level = model.level + np.log(joint)
     model = replace(model, factor=scale.factor * joint, level=level, typical_ln_det=np.array([typical]))
-    return model, _calibration(rows, scale, joint, split, weight, np.abs(z) / np.sqrt(joint))
+    return model, _calibration(rows, scale, joint, sums, np.abs(z) / np.sqrt(joint))
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """How errors add up: their parts, the correlation (3, 6, 6) of each, how much of the geometry's to believe, the log
+    of the typical speed (1,) and that of each motion (n, 1) over it."""
+
+    parts: Parts
+    correlation: Array
+    geometry_weight: float
+    ln_speed: Array
+    faster: Array
+
+
+def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None) -> _Sums:
+    step_s = float(np.median(rows.dt_s))
+    v_mps = rows.select(TWIST_COLUMNS[:3])
+    ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
+    faster = ln_faster(v_mps, ln_speed)
+    parts = fit_parts(rows.chains(error), rows.chains(sigma), rows.chains(faster), step_s)
+    correlation = part_correlations(rows.chains(error / sigma), parts, step_s)
+    share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)
+    weight = choose_geometry_weight(error, sigma, correlation, geometry, share)
+    return _Sums(parts, correlation, weight, ln_speed, faster)
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
@@ -105,7 +120,7 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     return out
 
 
-def _calibration(rows: Rows, scale: Scale, joint: float, split: Parts, weight: float, score: Array) -> dict[str, Any]:
+def _calibration(rows: Rows, scale: Scale, joint: float, sums: _Sums, score: Array) -> dict[str, Any]:
     axes = [conformal_quantiles(score[:, j], rows.group) for j in range(6)]
     return {
         "by": rows.grouped_by,
@@ -113,9 +128,9 @@ def _calibration(rows: Rows, scale: Scale, joint: float, split: Parts, weight: f
         "scale_of_groups": scale.by_group,
         "log_scale_spread": scale.spread,
         "joint_factor": joint,
-        "geometry_correlation_weight": weight,
+        "geometry_correlation_weight": sums.geometry_weight,
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
         "interval_guaranteed": [sure for _, sure in axes],
-        "parts": {"spans_frames": split.spans, "seen_over_stated": split.ratio},
+        "parts": {"spans_frames": sums.parts.spans, "seen_over_stated": sums.parts.ratio},
     }
