@@ -242,12 +242,16 @@ def _with_mean(
         gain = pose_gain(rows, np.where(axes, tried.oof_mean, 0.0)) if axes.any() else 0.0
         if gain > most:
             best, use, most = replace(seen, gains=gains.tolist()), axes, gain
+    kept = inputs if trust else tuple(inputs[i] for i in best.inputs)
     if trust == 0.0:
-        inputs = tuple(inputs[i] for i in best.inputs)
-        best = replace(best, inputs=np.arange(len(inputs)))
+        best = replace(best, inputs=np.arange(len(kept)))
     if use.any():
-        fitted = _fit_gp(rows, base, inputs, use, config, best)
-    return inputs, fitted if inputs else None, best
+        asked = _fit_gp(rows, base, kept, use, config, best)
+        # A mean that held with few inducing points may go astray with many: then there is none.
+        left = t_negative_log_likelihood((rows.error - asked.oof_mean) ** 2, v0 + asked.oof_epistemic_var)
+        if (rows.by_group(plain - left).mean(axis=0)[use] > 0).all():
+            return kept, asked, best
+    return (inputs, fitted, _NO_MEAN) if trust else ((), None, _NO_MEAN)
 
 
 def _means(inputs: Sequence[str]) -> list[_Mean]:
