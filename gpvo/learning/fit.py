@@ -233,23 +233,27 @@ def _with_mean(
     quick = replace(config, regressor="sparse", inducing=min(config.inducing, 64))
     v0 = base_oof * np.exp(trust * fitted.oof_log_noise_var)
     plain = t_negative_log_likelihood(rows.error**2, v0)
+
+    def gains_of(fit: HeteroscedasticFit) -> Array:
+        left = t_negative_log_likelihood((rows.error - fit.oof_mean) ** 2, v0 + fit.oof_epistemic_var)
+        return rows.by_group(plain - left).mean(axis=0)
+
     best, use, most = _NO_MEAN, np.zeros(6, dtype=bool), 0.0
     for seen in (m for m in _means(inputs) if trust or m.name == CONDITIONS):
         tried = _fit_gp(rows, base, inputs, np.ones(6, dtype=bool), quick, seen)
-        left = t_negative_log_likelihood((rows.error - tried.oof_mean) ** 2, v0 + tried.oof_epistemic_var)
-        gains = rows.by_group(plain - left).mean(axis=0)
+        gains = gains_of(tried)
         axes = (gains > 0) & helps_over_distance(rows, tried.oof_mean, np.sqrt(v0))
         gain = pose_gain(rows, np.where(axes, tried.oof_mean, 0.0)) if axes.any() else 0.0
         if gain > most:
             best, use, most = replace(seen, gains=gains.tolist()), axes, gain
-    kept = inputs if trust else tuple(inputs[i] for i in best.inputs)
-    if trust == 0.0:
-        best = replace(best, inputs=np.arange(len(kept)))
     if use.any():
+        kept = inputs
+        if trust == 0.0:
+            kept = tuple(inputs[i] for i in best.inputs)
+            best = replace(best, inputs=np.arange(len(kept)))
         asked = _fit_gp(rows, base, kept, use, config, best)
         # A mean that held with few inducing points may go astray with many: then there is none.
-        left = t_negative_log_likelihood((rows.error - asked.oof_mean) ** 2, v0 + asked.oof_epistemic_var)
-        if (rows.by_group(plain - left).mean(axis=0)[use] > 0).all():
+        if (gains_of(asked)[use] > 0).all():
             return kept, asked, best
     return (inputs, fitted, _NO_MEAN) if trust else ((), None, _NO_MEAN)
 

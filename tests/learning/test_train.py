@@ -108,7 +108,7 @@ def test_a_mean_sees_the_motion_where_the_error_is_one_of_motion():
 
 
 def test_a_mean_is_found_where_the_noise_needs_no_gp():
-    """The geometric covariance is all there is to know of the noise, but x is wrong by 0.7 sigma, by the turn rate."""
+    """The geometry tells all there is to know of the noise, but x is wrong by up to 0.7 sigma, by the inliers."""
     config = TrainConfig(features="velocity,rotation,n_inliers", noise_inducing=16, inducing=32, regressor="sparse")
     rng = np.random.default_rng(0)
     sets = []
