@@ -23,8 +23,8 @@ def fuse(
     gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
     mean: Annotated[
         str,
-        typer.Option(help="The predicted mean: absorb (left in the covariance), subtract (taken off), or auto."),
-    ] = "auto",
+        typer.Option(help="The mean error: absorb (part of the covariance) or subtract (predicted, and taken off)."),
+    ] = "absorb",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
@@ -46,7 +46,7 @@ def fuse(
         raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
     if gate not in ("discard", "inflate"):
         raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
-    uses: dict[str, MeanUse | None] = {"auto": None, "absorb": "absorb", "subtract": "subtract"}
+    uses: dict[str, MeanUse] = {"absorb": "absorb", "subtract": "subtract"}
     if mean not in uses:
         raise GpvoError(f"--mean is '{mean}'", cure=f"choose {', '.join(uses)}")
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES

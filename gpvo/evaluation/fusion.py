@@ -40,23 +40,16 @@ def predictions_of(predictor: Predictor, run: Run) -> dict[int, Prediction]:
     return {t: p for t, p in stepped if p is not None}
 
 
-def load_predictor(path: str | Path, mean: MeanUse | None = None) -> tuple[Predictor, MeanUse]:
-    """A model that filters can use, one that predicts the error of single motions, and what to do with its mean.
-
-    By default a mean that knows the conditions alone is taken off; of one that sees VO's own motion the model fitted
-    without it is used instead.
-    """
-    predictor = Predictor.load(path)
+def load_predictor(path: str | Path, mean: MeanUse = "absorb") -> Predictor:
+    """A model that predicts the error of single motions, the one without a mean where none is to be subtracted."""
+    predictor = Predictor.load(path, with_mean=mean == "subtract")
     if predictor.target != "frame":
         raise ModelError(
             f"predicts the error over {predictor.target}, a filter needs that of each motion",
             where=path,
             cure="train with --target frame",
         )
-    chosen: MeanUse = mean or ("absorb" if predictor.mean_sees_motion else "subtract")
-    if chosen == "absorb":
-        predictor = Predictor(predictor.arrays, predictor.header, predictor.digest, with_mean=False)
-    return predictor, chosen
+    return predictor
 
 
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
@@ -131,13 +124,13 @@ def constants_in(predictor: Predictor) -> Constants | None:
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """What ``gpvo fuse`` was asked for. ``mean`` None: as :func:`load_predictor` says."""
+    """What ``gpvo fuse`` was asked for."""
 
     policies: tuple[str, ...] = POLICIES
     model: Path | None = None
     training: tuple[Path, ...] = ()
     use_imu: bool = True
-    mean: MeanUse | None = None
+    mean: MeanUse = "absorb"
     options: FuseOptions = field(default_factory=FuseOptions)
 
 
@@ -176,9 +169,7 @@ def fuse_runs(
     unknown = [p for p in settings.policies if p not in POLICIES]
     if unknown:
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
-    predictor, mean = None, settings.mean or "absorb"
-    if settings.model is not None:
-        predictor, mean = load_predictor(settings.model, settings.mean)
+    predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
@@ -188,7 +179,7 @@ def fuse_runs(
         flights.append(flight)
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
-    policies = make_policies(constants, names=settings.policies, learned=learned, mean=mean)
+    policies = make_policies(constants, names=settings.policies, learned=learned, mean=settings.mean)
     traces: list[Trace] = []
 
     def keep(flight: Flight, fused: FusedRun) -> None:

@@ -31,7 +31,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets
 
-LEARNED_WHITE = "learned_white"
+LEARNED_WHITE, LEARNED_SUBTRACT = "learned_white", "learned_subtract"
 _POINTS_S, _PICTURES_S = 60.0, 25.0
 _COLUMNS = (
     ("ATE m", "ate_rmse_m", 4),
@@ -63,27 +63,27 @@ def experiment(
     """Tune the constants on the training runs and filter the others under every policy.
 
     ``learned_white`` is the learned covariance taken as independent from motion to motion: what the parts are worth.
-    ``learned_subtract``, or ``learned_absorb``: the other use of the predicted mean, what that costs or brings.
+    ``learned_subtract`` takes the predicted mean off: what that costs or brings.
     """
     options = FuseOptions(history_s=0.0)
     constants = constants_of(training)
     constants = replace(constants, best=fit_scalars([flight_of(r) for r in training], constants, options))
-    predictor, mean = load_predictor(model)
+    predictor = load_predictor(model)
     flights = [flight_of(r, predictor) for r in test]
     if hindsight:
         constants = replace(constants, hindsight=fit_scalars(flights, constants, options))
-    able = make_policies(constants, names=POLICIES, learned=True, mean=mean)
+    able = make_policies(constants, names=POLICIES, learned=True)
     policies = {name: policy for name, policy in able.items() if policy is not None}
-    policies[LEARNED_WHITE] = LearnedPolicy(LEARNED_WHITE, use_parts=False, mean=mean)
+    policies[LEARNED_WHITE] = LearnedPolicy(LEARNED_WHITE, use_parts=False)
     traces: list[Trace] = []
 
     def keep(flight: Flight, fused: FusedRun) -> None:
         traces.append(trace_of(flight, fused))
 
     result = study(flights, policies, options, constants=constants, on_run=keep)
-    predictor, other = load_predictor(model, "absorb" if mean == "subtract" else "subtract")
-    flights, name = [flight_of(r, predictor) for r in test], f"{LEARNED}_{other}"
-    otherwise = study(flights, {name: LearnedPolicy(name, mean=other)}, options)
+    predictor = load_predictor(model, "subtract")
+    flights = [flight_of(r, predictor) for r in test]
+    otherwise = study(flights, {LEARNED_SUBTRACT: LearnedPolicy(LEARNED_SUBTRACT, mean="subtract")}, options)
     result = replace(result, scores={**result.scores, **otherwise.scores})
     calm = [r for r in test if not with_accidents(r)]
     return Outcome(title, FusionReport(result, tuple(traces), ()), rise(calm))

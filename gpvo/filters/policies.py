@@ -75,10 +75,8 @@ class LearnedPolicy:
     """The predicted error: its covariance in the parts by which it accumulates, and its mean.
 
     ``mean``: ``absorb`` leaves the measurement alone and adds the mean's square to the covariance; ``subtract`` takes
-    it off the measurement. A mean that depends on VO's own motion (``Predictor.mean_sees_motion``) pulls it towards the
-    motions seen in training, a prior that a filter with its own motion model would count twice; a model fitted without
-    a mean (``Predictor.load(path, with_mean=False)``) is then better than either. ``use_parts`` False
-    treats the total as independent from motion to motion, to show what the parts are worth.
+    it off the measurement. A model fitted without a mean (``Predictor.load(path, with_mean=False)``) has none.
+    ``use_parts`` False treats the total as independent from motion to motion, to show what the parts are worth.
     """
 
     name: str = LEARNED

@@ -77,7 +77,7 @@ def assemble(
         typical_ln_det=np.zeros(1),
         usual_rate_var=np.maximum(np.nanmean(rows.weight[:, None] * rows.select(TWIST_COLUMNS) ** 2, axis=0), 1e-6),
         mean_in_sigma=np.array([mean_in_sigma]),
-        dt_s=float(np.median(rows.dt_s)),
+        dt_s=rows.step_s,
     )
     whole = model.split(sigma**2, sums.faster, geometry).sum(axis=1)
     joint = fit_joint_factor(error, whole, rows.group)
@@ -100,12 +100,11 @@ class _Sums:
 
 
 def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None) -> _Sums:
-    step_s = float(np.median(rows.dt_s))
     v_mps = rows.select(TWIST_COLUMNS[:3])
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
     faster = ln_faster(v_mps, ln_speed)
-    parts = fit_parts(rows.chains(error), rows.chains(sigma), rows.chains(faster), step_s)
-    correlation = part_correlations(rows.chains(error / sigma), parts, step_s)
+    parts = fit_parts(rows.chains(error), rows.chains(sigma), rows.chains(faster), rows.step_s)
+    correlation = part_correlations(rows.chains(error / sigma), parts, rows.step_s)
     share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)
     weight = choose_geometry_weight(error, sigma, correlation, geometry, share)
     return _Sums(parts, correlation, weight, ln_speed, faster)

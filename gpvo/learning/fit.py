@@ -182,7 +182,7 @@ def _fit_gp(
     )
     log_base = np.log(base(_base_inputs(rows, base.columns), rows.dt_s))
     # A bias of noise goes with the noise. What VO is wrong by on average of its motion, with the motion's duration.
-    longer = np.repeat((rows.dt_s / np.median(rows.dt_s))[:, None], 6, axis=1)
+    longer = np.repeat((rows.dt_s / rows.step_s)[:, None], 6, axis=1)
     unit = np.exp(0.5 * log_base) if seen is None or seen.name != ALL else longer
     fitted = fit_heteroscedastic(
         _gp_inputs(rows, inputs),
@@ -245,16 +245,17 @@ def _with_mean(
         axes = (gains > 0) & helps_over_distance(rows, tried.oof_mean, np.sqrt(v0))
         gain = pose_gain(rows, np.where(axes, tried.oof_mean, 0.0)) if axes.any() else 0.0
         if gain > most:
-            best, use, most = replace(seen, gains=gains.tolist()), axes, gain
+            best, use, most = seen, axes, gain
     if use.any():
         kept = inputs
         if trust == 0.0:
             kept = tuple(inputs[i] for i in best.inputs)
             best = replace(best, inputs=np.arange(len(kept)))
         asked = _fit_gp(rows, base, kept, use, config, best)
+        gains = gains_of(asked)
         # A mean that held with few inducing points may go astray with many: then there is none.
-        if (gains_of(asked)[use] > 0).all():
-            return kept, asked, best
+        if (gains[use] > 0).all():
+            return kept, asked, replace(best, gains=gains.tolist())
     return (inputs, fitted, _NO_MEAN) if trust else ((), None, _NO_MEAN)
 
 

@@ -2,7 +2,7 @@
 
 Of a motion's variance v a share is jitter (n_k - n_(k-1), that of the frames it joins), a share white, a share a
 first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). What adds up may grow with
-the speed, as it does so by landmarks that come and go along the path, while jitter is there at rest. The bias may grow
+the speed above the typical one, as it does so by landmarks that come and go along the path. The bias may grow
 faster than the noise: that of triangulated points goes with the variance of the noise, so its own variance with the
 square (G. Sibley, L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)).
 """

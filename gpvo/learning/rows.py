@@ -33,6 +33,11 @@ class Rows:
         error, dt = np.concatenate([s.Y for s in sets]), np.concatenate([s.dt_s for s in sets])
         return cls(sets, error, dt, group, by, weight / weight.mean())
 
+    @property
+    def step_s(self) -> float:
+        """Usual duration of a motion."""
+        return float(np.median(self.dt_s))
+
     def select(self, names: Sequence[str]) -> Array:
         return np.concatenate([s.select(names) for s in self.sets])
 

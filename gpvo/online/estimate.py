@@ -18,7 +18,7 @@ from gpvo.types import Array
 
 PARTS = ("jitter", "white", "bias")
 _EYE = np.eye(6)
-_LN_20 = float(np.log(20.0))
+LN_FASTEST = float(np.log(20.0))
 WITHOUT_MEAN = "without_mean."
 """Prefix of the arrays of the same model fitted to the errors as they stand; there where the model uses a mean."""
 
@@ -228,7 +228,7 @@ class ErrorModelArrays:
         return at, d.centre[at], (d.centre + d.scale * d.low)[at][6:]
 
     def faster(self, X: Array) -> Array:
-        """(n, 1) log of the speed over the typical one, between a twentieth and twenty times it."""
+        """(n, 1) log of the speed over the typical one (see :func:`ln_faster`)."""
         at = self._base_place[0][:3]
         return ln_faster(X[:, at], self.ln_speed)
 
@@ -272,18 +272,22 @@ def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
 
 
 def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
-    """(n, 1) log of the speed of (n, 3) over the typical one, no more than a factor of twenty; 0 where unknown."""
+    """(n, 1) log of the speed of (n, 3) over the typical one, from 0 to that of twenty times it; 0 where unknown.
+
+    Slower than typical counts as typical: by the metre alone errors would not add up at rest, but they do with time,
+    and a filter that is told otherwise learns its biases from that.
+    """
     speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
     ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical
-    return np.where(np.isfinite(ratio), np.clip(ratio, -_LN_20, _LN_20), 0.0)
+    return np.where(np.isfinite(ratio), np.clip(ratio, 0.0, LN_FASTEST), 0.0)
 
 
 def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """The arrays of a model file with those of the model without a mean in their place; as they are where it has none.
 
-    The mean is that of the error given, among others, VO's own motion, and so holds what was usual in training: where
-    VO sees little it says "you did not really move like that". A filter knows better how it moved, and would count
-    its own knowledge twice. It needs the covariance of the error itself.
+    For filters: a mean holds what was usual in training. One that sees VO's own motion says "you did not really move
+    like that" where VO sees little, which a filter knows better; one that sees the conditions is right of plain sums,
+    where bad frames count most, and too large in the good frames by which a filter goes. It estimates a bias by itself.
     """
     plain = {name.removeprefix(WITHOUT_MEAN): a for name, a in arrays.items() if name.startswith(WITHOUT_MEAN)}
     dropped = (WITHOUT_MEAN, "basis.") if plain else (WITHOUT_MEAN,)

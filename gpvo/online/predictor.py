@@ -17,8 +17,6 @@ from gpvo.errors import ModelError
 from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
-from gpvo.online.base import OWN_MOTION
-from gpvo.online.basis import NEVER
 from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_without_mean
 from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW
@@ -104,16 +102,6 @@ class Predictor:
             return cls(arrays, header, digest, with_mean=with_mean)
         except ModelError as problem:
             raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
-
-    @property
-    def mean_sees_motion(self) -> bool:
-        """Whether the mean was given VO's own motion, and so knows what was usual in training.
-
-        It then draws each motion towards that, a prior that whoever knows how the vehicle moves would count twice.
-        """
-        mean = self.model.basis.mean
-        own = [self.features[i] in OWN_MOTION for i in self.model.inputs]
-        return bool(mean.weights.any() and (mean.lengthscale[own] < NEVER).any())
 
     def reset(self, camera: StereoCamera | None = None) -> None:
         """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with."""

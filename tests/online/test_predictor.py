@@ -14,6 +14,7 @@ from gpvo.errors import ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.adapt import AdaptiveScale
+from gpvo.online.estimate import divide, ln_faster
 from gpvo.online.predictor import Predictor
 from gpvo.types import Status
 from small_model import small_model
@@ -235,3 +236,13 @@ assert not heavy, heavy
 def test_another_camera_is_told_by_reset(predictor, flight):
     predictor.reset(replace(CAMERA, fx_px=800.0))
     assert predictor.step(flight[0].records[0]).status is Status.START
+
+
+def test_errors_add_up_at_rest_as_at_the_typical_speed_and_faster_above():
+    speeds = np.array([0.0, 0.3, 1.0, 3.0])
+    faster = ln_faster(speeds[:, None] * [0.6, 0.0, 0.8], [0.0])
+    share = np.array([[0.6], [0.3], [0.1]])
+    white = divide(share, np.array([[1.0], [0.5]]), np.zeros((4, 1)), faster)[:, 1, 0]
+    np.testing.assert_allclose(white[:3], 0.3)
+    np.testing.assert_allclose(white[3], 0.9 / 1.8)
+    assert ln_faster(np.full((1, 3), np.nan), [0.0]) == 0.0

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
 from gpvo.online.base import motion_noise, positions
-from gpvo.online.estimate import PARTS, ErrorModelArrays
+from gpvo.online.estimate import LN_FASTEST, PARTS, ErrorModelArrays
 from gpvo.online.rowplan import stack
 from gpvo.types import Array
 
@@ -235,7 +235,7 @@ def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:
     v = g("Where", g.finite(v), v, 0.0)
     speed = g("Sqrt", g.expand(g.sum(g("Mul", v, v), 1), 1))
     ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), g.constant(model.ln_speed))
-    faster = g("Where", known, g("Max", g("Min", ratio, np.log(20.0)), -np.log(20.0)), 0.0)
+    faster = g("Where", known, g("Max", g("Min", ratio, LN_FASTEST), 0.0), 0.0)
     by_speed = g("Mul", faster, g.constant(model.growth[0]))
     above = g("Mul", g("Sub", g("Log", variance), g.constant(model.level)), g.constant(model.growth[1]))
     by_noise = g("Max", g("Min", above, 60.0), -60.0)

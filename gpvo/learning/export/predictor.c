@@ -145,7 +145,7 @@ static double gpvo_faster(const double *features) {
     int i;
     for (i = 0; i < 3; ++i) v2 += features[gpvo_base_column[i]] * features[gpvo_base_column[i]];
     ratio = log(sqrt(v2) > 1e-9 ? sqrt(v2) : 1e-9) - GPVO_LN_SPEED;
-    return isfinite(v2) ? gpvo_clip(ratio, -log(20.0), log(20.0)) : 0.0;
+    return isfinite(v2) ? gpvo_clip(ratio, 0.0, log(20.0)) : 0.0;
 }
 
 /* Standard deviations of jitter, white and bias on axis j: what adds up gains on the jitter as the speed grows, the bias
