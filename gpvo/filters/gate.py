@@ -47,14 +47,14 @@ class Gate:
     ``accept`` uses it as it is (the gate then only counts).
 
     A filter that discards cannot tell whether it or the measurement is wrong. So after ``recover_after_s`` without
-    one that passed, the state's own covariance is widened until one passes again. Sooner, and a burst of bad motions
-    gets in; later, and a filter that once believed a slip goes astray. PX4's EKF2 resets its velocity to that of vision
-    after 1 s without fusion (``no_aid_timeout_max``) and calls flight by the IMU alone valid for 5 s (EKF2_NOAID_TOUT).
+    one that passed, the state's own covariance is widened until one passes again. Later, and a filter that once
+    believed a slip goes astray; sooner, and a long burst of bad motions gets in. PX4's EKF2 calls flight by the IMU
+    alone valid for 5 s (EKF2_NOAID_TOUT).
     """
 
     probability: float = THREE_SIGMA
     on_fail: Literal["discard", "inflate", "accept"] = "discard"
-    recover_after_s: float = 2.0
+    recover_after_s: float = 5.0
 
     def threshold(self, dof: int) -> float:
         """Largest NIS that passes."""

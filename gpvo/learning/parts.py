@@ -1,9 +1,9 @@
 """How errors add up over a distance: jitter, white and bias, from the errors summed over 1, 2, 5, ... frames.
 
 Of a motion's variance v a share is jitter (n_k - n_(k-1), that of the frames it joins), a share white, a share a
-first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). What adds up may grow with
-the speed above the typical one, as it does so by landmarks that come and go along the path. The bias may grow
-faster than the noise: that of triangulated points goes with the variance of the noise, so its own variance with the
+first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). Above the typical speed what
+adds up may grow with it, as it does so by landmarks that come and go along the path. The bias may grow faster than the
+noise: that of triangulated points goes with the variance of the noise, so its own variance with the
 square (G. Sibley, L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)).
 """
 
@@ -28,7 +28,6 @@ _NOISE_GROWTHS = (0.0, 0.5, 1.0)
 _SPEED_GROWTHS = (0.0, 1.0, 2.0)
 _WORTH = 20.0
 """By so much the log-likelihood of a block must rise for what is not expected; the spans all count the same errors."""
-_BY_THE_METRE = 1.0
 _MIN_WINDOWS, _MOST_WINDOWS = 3.0, 1000
 _MOST_COUNT = 60.0
 """A span counts by its windows, up to this: short spans have many, but say the same over and over."""
@@ -144,17 +143,16 @@ def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Choice]
 
 
 def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
-    """The best shape of a block. Expected is that errors add up by the metre, and a bias that grows no faster than the
-    noise."""
-    tried = [(s, _fit_shape(windows, s)) for s in (_Shape(_BY_THE_METRE, g, tau) for g in _NOISE_GROWTHS)]
+    """The best shape of a block. Expected are shares that do not change."""
+    tried = [(s, _fit_shape(windows, s)) for s in (_Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
     by_noise = min(tried, key=_loss)[0].by_noise
-    others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS if v != _BY_THE_METRE)
+    others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS if v > 0)
     return min([*tried, *((s, _fit_shape(windows, s)) for s in others)], key=_loss)
 
 
 def _loss(choice: _Choice) -> float:
     shape, fit = choice
-    return fit.loss + _WORTH * ((shape.by_speed != _BY_THE_METRE) + (shape.by_noise > 0))
+    return fit.loss + _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
 
 
 def _at_most(values: Chains, limit: int) -> Chains:
