@@ -285,9 +285,9 @@ def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
 def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """The arrays of a model file with those of the model without a mean in their place; as they are where it has none.
 
-    For filters: a mean holds what was usual in training. One that sees VO's own motion says "you did not really move
-    like that" where VO sees little, which a filter knows better; one that sees the conditions is right of plain sums,
-    where bad frames count most, and too large in the good frames by which a filter goes. It estimates a bias by itself.
+    For filters, which estimate a bias by themselves. A mean that sees VO's own motion holds what was usual in training,
+    and says "you did not really move like that" where VO sees little; one that sees the conditions is right of plain
+    sums, where bad frames count most, and too large in the good frames by which a filter goes.
     """
     plain = {name.removeprefix(WITHOUT_MEAN): a for name, a in arrays.items() if name.startswith(WITHOUT_MEAN)}
     dropped = (WITHOUT_MEAN, "basis.") if plain else (WITHOUT_MEAN,)
