@@ -38,7 +38,7 @@ def fuse(
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
-    from gpvo.filters.policies import LEARNED, POLICIES, MeanUse
+    from gpvo.filters.policies import LEARNED, POLICIES
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
@@ -46,16 +46,15 @@ def fuse(
         raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
     if gate not in ("discard", "inflate"):
         raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
-    uses: dict[str, MeanUse] = {"absorb": "absorb", "subtract": "subtract"}
-    if mean not in uses:
-        raise GpvoError(f"--mean is '{mean}'", cure=f"choose {', '.join(uses)}")
+    if mean not in ("absorb", "subtract"):
+        raise GpvoError(f"--mean is '{mean}'", cure="choose absorb or subtract")
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
     settings = FusionSettings(
         policies=wanted,
         model=model,
         training=tuple(train or ()),
         use_imu=not no_imu,
-        mean=uses[mean],
+        mean="subtract" if mean == "subtract" else "absorb",
         options=FuseOptions(
             init="static" if init == "static" else "truth",
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import struct
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -139,7 +140,7 @@ class PairFiles:
     right: Path
 
 
-class ImageSource:
+class ImageSource(ABC):
     """Base of all sources of images: guards the stamps, decodes ahead, rectifies and counts what is wrong.
 
     A subclass passes the rig and what lies beside it, and gives the raw pairs by :meth:`raw_pairs`.
@@ -182,12 +183,13 @@ class ImageSource:
         self.span_ns: tuple[int, int] = (0, 0)
         self.usual_interval_ns: float | None = None
 
+    @abstractmethod
     def raw_pairs(self, report: SourceReport) -> Iterator[tuple[int, Image8 | None, Image8 | None]]:
         """Stamps [ns] with decoded raw images, None for an image that is not readable."""
-        raise NotImplementedError
 
+    @abstractmethod
     def __len__(self) -> int:
-        raise NotImplementedError
+        """Number of pairs."""
 
     def __iter__(self) -> Iterator[StereoFrame]:
         self.report = report = self._fresh_report()

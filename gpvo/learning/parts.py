@@ -3,8 +3,8 @@
 Of a motion's variance v a share is jitter (n_k - n_(k-1), that of the frames it joins), a share white, a share a
 first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). Above the typical speed what
 adds up may grow with it, as it does so by landmarks that come and go along the path. The bias may grow faster than the
-noise: that of triangulated points goes with the variance of the noise, so its own variance with the
-square (G. Sibley, L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)).
+noise: that of triangulated points goes with the variance of the noise, so its own variance with the square (G. Sibley,
+L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Chains = Sequence[Sequence[Array]]
 SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _TAU_FRAMES = (4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
 _NOISE_GROWTHS = (0.0, 0.5, 1.0)
-_SPEED_GROWTHS = (0.0, 1.0, 2.0)
+_SPEED_GROWTHS = (1.0, 2.0)
 _WORTH = 20.0
 """By so much the log-likelihood of a block must rise for what is not expected; the spans all count the same errors."""
 _MIN_WINDOWS, _MOST_WINDOWS = 3.0, 1000
@@ -146,7 +146,7 @@ def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
     """The best shape of a block. Expected are shares that do not change."""
     tried = [(s, _fit_shape(windows, s)) for s in (_Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
     by_noise = min(tried, key=_loss)[0].by_noise
-    others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS if v > 0)
+    others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS)
     return min([*tried, *((s, _fit_shape(windows, s)) for s in others)], key=_loss)
 
 
