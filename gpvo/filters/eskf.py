@@ -42,6 +42,7 @@ from gpvo.types import ImuNoise
 Array = NDArray[np.float64]
 
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
+_STATE = CLONE.stop  # core and clone; what follows is VO's
 _EYE = np.eye(JOINT)
 GRAVITY_MPS2 = 9.80665
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
@@ -49,18 +50,20 @@ _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no stat
 
 @dataclass(frozen=True)
 class Innovation:
-    """One update: ``residual`` (B, 6), its covariance ``S`` (B, 6, 6), ``nis`` (B,) and whether it was used (B,)."""
+    """One update: ``residual`` (B, 6), its covariance ``S`` (B, 6, 6), ``nis`` (B,), whether it passed and was used
+    (B,), and whether it failed and the filter more than the measurement has to answer for it (B,)."""
 
     residual: Array
     S: Array
     nis: Array
     passed: NDArray[np.bool_]
     used: NDArray[np.bool_]
+    own_fault: NDArray[np.bool_]
 
     def of_member(self, b: int) -> Innovation:
         """The same of one member."""
         one = slice(b, b + 1)
-        return Innovation(self.residual[one], self.S[one], self.nis[one], self.passed[one], self.used[one])
+        return Innovation(**{name: getattr(self, name)[one] for name in self.__dataclass_fields__})
 
 
 class ErrorStateFilter:
@@ -169,8 +172,8 @@ class ErrorStateFilter:
     ) -> Innovation:
         """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame.
 
-        ``recover`` (B,): members that have seen nothing pass for too long. Where the measurement fails again, the
-        state is doubted instead: its covariance grows until the measurement can move it.
+        ``recover`` (B,): members that have waited too long (:class:`gpvo.filters.gate.Wait`). Where the measurement
+        fails again, the state is doubted instead: its covariance grows until the measurement can move it.
         """
         gate = gate or Gate()
         if noise.jitter is not None:
@@ -191,7 +194,7 @@ class ErrorStateFilter:
         if recover is not None and (stuck := recover & ~innovation.used).any():
             self._doubt(np.where(stuck, innovation.nis / gate.threshold(6), 1.0))
             again = self.correct(H, r, noise.white, replace(gate, on_fail="inflate"), ~stuck)
-            innovation = replace(again, nis=innovation.nis, passed=innovation.passed, used=innovation.used | stuck)
+            innovation = replace(innovation, residual=again.residual, S=again.S, used=innovation.used | stuck)
         if innovation.used.any():
             self.inject()
         return innovation
@@ -217,6 +220,7 @@ class ErrorStateFilter:
         nis = (z * z).sum(1)
         limit = gate.threshold(H.shape[1]) if gate else np.inf
         passed = nis <= limit
+        own_fault = ~passed if passed.all() else ~passed & self._is_own_fault(H, S, r)
         used = passed
         alpha = np.ones(self.batch)
         if gate and not passed.all() and gate.on_fail != "discard":
@@ -232,7 +236,14 @@ class ErrorStateFilter:
             R = R + (alpha - 1.0)[:, None, None] * S
             self._joseph(K * (used / alpha)[:, None, None], H, R)
             self.dx += (K @ r[:, :, None])[:, :, 0] * (used / alpha)[:, None]
-        return Innovation(r, S, nis, passed, used)
+        return Innovation(r, S, nis, passed, used, own_fault)
+
+    def _is_own_fault(self, H: Array, S: Array, r: Array) -> NDArray[np.bool_]:
+        """(B,) whether state and clone have more than half of the NIS to answer for (see the gate's ``Wait``)."""
+        y = np.linalg.solve(S, r[:, :, None])
+        v = kernels.transpose(H[:, :, :_STATE]) @ np.asarray(y, dtype=np.float64)
+        share = kernels.transpose(v) @ self.P[:, :_STATE, :_STATE] @ v
+        return np.asarray(share > 0.5 * kernels.transpose(r[:, :, None]) @ y)[:, 0, 0]
 
     def _doubt(self, factor: Array) -> None:
         """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,), within reason."""

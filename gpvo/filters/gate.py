@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 # Share of a Gaussian within three standard deviations: the confidence of a "3-sigma" gate in any dimension.
 THREE_SIGMA = math.erf(3.0 / math.sqrt(2.0))
 
@@ -46,16 +49,47 @@ class Gate:
     ``on_fail``: ``discard`` drops what fails; ``inflate`` widens its covariance until it just passes;
     ``accept`` uses it as it is (the gate then only counts).
 
-    A filter that discards cannot tell whether it or the measurement is wrong. So after ``recover_after_s`` without
-    one that passed, the state's own covariance is widened until one passes again. Later, and a filter that once
-    believed a slip goes astray; sooner, and a long burst of bad motions gets in. PX4's EKF2 calls flight by the IMU
-    alone valid for 5 s (EKF2_NOAID_TOUT).
+    A filter that discards goes astray once it has believed a slip: everything after disagrees with it. Its own
+    covariance is then widened until a measurement passes again: after ``recover_after_s`` without one that passed,
+    and after ``doubt_after_s`` in which every failure was its own (:class:`Wait`). Were the first as short, a long
+    burst of bad motions would get in. PX4's EKF2 calls flight by the IMU alone valid for 5 s (EKF2_NOAID_TOUT).
     """
 
     probability: float = THREE_SIGMA
     on_fail: Literal["discard", "inflate", "accept"] = "discard"
     recover_after_s: float = 5.0
+    doubt_after_s: float = 1.0
 
     def threshold(self, dof: int) -> float:
         """Largest NIS that passes."""
         return chi2_quantile(self.probability, dof)
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Since when each of B members has had nothing that passed (or nothing to judge), and nothing to blame VO for.
+
+    Whose failure it is: of the innovation ``r`` the most likely part of the filter has ``r^T S^-1 P_r S^-1 r`` of the
+    NIS to answer for, ``P_r`` being the covariance of the predicted motion; the rest of ``r^T S^-1 r`` is VO's. The
+    failure is the filter's own where that is more than half: VO is then so much surer than the filter that an error
+    usual for VO and one unusual for the filter explain it best.
+    """
+
+    passed_ns: NDArray[np.int64]
+    sound_ns: NDArray[np.int64]
+
+    @staticmethod
+    def since(t_ns: int, batch: int) -> Wait:
+        """A filter that has just started."""
+        now = np.full(batch, t_ns, dtype=np.int64)
+        return Wait(now, now)
+
+    def over(self, t_ns: int, gate: Gate) -> NDArray[np.bool_]:
+        """(B,) members that are to be widened if they fail again at ``t_ns``."""
+        too_long = t_ns - self.passed_ns > gate.recover_after_s * 1e9
+        return too_long | (t_ns - self.sound_ns > gate.doubt_after_s * 1e9)
+
+    def after(self, t_ns: int, passed: NDArray[np.bool_] | bool, own_fault: NDArray[np.bool_] | bool) -> Wait:
+        """The same once a record has been judged; ``own_fault``: failed, and the filter has to answer for it."""
+        sound = np.logical_or(passed, np.logical_not(own_fault))
+        return Wait(np.where(passed, t_ns, self.passed_ns), np.where(sound, t_ns, self.sound_ns))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.filters.eskf import ErrorStateFilter, Innovation
-from gpvo.filters.gate import Gate
+from gpvo.filters.gate import Gate, Wait
 from gpvo.filters.measurement import MotionNoise
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V
@@ -53,7 +53,7 @@ class _Entry:
     filter: ErrorStateFilter
     t_ns: int
     reference_ns: int | None
-    passed_ns: NDArray[np.int64]
+    wait: Wait
 
 
 def _outcome(innovation: Innovation) -> str:
@@ -88,8 +88,7 @@ class Timeline:
         self._history_ns = round(history_s * 1e9)
         self._history: deque[_Entry] = deque()
         self._reference_ns: int | None = self.t_ns
-        # When each member last had a measurement that passed the gate, or none to judge.
-        self._passed_ns = np.full(filter.batch, self.t_ns, dtype=np.int64)
+        self._wait = Wait.since(self.t_ns, filter.batch)
         self._newest_ns: int | None = None
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
@@ -147,8 +146,9 @@ class Timeline:
         if noise is not None and noise.bias_tau_s is not None:
             self.filter.decay_bias(elapsed, noise.bias_tau_s)
         step = self._measure(record, noise)
-        passed = True if step.innovation is None else step.innovation.passed
-        self._passed_ns = np.where(passed, record.t_ns, self._passed_ns)
+        judged = step.innovation
+        passed, own_fault = (True, False) if judged is None else (judged.passed, judged.own_fault)
+        self._wait = self._wait.after(record.t_ns, passed, own_fault)
         self.counts[step.outcome] += 1
         if record.is_reference:
             self.filter.clone(measured=step.innovation is not None)
@@ -166,7 +166,7 @@ class Timeline:
             return Step(record.t_ns, "not_finite")
         if noise is None:
             return Step(record.t_ns, "no_covariance")
-        recover = record.t_ns - self._passed_ns > self.gate.recover_after_s * 1e9
+        recover = self._wait.over(record.t_ns, self.gate)
         innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate, recover)
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
         return Step(record.t_ns, _outcome(innovation), innovation)
@@ -175,7 +175,7 @@ class Timeline:
         if self._history_ns <= 0:
             self._drop_imu_before(self.t_ns)
             return
-        state = (self.filter.copy(), self.t_ns, self._reference_ns, self._passed_ns)
+        state = (self.filter.copy(), self.t_ns, self._reference_ns, self._wait)
         self._history.append(_Entry(record, noise, *state))
         while self._history[0].record.t_ns < record.t_ns - self._history_ns:
             self._history.popleft()
@@ -188,7 +188,7 @@ class Timeline:
             return None
         first = later[0]
         self.filter, self.t_ns = first.filter, first.t_ns
-        self._reference_ns, self._passed_ns = first.reference_ns, first.passed_ns
+        self._reference_ns, self._wait = first.reference_ns, first.wait
         for entry in later:
             self._history.remove(entry)
         return later

@@ -14,6 +14,8 @@ from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, ErrorLaw, Events, synth
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import ImuLog, Status, VoRecord
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 
 @pytest.fixture(scope="module")
@@ -173,21 +175,80 @@ def test_gate(flight: Flight, on_fail: str) -> None:
     np.linalg.cholesky(timeline.filter.covariance)
 
 
-def test_a_filter_that_is_wrong_recovers(flight: Flight) -> None:
+def _astray(speed_mps: float) -> tuple[Timeline, Flight]:
+    """A filter whose velocity has become wrong after 60 records, by the same on every axis."""
+    flight = synthetic_flight(9, duration_s=20)
+    timeline = _timeline(flight)
+    _feed_imu(timeline, flight)
+    _feed(timeline, flight, list(range(60)))
+    timeline.filter.x.velocity = timeline.filter.x.velocity + speed_mps
+    return timeline, flight
+
+
+def _is_right_again(timeline: Timeline, flight: Flight) -> bool:
+    speed = np.linalg.norm(np.diff(flight.T_world_imu[-2:, :3, 3], axis=0)) * 20
+    np.linalg.cholesky(timeline.filter.covariance)
+    return bool(abs(np.linalg.norm(timeline.filter.x.velocity) - speed) < 0.2)
+
+
+def test_a_filter_that_is_wrong_recovers() -> None:
     """A wrong velocity shuts good measurements out; after five seconds of that they are let in again."""
-    long = synthetic_flight(9, duration_s=20)
-    timeline = _timeline(long)
-    _feed_imu(timeline, long)
-    _feed(timeline, long, list(range(60)))
-    timeline.filter.x.velocity = timeline.filter.x.velocity + 3.0
+    timeline, long = _astray(3.0)
+    timeline.gate = Gate(doubt_after_s=np.inf)
     _feed(timeline, long, list(range(60, 155)))
     assert timeline.counts["rejected"] == 95
     assert timeline.counts["recovered"] == 0
     _feed(timeline, long, list(range(155, 400)))
     assert 0 < timeline.counts["recovered"] < 10
-    speed = np.linalg.norm(np.diff(long.T_world_imu[-2:, :3, 3], axis=0)) * 20
-    assert abs(np.linalg.norm(timeline.filter.x.velocity) - speed) < 0.2
-    np.linalg.cholesky(timeline.filter.covariance)
+    assert _is_right_again(timeline, long)
+
+
+def test_a_filter_that_knows_less_than_vo_recovers_sooner() -> None:
+    """Where the filter itself admits more error than VO does, one second of failures is enough."""
+    timeline, long = _astray(3.0)
+    timeline.filter.P[:, 3:6, 3:6] += 0.4**2 * np.eye(3)
+    _feed(timeline, long, list(range(60, 80)))
+    assert timeline.counts["rejected"] == 20
+    assert timeline.counts["recovered"] == 0
+    _feed(timeline, long, list(range(80, 400)))
+    assert 0 < timeline.counts["recovered"] < 10
+    assert _is_right_again(timeline, long)
+
+
+def test_a_filter_that_knows_more_than_vo_holds_out() -> None:
+    """Three seconds of motions that are wrong by far more than VO says move a sure filter nowhere."""
+    timeline, long = _astray(0.0)
+    for i in range(60, 120):
+        record = long.records[i]
+        slipped = replace(record, T_prev_cur=record.T_prev_cur @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0])))
+        timeline.add_vo(slipped, long.predictions[record.t_ns])
+    assert timeline.counts["rejected"] == 60
+    assert timeline.counts["recovered"] == 0
+    _feed(timeline, long, list(range(120, 400)))
+    assert _is_right_again(timeline, long)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**31), st.floats(-2.0, 2.0))
+def test_whose_fault_a_failure_is(flight: Flight, seed: int, log_ratio: float) -> None:
+    """Of the two likeliest parts of a failure, each over its own covariance, the greater one is to blame."""
+    rng = np.random.default_rng(seed)
+    start, gravity = begin(flight, FuseOptions())
+    filter = make_filter(flight, start, gravity, 1, FuseOptions())
+    A, B = rng.standard_normal((2, 21, 21))
+    filter.P[0, :21, :21] = A @ A.T
+    H = np.zeros((1, 6, 39))
+    H[0, :, :21] = B[:6]
+    N = 10.0**log_ratio * np.einsum("ij,kj->ik", A[:6], A[:6])
+    r = rng.standard_normal((1, 6))
+    P_r = H[0] @ filter.P[0] @ H[0].T
+    r *= 5.0 / np.sqrt(r[0] @ np.linalg.solve(P_r + N, r[0]))  # NIS 25, over the gate's 20
+    of_filter, of_vo = (C @ np.linalg.solve(P_r + N, r[0]) for C in (P_r, N))
+    parts = [e @ np.linalg.solve(C, e) for e, C in ((of_filter, P_r), (of_vo, N))]
+    assert sum(parts) == pytest.approx(25.0, rel=1e-6)
+    innovation = filter.correct(H, r, N[None], Gate())
+    assert not innovation.used[0]
+    assert innovation.own_fault[0] == (parts[0] > parts[1])
 
 
 def test_standing_still_against_one_reference_does_not_grow(flight: Flight) -> None:

@@ -12,6 +12,7 @@ from gpvo.types import Array
 
 F32 = NDArray[np.float32]
 _LIFT_M = 0.02
+_NOWHERE_M = 1e37
 
 
 class Baker:
@@ -35,11 +36,12 @@ class Baker:
         self._origins = (vertices + _LIFT_M * normals).astype(np.float32)
         self._faces = faces
 
-    def _reach(self, index: NDArray[np.int64], directions: Array) -> Array:
-        """Distance [m] from vertices along unit directions (N, 3) to what is hit, huge for nothing."""
+    def _reach(self, index: NDArray[np.int64], directions: Array, limit_m: Array | float) -> Array:
+        """Distance [m] from vertices along unit directions (N, 3) to what is hit, at most ``limit_m``."""
         origins = np.ascontiguousarray(self._origins[index])
         rays = np.ascontiguousarray(directions, dtype=np.float32)
-        return np.asarray(self._scene.run(origins, rays, query="DISTANCE"), dtype=np.float64)
+        limits = np.full(len(origins), limit_m, dtype=np.float32)
+        return np.asarray(self._scene.run(origins, rays, dists=limits, query="DISTANCE"), dtype=np.float64)
 
     def reaches(self, origins: Array, direction: Array) -> NDArray[np.bool_]:
         """Whether light from a unit direction (3,) far away reaches points (N, 3)."""
@@ -58,7 +60,7 @@ class Baker:
             if len(index) == 0:
                 continue
             distance = np.sqrt(square[index])
-            free = self._reach(index, to_lamp[index] / distance[:, None]) > distance - 0.05
+            free = self._reach(index, to_lamp[index] / distance[:, None], distance) > distance - 0.05
             fade = np.clip(2 * (1 - distance / reach_m), 0, 1)
             out[index] += np.where(free, power * fade * cosine[index] / (size_m**2 + square[index]), 0)
         return out
@@ -70,7 +72,7 @@ class Baker:
         for _ in range(samples):
             ray = direction + spread * rng.standard_normal(3)
             ray /= np.linalg.norm(ray)
-            free = self._reach(lit, np.broadcast_to(ray, (len(lit), 3))) > 1e6
+            free = self._reach(lit, np.broadcast_to(ray, (len(lit), 3)), _NOWHERE_M) > 1e6
             out[lit] += free * np.maximum(self._normals[lit] @ ray, 0) / samples
         return out
 
@@ -82,7 +84,7 @@ class Baker:
             ray = rng.standard_normal((len(everywhere), 3))
             ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) + self._normals
             ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-6)
-            out += np.minimum(self._reach(everywhere, ray), reach_m) / (reach_m * samples)
+            out += np.minimum(self._reach(everywhere, ray, reach_m), reach_m) / (reach_m * samples)
         return self._smoothed(self._smoothed(out))
 
     def _smoothed(self, x: Array) -> Array:

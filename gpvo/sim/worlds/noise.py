@@ -31,20 +31,24 @@ def lattice(rng: np.random.Generator) -> F32:
 
 
 def _value_noise(points: Array, values: F32) -> Array:
+    """At ``points`` (3, N)."""
     cell = np.floor(points).astype(np.int64)
     f = points - cell
     f = f**3 * (f * (f * 6 - 15) + 10)
-    out = np.zeros(len(points))
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.prod([f[:, k] if corner[k] else 1 - f[:, k] for k in range(3)], axis=0)
-        i, j, k = ((cell + corner) % _LATTICE).T
-        out += weight * values[i, j, k]
+    shares = (1 - f, f)
+    # Where along a flat lattice the near and the far neighbour of each axis lie.
+    steps = np.array([[_LATTICE**2], [_LATTICE], [1]])
+    places = (cell % _LATTICE * steps, (cell + 1) % _LATTICE * steps)
+    flat, out = values.ravel(), np.zeros(points.shape[1])
+    for a, b, c in np.ndindex(2, 2, 2):
+        weight = shares[a][0] * shares[b][1] * shares[c][2]
+        out += weight * flat.take(places[a][0] + places[b][1] + places[c][2])
     return out
 
 
 def fractal(points: Array, values: F32, octaves: int = 4, gain: float = 0.5) -> Array:
     """Sum of octaves of smooth lattice noise at points (N, 3); the lowest has a wavelength of about 2 units."""
-    out, amplitude, p = np.zeros(len(points)), 1.0, np.asarray(points, dtype=np.float64)
+    out, amplitude, p = np.zeros(len(points)), 1.0, np.ascontiguousarray(points.T, dtype=np.float64)
     for octave in range(octaves):
         out += amplitude * _value_noise(p + 17.3 * octave, values)
         p, amplitude = p * 2.03, amplitude * gain
