@@ -67,12 +67,12 @@ class Gate:
 
 @dataclass(frozen=True)
 class Wait:
-    """Since when each of B members has had nothing that passed (or nothing to judge), and nothing to blame VO for.
+    """What each of B members waits for: ``passed_ns`` (B,), when a motion last passed or there was none to judge;
+    ``sound_ns`` (B,), when one last passed or failed by VO's fault.
 
-    Whose failure it is: of the innovation ``r`` the most likely part of the filter has ``r^T S^-1 P_r S^-1 r`` of the
-    NIS to answer for, ``P_r`` being the covariance of the predicted motion; the rest of ``r^T S^-1 r`` is VO's. The
-    failure is the filter's own where that is more than half: VO is then so much surer than the filter that an error
-    usual for VO and one unusual for the filter explain it best.
+    Whose fault: of the NIS ``r^T S^-1 r`` the likeliest error of the predicted motion, over its own covariance
+    ``P_r``, makes ``r^T S^-1 P_r S^-1 r``; the rest is VO's. Where the filter's part is more than half, VO is so much
+    the surer of the two that an error usual for VO and one unusual for the filter explain the failure best.
     """
 
     passed_ns: NDArray[np.int64]
