@@ -220,7 +220,7 @@ class ErrorStateFilter:
         nis = (z * z).sum(1)
         limit = gate.threshold(H.shape[1]) if gate else np.inf
         passed = nis <= limit
-        own_fault = ~passed if passed.all() else ~passed & self._is_own_fault(H, S, r)
+        own_fault = ~passed if passed.all() else ~passed & (self._own_part(H, S, r) > 0.5 * nis)
         used = passed
         alpha = np.ones(self.batch)
         if gate and not passed.all() and gate.on_fail != "discard":
@@ -238,12 +238,11 @@ class ErrorStateFilter:
             self.dx += (K @ r[:, :, None])[:, :, 0] * (used / alpha)[:, None]
         return Innovation(r, S, nis, passed, used, own_fault)
 
-    def _is_own_fault(self, H: Array, S: Array, r: Array) -> NDArray[np.bool_]:
-        """(B,) whether state and clone have more than half of the NIS to answer for (see the gate's ``Wait``)."""
-        y = np.linalg.solve(S, r[:, :, None])
-        v = kernels.transpose(H[:, :, :_STATE]) @ np.asarray(y, dtype=np.float64)
-        share = kernels.transpose(v) @ self.P[:, :_STATE, :_STATE] @ v
-        return np.asarray(share > 0.5 * kernels.transpose(r[:, :, None]) @ y)[:, 0, 0]
+    def _own_part(self, H: Array, S: Array, r: Array) -> Array:
+        """How much of the NIS (B,) state and clone have to answer for (see the gate's ``Wait``)."""
+        y = np.asarray(np.linalg.solve(S, r[:, :, None]), dtype=np.float64)
+        v = kernels.transpose(H[:, :, :_STATE]) @ y
+        return np.asarray(kernels.transpose(v) @ self.P[:, :_STATE, :_STATE] @ v)[:, 0, 0]
 
     def _doubt(self, factor: Array) -> None:
         """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,), within reason."""

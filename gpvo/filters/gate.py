@@ -91,5 +91,4 @@ class Wait:
 
     def after(self, t_ns: int, passed: NDArray[np.bool_] | bool, own_fault: NDArray[np.bool_] | bool) -> Wait:
         """The same once a record has been judged; ``own_fault``: failed, and the filter has to answer for it."""
-        sound = np.logical_or(passed, np.logical_not(own_fault))
-        return Wait(np.where(passed, t_ns, self.passed_ns), np.where(sound, t_ns, self.sound_ns))
+        return Wait(np.where(passed, t_ns, self.passed_ns), np.where(own_fault, self.sound_ns, t_ns))

@@ -191,28 +191,28 @@ def _is_right_again(timeline: Timeline, flight: Flight) -> bool:
     return bool(abs(np.linalg.norm(timeline.filter.x.velocity) - speed) < 0.2)
 
 
+def _recovers_after(timeline: Timeline, flight: Flight, shut_out: int) -> None:
+    """So many records are rejected; of the rest a few are let in against the gate, and then all is well."""
+    _feed(timeline, flight, list(range(60, 60 + shut_out)))
+    assert timeline.counts["rejected"] == shut_out
+    assert timeline.counts["recovered"] == 0
+    _feed(timeline, flight, list(range(60 + shut_out, 400)))
+    assert 0 < timeline.counts["recovered"] < 10
+    assert _is_right_again(timeline, flight)
+
+
 def test_a_filter_that_is_wrong_recovers() -> None:
     """A wrong velocity shuts good measurements out; after five seconds of that they are let in again."""
     timeline, long = _astray(3.0)
     timeline.gate = Gate(doubt_after_s=np.inf)
-    _feed(timeline, long, list(range(60, 155)))
-    assert timeline.counts["rejected"] == 95
-    assert timeline.counts["recovered"] == 0
-    _feed(timeline, long, list(range(155, 400)))
-    assert 0 < timeline.counts["recovered"] < 10
-    assert _is_right_again(timeline, long)
+    _recovers_after(timeline, long, 95)
 
 
 def test_a_filter_that_knows_less_than_vo_recovers_sooner() -> None:
     """Where the filter itself admits more error than VO does, one second of failures is enough."""
     timeline, long = _astray(3.0)
     timeline.filter.P[:, 3:6, 3:6] += 0.4**2 * np.eye(3)
-    _feed(timeline, long, list(range(60, 80)))
-    assert timeline.counts["rejected"] == 20
-    assert timeline.counts["recovered"] == 0
-    _feed(timeline, long, list(range(80, 400)))
-    assert 0 < timeline.counts["recovered"] < 10
-    assert _is_right_again(timeline, long)
+    _recovers_after(timeline, long, 20)
 
 
 def test_a_filter_that_knows_more_than_vo_holds_out() -> None:

@@ -12,7 +12,6 @@ from gpvo.types import Array
 
 F32 = NDArray[np.float32]
 _LIFT_M = 0.02
-_NOWHERE_M = 1e37
 
 
 class Baker:
@@ -41,9 +40,10 @@ class Baker:
         origins = np.ascontiguousarray(self._origins[index])
         rays = np.ascontiguousarray(directions, dtype=np.float32)
         limits = np.full(len(origins), limit_m, dtype=np.float32)
-        return np.asarray(self._scene.run(origins, rays, dists=limits, query="DISTANCE"), dtype=np.float64)
+        found = np.asarray(self._scene.run(origins, rays, dists=limits, query="DISTANCE"), dtype=np.float64)
+        return np.minimum(found, limit_m)
 
-    def reaches(self, origins: Array, direction: Array) -> NDArray[np.bool_]:
+    def reaches(self, origins: Array | F32, direction: Array) -> NDArray[np.bool_]:
         """Whether light from a unit direction (3,) far away reaches points (N, 3)."""
         rays = np.broadcast_to(direction.astype(np.float32), (len(origins), 3))
         points = np.ascontiguousarray(origins, dtype=np.float32)
@@ -72,7 +72,7 @@ class Baker:
         for _ in range(samples):
             ray = direction + spread * rng.standard_normal(3)
             ray /= np.linalg.norm(ray)
-            free = self._reach(lit, np.broadcast_to(ray, (len(lit), 3)), _NOWHERE_M) > 1e6
+            free = self.reaches(self._origins[lit], ray)
             out[lit] += free * np.maximum(self._normals[lit] @ ray, 0) / samples
         return out
 
@@ -84,7 +84,7 @@ class Baker:
             ray = rng.standard_normal((len(everywhere), 3))
             ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) + self._normals
             ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-6)
-            out += np.minimum(self._reach(everywhere, ray, reach_m), reach_m) / (reach_m * samples)
+            out += self._reach(everywhere, ray, reach_m) / (reach_m * samples)
         return self._smoothed(self._smoothed(out))
 
     def _smoothed(self, x: Array) -> Array:
