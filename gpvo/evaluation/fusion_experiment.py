@@ -20,7 +20,16 @@ from gpvo.dataset.build import build_run
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
 from gpvo.evaluation.fusion_figure import plot_experiment
-from gpvo.evaluation.fusion_flights import Campaign, Rise, rise, training_runs, unseen_runs, with_accidents
+from gpvo.evaluation.fusion_flights import (
+    FIRST_TEST_SEED,
+    FIRST_TRAIN_SEED,
+    Campaign,
+    Rise,
+    rise,
+    training_runs,
+    unseen_runs,
+    with_accidents,
+)
 from gpvo.evaluation.fusion_report import document
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
@@ -145,6 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("scenario", help="such as tunnel-bursts, tunnel-clean, tunnel-noise")
     parser.add_argument("--train", type=int, default=12, help="training flights")
     parser.add_argument("--test", type=int, default=50, help="test flights")
+    parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="of the first test flight")
     parser.add_argument("--pictures", action="store_true", help="draw the pictures: real VO, a hundred times slower")
     parser.add_argument("--duration", type=float, help=f"s; default {_POINTS_S:g}, with pictures {_PICTURES_S:g}")
     parser.add_argument("--model", type=Path, help="use this model, such as one trained on points, in place of a new")
@@ -153,10 +163,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.train < 2 or given.test < 2:
         raise GpvoError("too few flights to learn or to judge", cure="--train and --test of 2 at least")
+    if given.test_seed < FIRST_TRAIN_SEED + given.train and given.test_seed + given.test > FIRST_TRAIN_SEED:
+        raise GpvoError("test flights are among the training flights", cure=f"--test-seed {FIRST_TRAIN_SEED + 1000}")
     duration = given.duration or (_PICTURES_S if given.pictures else _POINTS_S)
     campaign = Campaign(given.scenario, given.out, duration, given.pictures)
     training = training_runs(campaign, given.train, given.jobs)
-    test = unseen_runs(campaign, given.test, given.jobs)
+    test = unseen_runs(campaign, given.test, given.jobs, given.test_seed)
     kind = "pictures" if given.pictures else "points"
     stem = given.out / f"{given.scenario}-{kind}{'-other-model' if given.model else ''}"
     model = given.model or trained(training, stem.with_suffix(".gpvo"))

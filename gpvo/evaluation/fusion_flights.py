@@ -52,9 +52,9 @@ def training_runs(campaign: Campaign, count: int, jobs: int = 1) -> list[Run]:
     return flights(campaign, range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + count), jobs)
 
 
-def unseen_runs(campaign: Campaign, count: int, jobs: int = 1) -> list[Run]:
+def unseen_runs(campaign: Campaign, count: int, jobs: int = 1, first_seed: int = FIRST_TEST_SEED) -> list[Run]:
     """So many flights, every fourth with accidents."""
-    return _make(campaign, [(FIRST_TEST_SEED + i, i % 4 == 3) for i in range(count)], jobs)
+    return _make(campaign, [(first_seed + i, i % 4 == 3) for i in range(count)], jobs)
 
 
 def flights(campaign: Campaign, seeds: Iterable[int], jobs: int = 1) -> list[Run]:

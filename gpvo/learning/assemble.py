@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from gpvo.learning.calibrate import (
     LEVELS,
     Scale,
-    choose_geometry_weight,
     conformal_quantiles,
     fit_joint_factor,
     fit_outside_power,
     fit_scale,
 )
+from gpvo.learning.geometryweight import choose_geometry_weight, divided
 from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
 from gpvo.learning.partcorrelation import part_correlations
@@ -103,10 +103,14 @@ def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None) -> 
     v_mps = rows.select(TWIST_COLUMNS[:3])
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
     faster = ln_faster(v_mps, ln_speed)
-    parts = fit_parts(rows.chains(error), rows.chains(sigma), rows.chains(faster), rows.step_s)
-    correlation = part_correlations(rows.chains(error / sigma), parts, rows.step_s)
+    errors, sigmas = rows.chains(error), rows.chains(sigma)
+    parts = fit_parts(errors, sigmas, rows.chains(faster), rows.step_s)
+    correlation = part_correlations(errors, sigmas, parts, rows.step_s)
     share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)
-    weight = choose_geometry_weight(error, sigma, correlation, geometry, share)
+    weight = 0.0
+    if geometry is not None:
+        each = divided(errors, rows.chains(sigma**2), rows.chains(share), rows.chains(geometry))
+        weight = choose_geometry_weight(each, correlation, float(np.exp(-rows.step_s / parts.tau_s[0])))
     return _Sums(parts, correlation, weight, ln_speed, faster)
 
 

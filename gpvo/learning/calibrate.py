@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 
 from gpvo.learning.basefit import t_negative_log_likelihood
 from gpvo.online.guard import growth
-from gpvo.stats.consistency import nees, nll_per_dim
+from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
 LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95)
@@ -22,7 +22,6 @@ _NU_RANGE = (2.5, 200.0)
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
 _OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
 _POWERS = (1.0, 1.25, 1.5, 2.0)
-_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def robust_second_moment(square: Array) -> float:
@@ -136,34 +135,6 @@ def residual_correlation(z: Array, nu: float = 5.0) -> Array:
             break
     s = np.sqrt(np.diagonal(C))
     return C / np.outer(s, s)
-
-
-def choose_geometry_weight(
-    error: Array, sigma: Array, correlation: Array, geometry: Array | None, share: Array
-) -> float:
-    """How much of the geometry's correlation to believe of jitter and white: the weight with the best likelihood.
-
-    ``correlation`` (3, 6, 6) and ``share`` (n, 3, 6) of the parts.
-    """
-    if geometry is None:
-        return 0.0
-    s = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
-    R = geometry / (s[:, :, None] * s[:, None, :])
-    known = np.isfinite(R).all(axis=(1, 2))
-    if known.mean() < 0.5:
-        return 0.0
-    root = np.sqrt(share[known]) * sigma[known][:, None, :]
-    jitter, white, bias = np.moveaxis(root[..., :, None] * root[..., None, :], 1, 0)
-
-    def loss(w: float) -> float:
-        own = (1 - w) * (jitter * correlation[0] + white * correlation[1])
-        C = w * R[known] * (jitter + white) + own + bias * correlation[2]
-        C = C + 1e-6 * np.eye(6) * C
-        # The scale is fitted afterwards: compare shapes at their own best scale.
-        scale = robust_mean(nees(error[known], C) / 6.0)
-        return float(np.mean(nll_per_dim(error[known], C * scale)))
-
-    return min(_WEIGHTS, key=loss)
 
 
 def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list[bool]]:

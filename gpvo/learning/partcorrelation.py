@@ -21,15 +21,17 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
     return np.stack([np.ones_like(m), m, bias], axis=1)
 
 
-def part_correlations(z: Chains, split: Parts, step_s: float) -> Array:
-    """(3, 6, 6) correlations of jitter, white and bias, from those of the normalised residuals summed over each span.
+def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
+    """(3, 6, 6) correlations of jitter, white and bias, from those of the errors summed over each span.
 
+    Each sum is over its own stated deviation: among the motions that it sums the worst decide, as they do of the pose,
+    and their axes may go together more closely than those of the others.
     Of each pair of axes three numbers are sought whose mixture, by what each part contributes to the sum, is the
     correlation seen over every span; all are drawn towards that of single motions, as few windows show little.
     """
     part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
     whole = part.sum(axis=2).T
-    measured = np.array([residual_correlation(_all_sums(z, m) / np.sqrt(v)) for m, v in zip(split.spans, whole)])
+    measured = np.array([residual_correlation(_scaled_sums(error, sigma, m)) for m in split.spans])
     windows = 2.0 / split.doubt
     out = np.tile(np.eye(6), (3, 1, 1))
     for i, j in zip(*np.triu_indices(6, 1)):
@@ -41,8 +43,11 @@ def part_correlations(z: Chains, split: Parts, step_s: float) -> Array:
     return np.array([_nearest_correlation(R) for R in out])
 
 
-def _all_sums(z: Chains, m: int) -> Array:
-    return np.concatenate([sums(chain, m) for chains in z for chain in chains if len(chain) >= m])
+def _scaled_sums(error: Chains, sigma: Chains, m: int) -> Array:
+    """(w, D) sums over m motions, over their stated deviation were they independent; each axis of unit mean square."""
+    pairs = [(e, s) for es, ss in zip(error, sigma) for e, s in zip(es, ss) if len(e) >= m]
+    z = np.concatenate([sums(e, m) / np.sqrt(sums(s**2, m)) for e, s in pairs])
+    return np.asarray(z / np.sqrt((z**2).mean(axis=0)))
 
 
 def _nearest_correlation(R: Array) -> Array:

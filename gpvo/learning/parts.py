@@ -60,19 +60,26 @@ class Parts:
 @dataclass(frozen=True)
 class SpanVariances:
     """``spans`` (S,) that occur; ``mean_square`` (S, D) of sums over each; ``doubt`` (S, D): squared relative standard
-    error of that, by which sequences differ or, where they are few, by the number of separate windows. What is squared
-    over an uncertain variance ``v`` is, on average, too large by ``1 + var(v) / v^2``: so much more is to be stated of
-    a sequence not seen."""
+    error of that, by which sequences differ or, where they are few, by the number of separate windows."""
 
     spans: NDArray[np.int64]
     mean_square: Array
     doubt: Array
 
+    def widening(self, tau: float) -> Array:
+        """(S, D) by how much more is to be stated of a sequence not seen, errors being correlated over ``tau`` frames.
+
+        What is squared over an uncertain variance ``v`` is, on average, too large by ``1 + var(v) / v^2``. Sums over
+        more than two time constants add up from shorter ones, which are known better: they share the doubt of those.
+        """
+        last = max(int((self.spans <= 2.0 * tau).sum()) - 1, 0)
+        return np.asarray(1.0 + self.doubt[np.minimum(np.arange(len(self.spans)), last)])
+
 
 @dataclass(frozen=True)
 class _Windows:
-    """Of one span and block of axes: squared sums (w, d), widened by their doubt; stated variances (w, m, d), their
-    logs above the typical level and those of the speed (w, m, 1); what a window counts."""
+    """Of one span and block of axes: squared sums (w, d); stated variances (w, m, d), their logs above the typical
+    level and those of the speed (w, m, 1); what a window counts."""
 
     square: Array
     variance: Array
@@ -112,22 +119,21 @@ def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float) -> 
     D = len(level)
     share, growth, ratio = np.empty((3, D)), np.empty((2, D)), np.empty((len(found.spans), D))
     blocks = [slice(start, min(start + 3, D)) for start in range(0, D, 3)]
-    windows = [
-        [_windows(error, ln_var, ln_speed, m, block, level, 1.0 + doubt) for m, doubt in zip(found.spans, found.doubt)]
-        for block in blocks
-    ]
-    tau, chosen = _choose(windows)
-    for block, (shape, fit) in zip(blocks, chosen):
+    windows = [[_windows(error, ln_var, ln_speed, m, block, level) for m in found.spans] for block in blocks]
+    tau, shapes = _choose(windows)
+    widening = found.widening(tau)
+    for block, seen, shape in zip(blocks, windows, shapes):
+        fit = _fit_shape(seen, shape, widening[:, block])
         share[:, block], ratio[:, block] = fit.share, fit.ratio
         growth[:, block] = [[shape.by_speed], [shape.by_noise]]
-    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio / (1.0 + found.doubt), found.doubt)
+    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio, found.doubt)
 
 
 _Choice = tuple[_Shape, _Fit]
 
 
-def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Choice]]:
-    """The time constant [frames] of all blocks, and the shape and fit of each.
+def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Shape]]:
+    """The time constant [frames] of all blocks, and the shape of each.
 
     Sideways errors go with the turns that undo them; with time constants of their own they would part on the way.
     """
@@ -139,7 +145,7 @@ def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Choice]
 
     found = min(_TAU_FRAMES, key=loss)
     found = min((found, found / 2.0, found * 2.0), key=loss)
-    return found, tried[found]
+    return found, [shape for shape, _ in tried[found]]
 
 
 def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
@@ -169,29 +175,27 @@ def _at_most(values: Chains, limit: int) -> Chains:
     return out
 
 
-def _windows(
-    error: Chains, ln_var: Chains, ln_speed: Chains, m: int, block: slice, level: Array, widen: Array
-) -> _Windows:
+def _windows(error: Chains, ln_var: Chains, ln_speed: Chains, m: int, block: slice, level: Array) -> _Windows:
     e, v, u = (
         np.concatenate([c[: len(c) // m * m].reshape(-1, m, c.shape[1]) for chains in x for c in chains])
         for x in (error, ln_var, ln_speed)
     )
     some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
     e, v, u = e[some, :, block], v[some, :, block], u[some]
-    square = e.sum(axis=1) ** 2 * widen[block]
-    return _Windows(square, np.exp(v), v - level[block], u, min(len(e), _MOST_COUNT) / len(e))
+    return _Windows(e.sum(axis=1) ** 2, np.exp(v), v - level[block], u, min(len(e), _MOST_COUNT) / len(e))
 
 
-def _fit_shape(windows: Sequence[_Windows], shape: _Shape) -> _Fit:
-    """Shares for one shape, by the likelihood of squared sums.
+def _fit_shape(windows: Sequence[_Windows], shape: _Shape, widen: Array | None = None) -> _Fit:
+    """Shares for one shape, by the likelihood of squared sums, times ``widen`` (S, d) where given.
 
     A squared sum has the deviation of what is stated of it; so the fit is reweighted by its own statement, because
     weights by what is seen would favour statements that are too small.
     """
     d = windows[0].square.shape[1]
+    widen = np.ones((len(windows), d)) if widen is None else widen
     share = np.repeat([[0.5], [0.4], [0.1]], d, axis=1)
     count = np.concatenate([np.full(len(w.square), w.count) for w in windows])
-    square = np.concatenate([w.square for w in windows])
+    square = np.concatenate([w.square * more for w, more in zip(windows, widen)])
     changes = shape.by_speed > 0 or shape.by_noise > 0
     for k in range(_REWEIGHTINGS):
         if k == 0 or (changes and k <= _REDIVISIONS):
@@ -203,7 +207,7 @@ def _fit_shape(windows: Sequence[_Windows], shape: _Shape) -> _Fit:
     ratio = np.minimum(square / stated, _MOST_RATIO)
     loss = float((count[:, None] * (np.log(stated) + ratio)).sum())
     edges = np.cumsum([len(w.square) for w in windows])[:-1]
-    return _Fit(loss, share, np.array([r.mean(axis=0) for r in np.split(ratio, edges)]))
+    return _Fit(loss, share, np.array([r.mean(axis=0) for r in np.split(ratio, edges)]) / widen)
 
 
 def _terms(w: _Windows, shape: _Shape, share: Array) -> Array:

@@ -98,7 +98,7 @@ def test_each_part_has_its_own_correlation():
         bias = np.repeat(rng.standard_normal((20, 1)), 100, axis=0) * np.array([0.2, 0.2, 0, 0, 0, 0])
         z.append([bias + rng.standard_normal((2000, 6))])
     parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
-    R = part_correlations(z, parts, 0.05)
+    R = part_correlations(z, _like(z, 1.0), parts, 0.05)
     assert R[2, 0, 1] > 0.6
     assert np.abs(R[:2, 0, 1]).max() < 0.15
     assert np.linalg.eigvalsh(R).min() > 0.0
@@ -128,7 +128,7 @@ def test_what_is_stated_along_a_path_is_what_was_fitted():
         bias = np.array([lfilter([np.sqrt(1.0 - r**2)], [1.0, -r], column) for r, column in zip(rho, steps.T)]).T
         z.append([0.5 * bias + rng.standard_normal((4000, 6))])
     parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
-    R = part_correlations(z, parts, 0.05)
+    R = part_correlations(z, _like(z, 1.0), parts, 0.05)
     jitter, white, bias = R * (np.sqrt(parts.share) * sigma)[:, :, None] * (np.sqrt(parts.share) * sigma)[:, None, :]
     error = PoseError()
     for _ in range(200):
