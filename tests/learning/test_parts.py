@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from gpvo.evaluation.accumulate import PoseError, Step
 from gpvo.learning.partcorrelation import curves, part_correlations
-from gpvo.learning.parts import chains, fit_parts, span_variances
+from gpvo.learning.parts import SpanVariances, chains, fit_parts, span_variances
 from scipy.signal import lfilter
 
 
@@ -135,3 +135,27 @@ def test_what_is_stated_along_a_path_is_what_was_fitted():
         error.add(Step(np.eye(4), jitter, white, bias, parts.tau_s, 0.05))
     fitted = [curves(np.array([200]), tau / 0.05)[0] @ s for tau, s in zip(parts.tau_s, parts.share.T)]
     np.testing.assert_allclose(np.diagonal(error.covariance), sigma**2 * fitted, rtol=1e-6)
+
+
+def test_the_worst_motions_decide_how_the_axes_of_a_sum_go_together():
+    """One motion in five is five times as uncertain, and only there two axes go together."""
+    rng = np.random.default_rng(5)
+    error, sigma = [], []
+    for _ in range(10):
+        e, s = rng.standard_normal((2000, 6)), np.ones((2000, 6))
+        e[::5, 1] = 0.9 * e[::5, 0] + np.sqrt(1.0 - 0.9**2) * e[::5, 1]
+        s[::5] = 5.0
+        error.append([e * s])
+        sigma.append([s])
+    parts = fit_parts(error, sigma, _same_speed(error), 0.05)
+    white = part_correlations(error, sigma, parts, 0.05)[1]
+    np.testing.assert_allclose(white[0, 1], 0.9 * 25.0 / (25.0 + 4.0), atol=0.1)
+
+
+def test_sums_over_more_than_two_time_constants_share_the_doubt_of_shorter_ones():
+    spans = np.array([1, 10, 100, 1000])
+    doubt = np.array([0.01, 0.1, 0.3, 1.0])[:, None] * np.ones(3)
+    found = SpanVariances(spans, np.ones((4, 3)), doubt)
+    np.testing.assert_array_equal(found.widening(64.0)[:, 0], [1.01, 1.1, 1.3, 1.3])
+    np.testing.assert_array_equal(found.widening(1024.0)[:, 0], [1.01, 1.1, 1.3, 2.0])
+    np.testing.assert_array_equal(found.widening(0.1)[:, 0], np.full(4, 1.01))
