@@ -22,9 +22,9 @@ from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of,
 from gpvo.evaluation.fusion_figure import plot_experiment
 from gpvo.evaluation.fusion_flights import (
     FIRST_TEST_SEED,
-    FIRST_TRAIN_SEED,
     Campaign,
     Rise,
+    refuse_training_seeds,
     rise,
     training_runs,
     unseen_runs,
@@ -163,8 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.train < 2 or given.test < 2:
         raise GpvoError("too few flights to learn or to judge", cure="--train and --test of 2 at least")
-    if given.test_seed < FIRST_TRAIN_SEED + given.train and given.test_seed + given.test > FIRST_TRAIN_SEED:
-        raise GpvoError("test flights are among the training flights", cure=f"--test-seed {FIRST_TRAIN_SEED + 1000}")
+    refuse_training_seeds(given.train, given.test, given.test_seed)
     duration = given.duration or (_PICTURES_S if given.pictures else _POINTS_S)
     campaign = Campaign(given.scenario, given.out, duration, given.pictures)
     training = training_runs(campaign, given.train, given.jobs)

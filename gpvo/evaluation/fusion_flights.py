@@ -47,6 +47,12 @@ class Campaign:
         return self.folder / f"{self.scenario}-{kind}-{seed:04d}{_ACCIDENTS if accidents else ''}"
 
 
+def refuse_training_seeds(train: int, test: int, first_test_seed: int) -> None:
+    """Raise GpvoError where one of so many test flights is a training flight."""
+    if first_test_seed < FIRST_TRAIN_SEED + train and first_test_seed + test > FIRST_TRAIN_SEED:
+        raise GpvoError("test flights are among the training flights", cure=f"--test-seed {FIRST_TRAIN_SEED + train}")
+
+
 def training_runs(campaign: Campaign, count: int, jobs: int = 1) -> list[Run]:
     """So many flights without accidents; path, world and sensors are never those of a test flight."""
     return flights(campaign, range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + count), jobs)

@@ -23,7 +23,7 @@ from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
 from gpvo.evaluation.evaluate import judged, predictions_by_stamp
-from gpvo.evaluation.fusion_flights import Campaign, flights
+from gpvo.evaluation.fusion_flights import Campaign, flights, refuse_training_seeds, training_runs
 from gpvo.evaluation.statements import statements
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run import Run
@@ -43,7 +43,7 @@ DURATIONS_S: Mapping[str, float] = {
 
 METHODS = ("constant", "triangulation_scaled", "learned")
 NEES_COLUMNS = ("frame", *(f"{m:g} m" for m in HORIZONS_M))
-FIRST_TRAIN_SEED, FIRST_TEST_SEED = 1000, 2000
+FIRST_TEST_SEED = 2000
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRS
         duration_s: float | None = None) -> ScenarioFlights:  # fmt: skip
     """Simulate as points, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
     campaign = Campaign(name, folder, duration_s or DURATIONS_S[name])
-    seen = flights(campaign, range(FIRST_TRAIN_SEED, FIRST_TRAIN_SEED + train), jobs)
+    seen = training_runs(campaign, train, jobs)
     unseen = flights(campaign, range(test_seed, test_seed + test), jobs)
     return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
 
@@ -161,6 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     unknown = [s for s in given.scenarios if s not in DURATIONS_S]
     if unknown or given.train < 2 or given.test < 2:
         raise GpvoError(f"cannot judge {unknown or 'so few flights'}", cure="names of --help; two flights at least")
+    refuse_training_seeds(given.train, given.test, given.test_seed)
     results: dict[str, Mapping[str, MethodScores]] = {}
     flown = []
     for name in given.scenarios:

@@ -39,6 +39,12 @@ def scaled_root(C: Array) -> Array:
     return np.asarray(sigma[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
 
 
+def correlation(C: Array) -> Array:
+    """Correlations (..., n, n) of covariances; NaN where a variance is unknown."""
+    sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
+    return np.asarray(C / (sigma[..., :, None] * sigma[..., None, :]))
+
+
 def of_inverse(T_a_b: Array, cov_a_b: Array) -> Array:
     """Covariance of ``T_b_a`` from ``T_a_b`` and its covariance: ``(T Exp(xi))^-1 = T^-1 Exp(-Ad(T) xi)``."""
     A = se3.adjoint(T_a_b)

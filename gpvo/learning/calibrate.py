@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from gpvo.geometry.covariance import correlation
 from gpvo.learning.basefit import t_negative_log_likelihood
 from gpvo.online.guard import growth
 from gpvo.stats.consistency import nees
@@ -133,8 +134,7 @@ def residual_correlation(z: Array, nu: float = 5.0) -> Array:
         C = C_new
         if done:
             break
-    s = np.sqrt(np.diagonal(C))
-    return C / np.outer(s, s)
+    return correlation(C)
 
 
 def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list[bool]]:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
+from gpvo.geometry.covariance import correlation as correlation_of
 from gpvo.learning.calibrate import robust_mean
-from gpvo.learning.parts import Chains
+from gpvo.learning.parts import Chains, carried, cut
 from gpvo.stats.consistency import nees, nll_per_dim
 from gpvo.types import Array
 
@@ -37,8 +37,7 @@ def divided(error: Chains, variance: Chains, share: Chains, geometry: Chains) ->
     for of_sequence in zip(error, variance, share, geometry):
         for e, v, s, C in zip(*of_sequence):
             jitter, white, bias = np.moveaxis(np.sqrt(s * v[:, None, :]), 1, 0)
-            sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-            out.append(Divided(e, jitter, white, bias, C / (sigma[:, :, None] * sigma[:, None, :])))
+            out.append(Divided(e, jitter, white, bias, correlation_of(C)))
     return out
 
 
@@ -82,17 +81,12 @@ class _Sums:
 
 def _windows(c: Divided, correlation: Array, phi: float, m: int) -> tuple[Array, ...]:
     """What :class:`_Sums` holds, of each separate window of a chain."""
-
-    def cut(values: Array) -> Array:
-        return values[: len(values) // m * m].reshape(-1, m, *values.shape[1:])
-
-    error, geometry, jitter, white, bias = (cut(v) for v in (c.error, c.geometry, c.jitter, c.white, c.bias))
+    error, geometry, jitter, white, bias = (cut(v, m) for v in (c.error, c.geometry, c.jitter, c.white, c.bias))
     known = np.isfinite(geometry).all(axis=(2, 3), keepdims=True)
     of_jitter, of_white = (np.where(known, geometry, R) for R in correlation[:2])
     ends = 0.5 * _outer(jitter[:, [0, -1]])
     white = _outer(white)
-    earlier = lfilter([0.0, phi], [1.0, -phi], bias, axis=1)
-    lagged = np.einsum("wmi,wmj->wij", bias, earlier)
+    lagged = np.einsum("wmi,wmj->wij", bias, carried(bias, phi))
     return (
         error.sum(axis=1),
         (ends * of_jitter[:, [0, -1]]).sum(axis=1) + (white * of_white).sum(axis=1),

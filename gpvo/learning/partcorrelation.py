@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.geometry.covariance import correlation
 from gpvo.learning.calibrate import residual_correlation
 from gpvo.learning.parts import Chains, Parts, sums
 from gpvo.types import Array
@@ -54,5 +55,4 @@ def _nearest_correlation(R: Array) -> Array:
     """Positive definite, with a unit diagonal."""
     values, vectors = np.linalg.eigh(R)
     R = (vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
-    s = np.sqrt(np.diagonal(R))
-    return np.asarray(R / np.outer(s, s))
+    return correlation(R)

@@ -176,10 +176,7 @@ def _at_most(values: Chains, limit: int) -> Chains:
 
 
 def _windows(error: Chains, ln_var: Chains, ln_speed: Chains, m: int, block: slice, level: Array) -> _Windows:
-    e, v, u = (
-        np.concatenate([c[: len(c) // m * m].reshape(-1, m, c.shape[1]) for chains in x for c in chains])
-        for x in (error, ln_var, ln_speed)
-    )
+    e, v, u = (np.concatenate([cut(c, m) for chains in x for c in chains]) for x in (error, ln_var, ln_speed))
     some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
     e, v, u = e[some, :, block], v[some, :, block], u[some]
     return _Windows(e.sum(axis=1) ** 2, np.exp(v), v - level[block], u, min(len(e), _MOST_COUNT) / len(e))
@@ -221,10 +218,21 @@ def _terms(w: _Windows, shape: _Shape, share: Array) -> Array:
         more = gain * np.exp(shape.by_noise * w.above)
         each = w.variance / (share[0] + share[1] * gain + share[2] * more)
         white, bias = each * gain, each * more
-    amplitude, rho = np.sqrt(bias), np.exp(-1.0 / shape.tau)
-    before = lfilter([0.0, rho], [1.0, -rho], amplitude, axis=1)
+    amplitude = np.sqrt(bias)
+    before = carried(amplitude, float(np.exp(-1.0 / shape.tau)))
     jitter = 0.5 * (each[:, 0] + each[:, -1])
     return np.stack([jitter, white.sum(axis=1), bias.sum(axis=1) + 2.0 * (amplitude * before).sum(axis=1)], axis=1)
+
+
+def cut(values: Array, m: int) -> Array:
+    """(w, m, ...) separate windows of m rows; what is left over is dropped."""
+    return values[: len(values) // m * m].reshape(-1, m, *values.shape[1:])
+
+
+def carried(amplitude: Array, phi: float) -> Array:
+    """(w, m, d) what each motion has of the biases of those before it in its window. ``amplitude`` (w, m, d) of a bias
+    of unit variance, correlated by ``phi`` from one motion to the next."""
+    return np.asarray(lfilter([0.0, phi], [1.0, -phi], amplitude, axis=1))
 
 
 def _solve(A: Array, square: Array, weight: Array) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
+from gpvo.geometry.covariance import correlation as correlation_of
 from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
 from gpvo.online.guard import Domain, Whereabouts, growth
@@ -240,8 +241,7 @@ class ErrorModelArrays:
         out = np.repeat(self.correlation[None], len(variance), axis=0)
         w = float(self.geometry_weight[0])
         if geometry is not None and w > 0:
-            sigma = np.sqrt(np.diagonal(geometry, axis1=1, axis2=2))
-            R = geometry / (sigma[:, :, None] * sigma[:, None, :])
+            R = correlation_of(geometry)
             known = np.isfinite(R).all(axis=(1, 2))
             out[known, :2] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.

@@ -86,6 +86,9 @@ def test_tables_hold_every_run_and_every_comparison(tmp_path: Path) -> None:
 def test_too_few_flights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="too few flights"):
         main(["tunnel-clean", "--train", "1", "-o", str(tmp_path)])
+
+
+def test_a_test_flight_that_taught_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="among the training flights"):
         main(["tunnel-clean", "--train", "2", "--test-seed", "1001", "-o", str(tmp_path)])
 

@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 import pytest
-from gpvo.evaluation.scenario_experiment import MethodScores, fly, judge, markdown
+from gpvo.errors import GpvoError
+from gpvo.evaluation.scenario_experiment import MethodScores, fly, judge, main, markdown
 
 
 def _scores(nees: list[list[float]]) -> MethodScores:
@@ -25,6 +26,11 @@ def test_a_horizon_that_no_flight_reaches_is_left_blank():
     assert cells[3].startswith("1.10 [")
     assert cells[5].startswith("0.90")
     assert cells[6] == "-"
+
+
+def test_a_test_flight_that_taught_is_refused(tmp_path):
+    with pytest.raises(GpvoError, match="among the training flights"):
+        main(["tunnel-noise", "--train", "2", "--test-seed", "1001", "-o", str(tmp_path)])
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.evaluation.accumulate import PoseError, Step
+from gpvo.geometry.covariance import correlation
 from gpvo.learning.geometryweight import Divided, _Sums, choose_geometry_weight
 
 PHI = 0.9
@@ -70,6 +71,4 @@ def test_what_is_stated_of_a_sum_is_what_adds_up_along_a_path():
 
 def _random_correlation(rng: np.random.Generator) -> np.ndarray:
     A = rng.standard_normal((6, 8))
-    C = A @ A.T
-    s = np.sqrt(np.diagonal(C))
-    return C / np.outer(s, s)
+    return correlation(A @ A.T)
