@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -23,8 +23,8 @@ def fuse(
     gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
     mean: Annotated[
         str,
-        typer.Option(help="The mean error: absorb (part of the covariance) or subtract (predicted, and taken off)."),
-    ] = "absorb",
+        typer.Option(help="The mean error to take off: steady (in all frames alike), predicted, or none (absorb)."),
+    ] = "steady",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
@@ -38,7 +38,7 @@ def fuse(
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
-    from gpvo.filters.policies import LEARNED, POLICIES
+    from gpvo.filters.policies import LEARNED, POLICIES, MeanUse
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
@@ -46,15 +46,15 @@ def fuse(
         raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
     if gate not in ("discard", "inflate"):
         raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
-    if mean not in ("absorb", "subtract"):
-        raise GpvoError(f"--mean is '{mean}'", cure="choose absorb or subtract")
+    if mean not in ("steady", "predicted", "absorb"):
+        raise GpvoError(f"--mean is '{mean}'", cure="choose steady, predicted or absorb")
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
     settings = FusionSettings(
         policies=wanted,
         model=model,
         training=tuple(train or ()),
         use_imu=not no_imu,
-        mean="subtract" if mean == "subtract" else "absorb",
+        mean=cast(MeanUse, mean),
         options=FuseOptions(
             init="static" if init == "static" else "truth",
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),

@@ -40,9 +40,9 @@ def predictions_of(predictor: Predictor, run: Run) -> dict[int, Prediction]:
     return {t: p for t, p in stepped if p is not None}
 
 
-def load_predictor(path: str | Path, mean: MeanUse = "absorb") -> Predictor:
-    """A model that predicts the error of single motions, the one without a mean where none is to be subtracted."""
-    predictor = Predictor.load(path, with_mean=mean == "subtract")
+def load_predictor(path: str | Path, mean: MeanUse = "steady") -> Predictor:
+    """A model that predicts the error of single motions, with the mean that is to be used."""
+    predictor = Predictor.load(path, for_filter=mean != "predicted")
     if predictor.target != "frame":
         raise ModelError(
             f"predicts the error over {predictor.target}, a filter needs that of each motion",
@@ -130,7 +130,7 @@ class FusionSettings:
     model: Path | None = None
     training: tuple[Path, ...] = ()
     use_imu: bool = True
-    mean: MeanUse = "absorb"
+    mean: MeanUse = "steady"
     options: FuseOptions = field(default_factory=FuseOptions)
 
 
@@ -179,7 +179,9 @@ def fuse_runs(
         flights.append(flight)
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
-    policies = make_policies(constants, names=settings.policies, learned=learned, mean=settings.mean)
+    # What a run stores has the predicted mean, which is not for filters.
+    mean = "absorb" if predictor is None and settings.mean == "steady" else settings.mean
+    policies = make_policies(constants, names=settings.policies, learned=learned, mean=mean)
     traces: list[Trace] = []
 
     def keep(flight: Flight, fused: FusedRun) -> None:

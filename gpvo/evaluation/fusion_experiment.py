@@ -40,7 +40,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets
 
-LEARNED_WHITE, LEARNED_SUBTRACT = "learned_white", "learned_subtract"
+LEARNED_WHITE, LEARNED_PREDICTED = "learned_white", "learned_predicted"
 _POINTS_S, _PICTURES_S = 60.0, 25.0
 _COLUMNS = (
     ("ATE m", "ate_rmse_m", 4),
@@ -72,7 +72,7 @@ def experiment(
     """Tune the constants on the training runs and filter the others under every policy.
 
     ``learned_white`` is the learned covariance taken as independent from motion to motion: what the parts are worth.
-    ``learned_subtract`` takes the predicted mean off: what that costs or brings.
+    ``learned_predicted`` takes the predicted mean off in place of the steady one: what that costs or brings.
     """
     options = FuseOptions(history_s=0.0)
     constants = constants_of(training)
@@ -90,9 +90,9 @@ def experiment(
         traces.append(trace_of(flight, fused))
 
     result = study(flights, policies, options, constants=constants, on_run=keep)
-    predictor = load_predictor(model, "subtract")
+    predictor = load_predictor(model, "predicted")
     flights = [flight_of(r, predictor) for r in test]
-    otherwise = study(flights, {LEARNED_SUBTRACT: LearnedPolicy(LEARNED_SUBTRACT, mean="subtract")}, options)
+    otherwise = study(flights, {LEARNED_PREDICTED: LearnedPolicy(LEARNED_PREDICTED, mean="predicted")}, options)
     result = replace(result, scores={**result.scores, **otherwise.scores})
     calm = [r for r in test if not with_accidents(r)]
     return Outcome(title, FusionReport(result, tuple(traces), ()), rise(calm))

@@ -19,7 +19,8 @@ CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT = "constant", "constant_best", "cons
 TRIANGULATION, POINTING_MATCHING, LEARNED = "triangulation", "pointing_matching", "learned"
 POLICIES = (CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT, TRIANGULATION, POINTING_MATCHING, LEARNED)
 
-MeanUse = Literal["absorb", "subtract"]
+MeanUse = Literal["steady", "predicted", "absorb"]
+"""Which mean comes off the measurement: the one steady in good frames and bad, the predicted one, or none."""
 
 _ZERO_MEAN = np.zeros((1, 6))
 _ZERO_MEAN.setflags(write=False)
@@ -74,14 +75,14 @@ class GeometricPolicy:
 class LearnedPolicy:
     """The predicted error: its covariance in the parts by which it accumulates, and its mean.
 
-    ``mean``: ``absorb`` leaves the measurement alone and adds the mean's square to the covariance; ``subtract`` takes
-    it off the measurement. A model fitted without a mean (``Predictor.load(path, with_mean=False)``) has none.
+    ``mean``: ``steady`` takes off that of a predictor loaded ``for_filter``, ``predicted`` that of a usual one;
+    ``absorb`` leaves the measurement alone and adds the mean's square to the covariance.
     ``use_parts`` False treats the total as independent from motion to motion, to show what the parts are worth.
     """
 
     name: str = LEARNED
     use_parts: bool = True
-    mean: MeanUse = "absorb"
+    mean: MeanUse = "steady"
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
         """The prediction's parts as filter noise; None without a prediction for this frame."""

@@ -96,7 +96,7 @@ def _pairs(a: Array, b: Array) -> Array:
 
 
 def make_policies(
-    constants: Constants | None, *, names: Sequence[str], learned: bool, mean: MeanUse = "absorb"
+    constants: Constants | None, *, names: Sequence[str], learned: bool, mean: MeanUse = "steady"
 ) -> dict[str, Policy | None]:
     """The named policies; None for one that lacks what it needs. ``mean``: what the learned one does with its mean."""
     out: dict[str, Policy | None] = {}

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import Array
 
+_TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
+
 
 def symmetrise(C: Array) -> Array:
     """Average of a matrix and its transpose. (..., n, n)."""
@@ -37,6 +39,14 @@ def scaled_root(C: Array) -> Array:
     unit = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(C / (unit[:, None] * unit))
     return np.asarray(sigma[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
+
+
+def turn_first_root(C: Array) -> Array:
+    """U (..., 6, 6) with ``U U^T = C``: of an error ``U z`` each of rx, ry, rz, x, y, z in turn has an element of z for
+    what those before it leave unexplained. Raises LinAlgError where C is not positive definite.
+    """
+    L = np.linalg.cholesky(C[..., _TURN_FIRST[:, None], _TURN_FIRST])
+    return np.asarray(L[..., _TURN_FIRST[:, None], _TURN_FIRST])
 
 
 def correlation(C: Array) -> Array:

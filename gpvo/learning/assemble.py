@@ -77,6 +77,7 @@ def assemble(
         typical_ln_det=np.zeros(1),
         usual_rate_var=np.maximum(np.nanmean(rows.weight[:, None] * rows.select(TWIST_COLUMNS) ** 2, axis=0), 1e-6),
         mean_in_sigma=np.array([mean_in_sigma]),
+        steady_mean=np.zeros(6),
         dt_s=rows.step_s,
     )
     whole = model.split(sigma**2, sums.faster, geometry).sum(axis=1)

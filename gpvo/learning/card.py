@@ -40,8 +40,14 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}, trust {choices['trust']:g}): {inputs}",
             f"* mean corrected on: {mean}",
+            f"* mean that a filter takes off: {_steady(choices)}",
         ]
     )
+
+
+def _steady(choices: Mapping[str, Any]) -> str:
+    told = [f"{a} {c:+.3f}" for a, c in zip(AXES, choices.get("steady_mean") or ()) if c]
+    return f"{', '.join(told)} (in sigma that turn and earlier axes leave unexplained, at 1 px)" if told else "none"
 
 
 def _position(h: Mapping[str, Any], name: str) -> str:

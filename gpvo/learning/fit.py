@@ -20,9 +20,10 @@ from gpvo.learning.config import TrainConfig, base_candidates, candidates, guard
 from gpvo.learning.meantest import helps_over_distance, pose_gain
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
 from gpvo.learning.rows import Rows
+from gpvo.learning.steadymean import steady_mean
 from gpvo.online.base import OWN_MOTION, BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
-from gpvo.online.estimate import WITHOUT_MEAN, ErrorModelArrays
+from gpvo.online.estimate import FOR_FILTER, ErrorModelArrays
 from gpvo.online.guard import Domain
 from gpvo.types import Array
 
@@ -63,10 +64,12 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     error, variance = _out_of_fold(rows, base_oof, fitted)
     in_sigma = mean.name != ALL
     model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
-    arrays = model.to_arrays()
+    arrays, for_filter = model.to_arrays(), model
     if any(use_mean):
-        without, _ = assemble(rows, base, columns, inputs, plain, *_out_of_fold(rows, base_oof, plain))
-        arrays |= {f"{WITHOUT_MEAN}{name}": array for name, array in without.to_arrays().items()}
+        error, variance = _out_of_fold(rows, base_oof, plain)
+        for_filter, _ = assemble(rows, base, columns, inputs, plain, error, variance)
+        arrays |= {f"{FOR_FILTER}{name}": array for name, array in for_filter.to_arrays().items()}
+    arrays[f"{FOR_FILTER}steady_mean"] = steady = steady_mean(rows, for_filter, error, variance)
     choices = {
         "base": _name_of(base),
         "inputs": name if inputs else NONE,
@@ -75,6 +78,7 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
         "use_mean": use_mean,
         "mean_inputs": mean.name,
         "mean_gain_nats": mean.gains,
+        "steady_mean": steady.tolist(),
         "grouped_by": rows.grouped_by,
     }
     return Learned(model, arrays, choices, mean.inputs, calibration)

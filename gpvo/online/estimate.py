@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import correlation as correlation_of
+from gpvo.geometry.covariance import turn_first_root
 from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
 from gpvo.online.guard import Domain, Whereabouts, growth
@@ -20,8 +21,8 @@ from gpvo.types import Array
 PARTS = ("jitter", "white", "bias")
 _EYE = np.eye(6)
 LN_FASTEST = float(np.log(20.0))
-WITHOUT_MEAN = "without_mean."
-"""Prefix of the arrays of the same model fitted to the errors as they stand; there where the model uses a mean."""
+FOR_FILTER = "for_filter."
+"""Prefix of the arrays in which the model for filters differs (see :func:`arrays_for_filter`)."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class ErrorModelArrays:
     that changes (see :func:`divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
     ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]. ``mean_in_sigma`` (1,): whether the
     GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
+    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters.
     """
 
     columns: tuple[str, ...]
@@ -105,6 +107,7 @@ class ErrorModelArrays:
     typical_ln_det: Array
     usual_rate_var: Array
     mean_in_sigma: NDArray[np.bool_]
+    steady_mean: Array
     dt_s: float
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -124,7 +127,8 @@ class ErrorModelArrays:
     ) -> ErrorModelArrays:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
         try:
-            own = {name: arrays[name] for name in _OWN}
+            own = {"steady_mean": np.zeros(6), **arrays}
+            own = {name: own[name] for name in _OWN}
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
@@ -141,6 +145,7 @@ class ErrorModelArrays:
             "usual_rate_var": (6,),
             "mean_in_sigma": (1,),
             "geometry_weight": (1,),
+            "steady_mean": (6,),
         }
         wrong = [n for n, s in shapes.items() if own[n].shape != s]
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
@@ -165,8 +170,11 @@ class ErrorModelArrays:
         _, ln_det = np.linalg.slogdet(covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
+        mean = v.mean
+        if self._has_steady_mean:
+            mean = mean + self.steady(covariance, place.inside) * place.in_domain[:, None]
         return Estimate(
-            v.mean,
+            mean,
             covariance,
             parts,
             variance * (1.0 - v.known / unlimited),
@@ -174,6 +182,27 @@ class ErrorModelArrays:
             place.in_domain * precision,
             place.distance,
         )
+
+    def steady(self, covariance: Array, inside: Array) -> Array:
+        """(n, 6) mean error ``r U c`` of covariances ``U U^T`` (n, 6, 6): what noise biases in an estimate.
+
+        That bias goes with the variance of the noise (M. Box, "Bias in nonlinear estimation" (1971)): with its
+        deviation, of which U is the root, times the noise r that the residuals show. It is seen along an axis when what
+        the turn and the other axes explain is taken off (:func:`gpvo.geometry.covariance.turn_first_root`): then
+        ``c``, which is ``steady_mean``, is the same in good frames and bad. ``inside``: rows drawn into the domain.
+        """
+        return np.asarray((turn_first_root(covariance) @ self.steady_mean) * self.residual_px(inside)[:, None])
+
+    def residual_px(self, inside: Array) -> Array:
+        """(n,) noise [px] that the residuals show; 1 where the base does not look at it."""
+        if not self.base.residual:
+            return np.ones(len(inside))
+        k = self.columns.index(RESIDUAL_COLUMN)
+        return np.asarray(np.exp(inside[:, k] * self.domain.scale[k] + self.domain.centre[k]))
+
+    @cached_property
+    def _has_steady_mean(self) -> bool:
+        return bool(self.steady_mean.any())
 
     def locate(self, X: Array, dt_s: Array | None = None) -> Whereabouts:
         """Where rows X (n, d) lie, given how well their motions are known."""
@@ -282,16 +311,17 @@ def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
     return np.where(np.isfinite(ratio), np.clip(ratio, 0.0, LN_FASTEST), 0.0)
 
 
-def arrays_without_mean(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The arrays of a model file with those of the model without a mean in their place; as they are where it has none.
+def arrays_for_filter(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The arrays of a model file with those of the model for filters in their place.
 
-    For filters, which estimate a bias by themselves. A mean that sees VO's own motion holds what was usual in training,
-    and says "you did not really move like that" where VO sees little; one that sees the conditions is right of plain
-    sums, where bad frames count most, and too large in the good frames by which a filter goes.
+    Its covariance is that of the error as it stands, and its mean the steady one alone. A GP's mean that sees VO's own
+    motion holds what was usual in training, and says "you did not really move like that" where VO sees little; one that
+    sees the conditions is right of plain sums, where bad frames count most, and too large in the good frames by which a
+    filter goes.
     """
-    plain = {name.removeprefix(WITHOUT_MEAN): a for name, a in arrays.items() if name.startswith(WITHOUT_MEAN)}
-    dropped = (WITHOUT_MEAN, "basis.") if plain else (WITHOUT_MEAN,)
-    return {**{name: a for name, a in arrays.items() if not name.startswith(dropped)}, **plain}
+    own = {name.removeprefix(FOR_FILTER): a for name, a in arrays.items() if name.startswith(FOR_FILTER)}
+    dropped = (FOR_FILTER, "basis.") if any(name.startswith("basis.") for name in own) else (FOR_FILTER,)
+    return {**{name: a for name, a in arrays.items() if not name.startswith(dropped)}, **own}
 
 
 _OWN = (
@@ -309,4 +339,5 @@ _OWN = (
     "typical_ln_det",
     "usual_rate_var",
     "mean_in_sigma",
+    "steady_mean",
 )

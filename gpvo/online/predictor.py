@@ -17,7 +17,7 @@ from gpvo.errors import ModelError
 from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
-from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_without_mean
+from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_for_filter
 from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
@@ -66,14 +66,19 @@ def _check_known(features: tuple[str, ...]) -> None:
 class Predictor:
     """Predicts the error of VO's motions. One instance per run: it remembers what its features need.
 
-    ``header``: the model file's. ``digest``: of the model file. ``features``: columns, in order. ``with_mean`` False:
-    the covariance of the error as it stands, for whoever takes no mean off (see ``arrays_without_mean``).
+    ``header``: the model file's. ``digest``: of the model file. ``features``: columns, in order. ``for_filter``:
+    predict as a filter needs it, with the mean that is steady in good frames and bad (see ``arrays_for_filter``).
     """
 
     def __init__(
-        self, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any], digest: str = "", *, with_mean: bool = True
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        header: Mapping[str, Any],
+        digest: str = "",
+        *,
+        for_filter: bool = False,
     ) -> None:
-        arrays = dict(arrays) if with_mean else arrays_without_mean(arrays)
+        arrays = arrays_for_filter(arrays) if for_filter else dict(arrays)
         self.header, self.digest, self.arrays = dict(header), digest, arrays
         _check_schema(header)
         try:
@@ -94,12 +99,12 @@ class Predictor:
         self.reset()
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, with_mean: bool = True) -> Predictor:
+    def load(cls, path: str | PathLike[str], *, for_filter: bool = False) -> Predictor:
         """From a model file. Raises ModelError, one line, where the file cannot be used."""
         arrays, header = modelfile.load(path)
         try:
             digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-            return cls(arrays, header, digest, with_mean=with_mean)
+            return cls(arrays, header, digest, for_filter=for_filter)
         except ModelError as problem:
             raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
 

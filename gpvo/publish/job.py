@@ -98,7 +98,7 @@ def odometry_of(run: Run, settings: PublishSettings) -> list[Odometry]:
     """All messages of a run; its ``odom`` starts at the body's first pose."""
     predictions: dict[int, Prediction] = {p.t_ns: p for p in run.predictions}
     if settings.model is not None:
-        predictor = Predictor.load(settings.model, with_mean=settings.correct_twist)
+        predictor = Predictor.load(settings.model, for_filter=True)
         predictor.reset(run.log.camera)
         stepped = ((r.t_ns, predictor.step(r)) for r in run.log)
         predictions = {t: p for t, p in stepped if p is not None}

@@ -77,6 +77,7 @@ def some_model(
         typical_ln_det=np.array([-60.0]),
         usual_rate_var=rng.uniform(0.5, 2.0, 6),
         mean_in_sigma=np.array([in_sigma]),
+        steady_mean=np.zeros(6),
         dt_s=0.1,
     )
 

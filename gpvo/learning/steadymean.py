@@ -1,0 +1,32 @@
+"""The mean that a filter may take off: the part of the error that is the same, per axis, in good frames and bad."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpvo.geometry.covariance import turn_first_root
+from gpvo.learning.meantest import surely_positive
+from gpvo.learning.rows import Rows
+from gpvo.online.estimate import ErrorModelArrays
+from gpvo.types import Array
+
+_MOST_SIGMAS = 4.0
+
+
+def steady_mean(rows: Rows, model: ErrorModelArrays, error: Array, variance: Array) -> Array:
+    """(6,) of :meth:`gpvo.online.estimate.ErrorModelArrays.steady`, zero on axes where it may be chance.
+
+    From out-of-fold errors (n, 6) and their variances (n, 6) before calibration. Least squares over all motions, errors
+    in units of their own root of the covariance; kept where those of a left-out sequence surely lean the same way.
+    """
+    if rows.grouped_by != "sequences":
+        return np.zeros(6)
+    X = rows.select(model.columns)
+    covariance = model.split(variance * model.factor, model.faster(X), rows.geometry(model.base.method)).sum(axis=1)
+    z = np.linalg.solve(turn_first_root(covariance), error[:, :, None])[:, :, 0]
+    noise = model.residual_px(model.domain.locate(X).inside)[:, None]
+    # Per sequence, the sums of the normal equations.
+    right = rows.by_group(noise * np.clip(z, -_MOST_SIGMAS, _MOST_SIGMAS))
+    left = rows.by_group(noise**2)
+    same_way = np.sign(right.sum(axis=0) - right) * right / left
+    return np.where(surely_positive(same_way), right.sum(axis=0) / left.sum(axis=0), 0.0)
