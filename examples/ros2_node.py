@@ -30,7 +30,7 @@ class GpvoNode(Node):
         super().__init__("gpvo")
         model = self.declare_parameter("model", "").value
         mounting = self.declare_parameter("T_body_cam", [0.0] * 16).value
-        self.predictor = Predictor.load(model) if model else None
+        self.predictor = Predictor.load(model, for_filter=True) if model else None
         T_body_cam = np.reshape(mounting, (4, 4)) if any(mounting) else None
         self.builder = OdometryBuilder(T_body_cam, method="pointing_matching")
         self.odometry: StereoOdometry | None = None

@@ -96,7 +96,7 @@ def publish(
     method: Annotated[str, typer.Option(help="Geometric covariance where there is no prediction.")] = (
         "pointing_matching"
     ),
-    correct_twist: Annotated[bool, typer.Option(help="Take the predicted mean error off the twist.")] = False,
+    correct_twist: Annotated[bool, typer.Option(help="Take the mean error off the twist.")] = False,
     topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry",
     system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1,
     consumer: Annotated[str | None, typer.Option(help="px4, ardupilot or robot_localization.")] = None,

@@ -79,7 +79,7 @@ class OdometryBuilder:
     T_body_cam : (4, 4) mounting of the camera; None takes a forward-looking camera at the body's origin.
     T_odom_body : (4, 4) body pose of the first frame in ``odom``.
     method : geometric covariance used where there is no prediction.
-    correct_twist : take the predicted mean error off the twist. The pose stays VO's own: it must not jump.
+    correct_twist : take the mean error off the twist. The pose stays VO's own: it must not jump.
     """
 
     T_body_cam: Array | None = None
