@@ -1,4 +1,4 @@
-"""Error-state Kalman filter: 15 states driven by an IMU, a cloned pose, the jitter of its frame, a VO bias.
+"""Error-state Kalman filter: 15 states driven by an IMU, a cloned pose, the jitter of its frame; a VO bias considered.
 
 Joint error state (39): position, velocity (world), attitude (body), accelerometer and gyroscope bias; the cloned
 pose of VO's reference frame; that frame's jitter; the normalised VO bias; and, while an update runs, the jitter of the
@@ -45,7 +45,6 @@ _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _EYE = np.eye(JOINT)
 GRAVITY_MPS2 = 9.80665
-_PARTLY = 0.5
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
 
 
@@ -107,7 +106,6 @@ class ErrorStateFilter:
         self.clone_R: Array = self.x.R_world_imu
         self.jitter_cur_mean = np.zeros((self.batch, 6))
         self.jitter_mean = np.zeros((self.batch, 6))
-        self.bias_mean = np.zeros((self.batch, 6))
         self.jitter_known = False
         self._F = identity_transition(self.batch)
         self._H = np.zeros((self.batch, 6, JOINT))
@@ -125,7 +123,7 @@ class ErrorStateFilter:
         """An independent filter in the same state."""
         other = copy.copy(self)
         other.x = self.x.copy()
-        for name in ("P", "dx", "jitter_mean", "bias_mean", "clone_R", "clone_p", "_F", "_H", "_FP"):
+        for name in ("P", "dx", "jitter_mean", "clone_R", "clone_p", "_F", "_H", "_FP"):
             setattr(other, name, getattr(self, name).copy())
         return other
 
@@ -161,7 +159,6 @@ class ErrorStateFilter:
     def decay_bias(self, dt: float, tau_s: Array) -> None:
         """Let the normalised VO bias forget over ``dt``: phi = exp(-dt / tau), variance kept at one."""
         phi = np.exp(-dt / np.maximum(tau_s, 1e-9))
-        self.bias_mean *= phi
         self.P[:, BIAS, :] *= phi[:, None]
         self.P[:, :, BIAS] *= phi
         self.P[:, range(BIAS.start, BIAS.stop), range(BIAS.start, BIAS.stop)] += 1.0 - phi * phi
@@ -189,11 +186,10 @@ class ErrorStateFilter:
         H = self._H
         me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise.bias_root)
         r = me.residual(R_rel, t_rel, T_est, noise.mean)
-        expected = H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None] + H[:, :, BIAS] @ self.bias_mean[:, :, None]
-        r = r - expected[:, :, 0]
+        r = r - (H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None])[:, :, 0]
         # How the size of VO's bias follows the conditions is known only roughly. A filter that believes it to the
-        # letter reads the bias off that, and is too sure; one that leaves the bias alone is less exact.
-        innovation = self.correct(H, r, noise.white, gate, partly=BIAS)
+        # letter reads the bias off that, and is too sure: so it is considered, not estimated.
+        innovation = self.correct(H, r, noise.white, gate, consider=BIAS)
         if recover is not None and (stuck := recover & ~innovation.used).any():
             self._doubt(np.where(stuck, innovation.nis / gate.threshold(6), 1.0))
             again = self.correct(H, r, noise.white, replace(gate, on_fail="inflate"), ~stuck, BIAS)
@@ -209,13 +205,13 @@ class ErrorStateFilter:
         R: Array,
         gate: Gate | None = None,
         leave: NDArray[np.bool_] | None = None,
-        partly: slice = slice(0),
+        consider: slice = slice(0),
     ) -> Innovation:
         """Linear update of the error's mean and covariance, Joseph form; :meth:`inject` moves it into the estimate.
 
         ``H`` (B, m, 39), ``residual`` (B, m) at the estimate, ``R`` (b, m, m). ``leave`` (B,): members to leave alone.
-        ``partly``: states that are moved half as far as the update says, and stay as uncertain as that leaves them
-        (K. Brink, "Partial-update Schmidt-Kalman filter" (2017)).
+        ``consider``: states that count with their covariance but are not estimated (S. Schmidt, "Application of
+        state-space methods to navigation problems" (1966)).
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
         PHt = self.P @ kernels.transpose(H)
@@ -238,7 +234,7 @@ class ErrorStateFilter:
         if used.any():
             whitened_H = np.asarray(whitened[:, :, :-1], dtype=np.float64)
             K = np.asarray(np.linalg.solve(kernels.transpose(L), whitened_H), dtype=np.float64).transpose(0, 2, 1)
-            K[:, partly] *= _PARTLY
+            K[:, consider] = 0.0
             # A wider R turns S into alpha S, and the gain into a 1/alpha of itself.
             R = R + (alpha - 1.0)[:, None, None] * S
             self._joseph(K * (used / alpha)[:, None, None], H, R)
@@ -279,7 +275,6 @@ class ErrorStateFilter:
         self.clone_R = kernels.orthonormalise(self.clone_R @ E_clone)
         self.jitter_mean = self.jitter_mean + dx[:, JITTER_REF]
         self.jitter_cur_mean = dx[:, JITTER_CUR].copy()
-        self.bias_mean = self.bias_mean + dx[:, BIAS]
         for block, G in ((TH, J), (me.CLONE_TH, J_clone)):
             self.P[:, block, :] = G @ self.P[:, block, :]
             self.P[:, :, block] = self.P[:, :, block] @ kernels.transpose(G)

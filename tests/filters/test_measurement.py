@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.filters import kernels
 from gpvo.filters import measurement as me
-from gpvo.filters.eskf import ErrorStateFilter
+from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import CORE, TH, Nominal, P, constant_velocity_step, imu_step
-from gpvo.filters.synthetic import FORWARD_CAMERA
+from gpvo.filters.run import FuseOptions, begin, make_filter
+from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight
+from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 
 
@@ -116,15 +120,24 @@ def test_transition_of_the_error_state(with_imu: bool) -> None:
     np.testing.assert_allclose(F, numeric, atol=2e-7)
 
 
-def test_what_is_partly_believed_moves_half_as_far_and_stays_less_sure() -> None:
-    """Without noise in the bias' own place the whole update would leave none; half of one leaves a quarter."""
-    start = Nominal(*(np.zeros((1, 3)) for _ in range(2)), np.eye(3)[None], *(np.zeros((1, 3)) for _ in range(2)))
-    H = np.zeros((1, 6, me.JOINT))
-    H[0, :, me.BIAS] = np.eye(6)
-    r, R = np.full((1, 6), 0.7), 1e-9 * np.eye(6)[None]
-    whole, half = (ErrorStateFilter(start, np.eye(CORE)) for _ in range(2))
-    whole.correct(H, r, R)
-    half.correct(H, r, R, partly=me.BIAS)
-    np.testing.assert_allclose(half.dx[0, me.BIAS], 0.5 * whole.dx[0, me.BIAS], rtol=1e-12)
-    np.testing.assert_allclose(whole.P[0, me.BIAS, me.BIAS], 1e-9 * np.eye(6), atol=1e-12)
-    np.testing.assert_allclose(half.P[0, me.BIAS, me.BIAS], 0.25 * np.eye(6), atol=1e-8)
+def test_a_considered_bias_counts_but_is_not_estimated() -> None:
+    """It stays as uncertain as it was stated, and the position as uncertain as such a bias makes it."""
+    laws = [ErrorLaw(bias=np.array([b] * 3 + [1e-9] * 3)) for b in (1e-9, 5e-3)]
+    flights = [synthetic_flight(2, duration_s=6, imu_hz=50, law=law) for law in laws]
+    filters = []
+    for flight in flights:
+        flight = replace(flight, imu=None, T_imu_cam=None)
+        start, gravity = begin(flight, FuseOptions())
+        filter = make_filter(flight, start, gravity, 1, FuseOptions())
+        timeline = Timeline(filter, flight.records[0].t_ns, LearnedPolicy(), with_imu=False)
+        for record in flight.records:
+            timeline.add_vo(record, flight.predictions.get(record.t_ns))
+        filters.append(timeline.filter)
+    sure, unsure = filters
+    for filter in filters:
+        np.testing.assert_allclose(filter.P[0, me.BIAS, me.BIAS], np.eye(6), atol=1e-9)
+    seconds = flights[0].records[-1].t_ns * 1e-9 - flights[0].records[0].t_ns * 1e-9
+    # Six seconds of a bias that lasts ten: what is stated per motion adds up nearly as it stands.
+    added = 5e-3 * 20.0 * seconds
+    sigma = np.sqrt(unsure.P[0, :3, :3].trace() / 3.0 - sure.P[0, :3, :3].trace() / 3.0)
+    assert 0.5 * added < sigma < 1.25 * added
