@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
+from gpvo.geometry.covariance import turn_first_root
 from gpvo.learning.export import export_model, to_c, to_onnx
-from gpvo.online.base import BaseVariance, base_columns
+from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
 from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate
 from gpvo.online.guard import Domain
@@ -103,6 +104,18 @@ def some_inputs(model: ErrorModelArrays) -> tuple[np.ndarray, np.ndarray, np.nda
     geometry = A @ A.transpose(0, 2, 1)
     geometry[::5] = np.nan
     return X, geometry, rng.uniform(0.05, 0.3, n)
+
+
+def test_the_steady_mean_goes_with_the_noise_of_the_residuals() -> None:
+    c = np.array([0.0, 0.1, 0.0, -0.2, 0.0, 0.3])
+    model = replace(some_model(residual=True), steady_mean=c)
+    X = np.repeat(model.domain.centre[None], 3, axis=0)
+    k = model.columns.index(RESIDUAL_COLUMN)
+    X[:, k] += np.array([0.0, 0.2, -0.3]) * model.domain.scale[k]
+    plain, leaning = replace(model, steady_mean=np.zeros(6)).estimate(X), model.estimate(X)
+    np.testing.assert_array_equal(plain.covariance, leaning.covariance)
+    off = turn_first_root(plain.covariance) @ c * np.exp(X[:, k])[:, None] * plain.in_domain[:, None]
+    np.testing.assert_allclose(leaning.mean, plain.mean + off, atol=1e-15)
 
 
 def assert_equal(got: dict[str, np.ndarray], wanted: Estimate) -> None:
