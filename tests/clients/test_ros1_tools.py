@@ -37,7 +37,7 @@ def _environment(**more: str) -> dict[str, str]:
 needs_rosbag = pytest.mark.skipif(not _has("rosbag"), reason="Debian's python3-rosbag is not installed")
 needs_rospy = pytest.mark.skipif(
     not _has("rospy, netifaces, nav_msgs.msg") or shutil.which("rosmaster") is None,
-    reason="Debian's python3-rospy, python3-rosmaster or python3-nav-msgs is not installed",
+    reason="needs Debian's python3-rospy, -rosmaster, -netifaces, -nav-msgs, -geometry-msgs, -actionlib-msgs",
 )
 
 READ = """
