@@ -192,7 +192,7 @@ class ErrorStateFilter:
         innovation = self.correct(H, r, noise.white, gate, consider=BIAS)
         if recover is not None and (stuck := recover & ~innovation.used).any():
             self._doubt(np.where(stuck, innovation.nis / gate.threshold(6), 1.0))
-            again = self.correct(H, r, noise.white, replace(gate, on_fail="inflate"), ~stuck, BIAS)
+            again = self.correct(H, r, noise.white, replace(gate, on_fail="inflate"), ~stuck, consider=BIAS)
             innovation = replace(innovation, residual=again.residual, S=again.S, used=innovation.used | stuck)
         if innovation.used.any():
             self.inject()

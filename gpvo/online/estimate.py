@@ -127,8 +127,8 @@ class ErrorModelArrays:
     ) -> ErrorModelArrays:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
         try:
-            own = {"steady_mean": np.zeros(6), **arrays}
-            own = {name: own[name] for name in _OWN}
+            arrays = {"steady_mean": np.zeros(6), **arrays}
+            own = {name: arrays[name] for name in _OWN}
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
@@ -197,7 +197,7 @@ class ErrorModelArrays:
         """(n,) noise [px] that the residuals show; 1 where the base does not look at it."""
         if not self.base.residual:
             return np.ones(len(inside))
-        k = self.columns.index(RESIDUAL_COLUMN)
+        k = self._base_place[0][-1]
         return np.asarray(np.exp(inside[:, k] * self.domain.scale[k] + self.domain.centre[k]))
 
     @cached_property
