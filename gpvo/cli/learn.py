@@ -232,6 +232,9 @@ def export(
     model: Model,
     to: Annotated[str, typer.Option(help="onnx or c.")],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write; by default beside the model.")] = None,
+    for_filter: Annotated[
+        bool, typer.Option("--for-filter", help="As a filter needs it: the mean is the one that it may take off.")
+    ] = False,
 ) -> None:
     """Write a model for machines without Python: ONNX, or one C header.
 
@@ -241,8 +244,9 @@ def export(
 
     if to not in FORMATS:
         raise GpvoError(f"cannot export to '{to}'", cure=f"one of: {', '.join(FORMATS)}")
-    target = out or model.with_suffix({"onnx": ".onnx", "c": ".h"}[to])
-    export_model(model, target, to)
+    name = f"{model.stem}-for-filter" if for_filter else model.stem
+    target = out or model.with_name(name + {"onnx": ".onnx", "c": ".h"}[to])
+    export_model(model, target, to, for_filter=for_filter)
     print(f"{target}: {target.stat().st_size} bytes")
 
 

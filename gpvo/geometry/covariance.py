@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import Array
 
-_TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
+TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def symmetrise(C: Array) -> Array:
@@ -45,8 +45,8 @@ def turn_first_root(C: Array) -> Array:
     """U (..., 6, 6) with ``U U^T = C``: of an error ``U z`` each of rx, ry, rz, x, y, z in turn has an element of z for
     what those before it leave unexplained. Raises LinAlgError where C is not positive definite.
     """
-    L = np.linalg.cholesky(C[..., _TURN_FIRST[:, None], _TURN_FIRST])
-    return np.asarray(L[..., _TURN_FIRST[:, None], _TURN_FIRST])
+    L = np.linalg.cholesky(C[..., TURN_FIRST[:, None], TURN_FIRST])
+    return np.asarray(L[..., TURN_FIRST[:, None], TURN_FIRST])
 
 
 def correlation(C: Array) -> Array:

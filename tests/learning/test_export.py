@@ -10,13 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.geometry.covariance import turn_first_root
 from gpvo.learning.export import export_model, to_c, to_onnx
+from gpvo.online import modelfile
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
-from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate
+from gpvo.online.estimate import FOR_FILTER, PARTS, ErrorModelArrays, Estimate
 from gpvo.online.guard import Domain
+from gpvo.online.predictor import Predictor
+from small_model import small_model
+from typer.testing import CliRunner
 
 FIELDS = ("mean", "covariance", *PARTS, "epistemic", "in_domain", "confidence", "distance")
 
@@ -90,6 +95,8 @@ CASES = {
     "no geometry": some_model(method=None),
     "noise of the residuals": some_model(residual=True),
     "a mean of its own": some_model(in_sigma=False),
+    "a steady mean": replace(some_model(residual=True), steady_mean=np.array([0.02, -0.1, 0.3, -0.2, 0.4, 0.1])),
+    "a steady mean without residuals": replace(some_model(), steady_mean=np.array([0.0, 0.1, 0.0, -0.2, 0.0, 0.3])),
 }
 
 
@@ -205,6 +212,35 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
 
 
 _VECTORS = ("mean", "covariance", *PARTS, "epistemic")
+
+
+@pytest.mark.parametrize("to", ["onnx", "c"])
+def test_the_model_for_filters_is_exported_on_request(to: str, tmp_path: Path) -> None:
+    """Two files beside the model, each saying what it is for; only the one for filters has the steady mean."""
+    pytest.importorskip("onnx")
+    trained, c = small_model(), np.array([0.0, 0.0, -0.1234375, 0.0, 0.25, 0.0])
+    model = tmp_path / "errors.gpvo"
+    modelfile.save(model, {**trained.arrays, f"{FOR_FILTER}steady_mean": c}, trained.header)
+    for flag in ([], ["--for-filter"]):
+        result = CliRunner().invoke(app, ["export", str(model), "--to", to, *flag], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    end = {"onnx": ".onnx", "c": ".h"}[to]
+    plain, for_filter = (tmp_path / f"{name}{end}" for name in ("errors", "errors-for-filter"))
+    if to == "c":
+        assert "For prediction." in plain.read_text()
+        assert "For filters." in for_filter.read_text()
+        assert "-0.1234375" in for_filter.read_text()
+        assert "-0.1234375" not in plain.read_text()
+        return
+    runtime = pytest.importorskip("onnxruntime")
+    X, geometry, dt_s = some_inputs(Predictor.load(model).model)
+    for path, wanted in ((plain, False), (for_filter, True)):
+        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        assert session.get_modelmeta().custom_metadata_map["purpose"] == ("filters" if wanted else "prediction")
+        out = session.run(["mean"], {"features": X, "geometry": geometry, "dt_s": dt_s})[0]
+        expected = Predictor.load(model, for_filter=wanted).model.estimate(X, geometry, dt_s)
+        assert np.abs((out - expected.mean) / expected.sigma).max() < 1e-5
+        assert bool(expected.mean.any()) == wanted
 
 
 def test_c_names_must_be_identifiers(tmp_path: Path) -> None:

@@ -104,6 +104,7 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("share", model.share),
         *_array("growth", model.growth),
         *_array("level", model.level),
+        *_array("steady_mean", model.steady_mean),
         *_basis_arrays(stacked),
         "",
     ]

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
-from gpvo.online.base import motion_noise, positions
+from gpvo.geometry.covariance import TURN_FIRST
+from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
 from gpvo.online.estimate import LN_FASTEST, PARTS, ErrorModelArrays
 from gpvo.online.rowplan import stack
 from gpvo.types import Array
@@ -115,7 +116,7 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
     short = g("Max", g("Sub", g.constant(model.high), log_noise), 0.0)
     cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
-    trusted = g("Mul", mean, near, out="mean")
+    trusted = g("Mul", mean, near)
     lost = g("Sub", mean, trusted)
     more = g("Mul", g("Sub", 1.0, near), g("Max", g("Sub", plain, base), 0.0))
     noise = g("Mul", g("Add", base, more), g("Exp", cautious))
@@ -127,7 +128,10 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     each = zip(PARTS, sigmas, _correlations(g, model), strict=True)
     parts = [g("Mul", g.outer(sigma), R, out=name) for name, sigma, R in each]
     covariance = g.add(*parts, out="covariance")
-    precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), _log_det(g, covariance)), 12.0))
+    ln_det, steady = _turn_first(g, covariance, model.steady_mean)
+    noise = g("Mul", _residual_px(g, model, inside), near)
+    g("Add", trusted, g("Mul", steady, noise), out="mean")
+    precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), ln_det), 12.0))
     g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
 
 
@@ -246,17 +250,34 @@ def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:
     return [g("Div", part, whole) for part in (jitter, white, bias)]
 
 
-def _log_det(g: _Graph, covariance: str) -> str:
-    """(N,) log-determinant of (N, 6, 6) positive definite matrices: pivots of successive Schur complements."""
-    logs, rest = [], covariance
+def _residual_px(g: _Graph, model: ErrorModelArrays, inside: str) -> str:
+    """(N, 1), or (1, 1) where the base does not look at the residuals; ``ErrorModelArrays.residual_px``."""
+    if not model.base.residual:
+        return g.constant([[1.0]])
+    k = positions(model.columns, (RESIDUAL_COLUMN,))
+    return g("Exp", g("Add", g("Mul", g.take(inside, k, axis=1), model.domain.scale[k[0]]), model.domain.centre[k[0]]))
+
+
+def _turn_first(g: _Graph, covariance: str, steady_mean: Array) -> tuple[str, str]:
+    """Of (N, 6, 6) positive definite matrices the log-determinants (N,), and their root times ``steady_mean`` (N, 6).
+
+    ``gpvo.geometry.covariance.turn_first_root``: the columns of its Cholesky factor are those of successive Schur
+    complements over the roots of the pivots.
+    """
+    rest = g.take(g.take(covariance, TURN_FIRST, axis=1), TURN_FIRST, axis=2)
+    logs, lean = [], []
     for size in range(6, 0, -1):
         column = g.take(rest, [0], axis=2)
         pivot = g.take(column, [0], axis=1)
         logs.append(g("Log", g("Reshape", pivot, g.constant([-1], np.int64))))
+        # Each axis still there back to its place among the six.
+        back = steady_mean[TURN_FIRST[-size]] * np.eye(6)[TURN_FIRST[-size:]]
+        unit = g("Div", column, g("Sqrt", pivot))
+        lean.append(g("MatMul", g("Reshape", unit, g.constant([-1, size], np.int64)), g.constant(back)))
         if size > 1:
             others = np.arange(1, size)
             below = g.take(column, others, axis=1)
             right = g.take(g.take(rest, [0], axis=1), others, axis=2)
             block = g.take(g.take(rest, others, axis=1), others, axis=2)
             rest = g("Sub", block, g("Div", g("MatMul", below, right), pivot))
-    return g.add(*logs)
+    return g.add(*logs), g.add(*lean)

@@ -160,13 +160,14 @@ static void gpvo_divide(int j, double variance, double faster, double part[3][6]
     part[2][j] = sqrt(variance * bias / whole);
 }
 
-/* Log-determinant of a symmetric positive definite 6x6 matrix, by Cholesky. */
-static double gpvo_log_det(const double C[36]) {
-    double L[36], sum = 0.0;
+/* Lower Cholesky factor of a symmetric positive definite 6x6 matrix, the turn before the translation: row and column i are
+ * of axis (i + 3) % 6. Returns the log-determinant. */
+static double gpvo_turn_first_root(const double C[36], double L[36]) {
+    double sum = 0.0;
     int i, j, k;
     for (i = 0; i < 6; ++i)
         for (j = 0; j <= i; ++j) {
-            double v = C[i * 6 + j];
+            double v = C[(i + 3) % 6 * 6 + (j + 3) % 6];
             for (k = 0; k < j; ++k) v -= L[i * 6 + k] * L[j * 6 + k];
             L[i * 6 + j] = i == j ? sqrt(v) : v / L[j * 7];
             if (i == j) sum += 2.0 * log(L[i * 7]);
@@ -174,11 +175,22 @@ static double gpvo_log_det(const double C[36]) {
     return sum;
 }
 
+/* Noise [px] that the residuals show; 1 where the base does not look at it. */
+static double gpvo_residual_px(const double *inside) {
+#if GPVO_N_BASE > 12
+    int k = gpvo_base_column[12];
+    return exp(inside[k] * gpvo_scale[k] + gpvo_centre[k]);
+#else
+    (void)inside;
+    return 1.0;
+#endif
+}
+
 /* The error of one motion. features: GPVO_N_FEATURES values in the order above, NAN where missing. geometry: 6x6
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], part[3][6], limit[2], distance, outside, growth;
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], limit[2], distance, outside, growth, ln_det, noise;
     double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     gpvo_base(features, duration, base, plain);
@@ -211,7 +223,11 @@ static void gpvo_predict(const double *features, const double *geometry, double 
             out->bias[at] = R[2][at] * part[2][i] * part[2][j];
             out->covariance[i * 6 + j] = out->jitter[i * 6 + j] + out->white[i * 6 + j] + out->bias[i * 6 + j];
         }
-    out->confidence = exp((GPVO_TYPICAL_LN_DET - gpvo_log_det(out->covariance)) / 12.0);
+    ln_det = gpvo_turn_first_root(out->covariance, L);
+    noise = gpvo_residual_px(inside) * out->in_domain;
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j <= i; ++j) out->mean[(i + 3) % 6] += L[i * 6 + j] * gpvo_steady_mean[(j + 3) % 6] * noise;
+    out->confidence = exp((GPVO_TYPICAL_LN_DET - ln_det) / 12.0);
     if (out->confidence > 1.0) out->confidence = 1.0;
     out->confidence *= out->in_domain;
 }
