@@ -289,6 +289,10 @@ class Prediction:
         """(6,) standard deviation per axis [m, m, m, rad, rad, rad]."""
         return np.sqrt(np.diagonal(self.covariance))
 
+    def is_of(self, record: VoRecord) -> bool:
+        """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
+        return self.t_ns == record.t_ns and abs(self.dt_s - record.dt_s) < 1e-6
+
 
 def field_names(cls: type) -> tuple[str, ...]:
     """Names of a dataclass' fields, in order."""

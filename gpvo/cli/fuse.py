@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, cast, get_args
 
 import typer
 
@@ -46,8 +46,8 @@ def fuse(
         raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
     if gate not in ("discard", "inflate"):
         raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
-    if mean not in ("steady", "predicted", "absorb"):
-        raise GpvoError(f"--mean is '{mean}'", cure="choose steady, predicted or absorb")
+    if mean not in get_args(MeanUse):
+        raise GpvoError(f"--mean is '{mean}'", cure=f"choose one of: {', '.join(get_args(MeanUse))}")
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
     settings = FusionSettings(
         policies=wanted,

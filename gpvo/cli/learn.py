@@ -179,9 +179,7 @@ def predict(
     from gpvo.io.run import read_run, write_predictions
     from gpvo.online.predictor import Predictor
 
-    predictor, log = Predictor.load(model), read_run(run).log
-    predictor.reset(log.camera)
-    predictions = [p for p in map(predictor.step, log) if p is not None]
+    predictions = list(Predictor.load(model).replay(read_run(run).log).values())
     write_predictions(out, predictions)
     moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
     sigma = np.median([p.sigma for p in moving], axis=0) if moving else np.full(6, np.nan)

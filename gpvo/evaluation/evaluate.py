@@ -14,7 +14,7 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import align_rotation
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
-from gpvo.errors import GpvoError, ModelError, SourceError
+from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
@@ -115,14 +115,9 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
 def predictions_by_stamp(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
     """Predictions of a model over the run's log, or those stored with the run."""
     if predictor is None:
-        return {p.t_ns: p for p in run.predictions}
-    if predictor.target != "frame":
-        raise ModelError(
-            f"this model predicts the error over {predictor.target}, not that of each motion",
-            cure="train with --target frame; gpvo train itself scores the others",
-        )
-    predictor.reset(run.log.camera)
-    return {p.t_ns: p for p in map(predictor.step, run.log) if p is not None}
+        return run.predictions_of_motions
+    predictor.require_motions()
+    return predictor.replay(run.log)
 
 
 def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:

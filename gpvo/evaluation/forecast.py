@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import ModelError
 from gpvo.evaluation.accumulate import Step, along
 from gpvo.evaluation.plan import Plan
 from gpvo.geometry import se3
@@ -94,11 +93,7 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
     ModelError
         If the model predicts something else than the error of a motion, or keeps no sample of its training rows.
     """
-    if predictor.target != "frame":
-        raise ModelError(
-            f"this model predicts the error over {predictor.target}, not that of each motion",
-            cure="train with --target frame",
-        )
+    predictor.require_motions()
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
     rng = np.random.default_rng(seed)
     flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]

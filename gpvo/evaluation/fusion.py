@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
-from gpvo.errors import GpvoError, ModelError
+from gpvo.errors import GpvoError
 from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
@@ -28,27 +28,14 @@ from gpvo.filters.start import StartSigmas
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
-from gpvo.types import Prediction
 
 Array = NDArray[np.float64]
-
-
-def predictions_of(predictor: Predictor, run: Run) -> dict[int, Prediction]:
-    """What the model predicts for every record of a run, in order."""
-    predictor.reset(run.log.camera)
-    stepped = ((r.t_ns, predictor.step(r)) for r in run.log)
-    return {t: p for t, p in stepped if p is not None}
 
 
 def load_predictor(path: str | Path, mean: MeanUse = "steady") -> Predictor:
     """A model that predicts the error of single motions, with the mean that is to be used."""
     predictor = Predictor.load(path, for_filter=mean != "predicted")
-    if predictor.target != "frame":
-        raise ModelError(
-            f"predicts the error over {predictor.target}, a filter needs that of each motion",
-            where=path,
-            cure="train with --target frame",
-        )
+    predictor.require_motions(path)
     return predictor
 
 
@@ -72,7 +59,7 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         poses, valid = interpolate_truth(run.truth, run.log.t_ns)
         if not valid.any():
             raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
-    predictions = predictions_of(predictor, run) if predictor else {p.t_ns: p for p in run.predictions}
+    predictions = predictor.replay(run.log) if predictor else run.predictions_of_motions
     return Flight(
         name=run.name,
         records=run.log.records,

@@ -112,9 +112,7 @@ def _learned(log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
     last = Step.independent(np.eye(4), np.eye(6) * 1e-6)
     for k, record in enumerate(log):
         prediction = predictions.get(record.t_ns)
-        # A prediction over a window of motions is not one of this motion.
-        fits = prediction is not None and abs(prediction.dt_s - record.dt_s) < 1e-6
-        if prediction is not None and fits and record.status is not Status.START:
+        if prediction is not None and prediction.is_of(record) and record.status is not Status.START:
             mean[k], covariance[k] = prediction.mean, prediction.covariance
             last = Step.predicted(record.T_prev_cur, prediction)
         steps.append(

@@ -32,6 +32,13 @@ class Run:
     predictions: list[Prediction]
     meta: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def predictions_of_motions(self) -> dict[int, Prediction]:
+        """What is stored, by time stamp, but for predictions over windows of motions."""
+        stored = {p.t_ns: p for p in self.predictions}
+        found = ((r, stored.get(r.t_ns)) for r in self.log)
+        return {r.t_ns: p for r, p in found if p is not None and p.is_of(r)}
+
     def __str__(self) -> str:
         parts = [f"{len(self.log)} records"]
         parts += [word for word, has in (("truth", self.truth), ("imu", self.imu)) if has is not None]

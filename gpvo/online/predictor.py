@@ -21,7 +21,7 @@ from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_for_f
 from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
-from gpvo.types import Array, Prediction, Status, StereoCamera, VoRecord
+from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
 """Of the arrays and header keys described in :mod:`gpvo.online.modelfile`."""
@@ -114,6 +114,20 @@ class Predictor:
         self._adaptive = AdaptiveScale()
         self._last: tuple[VoRecord, Array] | None = None
         self._stated: dict[int, tuple[Array, Array]] = {}
+
+    def require_motions(self, where: str | PathLike[str] | None = None) -> None:
+        """Raise ModelError, one line, where the model (file ``where``) predicts the error over windows of motions."""
+        if self.target != "frame":
+            raise ModelError(
+                f"this model predicts the error over {self.target}, not that of each motion",
+                where=where,
+                cure="train with --target frame",
+            )
+
+    def replay(self, log: VoLog) -> dict[int, Prediction]:
+        """Predictions for a recorded run, by time stamp and in order; begins anew with its camera."""
+        self.reset(log.camera)
+        return {p.t_ns: p for p in map(self.step, log) if p is not None}
 
     def predict(
         self, features: ArrayLike, geometry: ArrayLike | None = None, dt_s: ArrayLike | None = None

@@ -15,7 +15,6 @@ from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.publish import consumers, mavlink, ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
-from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
 
@@ -89,19 +88,19 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     verdicts = consumers.check(odometry, consumer) if settings.check else []
     only_check = settings.check and not (settings.to or settings.out or settings.link)
     out, count = (None, 0) if only_check else _write(run, odometry, settings)
-    source = "the model" if settings.model or run.predictions else settings.method
+    source = "the model" if settings.model or run.predictions_of_motions else settings.method
     lost = sum(not o.tracked for o in odometry)
     return Published(run.name, settings.to, out, count, lost, source, consumer if settings.check else None, verdicts)
 
 
 def odometry_of(run: Run, settings: PublishSettings) -> list[Odometry]:
     """All messages of a run; its ``odom`` starts at the body's first pose."""
-    predictions: dict[int, Prediction] = {p.t_ns: p for p in run.predictions}
-    if settings.model is not None:
+    if settings.model is None:
+        predictions = run.predictions_of_motions
+    else:
         predictor = Predictor.load(settings.model, for_filter=True)
-        predictor.reset(run.log.camera)
-        stepped = ((r.t_ns, predictor.step(r)) for r in run.log)
-        predictions = {t: p for t, p in stepped if p is not None}
+        predictor.require_motions(settings.model)
+        predictions = predictor.replay(run.log)
     builder = OdometryBuilder(
         T_body_cam=run.mounting.T_body_cam, method=settings.method, correct_twist=settings.correct_twist
     )

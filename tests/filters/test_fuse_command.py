@@ -109,7 +109,7 @@ def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
         (("--init", "magic"), "truth or static"),
         (("--init", "static"), "not at rest"),
         (("--gate", "magic"), "discard or inflate"),
-        (("--mean", "magic"), "steady, predicted or absorb"),
+        (("--mean", "magic"), "steady, predicted, absorb"),
         (("--policies", "best"), "unknown policy"),
         (("--model", "nowhere.gpvo"), "nowhere.gpvo"),
     ],

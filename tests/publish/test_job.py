@@ -1,0 +1,64 @@
+"""``gpvo publish`` takes predictions of single motions, and those alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.errors import ModelError
+from gpvo.evaluation.fusion import load_predictor
+from gpvo.io.run import read_run, write_run
+from gpvo.online import modelfile
+from gpvo.online.predictor import Predictor
+from gpvo.publish.job import PublishSettings, odometry_of, publish_run
+from gpvo.types import Prediction
+from small_model import small_model
+from synthetic_runs import make_run
+
+GEOMETRY = PublishSettings(method="pointing_matching")
+
+
+@pytest.fixture(scope="module")
+def predicted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with the predictions of a model."""
+    log, truth = make_run(60, n=40)
+    predictions = list(small_model().predictor().replay(log).values())
+    path = tmp_path_factory.mktemp("runs") / "flight"
+    write_run(path, log, predictions=predictions, truth=truth, meta={"source": "made"})
+    return path
+
+
+def _covariances(path: Path, predictions: list[Prediction]) -> np.ndarray:
+    run = replace(read_run(path), predictions=predictions)
+    return np.array([o.pose_covariance for o in odometry_of(run, GEOMETRY)])
+
+
+def test_what_is_stored_is_published_unless_it_is_of_windows(predicted: Path) -> None:
+    stored = read_run(predicted).predictions
+    windows = [replace(p, dt_s=p.dt_s + 1.0) for p in stored]
+    plain, of_motions, of_windows = (_covariances(predicted, p) for p in ([], stored, windows))
+    assert not np.allclose(of_motions, plain, rtol=0.1)
+    np.testing.assert_array_equal(of_windows, plain)
+
+
+def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -> None:
+    settings = replace(GEOMETRY, to="bag", out=tmp_path / "out")
+    assert publish_run(predicted, settings).source == "the model"
+    run = read_run(predicted)
+    windows = [replace(p, dt_s=p.dt_s + 1.0) for p in run.predictions]
+    other = tmp_path / "windows"
+    write_run(other, run.log, predictions=windows, truth=run.truth, meta={"source": "made"})
+    assert publish_run(other, replace(settings, out=tmp_path / "other")).source == "pointing_matching"
+
+
+def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) -> None:
+    trained = small_model()
+    model = tmp_path / "windows.gpvo"
+    modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
+    assert Predictor.load(model).target == "window:1s"
+    with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
+        publish_run(predicted, replace(GEOMETRY, model=model))
+    with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
+        load_predictor(model)
