@@ -121,7 +121,7 @@ class Predictor:
             raise ModelError(
                 f"this model predicts the error over {self.target}, not that of each motion",
                 where=where,
-                cure="train with --target frame",
+                cure="train with --target frame; gpvo train itself scores the others",
             )
 
     def replay(self, log: VoLog) -> dict[int, Prediction]:

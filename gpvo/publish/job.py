@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.publish import consumers, mavlink, ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
+from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
 
@@ -83,24 +84,28 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     """
     _require(settings)
     run = read_run(path)
-    odometry = odometry_of(run, settings)
+    predictions = predictions_of(run, settings.model)
+    odometry = odometry_of(run, predictions, settings)
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
     verdicts = consumers.check(odometry, consumer) if settings.check else []
     only_check = settings.check and not (settings.to or settings.out or settings.link)
     out, count = (None, 0) if only_check else _write(run, odometry, settings)
-    source = "the model" if settings.model or run.predictions_of_motions else settings.method
+    source = "the model" if settings.model or predictions else settings.method
     lost = sum(not o.tracked for o in odometry)
     return Published(run.name, settings.to, out, count, lost, source, consumer if settings.check else None, verdicts)
 
 
-def odometry_of(run: Run, settings: PublishSettings) -> list[Odometry]:
-    """All messages of a run; its ``odom`` starts at the body's first pose."""
-    if settings.model is None:
-        predictions = run.predictions_of_motions
-    else:
-        predictor = Predictor.load(settings.model, for_filter=True)
-        predictor.require_motions(settings.model)
-        predictions = predictor.replay(run.log)
+def predictions_of(run: Run, model: Path | None) -> dict[int, Prediction]:
+    """What the model for filters in a file predicts of every motion, else what is stored with the run."""
+    if model is None:
+        return run.predictions_of_motions
+    predictor = Predictor.load(model, for_filter=True)
+    predictor.require_motions(model)
+    return predictor.replay(run.log)
+
+
+def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
+    """All messages of a run, with ``predictions`` by ``t_ns``; its ``odom`` starts at the body's first pose."""
     builder = OdometryBuilder(
         T_body_cam=run.mounting.T_body_cam, method=settings.method, correct_twist=settings.correct_twist
     )

@@ -214,25 +214,30 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
 _VECTORS = ("mean", "covariance", *PARTS, "epistemic")
 
 
-@pytest.mark.parametrize("to", ["onnx", "c"])
-def test_the_model_for_filters_is_exported_on_request(to: str, tmp_path: Path) -> None:
-    """Two files beside the model, each saying what it is for; only the one for filters has the steady mean."""
-    pytest.importorskip("onnx")
+def _export_both(model: Path, to: str) -> tuple[Path, Path]:
+    """A model with a steady mean in the file ``model``, and its exports for prediction and for filters beside it."""
     trained, c = small_model(), np.array([0.0, 0.0, -0.1234375, 0.0, 0.25, 0.0])
-    model = tmp_path / "errors.gpvo"
     modelfile.save(model, {**trained.arrays, f"{FOR_FILTER}steady_mean": c}, trained.header)
     for flag in ([], ["--for-filter"]):
         result = CliRunner().invoke(app, ["export", str(model), "--to", to, *flag], catch_exceptions=False)
         assert result.exit_code == 0, result.output
     end = {"onnx": ".onnx", "c": ".h"}[to]
-    plain, for_filter = (tmp_path / f"{name}{end}" for name in ("errors", "errors-for-filter"))
-    if to == "c":
-        assert "For prediction." in plain.read_text()
-        assert "For filters." in for_filter.read_text()
-        assert "-0.1234375" in for_filter.read_text()
-        assert "-0.1234375" not in plain.read_text()
-        return
+    return model.with_suffix(end), model.with_name(f"{model.stem}-for-filter{end}")
+
+
+def test_c_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> None:
+    plain, for_filter = (path.read_text() for path in _export_both(tmp_path / "errors.gpvo", "c"))
+    assert "For prediction." in plain
+    assert "For filters." in for_filter
+    assert "-0.1234375" in for_filter
+    assert "-0.1234375" not in plain
+
+
+def test_onnx_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
+    model = tmp_path / "errors.gpvo"
+    plain, for_filter = _export_both(model, "onnx")
     X, geometry, dt_s = some_inputs(Predictor.load(model).model)
     for path, wanted in ((plain, False), (for_filter, True)):
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])

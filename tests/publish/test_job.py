@@ -12,7 +12,7 @@ from gpvo.evaluation.fusion import load_predictor
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
-from gpvo.publish.job import PublishSettings, odometry_of, publish_run
+from gpvo.publish.job import PublishSettings, odometry_of, predictions_of, publish_run
 from gpvo.types import Prediction
 from small_model import small_model
 from synthetic_runs import make_run
@@ -32,7 +32,7 @@ def predicted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _covariances(path: Path, predictions: list[Prediction]) -> np.ndarray:
     run = replace(read_run(path), predictions=predictions)
-    return np.array([o.pose_covariance for o in odometry_of(run, GEOMETRY)])
+    return np.array([o.pose_covariance for o in odometry_of(run, predictions_of(run, None), GEOMETRY)])
 
 
 def test_what_is_stored_is_published_unless_it_is_of_windows(predicted: Path) -> None:

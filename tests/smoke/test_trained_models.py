@@ -27,9 +27,7 @@ def _script() -> ModuleType:
 
 
 def _predictions(model: Path) -> list[Prediction]:
-    predictor, run = Predictor.load(model), read_run(ROOT / "data" / "unseen")
-    predictor.reset(run.log.camera)
-    return [p for p in map(predictor.step, run.log) if p is not None]
+    return list(Predictor.load(model).replay(read_run(ROOT / "data" / "unseen").log).values())
 
 
 def _ln_sigma(predictions: list[Prediction]) -> Array:
