@@ -233,6 +233,7 @@ def export(
     for_filter: Annotated[
         bool, typer.Option("--for-filter", help="As a filter needs it: the mean is the one that it may take off.")
     ] = False,
+    prefix: Annotated[str, typer.Option(help="Of every symbol in C, for several models in one program.")] = "gpvo",
 ) -> None:
     """Write a model for machines without Python: ONNX, or one C header.
 
@@ -244,7 +245,7 @@ def export(
         raise GpvoError(f"cannot export to '{to}'", cure=f"one of: {', '.join(FORMATS)}")
     name = f"{model.stem}-for-filter" if for_filter else model.stem
     target = out or model.with_name(name + {"onnx": ".onnx", "c": ".h"}[to])
-    export_model(model, target, to, for_filter=for_filter)
+    export_model(model, target, to, for_filter=for_filter, prefix=prefix)
     print(f"{target}: {target.stat().st_size} bytes")
 
 

@@ -191,7 +191,7 @@ def fuse_runs(
 def _why_not(policy: str) -> str:
     """Why a policy could not run at all, and the cure."""
     if policy == LEARNED:
-        return "the runs hold no predictions; give --model"
+        return "the runs hold no predictions of single motions; give --model"
     if policy in (TRIANGULATION, POINTING_MATCHING):
         return f"the runs hold too few usable covariances; run VO with --methods {policy}"
     return "no training errors to take a constant from; give --train, or a --model that carries them"

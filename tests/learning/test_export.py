@@ -233,6 +233,30 @@ def test_c_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> None:
     assert "-0.1234375" not in plain
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler 'cc' on this machine")
+def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> None:
+    model = tmp_path / "errors.gpvo"
+    trained = small_model()
+    modelfile.save(model, trained.arrays, trained.header)
+    for prefix in ("predict", "fuse"):
+        command = ["export", str(model), "--to", "c", "--prefix", prefix, "-o", str(tmp_path / f"{prefix}.h")]
+        result = CliRunner().invoke(app, command, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    source = tmp_path / "both.c"
+    source.write_text(
+        '#include "predict.h"\n#include "fuse.h"\n'
+        "void run(const double *f, predict_estimate *a, fuse_estimate *b)"
+        " { predict_predict(f, 0, 0.0, a); fuse_predict(f, 0, 0.0, b); }\n"
+    )
+    flags = ["-std=c99", "-Wall", "-Werror", "-c"]
+    subprocess.run(["cc", *flags, str(source), "-o", str(tmp_path / "both.o")], check=True)
+
+
+def test_onnx_has_no_prefix(tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match="c alone"):
+        export_model(tmp_path / "model", tmp_path / "out", "onnx", prefix="mine")
+
+
 def test_onnx_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
@@ -249,7 +273,7 @@ def test_onnx_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> Non
 
 
 def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="identifier"):
+    with pytest.raises(GpvoError, match="no C identifier"):
         to_c(CASES["own noise kernel"], tmp_path / "model.h", name="1+1")
 
 

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gpvo.errors import GpvoError
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.rowplan import StackedBasis, stack
 
+PREFIX = "gpvo"
+"""Of every symbol, unless another is asked for."""
 _PER_LINE = 8
 
 
@@ -20,18 +23,18 @@ def to_c(
     model: ErrorModelArrays,
     path: str | os.PathLike[str],
     *,
-    name: str = "gpvo",
+    name: str = PREFIX,
     units: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
     """Write the header. ``name`` prefixes every symbol, so that one program can hold several models.
 
     ``units``: of the features, for the comment at the top; ``note``: one more line there. The numbers equal those of
-    ``ErrorModelArrays.estimate`` to about 1e-6: projections are kept in single precision. Raises ValueError where
-    ``name`` is no C identifier.
+    ``ErrorModelArrays.estimate`` to about 1e-6: projections are kept in single precision. GpvoError where ``name``
+    is no C identifier.
     """
     if not name.isidentifier() or not name.isascii():
-        raise ValueError(f"'{name}' is no C identifier")
+        raise GpvoError(f"the prefix '{name}' is no C identifier", cure="letters, digits and _, no digit first")
     template = files("gpvo.learning.export").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
     code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
