@@ -155,7 +155,7 @@ def _check_ardupilot(pose: Array, twist: Array, good: Sequence[Odometry]) -> lis
         out.append(_verdict(quantity, name, value, new, unit))
         out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit))
     low, middle, high = np.quantile(np.sqrt(twist[:, :3]).max(axis=1), [0.05, 0.5, 0.95])
-    lever = "VISO_QUAL_MIN lets quality decide frame by frame"
+    lever = "VISO_QUAL_MIN lets quality decide frame by frame; below 0 it would let lost frames in"
     out.append(
         Verdict(
             "velocity",

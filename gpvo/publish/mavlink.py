@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LOCAL_FRD, _BODY_FRD, _ESTIMATOR_VISION = 20, 12, 2
 _UPPER = np.triu_indices(6)
+# ``in_domain`` three training standard deviations outside: there the model knows nothing of use.
+_OUTSIDE_BELOW = 0.01
 
 
 def dialect() -> ModuleType:
@@ -43,7 +45,7 @@ def dialect() -> ModuleType:
 
 def quality(odometry: Odometry) -> int:
     """MAVLink quality: -1 lost or out of domain, 0 no model, else 1 to 100 from the confidence."""
-    if not odometry.tracked or (odometry.in_domain is not None and odometry.in_domain <= 0.0):
+    if not odometry.tracked or (odometry.in_domain is not None and odometry.in_domain < _OUTSIDE_BELOW):
         return -1
     if odometry.confidence is None:
         return 0
@@ -67,11 +69,16 @@ class Sender:
         self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=component)
 
     def odometry(self, odometry: Odometry) -> bytes:
-        """ODOMETRY of one frame, tracked or not."""
-        R = R_FRD_FLU @ odometry.T_odom_body[:3, :3] @ R_FRD_FLU
-        position = R_FRD_FLU @ odometry.T_odom_body[:3, 3]
-        x, y, z, w = se3.rotation_to_quaternion_xyzw(R)
-        twist = np.full(6, np.nan)
+        """ODOMETRY of one frame; a lost one is NaN throughout.
+
+        PX4 skips what is not finite. Its quality alone would not keep a lost frame out: with EKF2_EV_QMIN at 0, the
+        default, every quality passes (src/modules/ekf2/EKF/aid_sources/external_vision/ev_control.cpp).
+        """
+        pose, twist = np.full(7, np.nan), np.full(6, np.nan)
+        if odometry.tracked:
+            R = R_FRD_FLU @ odometry.T_odom_body[:3, :3] @ R_FRD_FLU
+            pose[:3] = R_FRD_FLU @ odometry.T_odom_body[:3, 3]
+            pose[3:] = np.roll(se3.rotation_to_quaternion_xyzw(R), 1)
         velocity_covariance = None
         if odometry.twist_body is not None and odometry.twist_covariance is not None:
             twist = np.concatenate([R_FRD_FLU @ odometry.twist_body[:3], R_FRD_FLU @ odometry.twist_body[3:]])
@@ -80,8 +87,8 @@ class Sender:
             odometry.t_ns // 1000,
             _LOCAL_FRD,
             _BODY_FRD,
-            *(float(v) for v in position),
-            [float(w), float(x), float(y), float(z)],
+            *(float(v) for v in pose[:3]),
+            [float(v) for v in pose[3:]],
             *(float(v) for v in twist),
             upper_triangle(rotate_covariance(R_FRD_FLU, odometry.pose_covariance) if odometry.tracked else None),
             upper_triangle(velocity_covariance),
@@ -92,11 +99,13 @@ class Sender:
         return self._packed(message)
 
     def speed(self, odometry: Odometry) -> bytes | None:
-        """VISION_SPEED_ESTIMATE: velocity in local FRD axes with its full 3x3, row-major. None for a lost frame.
+        """VISION_SPEED_ESTIMATE: velocity in local FRD axes with its full 3x3, row-major.
+
+        None where the quality is -1: this message carries none by which a receiver could refuse it.
 
         LOCAL_FRD serves as the local NED frame where the vehicle's heading is given to the autopilot by vision too.
         """
-        if odometry.twist_body is None or odometry.twist_covariance is None:
+        if odometry.twist_body is None or odometry.twist_covariance is None or quality(odometry) < 0:
             return None
         R = R_FRD_FLU @ odometry.T_odom_body[:3, :3]
         velocity = R @ odometry.twist_body[:3]
@@ -124,17 +133,24 @@ class Sender:
         return packed
 
 
+def _messages(sender: Sender, odometry: Odometry) -> list[bytes]:
+    """What is sent of one frame: speed, then odometry.
+
+    ArduPilot's EKF3 takes one velocity in 20 ms, the first: the one whose covariance it reads comes first.
+    """
+    speed, pose = sender.speed(odometry), sender.odometry(odometry)
+    return [pose] if speed is None else [speed, pose]
+
+
 def stream(odometry: Iterable[Odometry], sender: Sender, emit: Callable[[int, bytes], None]) -> int:
-    """Hand ``emit(t_ns, bytes)`` every message of a run: odometry, speed and a heartbeat a second; returns frames."""
+    """Hand ``emit(t_ns, bytes)`` every message of a run: speed, odometry and a heartbeat a second; returns frames."""
     next_beat, count = None, 0
     for item in odometry:
         if next_beat is None or item.t_ns >= next_beat:
             emit(item.t_ns, sender.heartbeat())
             next_beat = item.t_ns + 10**9
-        emit(item.t_ns, sender.odometry(item))
-        speed = sender.speed(item)
-        if speed is not None:
-            emit(item.t_ns, speed)
+        for message in _messages(sender, item):
+            emit(item.t_ns, message)
         count += 1
     return count
 
@@ -184,9 +200,8 @@ class Link:
         if odometry.t_ns >= self._next_beat:
             self._send(self.sender.heartbeat())
             self._next_beat = odometry.t_ns + 10**9
-        for message in (self.sender.odometry(odometry), self.sender.speed(odometry)):
-            if message is not None:
-                self._send(message)
+        for message in _messages(self.sender, odometry):
+            self._send(message)
 
 
 def _udp(host: str, port: int) -> Callable[[bytes], object]:

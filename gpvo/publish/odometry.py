@@ -22,8 +22,9 @@ class Odometry:
     """One odometry message before it is dressed for a transport. SI, FLU body, z-up ``odom``.
 
     ``T_odom_body`` (4, 4); ``pose_covariance`` (6, 6) in ``odom``'s fixed axes; ``twist_body`` (6,) linear then
-    angular, expressed in the body; ``twist_covariance`` (6, 6) likewise. ``tracked`` is False for a lost frame: the
-    pose is VO's guess, twist and its covariance are None. ``confidence`` and ``in_domain`` are None without a model.
+    angular, expressed in the body; ``twist_covariance`` (6, 6) likewise. ``tracked`` is False for a frame that VO or
+    the model calls lost: the pose is a guess, twist and its covariance are None. ``confidence`` and ``in_domain`` are
+    None without a model.
     """
 
     t_ns: int
@@ -110,7 +111,8 @@ class OdometryBuilder:
         if base is None:
             self._resets += bool(self._chain)
             base = self._latest() or _Chain(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), record.t_prev_ns)
-        if not record.usable:
+            self._last = None
+        if not record.usable or _status(record, prediction) is Status.LOST:
             return self._lost(record, prediction, base)
         white, jitter, root, tau_s = self._parts(record, prediction)
         chain = _extend(base, record, white, root, tau_s)
@@ -173,15 +175,18 @@ class OdometryBuilder:
         return twist, lift(moved, self.floors.velocity_m2ps2, self.floors.rate_rad2ps2)
 
     def _lost(self, record: VoRecord, prediction: Prediction | None, base: _Chain) -> Odometry:
-        """A frame without a measured motion: VO's guess stands in, as uncertain as what may have happened."""
+        """A frame without a motion to be believed: what VO says stands in, as uncertain as what may have happened."""
         stated = prediction.covariance if prediction is not None else record.covariances.get(self.method or "")
         if stated is None or not is_positive_definite(stated):
             dt = (record.t_ns - base.t_ns) * 1e-9
             stated = np.diag((np.abs(self._speed) * dt) ** 2)
         chain = _extend(base, record, stated, np.zeros((6, 6)), np.full(6, np.inf))
         self._remember(record, chain)
-        # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone.
-        self._resets += record.is_reference and record.status is Status.LOST
+        if record.is_reference and _status(record, prediction) is Status.LOST:
+            # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone,
+            # and its twist must not begin before it.
+            self._resets += 1
+            self._last = None
         first = np.zeros((6, 6)) if self._first_jitter is None else self._first_jitter
         return self._message(record, prediction, chain, chain.walked + first, None, None)
 
@@ -195,6 +200,7 @@ class OdometryBuilder:
         twist_covariance: Array | None,
     ) -> Odometry:
         T = self.T_odom_body @ self._T_body_cam @ chain.T_first_cam @ se3.inverse(self._T_body_cam)
+        status = _status(record, prediction)
         in_odom = rotate_covariance(T[:3, :3], self._Ad @ total @ self._Ad.T)
         return Odometry(
             t_ns=record.t_ns,
@@ -202,8 +208,8 @@ class OdometryBuilder:
             pose_covariance=lift(in_odom, self.floors.translation_m2, self.floors.rotation_rad2),
             twist_body=twist,
             twist_covariance=twist_covariance,
-            status=record.status if prediction is None else max(record.status, prediction.status, key=_severity),
-            tracked=record.status is not Status.LOST,
+            status=status,
+            tracked=status is not Status.LOST,
             confidence=None if prediction is None else prediction.confidence,
             in_domain=None if prediction is None else prediction.in_domain,
             reset_counter=self._resets % 256,
@@ -228,8 +234,11 @@ def _extend(base: _Chain, record: VoRecord, white: Array, root: Array, tau_s: Ar
     return _Chain(base.T_first_cam @ record.T_prev_cur, symmetrise(walked), cross + root, record.t_ns)
 
 
-def _severity(status: Status) -> int:
-    return status.severity
+def _status(record: VoRecord, prediction: Prediction | None) -> Status:
+    """The worse of what VO and the model call the frame: a slip looks well to VO."""
+    if prediction is None:
+        return record.status
+    return max(record.status, prediction.status, key=lambda status: status.severity)
 
 
 def messages(

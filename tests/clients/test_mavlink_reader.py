@@ -47,15 +47,15 @@ def test_odometry_comes_back_in_frd(odometry: list[Odometry], received: list) ->
         assert (message.frame_id, message.child_frame_id) == (20, 12)
         assert (message.get_srcSystem(), message.get_srcComponent()) == (1, COMPONENT)
         assert message.estimator_type == common.MAV_ESTIMATOR_TYPE_VISION
-        position = sent.T_odom_body[:3, 3] * FLIP[:3]
-        np.testing.assert_allclose([message.x, message.y, message.z], position, rtol=1e-6, atol=1e-6)
         assert message.quality == quality(sent)
+        position = sent.T_odom_body[:3, 3] * FLIP[:3] if sent.tracked else np.full(3, np.nan)
+        np.testing.assert_allclose([message.x, message.y, message.z], position, rtol=1e-6, atol=1e-6)
         twist = [message.vx, message.vy, message.vz, message.rollspeed, message.pitchspeed, message.yawspeed]
         if sent.twist_body is None:
             assert np.isnan(twist).all()
             assert np.isnan(message.velocity_covariance[0])
             assert not any(message.velocity_covariance[1:])
-            # The first frame has no motion yet, but a pose; a lost frame's pose is only held.
+            # The first frame has no motion yet, but a pose; a lost frame has neither.
             assert np.isnan(message.pose_covariance[0]) == (not sent.tracked)
             continue
         np.testing.assert_allclose(twist, sent.twist_body * FLIP, rtol=1e-6, atol=1e-7)
@@ -71,6 +71,9 @@ def test_quaternion_turns_body_frd_into_local_frd(odometry: list[Odometry], rece
     got = [m for m in received if m.get_type() == "ODOMETRY"]
     for message, sent in zip(got, odometry, strict=True):
         w, x, y, z = message.q
+        if not sent.tracked:
+            assert np.isnan(message.q).all()
+            continue
         R = np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -106,6 +109,7 @@ def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None
         ({"confidence": 0.0, "in_domain": 0.9}, 1),
         ({"confidence": 1.0, "in_domain": 1.0}, 100),
         ({"confidence": 0.7, "in_domain": 0.0}, -1),
+        ({"confidence": 0.001, "in_domain": 0.001}, -1),
         ({"confidence": None, "in_domain": None}, 0),
         ({"tracked": False}, -1),
     ],
@@ -120,9 +124,11 @@ def test_udp(odometry: list[Odometry]) -> None:
         receiver.settimeout(5)
         link = Link(f"udp:127.0.0.1:{receiver.getsockname()[1]}")
         link.send(odometry[5])
+        link.send(replace(odometry[6], in_domain=0.0))
         parser = common.MAVLink(None)
-        names = [parser.decode(bytearray(receiver.recv(1000))).get_type() for _ in range(3)]
-    assert names == ["HEARTBEAT", "ODOMETRY", "VISION_SPEED_ESTIMATE"]
+        names = [parser.decode(bytearray(receiver.recv(1000))).get_type() for _ in range(4)]
+    # The velocity that has a covariance comes first, as EKF3 takes one of the two; none goes without its quality of -1.
+    assert names == ["HEARTBEAT", "VISION_SPEED_ESTIMATE", "ODOMETRY", "ODOMETRY"]
 
 
 @pytest.mark.parametrize("address", ["udp:localhost", "tcp:localhost:1", "serial::9600", "serial:/nowhere:57600"])

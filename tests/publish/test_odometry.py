@@ -92,6 +92,37 @@ def test_lost_frames_hold_the_pose_and_widen_it() -> None:
     assert np.trace(after.pose_covariance[:3, :3]) < np.trace(lost[-1].pose_covariance[:3, :3])
 
 
+def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
+    C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
+    guess = se3.exp(np.array([0.3, 0, 1.5, 0, 0, 0]))
+    builder = OdometryBuilder(floors=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    builder.step(VoRecord(10**8, 0, Status.OK, step), _prediction(10**8, 0 * C, C, 0 * C))
+    # Lost for a second; the new beginning is placed by a guess that is half a metre off.
+    t = 11 * 10**8
+    wide = replace(_prediction(t, 0 * C, np.eye(6), 0 * C), status=Status.LOST)
+    builder.step(VoRecord(t, 10**8, Status.LOST, guess), wide)
+    after = builder.step(VoRecord(t + 10**8, t, Status.OK, step), _prediction(t + 10**8, 0 * C, C, 0 * C))
+    np.testing.assert_allclose(after.twist_body, [1, 0, 0, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(np.diagonal(after.twist_covariance), 1e-4, rtol=1e-6)
+    assert after.pose_covariance[0, 0] > 0.9
+    assert after.reset_counter == 1
+
+
+def test_a_slip_that_only_the_model_sees_is_a_lost_frame() -> None:
+    C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
+    builder = OdometryBuilder(floors=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    slip = replace(_prediction(10**8, 0 * C, np.eye(6), 0 * C), status=Status.LOST)
+    out = builder.step(VoRecord(10**8, 0, Status.OK, se3.exp(np.array([0, 0, 2.0, 0, 0, 0]))), slip)
+    assert out.status is Status.LOST
+    assert not out.tracked
+    assert out.twist_body is None
+    after = builder.step(VoRecord(2 * 10**8, 10**8, Status.OK, step), _prediction(2 * 10**8, 0 * C, C, 0 * C))
+    np.testing.assert_allclose(after.twist_body, [1, 0, 0, 0, 0, 0], atol=1e-9)
+    assert after.reset_counter == out.reset_counter == 1
+
+
 def test_a_vehicle_at_rest_against_one_reference_does_not_drift() -> None:
     C = 1e-6 * np.eye(6)
     builder = OdometryBuilder(floors=TINY)
