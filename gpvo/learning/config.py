@@ -58,9 +58,9 @@ def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tup
     """Those of the wanted columns that every log knows and that are not constant."""
     known = set.intersection(*(s.supported() for s in sets))
     varied = set()
-    for i, name in enumerate(sets[0].columns):
-        values = [s.X[:, i] for s in sets]
-        if name in known and max(float(abs(v[v == v] - v[v == v][0]).max()) for v in values if (v == v).any()) > 1e-9:
+    for name in sorted(known):
+        values = [s.select((name,)) for s in sets]
+        if max(float(abs(v[v == v] - v[v == v][0]).max()) for v in values if (v == v).any()) > 1e-9:
             varied.add(name)
     return tuple(n for n in wanted if n in known and n in varied)
 

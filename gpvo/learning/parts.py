@@ -31,7 +31,7 @@ _WORTH = 20.0
 _MIN_WINDOWS, _MOST_WINDOWS = 3.0, 1000
 _MOST_COUNT = 60.0
 """A span counts by its windows, up to this: short spans have many, but say the same over and over."""
-_MOST_ROWS = 30_000
+_MOST_ROWS = 100_000
 _MIN_SHARE = 1e-6
 _REWEIGHTINGS, _REDIVISIONS = 6, 3
 _MOST_RATIO = 16.0
@@ -162,16 +162,14 @@ def _loss(choice: _Choice) -> float:
 
 
 def _at_most(values: Chains, limit: int) -> Chains:
-    """Whole sequences up to so many rows; the last one is cut."""
+    """Up to so many rows, equally many of each sequence from its beginning: every place and scenario has its say."""
     out = []
     for chains in values:
-        kept = []
+        kept, left = [], max(limit // len(values), 1)
         for chain in chains:
-            kept.append(chain[:limit])
-            limit -= len(kept[-1])
+            kept.append(chain[:left])
+            left -= len(kept[-1])
         out.append(kept)
-        if limit <= 0:
-            break
     return out
 
 

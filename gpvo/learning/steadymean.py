@@ -29,4 +29,5 @@ def steady_mean(rows: Rows, model: ErrorModelArrays, error: Array, variance: Arr
     right = rows.by_group(noise * np.clip(z, -_MOST_SIGMAS, _MOST_SIGMAS))
     left = rows.by_group(noise**2)
     same_way = np.sign(right.sum(axis=0) - right) * right / left
-    return np.where(surely_positive(same_way), right.sum(axis=0) / left.sum(axis=0), 0.0)
+    # The mean may lean either way, so that half of the risk is that of each.
+    return np.where(surely_positive(same_way, risk=0.025), right.sum(axis=0) / left.sum(axis=0), 0.0)

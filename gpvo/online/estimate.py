@@ -21,6 +21,8 @@ from gpvo.types import Array
 PARTS = ("jitter", "white", "bias")
 _EYE = np.eye(6)
 LN_FASTEST = float(np.log(20.0))
+LN_LARGEST = 60.0
+"""Geometric log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
 FOR_FILTER = "for_filter."
 """Prefix of the arrays in which the model for filters differs (see :func:`arrays_for_filter`)."""
 
@@ -243,11 +245,11 @@ class ErrorModelArrays:
         return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit)
 
     def _base_columns(self, X: Array) -> Array:
-        """The base's columns, missing ones typical, geometric variances never below the training's smallest."""
+        """The base's columns, missing ones typical, geometric log variances never below the training's smallest."""
         at, centre, smallest = self._base_place
         C = X[:, at]
         C = np.where(np.isfinite(C), C, centre)
-        C[:, 6:] = np.maximum(C[:, 6:], smallest)
+        C[:, 6:] = np.clip(C[:, 6:], smallest, LN_LARGEST)
         return C
 
     @cached_property
@@ -281,7 +283,9 @@ class ErrorModelArrays:
 
 def within(variance: Array, limit: Array) -> Array:
     """The variance where it is small against the limit, the limit where it is far above; it grows all the way."""
-    return variance / np.sqrt(1.0 + (variance / limit) ** 2)
+    # So far above, the limit it is; the square of what is farther would overflow.
+    ratio = np.minimum(variance / limit, 1e8)
+    return limit * ratio / np.sqrt(1.0 + ratio**2)
 
 
 def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:

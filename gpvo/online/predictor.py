@@ -21,6 +21,7 @@ from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_for_f
 from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
+from gpvo.online.slip import REASON
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
@@ -113,7 +114,7 @@ class Predictor:
         self._observer = Observer(self.features, self.target, camera or self.camera)
         self._adaptive = AdaptiveScale()
         self._last: tuple[VoRecord, Array] | None = None
-        self._stated: dict[int, tuple[Array, Array]] = {}
+        self._stated: dict[int, tuple[Array, Array] | None] = {}
 
     def require_motions(self, where: str | PathLike[str] | None = None) -> None:
         """Raise ModelError, one line, where the model (file ``where``) predicts the error over windows of motions."""
@@ -163,7 +164,7 @@ class Predictor:
     def observe(self, xi_true: ArrayLike, t_ns: int | None = None) -> None:
         """Late truth: the error (6,) that the motion ending at ``t_ns`` (default: the last) turned out to have.
 
-        Adapts the scale of later predictions; axes that are NaN are left alone.
+        Adapts the scale of later predictions; axes that are NaN are left alone, and so are lost motions.
         """
         if not self._stated:
             return
@@ -218,7 +219,8 @@ class Predictor:
             confidence, mean = 0.0, np.zeros(6)
         covariance = parts["jitter"] + parts["white"] + parts["bias"]
         sigma = np.sqrt(np.diagonal(covariance))
-        self._stated[record.t_ns] = (mean, sigma)
+        # What is stated of a lost motion was not learnt: truth of it says nothing of the scale of what was.
+        self._stated[record.t_ns] = None if status is Status.LOST else (mean, sigma)
         if len(self._stated) > _REMEMBERED:
             del self._stated[next(iter(self._stated))]
         return Prediction(
@@ -235,13 +237,13 @@ class Predictor:
         )
 
     def _lost_variance(self, record: VoRecord) -> Array:
-        """(6,) variance of a lost motion: the training's usual motion, and the distance from what was expected."""
-        usual = self.model.usual_rate_var * record.dt_s**2
-        expected = self._observer.slip.expected
-        if expected is None:
-            return usual
-        jump = se3.log(record.T_prev_cur) - expected * record.dt_s
-        return np.maximum(usual, np.repeat([(jump[:3] ** 2).sum(), (jump[3:] ** 2).sum()], 3))
+        """(6,) variance of a lost motion: at least the training's usual motion, and the distance from what was
+        expected. What VO gives is a guess where it lost the motion itself: the vehicle may also have stopped."""
+        xi, expected = se3.log(record.T_prev_cur), self._observer.slip.expected
+        wrong_by = [] if REASON in record.reason else [xi]
+        wrong_by += [] if expected is None else [xi - expected * record.dt_s]
+        squared = [np.repeat((d.reshape(2, 3) ** 2).sum(axis=1), 3) for d in wrong_by]
+        return np.max([self.model.usual_rate_var * record.dt_s**2, *squared], axis=0)
 
     def _at_rest(self, record: VoRecord) -> Prediction:
         """The first frame has no motion and hence no error to speak of."""

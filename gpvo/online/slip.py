@@ -63,11 +63,11 @@ class SlipDetector:
     def step(self, record: VoRecord) -> VoRecord:
         """The record, ``lost`` if its motion is impossible. Call once per record, in time order."""
         record = _unflagged(record)
+        self.expected = None if self._anchor is None else self._anchor[1]
         if not record.usable or record.dt_s <= 0:
             return record
         now = twist(record)
         middle_s = (record.t_ns + record.t_prev_ns) * 0.5e-9
-        self.expected = None if self._anchor is None else self._anchor[1]
         if self._anchor is None or middle_s - self._anchor[0] > _PATIENCE_S:
             self._believe(middle_s, now)
             return record

@@ -80,7 +80,7 @@ def joined(motions: list[VoRecord]) -> VoRecord:
     for r in motions:
         T = T @ r.T_prev_cur
         covariances = {
-            m: transport.compound(r.T_prev_cur, C, r.covariances[m])
+            m: transport.symmetrise(transport.compound(r.T_prev_cur, C, r.covariances[m]))
             for m, C in covariances.items()
             if m in r.covariances
         }

@@ -14,7 +14,7 @@ from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, Frontend, Matches
 from gpvo.vo.motion import Motion, refine
-from gpvo.vo.parts import Stopwatch, check_frame, imu_fields, make_frontend, motion_fields, stats_fields
+from gpvo.vo.parts import ImuMoments, Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.sigmas import SigmaEstimator
@@ -50,12 +50,14 @@ class StereoOdometry:
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
         self._state: _State | None = None
+        self._imu = ImuMoments.of(None)  # since the reference
         self.last: Followed = Followed(EMPTY, np.zeros(0, bool))
 
     def step(self, frame: StereoFrame | TrackFrame, imu: ImuLog | None = None) -> VoRecord:
         """Take in one frame and say how the camera moved since the reference frame.
 
-        ``imu`` holds the samples since the last frame, if any; their mean and spread go into the record.
+        ``imu`` holds the samples since the last frame, if any. Mean and spread of all since the reference go into the
+        record: they are of the same interval as its motion.
 
         Raises
         ------
@@ -71,7 +73,7 @@ class StereoOdometry:
             counts = frontend.promote(None)
             self._state = _State(frame.t_ns, frame.t_ns, frame.t_ns, np.eye(4), np.zeros(6), 0.0, counts[1])
             record = VoRecord(frame.t_ns, frame.t_ns, Status.START, np.eye(4), n_detected=counts[0], n_stereo=counts[1])
-            return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **imu_fields(imu))
+            return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **ImuMoments.of(imu).fields())
         guess = self._state.guess(frame.t_ns)
         matches, motion = self._solve(guess, clock)
         self.last = Followed(matches, np.zeros(len(matches.uvd_cur), bool) if motion is None else motion.inliers)
@@ -80,6 +82,8 @@ class StereoOdometry:
         clock.lap("covariance")
         is_reference, counts = self._advance(record, matches, motion)
         clock.lap("reference")
+        sensed = self._imu.with_later(ImuMoments.of(imu))
+        self._imu = ImuMoments.of(None) if is_reference else sensed
         return replace(
             record,
             is_reference=is_reference,
@@ -87,7 +91,7 @@ class StereoOdometry:
             n_stereo=counts[1],
             stage_ms=clock.stages,
             **stats_fields(seen.stats),
-            **imu_fields(imu),
+            **sensed.fields(),
         )
 
     def _solve(self, guess: Array, clock: Stopwatch) -> tuple[Matches, Motion | None]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.types import Status, StereoFrame, TrackFrame, VoLog, VoRecord
+from gpvo.types import ImuLog, Status, StereoFrame, TrackFrame, VoLog, VoRecord
 from gpvo.vo.config import make_config
 from gpvo.vo.odometry import StereoOdometry
 
@@ -94,6 +94,30 @@ def test_standing_still_does_not_drift(clip: Clip) -> None:
     assert all(r.status is Status.OK for r in records[1:])
     assert sum(r.is_reference for r in records) <= 2
     assert np.linalg.norm(VoLog(records, still.camera).trajectory()[-1, :3, 3]) < 2e-3
+
+
+def test_the_imu_of_a_record_is_of_the_motion_from_its_reference(clip: Clip) -> None:
+    """While one reference is kept, its first motion spans many frames, and so do mean and spread of the IMU."""
+    still = [clip.frames[0]] * 20
+    odometry = StereoOdometry(clip.camera)
+    rng = np.random.default_rng(0)
+    since, longest_s = [], 0.0
+    for k, frame in enumerate([*still, *clip.frames[1:4]]):
+        gyro, acc = rng.standard_normal((2, 10, 3))
+        t_ns = k * 50_000_000
+        imu = ImuLog(t_ns - np.arange(10)[::-1] * 1_000_000, gyro, acc)
+        record = odometry.step(replace(frame, t_ns=t_ns), imu)
+        since = [*since, np.hstack([gyro, acc])] if k else []
+        if k == 0:
+            continue
+        seen = np.concatenate(since)
+        assert len(seen) == 10 * round(record.dt_s / 0.05)
+        np.testing.assert_allclose(np.r_[record.imu_gyro_mean_radps, record.imu_acc_mean_mps2], seen.mean(0))
+        np.testing.assert_allclose(np.r_[record.imu_gyro_std_radps, record.imu_acc_std_mps2], seen.std(0))
+        longest_s = max(longest_s, record.dt_s)
+        if record.is_reference:
+            since = []
+    assert longest_s > 0.9
 
 
 @pytest.mark.parametrize("seed", [5, 6, 7, 8])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from gpvo.errors import GpvoError
 from gpvo.online.base import motion_noise, positions
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import LN_LARGEST, ErrorModelArrays
 from gpvo.online.rowplan import StackedBasis, stack
 
 PREFIX = "gpvo"
@@ -83,6 +83,7 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         "TYPICAL_LN_DET": _number(model.typical_ln_det[0]),
         "OUTSIDE_POWER": _number(model.outside_power[0]),
         "LN_SPEED": _number(model.ln_speed[0]),
+        "LN_LARGEST": _number(LN_LARGEST),
         "MEAN_IN_SIGMA": int(model.mean_in_sigma[0]),
     }
     return [

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from gpvo.errors import MissingExtraError
 from gpvo.geometry.covariance import TURN_FIRST
 from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
-from gpvo.online.estimate import LN_FASTEST, PARTS, ErrorModelArrays
+from gpvo.online.estimate import LN_FASTEST, LN_LARGEST, PARTS, ErrorModelArrays
 from gpvo.online.rowplan import stack
 from gpvo.types import Array
 
@@ -190,8 +190,8 @@ def _limit(g: _Graph, model: ErrorModelArrays) -> str:
 
 
 def _within(g: _Graph, variance: str, limit: str) -> str:
-    ratio = g("Div", variance, limit)
-    return g("Div", variance, g("Sqrt", g("Add", g("Mul", ratio, ratio), 1.0)))
+    ratio = g("Min", g("Div", variance, limit), 1e8)
+    return g("Div", g("Mul", limit, ratio), g("Sqrt", g("Add", g("Mul", ratio, ratio), 1.0)))
 
 
 def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:
@@ -205,7 +205,7 @@ def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:
     terms = [g("Mul", squared[i], g.constant(theta[:, 2 + i])) for i in range(2)]
     if len(at) >= 12:
         least = g.constant((domain.centre + domain.scale * domain.low)[at][6:])
-        known = g("Exp", g("Max", g.take(columns, np.arange(6, len(at)), axis=1), least))
+        known = g("Exp", g("Min", g("Max", g.take(columns, np.arange(6, len(at)), axis=1), least), LN_LARGEST))
         geometry = g.take(known, np.arange(6), axis=1)
         terms.append(g("Mul", geometry, g.constant(theta[:, 0])))
         if len(at) > 12:

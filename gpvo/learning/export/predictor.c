@@ -91,7 +91,7 @@ static void gpvo_base(const double *features, double dt_s, double base[6], doubl
         int at = gpvo_base_column[i];
         double least = gpvo_centre[at] + gpvo_scale[at] * gpvo_low[at];
         column[i] = isfinite(features[at]) ? features[at] : gpvo_centre[at];
-        if (i >= 6 && column[i] < least) column[i] = least;
+        if (i >= 6) column[i] = gpvo_clip(column[i], least, GPVO_LN_LARGEST);
     }
     for (i = 0; i < 3; ++i) {
         translation += column[i] * dt_s * column[i] * dt_s;
@@ -119,7 +119,8 @@ static void gpvo_limits(const double *features, double dt_s, double limit[2]) {
 
 static double gpvo_within(double variance, double limit) {
     double ratio = variance / limit;
-    return variance / sqrt(1.0 + ratio * ratio);
+    if (ratio > 1e8) ratio = 1e8;
+    return limit * ratio / sqrt(1.0 + ratio * ratio);
 }
 
 /* Correlations of jitter, white and bias; the first two mixed with those of the geometric covariance where there is one. */
