@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +20,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 def train(
+    ctx: typer.Context,
     runs: Runs,
     out: Annotated[Path, typer.Option("-o", "--out", help="Model file to write.")],
     features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto",
@@ -27,7 +29,9 @@ def train(
     align: Annotated[
         str, typer.Option(help="rotation: fit a fixed rotation between log and truth first; none.")
     ] = "none",
-    update: Annotated[Path | None, typer.Option(help="Add the runs to this model's own.")] = None,
+    update: Annotated[
+        Path | None, typer.Option(help="Add the runs to this model's own; its settings hold unless given.")
+    ] = None,
     max_rows: Annotated[
         int, typer.Option(min=1000, help="Rows held in memory; of more, the noise learns from blocks.")
     ] = 100_000,
@@ -52,6 +56,8 @@ def train(
         "seed": seed,
         "max_rows": max_rows,
     }
+    if update is not None:
+        settings = _settings_of(update) | {k: v for k, v in settings.items() if _is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     trained = _train(runs, settings, update)
     save_model(trained, out)
@@ -66,11 +72,28 @@ def train(
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
 
 
+def _settings_of(model: Path) -> dict[str, Any]:
+    """What a model was trained with."""
+    from dataclasses import asdict
+
+    from gpvo.learning.update import config_of
+
+    return asdict(config_of(model))
+
+
+def _is_given(ctx: typer.Context, option: str) -> bool:
+    """Whether the user wrote an option, or it stands at its default."""
+    source = ctx.get_parameter_source(option)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> TrainedModel:
     from gpvo.io.run import read_run
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
+    if update is not None and config.target == "position":
+        raise GpvoError("a model of positions cannot be updated", where=update, cure="train anew from all runs")
     if any(p.is_file() for p in paths):
         return _train_file(paths, config, update)
     if update is None and config.target != "position" and _frames(paths) > config.max_rows:
@@ -84,7 +107,7 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     if update is not None:
         from gpvo.learning.update import update as update_model
 
-        return update_model(update, runs, config)
+        return update_model(update, runs, config, tell=lambda what: print(f"gpvo: {what}", file=sys.stderr))
     from gpvo.learning.train import train as train_model
 
     return train_model(runs, config)

@@ -37,6 +37,8 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
                     "counts": dict(s.counts),
                     "camera": None if s.camera is None else asdict(s.camera),
                     "columns": list(s.columns),
+                    "lost_xi": s.lost_xi.tolist(),
+                    "lost_jump": s.lost_jump.tolist(),
                 }
             )
         metadata = {"gpvo": json.dumps({"schema": SCHEMA, "sequences": about}, sort_keys=True)}
@@ -102,6 +104,8 @@ def set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         counts=entry["counts"],
         camera=None if entry["camera"] is None else StereoCamera(**entry["camera"]),
         target=entry["target"],
+        lost_xi=np.array(entry.get("lost_xi", []), dtype=np.float64).reshape(-1, 6),
+        lost_jump=np.array(entry.get("lost_jump", []), dtype=np.float64).reshape(-1, 6),
     )
 
 

@@ -19,6 +19,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_gp
 from gpvo.learning.parallel import map_jobs
+from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score
 from gpvo.online.estimate import Estimate
@@ -55,6 +56,8 @@ def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedMode
     return train_sets([build_run(r, target=config.target, align=config.align) for r in runs], config)
 
 
+# On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.
+@fixed_threads(1)
 def train_sets(
     sets: Sequence[TrainingSet],
     config: TrainConfig,
@@ -63,7 +66,7 @@ def train_sets(
     refine: Callable[[Learned], Learned] | None = None,
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out; ``refine``: a last step of the final fit."""
-    sets = _checked(sets)
+    sets = _checked(sets, config.target)
     table = train_table(sets, config) if judge else {}
     learned = fit_model(sets, config)
     learned = learned if refine is None else refine(learned)
@@ -76,9 +79,16 @@ def train_sets(
     )
 
 
-def _checked(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
+def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
     if not sets:
         raise GpvoError("there is no run to train on", cure="gpvo train RUN... -o MODEL")
+    other = next((s for s in sets if s.target != target), None)
+    if other is not None:
+        raise GpvoError(
+            f"holds rows of the target '{other.target}', not '{target}'",
+            where=other.name,
+            cure=f"--target {other.target}",
+        )
     names = [s.name for s in sets]
     if len(set(names)) < len(names):
         sets = [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]
@@ -106,6 +116,7 @@ def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, A
     return {"folds": folds, "mean": mean, "comparison": _compare(folds, mean)}
 
 
+@fixed_threads(1)
 def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
     """All methods fitted without one sequence and scored on it."""
     arrays = method_arrays(train_on)

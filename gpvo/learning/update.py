@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -21,11 +21,20 @@ def config_of(path: str | Path) -> TrainConfig:
     return TrainConfig(**{k: v for k, v in modelfile.read_header(path).get("config", {}).items() if k in known})
 
 
-def update(path: str | Path, runs: Sequence[Run], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
-    """The model at ``path`` with more sequences. A run of a name it knows replaces that sequence."""
+def update(
+    path: str | Path,
+    runs: Sequence[Run],
+    config: TrainConfig,
+    *,
+    judge: bool = True,
+    tell: Callable[[str], None] = lambda _: None,
+) -> TrainedModel:
+    """The model at ``path`` with more sequences. A run of a name it knows replaces that sequence; ``tell`` hears so."""
     old = training_rows(path)
     if old[0].target != config.target:
         raise ModelError(f"learns the target '{old[0].target}', not '{config.target}'", where=path)
     new = [build_run(r, target=config.target, align=config.align) for r in runs]
     names = {s.name for s in new}
+    for gone in (s.name for s in old if s.name in names):
+        tell(f"sequence '{gone}' of {path} is replaced by the run of that name")
     return train_sets([*(s for s in old if s.name not in names), *new], config, judge=judge)

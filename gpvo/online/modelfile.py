@@ -115,12 +115,16 @@ def _read_document(path: Path) -> tuple[dict[str, Any], int]:
         tensors = json.loads(raw)
         metadata = tensors.pop("__metadata__")
         _check_sizes(tensors, size - 8 - n_header, path)
-        document = json.loads(metadata["gpvo"])
+        document = json.loads(metadata["gpvo"], parse_constant=_refuse)
     except ModelError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise ModelError("is not a gpvo model file, or its header is damaged", where=path) from None
     return document, size
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no JSON")
 
 
 def _check_sizes(tensors: dict[str, Any], n_bytes: int, path: Path) -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from gpvo.cli import app
+from gpvo.cli.learn import _train
+from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
+from gpvo.geometry import se3
+from gpvo.io.run import write_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.meantest import helps_over_distance, pose_gain, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
@@ -15,14 +20,17 @@ from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, rows_path, save_model
 from gpvo.learning.train import train_sets
-from gpvo.learning.update import update
+from gpvo.learning.update import config_of, update
 from gpvo.online.base import OWN_MOTION, TWIST_COLUMNS
 from gpvo.online.basis import NEVER
 from gpvo.online.estimate import divide
 from gpvo.online.predictor import Predictor
 from gpvo.stats.consistency import nees
+from gpvo.types import VoLog
 from small_model import small_model, training_sets
 from synthetic_runs import make_run
+from threadpoolctl import threadpool_info, threadpool_limits
+from typer.testing import CliRunner
 
 QUICK = TrainConfig(features="velocity,rotation,n_inliers", noise_inducing=32)
 
@@ -156,6 +164,25 @@ def test_same_data_and_seed_give_the_same_bytes(tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
+def test_linear_algebra_runs_on_one_thread_so_that_bytes_do_not_depend_on_the_machine():
+    seen = []
+
+    def look(learned):
+        seen.extend(pool["num_threads"] for pool in threadpool_info())
+        return learned
+
+    with threadpool_limits(limits=2):
+        train_sets(training_sets(range(3), n=120), QUICK, judge=False, refine=look)
+    assert seen
+    assert set(seen) == {1}
+
+
+def test_rows_of_another_target_are_refused():
+    rows = [replace(s, target="window:1s") for s in training_sets(range(3), n=120)]
+    with pytest.raises(GpvoError, match="target 'window:1s', not 'frame'"):
+        train_sets(rows, QUICK)
+
+
 def test_table_has_every_row_and_every_key(tmp_path):
     sets = training_sets(range(3), n=120)
     trained = train_sets(sets, QUICK)
@@ -181,9 +208,50 @@ def test_update_adds_flights(tmp_path):
     run = _as_run(*make_run(9, n=120), "flight9")
     more = update(path, [run], QUICK, judge=False)
     assert [s.name for s in more.sets] == ["flight0", "flight1", "flight2", "flight9"]
+    told = []
+    again = update(path, [_as_run(*make_run(8, n=120), "flight1")], QUICK, judge=False, tell=told.append)
+    assert [s.name for s in again.sets] == ["flight0", "flight2", "flight1"]
+    assert "flight1" in told[0]
     rows_path(path).unlink()
     with pytest.raises(ModelError, match="not beside"):
         update(path, [run], QUICK)
+
+
+def test_rows_of_windows_and_slips_are_found_again_beside_the_model(tmp_path):
+    from gpvo.dataset.build import build
+
+    log, truth = make_run(1, n=200)
+    records = list(log)
+    jump = se3.exp(np.array([0, 0, 5.0, 0, 0, 0]))
+    records[90] = replace(records[90], T_prev_cur=records[90].T_prev_cur @ jump)
+    for target in ("frame", "window:0.5s"):
+        made = build(VoLog(records, log.camera), truth, name="one", target=target)
+        assert made.counts["lost"] == len(made.lost_xi) == 1
+        write_sets(tmp_path / "rows", [made])
+        (found,) = read_sets(tmp_path / "rows")
+        assert found.digest() == made.digest()
+        np.testing.assert_array_equal(found.lost_xi, made.lost_xi)
+        np.testing.assert_array_equal(found.lost_jump, made.lost_jump)
+
+
+def test_an_update_keeps_the_settings_of_the_model(tmp_path):
+    path = tmp_path / "m.gpvo"
+    config = replace(QUICK, features="velocity", seed=5)
+    save_model(train_sets(training_sets(range(3), n=120), config, judge=False), path)
+    log, truth = make_run(9, n=120)
+    write_run(tmp_path / "flight9", log, truth=truth)
+    out = tmp_path / "more.gpvo"
+    command = ["train", str(tmp_path / "flight9"), "--update", str(path), "--seed", "6", "-o", str(out)]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert config_of(out) == replace(config, seed=6)
+
+
+def test_a_model_of_positions_is_not_updated(tmp_path):
+    path = tmp_path / "m.gpvo"
+    save_model(train_sets(training_sets(range(3), n=120), QUICK, judge=False), path)
+    with pytest.raises(GpvoError, match="train anew"):
+        _train([tmp_path], asdict(replace(QUICK, target="position")), path)
 
 
 def _as_run(log, truth, name):

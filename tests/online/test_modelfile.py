@@ -130,6 +130,14 @@ def test_a_changed_header_does_not_match_the_digest(model: Path) -> None:
         modelfile.load(model)
 
 
+def test_numbers_that_are_not_json_are_refused(model: Path) -> None:
+    blob = model.read_bytes()
+    assert b"0.5" in blob
+    model.write_bytes(blob.replace(b"0.5", b"NaN", 1))
+    with pytest.raises(ModelError, match="damaged"):
+        modelfile.load(model)
+
+
 def test_other_metadata_is_refused(model: Path) -> None:
     rewrite(model, lambda tensors, document: document.update(kind="something else"))
     with pytest.raises(ModelError, match="not a gpvo model"):
