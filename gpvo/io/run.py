@@ -109,6 +109,9 @@ class RunWriter:
             raise ValueError(f"record at {record.t_ns} ns does not follow {state.last_t_ns} ns")
         if state.records_total and T_prev is None:
             raise ValueError(f"record at {record.t_ns} ns starts from {record.t_prev_ns} ns, which is not in the run")
+        if T_prev is not None:
+            # At rest and in the dark one reference serves for as long as that lasts.
+            state.poses.move_to_end(record.t_prev_ns)
         pose = record.T_prev_cur if T_prev is None else T_prev @ record.T_prev_cur
         state.remember(record.t_ns, pose)
         state.records.append(record)
@@ -190,7 +193,7 @@ class _State:
     clock: float = field(default_factory=time.monotonic)
 
     def remember(self, t_ns: int, pose: Array) -> None:
-        """Keep the pose as a possible start of later motions, for the last 20,000 frames."""
+        """Keep the pose as a possible start of later motions, for the 20,000 frames that came or served last."""
         self.poses[t_ns] = pose
         if len(self.poses) > 20_000:
             self.poses.popitem(last=False)

@@ -215,6 +215,14 @@ def test_writer_refuses_records_that_do_not_chain(tmp_path):
         write_run(tmp_path / "r2", VoLog([a, c]))
 
 
+def test_a_reference_lasts_as_long_as_rest(tmp_path):
+    with RunWriter(tmp_path / "run", chunk=5_000) as writer:
+        writer.append(VoRecord(0, 0, Status.START, np.eye(4)))
+        for t_ns in range(1, 20_003):
+            writer.append(VoRecord(t_ns, 0, Status.LOST, np.eye(4)))
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["frames"] == 20_003
+
+
 def test_predictions_file(tmp_path):
     rng = np.random.default_rng(3)
     predictions = [make_prediction(r, rng) for r in make_records(5)[1:]]
