@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -91,6 +92,8 @@ def run(
                 show(step, prediction)
 
         summary = runner.run(sequence, out, config, predictor, on_frame=on_frame)
+    for note in sequence.report.notes:
+        print(f"source: {note}", file=sys.stderr)
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:

@@ -20,7 +20,7 @@ RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folde
 LeftTopic = Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")]
 RightTopic = Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")]
 ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")]
-TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")]
+TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none for no truth.")]
 TruthFrame = Annotated[str | None, typer.Option(help="Whose poses the truth topic holds: imu or cam.")]
 
 

@@ -49,8 +49,7 @@ _SIDES = (
     ("cam_0", "cam_1"),
     ("camera1", "camera2"),
 )
-_TRUTH_NAMES = ("vicon", "mocap", "optitrack", "vrpn", "qualisys", "ground_truth", "groundtruth", "truth")
-_CAPTURE_NAMES = _TRUTH_NAMES[:5]
+_CAPTURE_NAMES = ("vicon", "mocap", "optitrack", "vrpn", "qualisys")
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,7 @@ class _Topics:
     right: str
     imu: str | None
     truth: str | None
+    doubtful: str | None  # poses that may be a truth, but nobody said whose
     count: int
 
 
@@ -66,9 +66,10 @@ class BagSource(ImageSource):
     """A pair of image topics with CameraInfo, or a Kalibr camera chain beside the bag.
 
     Topics are guessed from the calibration's ``rostopic`` or the drivers' habits; ``left_topic``, ``right_topic``,
-    ``imu_topic`` and ``truth_topic`` override. Stamps of a pair may differ by ``tolerance_s``. ``truth_frame``
-    (``"imu"`` or ``"cam"``) says whose poses the truth topic holds: the IMU's where its place is known, unless stated.
-    ``bits`` is the depth of the samples in 16-bit images.
+    ``imu_topic`` and ``truth_topic`` (``"none"`` for no truth) override. Stamps of a pair may differ by
+    ``tolerance_s``. ``truth_frame`` (``"imu"`` or ``"cam"``) says whose poses the truth topic holds: the IMU's where
+    its place is known, unless stated. Poses of motion capture are guessed to be the truth only with ``truth_frame``:
+    its markers rarely sit where the IMU does. ``bits`` is the depth of the samples in 16-bit images.
     """
 
     format = "rosbag"
@@ -92,7 +93,7 @@ class BagSource(ImageSource):
         chain = Path(calibration) if calibration is not None else _calibration_beside(path)
         with open_bag(path) as reader:
             asked = (left_topic, right_topic, imu_topic, truth_topic)
-            self._topics = _choose_topics(reader, path, chain, asked)
+            self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
             size, span = _first_images(reader, path, self._topics)
             rig = read_stereo_yaml(chain, size=size[0]) if chain else _rig_from_bag(reader, path, self._topics)
             _check_sizes(size, rig, path, self._topics)
@@ -103,6 +104,9 @@ class BagSource(ImageSource):
             self.imu = _read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s)
         if self._topics.truth is not None:
             self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
+        if self._topics.doubtful is not None:
+            whose = "whose they are is unknown; give --truth-topic and --truth-frame"
+            self.remark(f"poses on '{self._topics.doubtful}' not used as truth: {whose}")
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -121,14 +125,17 @@ class BagSource(ImageSource):
                 yield t_ns, decode_message(left, self.bits), decode_message(right, self.bits)
 
     def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
-        t, T, _ = read_poses(self.path, topic)
+        try:
+            t, T, _ = read_poses(self.path, topic)
+        except SourceError as error:
+            raise SourceError(error.what, where=error.where, cure="--truth-topic none does without") from None
         if frame == "imu" and self.mounting.T_imu_cam is None:
             raise CalibrationError("does not say where the IMU sits", where=self.path, cure="use --truth-frame cam")
         whose = frame or ("cam" if self.mounting.T_imu_cam is None else "imu")
         place = self.rectifier.T_left_cam if whose == "cam" else self.mounting.T_imu_cam
         assert place is not None
         self.remark(f"truth on '{topic}' taken as poses of the {whose} frame")
-        usual = MOTION_CAPTURE if any(n in topic.lower() for n in _CAPTURE_NAMES) else UNKNOWN
+        usual = MOTION_CAPTURE if _is_capture(topic) else UNKNOWN
         truth = carry(Trajectory(t, T), place, noise or usual)
         check_overlap(truth, np.array(self.span_ns, dtype=np.int64), self.path)
         return truth
@@ -139,7 +146,9 @@ def _calibration_beside(path: Path) -> Path | None:
     return next((found for folder in folders if (found := find_calibration(folder))), None)
 
 
-def _choose_topics(reader: Any, path: Path, chain: Path | None, asked: tuple[str | None, ...]) -> _Topics:
+def _choose_topics(
+    reader: Any, path: Path, chain: Path | None, asked: tuple[str | None, ...], *, any_truth: bool
+) -> _Topics:
     left, right, imu, truth = asked
     images = topics_of(reader, IMAGE_TYPES)
     for topic in (left, right):
@@ -159,12 +168,29 @@ def _choose_topics(reader: Any, path: Path, chain: Path | None, asked: tuple[str
         raise SourceError(f"left and right are the same topic '{left}'", where=path)
     imus = list(topics_of(reader, (IMU_TYPE,)))
     poses = list(topics_of(reader, POSE_TYPES))
-    for topic, available in ((imu, imus), (truth, poses)):
+    for topic, available in ((imu, imus), (truth, [*poses, "none"])):
         if topic is not None and topic not in available:
             raise SourceError(f"has nothing to read on '{topic}' (there are: {', '.join(available)})", where=path)
     counts = [reader.topics[t].msgcount for t in (left, right)]
-    guessed_truth = next((t for n in _TRUTH_NAMES for t in poses if n in t.lower()), None)
-    return _Topics(left, right, imu or (imus[0] if imus else None), truth or guessed_truth, min(counts))
+    doubtful = None
+    if truth is None:
+        truth, doubtful = _guess_truth(poses, any_truth)
+    truth = None if truth == "none" else truth
+    return _Topics(left, right, imu or (imus[0] if imus else None), truth, doubtful, min(counts))
+
+
+def _guess_truth(poses: list[str], any_truth: bool) -> tuple[str | None, str | None]:
+    """The topic that calls itself the truth, and one of motion capture where that is left unused."""
+    markers = [t for t in poses if _is_capture(t)]
+    named = [t for t in poses if "truth" in t.lower() and t not in markers]
+    usable = named + markers if any_truth else named
+    if usable:
+        return usable[0], None
+    return None, markers[0] if markers else None
+
+
+def _is_capture(topic: str) -> bool:
+    return any(n in topic.lower() for n in _CAPTURE_NAMES)
 
 
 def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None:

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 import sequences as seq
+from bag_maker import stereo_bag
 from gpvo import cli
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.geometry import se3
@@ -253,3 +254,13 @@ def test_simulated_log_with_turned_truth_is_put_right(gpvo, tmp_path):
 def test_python_m_gpvo_is_the_command_line():
     done = subprocess.run([sys.executable, "-m", "gpvo", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("gpvo ")
+
+
+def test_run_says_what_the_source_remarks(gpvo, tmp_path):
+    path = stereo_bag(True).write(tmp_path / "a.bag")
+    code, out, err = gpvo("run", path, "-o", tmp_path / "run", "--preset", "thesis", "--json")
+    assert code == 0
+    assert json.loads(out)["frames"] == 12
+    assert err.count("poses on '/vicon/head/head' not used as truth") == 1
+    code, _, err = gpvo("run", path, "-o", tmp_path / "run", "--preset", "thesis", "--truth-topic", "none")
+    assert (code, err) == (0, "")

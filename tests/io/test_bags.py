@@ -23,7 +23,7 @@ def _write(tmp_path, kind, maker_of=stereo_bag, **options):
 def test_stereo_bag(tmp_path, kind):
     path = _write(tmp_path, kind)
     assert guess(path) == "rosbag"
-    source = open_source(path)
+    source = open_source(path, truth_frame="cam")
     assert len(source) == 12
     assert seq.frames_of(source) == list(zip(seq.stamps(12), range(12), strict=True))
     assert str(source.report) == "12 frames"
@@ -149,7 +149,31 @@ def test_truth_frame_and_overlap(tmp_path):
     for k, t in enumerate(seq.stamps(12)):
         late.transform("/mocap/pose", t + 10**12, seq.true_poses(12)[k])
     with pytest.raises(SourceError, match="does not overlap"):
-        open_source(late.write(tmp_path / "late.bag"))
+        open_source(late.write(tmp_path / "late.bag"), truth_topic="/mocap/pose")
+
+
+def test_markers_are_no_truth_unless_said_whose(tmp_path):
+    maker = stereo_bag(True)
+    # A marker that is turned by half, and lost for a moment.
+    maker.messages = [m for m in maker.messages if "vicon" not in m[1]]
+    T = seq.true_poses(12) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    T[4, :3, 3] = np.nan
+    for k, t in enumerate(seq.stamps(12)):
+        maker.transform("/vicon/head/head", t, T[k])
+    path = maker.write(tmp_path / "a.bag")
+    source = open_source(path)
+    assert source.truth is None
+    assert len(seq.frames_of(source)) == 12
+    assert any("'/vicon/head/head' not used as truth" in n and "--truth-frame" in n for n in source.report.notes)
+    with pytest.raises(SourceError, match="message 5 .*--truth-topic none"):
+        open_source(path, truth_frame="cam")
+    source = open_source(path, truth_topic="none", truth_frame="cam")
+    assert source.truth is None
+    assert not source.report.notes
+    for k, t in enumerate(seq.stamps(12)):
+        maker.transform("/ground_truth", t, seq.true_poses(12)[k])
+    source = open_source(maker.write(tmp_path / "b.bag"))
+    np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12), atol=1e-9)
 
 
 def _odometry_bag(ros1: bool, twist: bool) -> BagMaker:
