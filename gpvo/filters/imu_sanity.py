@@ -94,7 +94,13 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         keep = size <= np.quantile(size, 0.95)
         vo, gyro = vo[keep] - vo[keep].mean(axis=0), gyro[keep] - gyro[keep].mean(axis=0)
     energy_vo, energy_gyro = (vo**2).sum(), (gyro**2).sum()
-    if len(vo) < 10 or energy_vo < _MIN_ROTATION_RAD**2 or energy_gyro == 0:
+    turned = len(vo) >= 10 and bool(energy_vo >= _MIN_ROTATION_RAD**2)
+    if not imu.gyro_radps.any():
+        # Of a noiseless simulation that never turns this is true.
+        text = "the gyroscope reads exactly zero throughout: nothing measures the rates"
+        yield Finding("gyro_zero", text, "give the gyroscope's topic or columns, or use --no-imu", fatal=turned)
+        return
+    if not turned or energy_gyro == 0:
         rms = float(np.sqrt((imu.gyro_radps**2).sum(axis=1).mean()))
         if rms > 8.0:
             text = f"the gyroscope turns at {rms:.0f} rad/s on average: it is in degrees per second"

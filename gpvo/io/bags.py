@@ -18,6 +18,7 @@ from gpvo.cameras.rig import StereoRig
 from gpvo.cameras.yamlfile import read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.bag_images import decode_message, pair_streams
+from gpvo.io.bag_imu import imu_topics, read_imu
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
@@ -31,12 +32,11 @@ from gpvo.io.bag_reader import (
     topics_of,
 )
 from gpvo.io.images import Image8, ImageSource
-from gpvo.io.imu import make_imu
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import usual_interval
 from gpvo.io.trajectory import Trajectory
 from gpvo.io.truth import MOTION_CAPTURE, UNKNOWN, TruthNoise, carry, check_overlap
-from gpvo.types import ImuLog, TruthLog
+from gpvo.types import TruthLog
 
 # How drivers name the two cameras of one head.
 _SIDES = (
@@ -56,7 +56,7 @@ _CAPTURE_NAMES = ("vicon", "mocap", "optitrack", "vrpn", "qualisys")
 class _Topics:
     left: str
     right: str
-    imu: str | None
+    imu: list[tuple[str, ...]]
     truth: str | None
     doubtful: str | None  # poses that may be a truth, but nobody said whose
     count: int
@@ -100,8 +100,7 @@ class BagSource(ImageSource):
         super().__init__(path, path.stem, rig, **options)
         self.span_ns = span
         self._tolerance_ns = round(tolerance_s * 1e9)
-        if self._topics.imu is not None:
-            self.imu = _read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s)
+        self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
         if self._topics.truth is not None:
             self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
         if self._topics.doubtful is not None:
@@ -176,7 +175,10 @@ def _choose_topics(
     if truth is None:
         truth, doubtful = _guess_truth(poses, any_truth)
     truth = None if truth == "none" else truth
-    return _Topics(left, right, imu or (imus[0] if imus else None), truth, doubtful, min(counts))
+    sensors = imu_topics(imus)
+    if imu is not None:
+        sensors = [s for s in sensors if s[0] == imu] or [(imu,)]
+    return _Topics(left, right, sensors, truth, doubtful, min(counts))
 
 
 def _guess_truth(poses: list[str], any_truth: bool) -> tuple[str | None, str | None]:
@@ -283,17 +285,3 @@ def _camera_info(message: Any, path: Path, topic: str) -> CameraInfo:
         R=R,
         P=P.reshape(3, 4),
     )
-
-
-def _read_imu(path: Path, topic: str, shift_s: float) -> ImuLog | None:
-    stamps, rows = [], []
-    with open_bag(path) as reader:
-        for _, message in messages(reader, [topic]):
-            w, a = message.angular_velocity, message.linear_acceleration
-            stamps.append(stamp_ns(message))
-            rows.append((w.x, w.y, w.z, a.x, a.y, a.z))
-    data = np.array(rows, dtype=np.float64)
-    good = np.isfinite(data).all(axis=1)
-    if not good.any():
-        return None
-    return make_imu(np.array(stamps, dtype=np.int64)[good], data[good], shift_s=shift_s)

@@ -43,6 +43,7 @@ def test_a_good_flight_has_no_findings(seed: int) -> None:
             "gyro_axes",
             "axes renamed to (y, z, x)",
         ),
+        (lambda i: replace(i, gyro_radps=0 * i.gyro_radps), "gyro_zero", "exactly zero throughout"),
         (lambda i: replace(i, acc_mps2=-i.acc_mps2), "acc_sign", "its sign is wrong"),
         (lambda i: replace(i, t_ns=i.t_ns + 10**12), "clock", "do not overlap"),
     ],

@@ -62,13 +62,14 @@ class BagMaker:
         )  # fmt: skip
         self.add(topic, message, t_ns)
 
-    def imu(self, topic: str, t_ns: int) -> None:
+    def imu(self, topic: str, t_ns: int, gyro=(0.1, 0.2, 0.3), acc=(0.0, 0.0, 9.81), *, known=(0.0, 0.0)) -> None:
+        """``known``: what the covariances of rate and acceleration begin with, -1 for none."""
         v = self.type("geometry_msgs/msg/Vector3")
         q = self.type("geometry_msgs/msg/Quaternion")
         message = self.type("sensor_msgs/msg/Imu")(
             header=self.header(t_ns), orientation=q(0, 0, 0, 1), orientation_covariance=np.zeros(9),
-            angular_velocity=v(0.1, 0.2, 0.3), angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=v(0, 0, 9.81), linear_acceleration_covariance=np.zeros(9),
+            angular_velocity=v(*gyro), angular_velocity_covariance=np.array([known[0], *[0.0] * 8]),
+            linear_acceleration=v(*acc), linear_acceleration_covariance=np.array([known[1], *[0.0] * 8]),
         )  # fmt: skip
         self.add(topic, message, t_ns)
 

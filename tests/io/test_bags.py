@@ -176,6 +176,48 @@ def test_markers_are_no_truth_unless_said_whose(tmp_path):
     np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12), atol=1e-9)
 
 
+def _bag_with_imus(tmp_path, *streams):
+    """A stereo bag whose IMU topics are (name, step [ns], function of time [s] to the arguments of the message)."""
+    maker = stereo_bag(True)
+    maker.messages = [m for m in maker.messages if "imu" not in m[1]]
+    for topic, step_ns, sample in streams:
+        for t in range(0, 500_000_000, step_ns):
+            maker.imu(topic, seq.START_NS + t, **sample(t * 1e-9))
+    return maker.write(tmp_path / "a.bag")
+
+
+@pytest.mark.parametrize("known", [0.0, -1.0])
+def test_gyro_and_accelerometer_on_topics_of_their_own(tmp_path, known):
+    path = _bag_with_imus(
+        tmp_path,
+        ("/camera/accel/sample", 16_000_000, lambda t: {"gyro": (0, 0, 0), "acc": (t, 0, 9.81), "known": (known, 0)}),
+        ("/camera/gyro/sample", 5_000_000, lambda t: {"gyro": (0, t, 0.1), "acc": (0, 0, 0), "known": (0, known)}),
+    )
+    source = open_source(path)
+    t = (source.imu.t_ns - seq.START_NS) * 1e-9
+    # The last sample of the accelerometer is of 496 ms.
+    np.testing.assert_allclose(t, np.arange(100) * 5e-3, atol=1e-12)
+    np.testing.assert_allclose(source.imu.gyro_radps[:, 1], t, atol=1e-9)
+    np.testing.assert_allclose(source.imu.acc_mps2[:, 0], t, atol=1e-9)
+    assert any("/camera/accel/sample" in n and "interpolated" in n for n in source.report.notes)
+    source = open_source(path, imu_topic="/camera/accel/sample")
+    assert source.imu is None
+    assert any("not used as IMU" in n for n in source.report.notes)
+
+
+def test_a_whole_imu_goes_before_halves_and_before_zeros(tmp_path):
+    path = _bag_with_imus(
+        tmp_path,
+        ("/a/accel/sample", 5_000_000, lambda t: {"gyro": (0, 0, 0)}),
+        ("/a/gyro/sample", 5_000_000, lambda t: {"acc": (0, 0, 0)}),
+        ("/b/imu", 5_000_000, lambda t: {"gyro": (0, 0, 0)}),
+        ("/c/imu", 5_000_000, lambda t: {"gyro": (0, 0, 0.7)}),
+    )
+    source = open_source(path)
+    np.testing.assert_array_equal(source.imu.gyro_radps[0], [0, 0, 0.7])
+    assert any("'/b/imu' not used as IMU" in n for n in source.report.notes)
+
+
 def _odometry_bag(ros1: bool, twist: bool) -> BagMaker:
     maker = BagMaker(ros1)
     C = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
