@@ -260,14 +260,24 @@ def _read_bag(path: Path, topic: str | None) -> ForeignLog:
         topic = poses[0]
     t, T, read = read_poses(path, topic)
     trajectory = Trajectory(t, T)
-    if not hasattr(read[0], "twist"):
-        return ForeignLog(path, trajectory)
-    # The twist's covariance is of the velocity in the child frame over the step that ends at the stamp.
-    twist = np.array([m.twist.covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
-    dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
-    if all(transport.is_positive_definite(C) for C in twist[: min(len(twist), 50)]):
+    twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
+    if twist is not None and _looks_stated(twist):
+        # Of the velocity in the child frame over the step that ends at the stamp.
+        dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
         return ForeignLog(path, trajectory, twist * dt[:, None, None] ** 2, "motion")
-    pose = np.array([m.pose.covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
-    if all(transport.is_positive_definite(C) for C in pose[: min(len(pose), 50)]):
+    if pose is None:
+        return ForeignLog(path, trajectory)
+    if _looks_stated(pose):
         return ForeignLog(path, trajectory, _into_body(trajectory, pose), "pose")
     return ForeignLog(path, trajectory, notes=("its covariances are not positive definite and were left out",))
+
+
+def _bag_covariance(read: list[Any], name: str) -> Array | None:
+    """(N, 6, 6) covariances of a field of the messages, None where their type has none."""
+    if not hasattr(getattr(read[0], name, None), "covariance"):
+        return None
+    return np.array([getattr(m, name).covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
+
+
+def _looks_stated(covariance: Array) -> bool:
+    return all(transport.is_positive_definite(C) for C in covariance[:50])

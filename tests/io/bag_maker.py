@@ -83,6 +83,14 @@ class BagMaker:
         message = self.type("geometry_msgs/msg/TransformStamped")(self.header(t_ns, "world"), "body", body)
         self.add(topic, message, t_ns)
 
+    def pose_with_covariance(self, topic: str, t_ns: int, T: np.ndarray, cov: np.ndarray) -> None:
+        p, q = self._pose(T)
+        t = self.type
+        pose = t("geometry_msgs/msg/Pose")(t("geometry_msgs/msg/Point")(*p), q)
+        body = t("geometry_msgs/msg/PoseWithCovariance")(pose, cov.ravel())
+        message = t("geometry_msgs/msg/PoseWithCovarianceStamped")(self.header(t_ns, "odom"), body)
+        self.add(topic, message, t_ns)
+
     def odometry(self, topic: str, t_ns: int, T: np.ndarray, pose_cov: np.ndarray, twist_cov: np.ndarray) -> None:
         p, q = self._pose(T)
         t = self.type

@@ -9,6 +9,7 @@ from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
+from gpvo.io.bag_reader import pose_of
 from gpvo.io.foreign import read_foreign, to_records
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
@@ -247,8 +248,22 @@ def test_odometry_of_others(tmp_path, kind):
     assert not records[0].covariances
 
 
-def test_pose_covariance_gives_the_growth(tmp_path):
-    path = _write(tmp_path, "ros1", lambda ros1: _odometry_bag(ros1, twist=False))
+def _matrix(message) -> np.ndarray:
+    p = pose_of(message)
+    return se3.from_quaternion(p[:3], p[3:])
+
+
+def _poses_with_covariance(ros1: bool) -> BagMaker:
+    """The poses and covariances of an odometry that states no velocity."""
+    maker = BagMaker(ros1)
+    for t_ns, _, m in _odometry_bag(ros1, twist=False).messages:
+        maker.pose_with_covariance("/pose", t_ns, _matrix(m), m.pose.covariance)
+    return maker
+
+
+@pytest.mark.parametrize("maker_of", [lambda ros1: _odometry_bag(ros1, twist=False), _poses_with_covariance])
+def test_pose_covariance_gives_the_growth(tmp_path, maker_of):
+    path = _write(tmp_path, "ros1", maker_of)
     records, notes = to_records(read_foreign(path))
     assert not notes
     expected = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
