@@ -49,7 +49,7 @@ def read_imu(
             remark(f"IMU of '{topics[0]}', with '{topics[1]}' interpolated onto its stamps")
         elif no_acc:
             remark(f"'{topics[0]}' is a gyroscope only: it measures no acceleration")
-        return make_imu(t_ns[good], data[good], shift_s=shift_s)
+        return make_imu(t_ns[good], data[good], shift_s=shift_s, remark=remark)
     return None
 
 

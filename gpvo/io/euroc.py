@@ -52,7 +52,7 @@ class EurocSource(FileSource):
         rig = _read_rig(path, mav, None if calibration is None else Path(calibration))
         known = SourceReport()
         super().__init__(path, path.resolve().name, rig, _list_pairs(mav, known), known, **options)
-        self.imu = _read_imu(path, mav, rig)
+        self.imu = self._read_imu(mav)
         self.truth = self._read_truth(mav, truth_noise)
         if self.truth is None and (mav / "leica0").is_dir():
             self.remark("leica0 gives positions only: not used as truth of motions")
@@ -61,6 +61,13 @@ class EurocSource(FileSource):
     def recognises(cls, path: Path) -> bool:
         """A folder with ``mav0/cam0/data.csv``, or that folder."""
         return path.is_dir() and any((p / "cam0" / "data.csv").is_file() for p in (path / "mav0", path))
+
+    def _read_imu(self, mav: Path) -> ImuLog | None:
+        file = mav / "imu0" / "data.csv"
+        if not file.is_file():
+            return None
+        noise = _imu_noise(self.path, mav)
+        return read_imu_csv(file, shift_s=self.rig.timeshift_cam_imu_s, noise=noise, remark=self.remark)
 
     def _read_truth(self, mav: Path, noise: TruthNoise | None) -> TruthLog | None:
         if self.mounting.T_imu_cam is None:
@@ -114,7 +121,7 @@ def _list_pairs(mav: Path, known: SourceReport) -> list[PairFiles]:
 
 
 def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
-    """(stamp, file name) of each line; a line that is neither is counted and skipped."""
+    """(stamp, file name) of each line, in order of time; a line that is neither is counted and skipped."""
     out = []
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -133,19 +140,15 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
         out.append((int(stamp), name))
     if not out:
         raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
-    return out
+    in_time = sorted(out, key=lambda line: line[0])
+    if in_time != out:
+        known.note(f"{path.parent.name}/{path.name} is not in order of time: sorted by stamp")
+    return in_time
 
 
 def _is_plain_name(name: str) -> bool:
     """Whether a name stays inside its folder."""
     return bool(name) and name not in (".", "..") and not any(c in name for c in ("/", "\\", "\0"))
-
-
-def _read_imu(path: Path, mav: Path, rig: StereoRig) -> ImuLog | None:
-    file = mav / "imu0" / "data.csv"
-    if not file.is_file():
-        return None
-    return read_imu_csv(file, shift_s=rig.timeshift_cam_imu_s, noise=_imu_noise(path, mav))
 
 
 def _imu_noise(path: Path, mav: Path) -> ImuNoise | None:

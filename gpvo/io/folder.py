@@ -60,6 +60,7 @@ class FolderSource(FileSource):
                 path / "imu.csv",
                 shift_s=rig.timeshift_cam_imu_s,
                 noise=read_imu_noise(noise) if noise.is_file() else None,
+                remark=self.remark,
             )
         if (path / "truth.tum").is_file():
             truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, truth_noise)

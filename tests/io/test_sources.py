@@ -71,9 +71,27 @@ def test_euroc_lists_with_every_disorder(tmp_path):
     lists["cam1"].write_text("\n".join([*right, f"{future},{future}.png"]) + "\n")
     shutil.copy(path / f"mav0/cam0/data/{future}.png", path / f"mav0/cam1/data/{future}.png")
     source = open_source(path)
-    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 4, 6, 7, 8, 9, 10, 11]
+    assert seq.frames_of(source) == [*((t[k], k) for k in (0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11)), (future, 0)]
     report = source.report
-    assert (report.duplicate, report.out_of_order, report.missing, report.unreadable) == (1, 2, 1, 2)
+    assert (report.duplicate, report.out_of_order, report.missing, report.unreadable) == (1, 0, 1, 2)
+    assert report.gaps == 2
+    assert "cam0/data.csv is not in order of time: sorted by stamp" in report.notes
+
+
+def test_euroc_lists_and_imu_in_any_order(tmp_path):
+    path = seq.write_euroc(tmp_path / "s", 40)
+    for camera in ("cam0", "cam1"):
+        file = path / "mav0" / camera / "data.csv"
+        head, *lines = file.read_text().splitlines()
+        file.write_text("\n".join([head, *np.random.default_rng(0).permutation(lines)]))
+    imu = path / "mav0" / "imu0" / "data.csv"
+    lines = imu.read_text().splitlines()
+    imu.write_text("\n".join([*lines[:7], lines[3], lines[6], *lines[7:]]))
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == list(range(40))
+    assert source.report.notes[:2] == [f"cam{i}/data.csv is not in order of time: sorted by stamp" for i in (0, 1)]
+    assert "2 of 402 IMU samples repeat or go back in time: dropped" in source.report.notes
+    assert len(source.imu.t_ns) == 400
 
 
 def test_kitti_times_with_disorder(tmp_path):
