@@ -2,15 +2,16 @@
 
 An ``.npz`` with one row per observation: ``frame`` (M,), ``track`` (M,), ``uv_left``, ``uv_right`` (M, 2) [px]; per
 frame ``t_s`` (N,); ``fx fy cx cy`` [px] and ``baseline_m``. Where present: ``T_world_cam`` (N, 4, 4) truth of the left
-camera, ``gyro_body_radps`` and ``acc_body_mps2`` (N, 3) in body axes with ``R_cam_body`` (3, 3) and
-``p_body_cam_in_body_m`` (3,), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``; an IMU at
-its own rate in body axes as ``imu_t_ns`` (K,), ``imu_gyro_radps``, ``imu_acc_mps2`` (K, 3) and ``imu_noise`` (4,),
-the fields of :class:`gpvo.types.ImuNoise`.
+camera, NaN in frames without; ``gyro_body_radps`` and ``acc_body_mps2`` (N, 3) in body axes with ``R_cam_body``
+(3, 3) and ``p_body_cam_in_body_m`` (3,), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``;
+an IMU at its own rate in body axes as ``imu_t_ns`` (K,), ``imu_gyro_radps``, ``imu_acc_mps2`` (K, 3) and
+``imu_noise`` (4,), the fields of :class:`gpvo.types.ImuNoise`.
 """
 
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.cameras.models import PinholeRadtan
-from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import Array
@@ -115,7 +116,7 @@ class TracksSource:
         p = np.zeros(3)
         if "p_body_cam_in_body_m" in self._data:
             p = _shaped(self._data, "p_body_cam_in_body_m", (3,), self.path)
-        return se3.orthonormalise(se3.from_rt(R_cam_body.T, p))
+        return check_pose(se3.from_rt(R_cam_body.T, p), "R_cam_body", self.path)
 
     def _make_imu(self) -> ImuLog | None:
         n = len(self._t_ns)
@@ -146,13 +147,16 @@ class TracksSource:
     def _make_truth(self, noise: TruthNoise | None) -> TruthLog | None:
         if "T_world_cam" not in self._data:
             return None
-        T = _shaped(self._data, "T_world_cam", (len(self._t_ns), 4, 4), self.path)
-        keep = _growing(self._t_ns)
+        T = _shaped(self._data, "T_world_cam", (len(self._t_ns), 4, 4), self.path, finite=False)
+        keep = _growing(self._t_ns) & ~np.isnan(T[:, :3]).all(axis=(1, 2))
+        if not keep.any():
+            raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="leave it out: no truth")
+        poses = [check_pose(T[k], f"'T_world_cam' row {k}", self.path) for k in np.flatnonzero(keep)]
         stated = [self._data.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
         if noise is None and all(s is not None and s.shape == () for s in stated):
             noise = TruthNoise(*(float(s) for s in stated if s is not None))
         noise = noise or GPS_INS
-        return TruthLog(self._t_ns[keep], se3.orthonormalise(T[keep]), noise.translation_m, noise.rotation_rad)
+        return TruthLog(self._t_ns[keep], np.stack(poses), noise.translation_m, noise.rotation_rad)
 
 
 def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, NDArray[Any]]:
@@ -171,7 +175,7 @@ def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, NDArray[Any]
             data = {name: np.asarray(file[name]) for name in file.files}
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror or error}", where=path) from None
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
         raise SourceError(
             f"not readable as .npz: {str(error).splitlines()[0] if str(error) else error!r}", where=path
         ) from None
@@ -181,8 +185,10 @@ def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, NDArray[Any]
     return data
 
 
-def _shaped(data: dict[str, NDArray[Any]], key: str, shape: tuple[int | None, ...], path: Path) -> Array:
-    """``data[key]`` as finite float64 of the given shape; None matches any length."""
+def _shaped(
+    data: dict[str, NDArray[Any]], key: str, shape: tuple[int | None, ...], path: Path, *, finite: bool = True
+) -> Array:
+    """``data[key]`` as float64 of the given shape; None matches any length."""
     array = data[key]
     fits = array.ndim == len(shape) and all(s is None or s == n for s, n in zip(shape, array.shape))
     if not fits:
@@ -191,7 +197,7 @@ def _shaped(data: dict[str, NDArray[Any]], key: str, shape: tuple[int | None, ..
     if array.dtype.kind not in "fiu":
         raise SourceError(f"'{key}' holds {array.dtype}, not numbers", where=path)
     out = array.astype(np.float64)
-    if not np.isfinite(out).all():
+    if finite and not np.isfinite(out).all():
         first = int(np.argwhere(~np.isfinite(np.atleast_1d(out)))[0][0])
         raise SourceError(f"'{key}' is NaN or infinite at row {first}", where=path, cure="drop that row")
     return out

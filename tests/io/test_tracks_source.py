@@ -98,6 +98,21 @@ def test_stamps_with_disorder(tmp_path):
     assert (np.diff(source.truth.t_ns) > 0).all()
 
 
+def test_truth_with_dropouts(tmp_path):
+    data = arrays()
+    data["T_world_cam"][[0, 3]] = np.nan
+    data["T_world_cam"][3, 3] = [0, 0, 0, 1]
+    truth = open_source(save(tmp_path / "a.npz", data)).truth
+    assert (truth.t_ns // 10**8).tolist() == [1, 2, 4, 5]
+    np.testing.assert_allclose(truth.T_world_cam, data["T_world_cam"][[1, 2, 4, 5]], atol=1e-12)
+
+
+def _poses_with(row: np.ndarray) -> np.ndarray:
+    T = arrays()["T_world_cam"]
+    T[2] = row
+    return T
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -106,6 +121,10 @@ def test_stamps_with_disorder(tmp_path):
         ({"frame": np.full(100, 7)}, "'frame' goes to 7"),
         ({"t_s": np.array([0, 1, 2, np.nan, 4, 5])}, "'t_s' is NaN or infinite at row 3"),
         ({"T_world_cam": np.full((6, 4, 4), np.nan)}, "'T_world_cam' is NaN"),
+        ({"T_world_cam": _poses_with(np.zeros((4, 4)))}, "'T_world_cam' row 2 is not a rigid transform"),
+        ({"T_world_cam": _poses_with(np.diag([2.0, 2.0, 2.0, 1.0]))}, "row 2 is not a rigid transform"),
+        ({"T_world_cam": _poses_with(np.diag([1.0, 1.0, np.nan, 1.0]))}, "row 2 holds a number that is not finite"),
+        ({"R_cam_body": np.zeros((3, 3))}, "R_cam_body is not a rigid transform"),
         ({"uv_right": np.array([["a", "b"]] * 100)}, "not numbers"),
         ({"baseline_m": np.float64(-0.5)}, "left and right are swapped"),
         ({"fx": np.float64(-1)}, "focal lengths"),
@@ -129,13 +148,18 @@ def test_no_pickle_and_no_bomb(tmp_path, monkeypatch):
         open_source(save(tmp_path / "b.npz", arrays()))
 
 
-@pytest.mark.parametrize("how", ["cut", "rubbish", "zip"])
+@pytest.mark.parametrize("how", ["cut", "rubbish", "zip", "deflated"])
 def test_damaged_file(tmp_path, how):
     path = save(tmp_path / "a.npz", arrays())
     raw = path.read_bytes()
     if how == "zip":
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("frame.npy", b"no array")
+    elif how == "deflated":
+        np.savez_compressed(path, **arrays())
+        raw = bytearray(path.read_bytes())
+        raw[70:90] = b"\xff" * 20  # behind the header of the first array
+        path.write_bytes(raw)
     else:
         path.write_bytes(raw[: len(raw) // 2] if how == "cut" else b"rubbish" * 100)
     with pytest.raises(GpvoError) as caught:
