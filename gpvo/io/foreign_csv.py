@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.geometry.se3 import Array
 from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
-from gpvo.io.stamps import seconds_text_to_ns
+from gpvo.io.stamps import UNITS_NS, check_interval, text_to_ns
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
 _COV = tuple(f"cov_{i}{j}" for i in range(6) for j in range(6))
+_STAMPS = ("t_ns", "t_us", "t_ms", "t_s")
 # Everything that a column can be mapped to.
-TARGETS = ("t_s", "t_ns", *_POSE, *_COV, *COUNT_FIELDS, *FLOAT_FIELDS)
+TARGETS = (*_STAMPS, *_POSE, *_COV, *COUNT_FIELDS, *FLOAT_FIELDS)
 
-_STAMP_NAMES = {"t", "time", "timestamp", "stamp", "t_s", "t_ns", "time_s", "time_ns", "sec", "secs"}
+_STAMP_NAMES = {"t", "time", "timestamp", "stamp", "sec", "secs", *(f"time_{u}" for u in UNITS_NS)}
 _OPENVINS = {
     **{f"p{a}{b}": f"cov_{i}{j}" for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j},
     **{f"q{a}{b}": f"cov_{i + 3}{j + 3}" for i, a in enumerate("rpy") for j, b in enumerate("rpy") if i <= j},
@@ -43,7 +44,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     """Read a CSV with a header line (comma, semicolon, tab or blanks between).
 
     ``mapping`` gives column name -> target (one of :data:`TARGETS`) and goes before what the names suggest. A stamp is
-    in nanoseconds where its target or name says so or it has 16 digits and more, else in seconds.
+    in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds.
 
     Raises
     ------
@@ -59,21 +60,24 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     stamps: list[int] = []
     rows: list[list[float]] = []
     numbers: list[int] = []
-    order = [name for name in targets if name not in ("t_s", "t_ns")]
-    stamp = "t_ns" if "t_ns" in targets else "t_s"
+    order = [name for name in targets if name not in _STAMPS]
+    stamp = next(s for s in _STAMPS if s in targets)
+    is_stated = stamp in mapping.values()
     for number, fields in lines:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
         if len(fields) < len(header):
             raise SourceError(f"line {number} holds {len(fields)} fields, the header {len(header)}", where=path)
         try:
-            stamps.append(_stamp(fields[targets[stamp]], stamp))
+            stamps.append(_stamp(fields[targets[stamp]], stamp[2:], is_stated))
             rows.append([float(fields[targets[name]] or "nan") for name in order])
         except ValueError as error:
             raise SourceError(f"line {number}: {error}", where=path) from None
         numbers.append(number)
     if not rows:
         raise SourceError("holds a header and no rows", where=path)
+    column = header[targets[stamp]]
+    check_interval(stamps, path, f"name the unit: --map {column}=t_us, or t_ms, t_s, t_ns")
     data = np.array(rows, dtype=np.float64)
     return Table(np.array(stamps, dtype=np.int64), {n: data[:, i] for i, n in enumerate(order)}, numbers)
 
@@ -127,17 +131,17 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
             raise SourceError(
                 f"--map {column}={target}: there is no '{target}'",
                 where=path,
-                cure="targets are t_s or t_ns, p_x.., q_x..q_w, cov_00..cov_55, n_inliers and the other record fields",
+                cure="targets are t_s, t_ms, t_us, t_ns, p_x.., q_x..q_w, cov_00..cov_55, n_inliers and the like",
             )
         if column not in header:
             raise SourceError(f"has no column '{column}' (there are: {', '.join(header)})", where=path)
     found: dict[str, int] = {mapping[c]: header.index(c) for c in mapping}
     for index, column in enumerate(header):
         guess = None if column in mapping else _suggest(column)
-        if guess is not None and guess not in found and not (guess[:2] == "t_" and {"t_s", "t_ns"} & found.keys()):
+        if guess is not None and guess not in found and not (guess in _STAMPS and found.keys() & _STAMPS):
             found[guess] = index
     absent = [p for p in _POSE if p not in found]
-    if not {"t_s", "t_ns"} & found.keys():
+    if not found.keys() & _STAMPS:
         absent.insert(0, "t_s")
     if absent:
         raise SourceError(
@@ -155,7 +159,8 @@ def _suggest(column: str) -> str | None:
     if name in TARGETS:
         return name
     if name in _STAMP_NAMES:
-        return "t_ns" if name.endswith("_ns") or (unit and unit[1].strip() == "ns") else "t_s"
+        said = unit[1].strip() if unit else name.rpartition("_")[2]
+        return f"t_{said}" if said in UNITS_NS else "t_s"
     if name in _OPENVINS:
         return _OPENVINS[name]
     if covariance := re.fullmatch(r"(?:field_)?pose_covariance_?(\d+)_?", name):
@@ -174,9 +179,6 @@ def _suggest(column: str) -> str | None:
     return f"{'q' if is_quaternion else 'p'}_{pose[2]}"
 
 
-def _stamp(text: str, target: str) -> int:
-    if target == "t_ns":
-        return int(text) if text.lstrip("-").isdigit() else round(float(text))
-    if text.isdigit() and len(text) >= 16:
-        return int(text)
-    return seconds_text_to_ns(text)
+def _stamp(text: str, unit: str, is_stated: bool) -> int:
+    is_epoch_ns = unit == "s" and not is_stated and text.isdigit() and len(text) >= 16
+    return text_to_ns(text, "ns" if is_epoch_ns else unit)

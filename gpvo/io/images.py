@@ -21,7 +21,7 @@ from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.order import OrderCheck
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import in_order, usual_interval
+from gpvo.io.stamps import check_interval, in_order, usual_interval
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
@@ -239,6 +239,7 @@ class FileSource(ImageSource):
     ) -> None:
         if not pairs:
             raise SourceError("holds no image pair with equal stamps", where=path)
+        check_interval((p.t_ns for p in pairs), path, "names and lists hold nanoseconds, times.txt seconds")
         super().__init__(path, name, rig, known=known, **options)
         self._pairs = pairs
         self.span_ns = (min(p.t_ns for p in pairs), max(p.t_ns for p in pairs))

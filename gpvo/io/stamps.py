@@ -9,14 +9,24 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from gpvo.errors import SourceError
 from gpvo.io.source import SourceReport
 
 GAP_FACTOR = 1.75
 _WINDOW = 51
+UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+_UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+# Usual intervals of any odometry [ns]; beyond them the stamps are in another unit.
+_SHORTEST_NS, _LONGEST_NS = 1e5, 1e12
 
 
 def seconds_text_to_ns(text: str) -> int:
-    """Decimal seconds as written, to whole nanoseconds without passing through a float.
+    """Decimal seconds as written, to whole nanoseconds: :func:`text_to_ns`."""
+    return text_to_ns(text, "s")
+
+
+def text_to_ns(text: str, unit: str) -> int:
+    """A decimal number of ``unit`` (of :data:`UNITS_NS`) to whole nanoseconds without passing through a float.
 
     Raises
     ------
@@ -27,9 +37,10 @@ def seconds_text_to_ns(text: str) -> int:
         value = Decimal(text)
     except InvalidOperation:
         raise ValueError(f"'{text}' is not a number") from None
-    if not value.is_finite() or abs(value) > 9_200_000_000:
-        raise ValueError(f"'{text}' is not a stamp in seconds")
-    return int((value * 1_000_000_000).to_integral_value())
+    factor = UNITS_NS[unit]
+    if not value.is_finite() or abs(value) > Decimal(9_200_000_000_000_000_000) / factor:
+        raise ValueError(f"'{text}' is not a stamp in {_UNIT_NAMES[unit]}")
+    return int((value * factor).to_integral_value())
 
 
 def ns_to_seconds_text(t_ns: int) -> str:
@@ -101,6 +112,24 @@ def usual_interval(t_ns: Iterable[int]) -> float | None:
     """Median interval of stamps [ns], whatever their order; None for fewer than three."""
     stamps = np.unique(np.fromiter(t_ns, dtype=np.int64))
     return float(np.median(np.diff(stamps))) if len(stamps) > 2 else None
+
+
+def check_interval(t_ns: Iterable[int], where: object, cure: str) -> None:
+    """Refuse stamps whose usual interval no odometry has, because they are in another unit than they were read in.
+
+    Raises
+    ------
+    SourceError
+        Naming the interval, the likely unit and the ``cure``.
+    """
+    usual_ns = usual_interval(t_ns)
+    if usual_ns is None or _SHORTEST_NS <= usual_ns <= _LONGEST_NS:
+        return
+    # Too short: read as nanoseconds. Too long: read as seconds. Their own unit makes it a millisecond or more.
+    limits = ((1e3, "ms"), (1e15, "us"), (np.inf, "ns"))
+    unit = next(name for limit, name in limits if usual_ns < limit)
+    text = f"the stamps look like {_UNIT_NAMES[unit]}: as they were read, the usual interval is {usual_ns * 1e-9:.3g} s"
+    raise SourceError(text, where=where, cure=cure)
 
 
 def match_equal(

@@ -153,6 +153,37 @@ def test_bad_logs_in_one_line(tmp_path, text, reason):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("unit", "per_s"), [("us", 10**6), ("ms", 10**3)])
+def test_stamps_in_other_units(tmp_path, unit, per_s):
+    header = "timestamp,p_x,p_y,p_z,q_x,q_y,q_z,q_w"
+    path = _csv(tmp_path / "a.csv", header)
+    t = T_NS // 10**6 * 10**6
+    text = path.read_text()
+    for k in range(N):
+        text = text.replace(str(T_NS[k]), str(int(t[k]) * per_s // 10**9))
+    path.write_text(text)
+    reason = (
+        "look like microseconds.*--map timestamp=t_us" if unit == "us" else "'1403636579763' is not a stamp in seconds"
+    )
+    with pytest.raises(SourceError, match=reason):
+        read_foreign(path)
+    np.testing.assert_array_equal(read_foreign(path, mapping={"timestamp": f"t_{unit}"}).t_ns, t)
+    path.write_text(text.replace("timestamp", f"#timestamp [{unit}]"))
+    np.testing.assert_array_equal(read_foreign(path).t_ns, t)
+
+
+def test_a_column_mapped_to_seconds_is_seconds(tmp_path):
+    path = _csv(tmp_path / "a.csv", "when,p_x,p_y,p_z,q_x,q_y,q_z,q_w", stamp="{}")
+    with pytest.raises(SourceError, match="line 2: '1403636579763555584' is not a stamp in seconds"):
+        read_foreign(path, mapping={"when": "t_s"})
+    text = path.read_text()
+    for k in range(N):
+        text = text.replace(str(T_NS[k]), f"{k * 50_000:016d}")
+    path.write_text(text)
+    with pytest.raises(SourceError, match="look like microseconds"):
+        read_foreign(path, mapping={"when": "t_s"})
+
+
 def test_bad_mapping(tmp_path):
     path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
     with pytest.raises(SourceError, match="there is no 'speed'"):

@@ -347,6 +347,23 @@ def test_truth_of_another_time(tmp_path):
     assert str(truth) in _one_line(caught)
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(10**3, "microseconds"), (10**6, "milliseconds")])
+def test_names_in_another_unit(tmp_path, factor, unit):
+    path = seq.write_folder(tmp_path / "s")
+    for file in path.rglob("*.png"):
+        file.rename(file.with_stem(str(int(file.stem) // factor)))
+    with pytest.raises(SourceError, match=f"look like {unit}") as caught:
+        open_source(path)
+    assert "nanoseconds" in _one_line(caught)
+
+
+def test_times_in_microseconds(tmp_path):
+    path = seq.write_kitti(tmp_path / "s")
+    (path / "times.txt").write_text("".join(f"{k * 100_000}\n" for k in range(12)))
+    with pytest.raises(SourceError, match="look like microseconds"):
+        open_source(path)
+
+
 def test_kitti_poses_of_another_length(tmp_path):
     path = seq.write_kitti(tmp_path / "s")
     lines = (path / "poses.txt").read_text().splitlines()
