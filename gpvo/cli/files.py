@@ -15,6 +15,7 @@ def info(
     path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
     kind: options.Kind = None,
     calibration: options.Calibration = None,
+    pair_tolerance: options.PairTolerance = None,
     left_topic: options.LeftTopic = None,
     right_topic: options.RightTopic = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the document as JSON.")] = False,
@@ -26,7 +27,9 @@ def info(
     from gpvo.cli.describe import as_lines, describe
     from gpvo.cli.output import jsonable, print_json
 
-    given = options.source_options(calibration=calibration, left_topic=left_topic, right_topic=right_topic)
+    given = options.source_options(
+        calibration=calibration, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic
+    )
     document = jsonable(describe(path, kind, given))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})

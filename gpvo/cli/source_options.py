@@ -17,6 +17,9 @@ MaskLeft = Annotated[Path | None, typer.Option(help="Image of the left lens' usa
 MaskRight = Annotated[Path | None, typer.Option(help="The same of the right lens.")]
 Bits = Annotated[int | None, typer.Option(help="Depth of the samples in 16-bit images, e.g. 12.")]
 RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folder whose names are numbers.")]
+PairTolerance = Annotated[
+    float | None, typer.Option(help="How far the stamps of a pair may be apart [s]; bags, EuRoC and image folders.")
+]
 LeftTopic = Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")]
 RightTopic = Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")]
 ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")]

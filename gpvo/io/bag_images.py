@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.images import Image8, decode_grey8, to_grey8
 from gpvo.io.source import SourceReport
+from gpvo.io.stamps import no_pair
 
 # name: (type, channels, blue first)
 _ENCODINGS: dict[str, tuple[str, int, bool]] = {
@@ -61,17 +62,24 @@ def decode_message(message: Any, bits: int = 16) -> Image8 | None:
 
 
 def pair_streams(
-    stream: Iterable[tuple[str, Any]], left: str, tolerance_ns: int, report: SourceReport
+    stream: Iterable[tuple[str, Any]], left: str, tolerance_ns: int, report: SourceReport, where: object
 ) -> Iterator[tuple[int, Any, Any]]:
     """(left stamp, left message, right message) of messages whose stamps agree to ``tolerance_ns``.
 
     A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
+
+    Raises
+    ------
+    SourceError
+        At the end, where no message found a partner.
     """
     waiting: dict[bool, deque[tuple[int, Any]]] = {True: deque(), False: deque()}
+    nearest_ns: float = np.inf
     for topic, message in stream:
         is_left = topic == left
         t = stamp_ns(message)
         others = waiting[not is_left]
+        nearest_ns = min([nearest_ns, *(abs(s - t) for s, _ in others)])
         match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= tolerance_ns), None)
         if match is None:
             own = waiting[is_left]
@@ -85,6 +93,8 @@ def pair_streams(
         yield (t, message, other) if is_left else (s, other, message)
     for queue in waiting.values():
         _drop(queue, len(queue), report)
+    if tolerance_ns < nearest_ns < np.inf:
+        raise no_pair(tolerance_ns, int(nearest_ns), where)
 
 
 def _drop(queue: deque[tuple[int, Any]], count: int, report: SourceReport) -> None:

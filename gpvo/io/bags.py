@@ -33,7 +33,7 @@ from gpvo.io.bag_reader import (
 )
 from gpvo.io.images import Image8, ImageSource
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import usual_interval
+from gpvo.io.stamps import PAIR_TOLERANCE_S, usual_interval
 from gpvo.io.trajectory import Trajectory
 from gpvo.io.truth import MOTION_CAPTURE, UNKNOWN, TruthNoise, carry, check_overlap
 from gpvo.types import TruthLog
@@ -84,7 +84,7 @@ class BagSource(ImageSource):
         truth_topic: str | None = None,
         truth_frame: str | None = None,
         truth_noise: TruthNoise | None = None,
-        tolerance_s: float = 0.002,
+        tolerance_s: float = PAIR_TOLERANCE_S,
         calibration: str | Path | None = None,
         **options: Any,
     ) -> None:
@@ -120,7 +120,7 @@ class BagSource(ImageSource):
         topics = self._topics
         with open_bag(self.path) as reader:
             stream = messages(reader, [topics.left, topics.right])
-            for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report):
+            for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.bits), decode_message(right, self.bits)
 
     def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:

@@ -18,7 +18,7 @@ from gpvo.geometry.se3 import Array
 from gpvo.io.images import FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import match_equal
+from gpvo.io.stamps import PAIR_TOLERANCE_S, match_nearest
 from gpvo.io.trajectory import read_euroc_csv
 from gpvo.io.truth import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap
 from gpvo.types import ImuLog, ImuNoise, TruthLog
@@ -35,7 +35,8 @@ class EurocSource(FileSource):
     """A sequence folder that holds ``mav0/`` (or is it), with ``cam0 cam1`` and, where present, ``imu0`` and truth.
 
     The calibration is that of ``sensor.yaml`` in both camera folders, else a Kalibr chain in ``dso/`` or the folder
-    itself (TUM-VI). ``body.yaml`` with the line ``axes: FLU`` says that the body is x forward, y left, z up.
+    itself (TUM-VI). Stamps of a pair may differ by ``tolerance_s``. ``body.yaml`` with the line ``axes: FLU`` says that
+    the body is x forward, y left, z up.
     """
 
     format = "euroc"
@@ -45,13 +46,14 @@ class EurocSource(FileSource):
         path: Path,
         *,
         calibration: str | Path | None = None,
+        tolerance_s: float = PAIR_TOLERANCE_S,
         truth_noise: TruthNoise | None = None,
         **options: Any,
     ) -> None:
         mav = _mav_folder(path)
         rig = _read_rig(path, mav, None if calibration is None else Path(calibration))
         known = SourceReport()
-        super().__init__(path, path.resolve().name, rig, _list_pairs(mav, known), known, **options)
+        super().__init__(path, path.resolve().name, rig, _list_pairs(mav, tolerance_s, known), known, **options)
         self.imu = self._read_imu(mav)
         self.truth = self._read_truth(mav, truth_noise)
         if self.truth is None and (mav / "leica0").is_dir():
@@ -114,10 +116,11 @@ def _body_is_flu(mav: Path) -> bool:
     return body.is_file() and str(read_yaml(body).get("axes", "")).upper() == "FLU"
 
 
-def _list_pairs(mav: Path, known: SourceReport) -> list[PairFiles]:
+def _list_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
     left, right = (_read_image_list(mav / camera / "data.csv", known) for camera in ("cam0", "cam1"))
     folders = [mav / camera / "data" for camera in ("cam0", "cam1")]
-    return [PairFiles(t, folders[0] / a, folders[1] / b) for t, a, b in match_equal(left, right, known)]
+    pairs = match_nearest(left, right, round(tolerance_s * 1e9), known, mav)
+    return [PairFiles(t, folders[0] / a, folders[1] / b) for t, a, b in pairs]
 
 
 def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:

@@ -14,7 +14,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import match_equal, seconds_text_to_ns
+from gpvo.io.stamps import PAIR_TOLERANCE_S, match_nearest, seconds_text_to_ns
 from gpvo.io.trajectory import read_times, read_tum
 from gpvo.io.truth import UNKNOWN, TruthNoise, carry, check_overlap
 
@@ -29,8 +29,9 @@ class FolderSource(FileSource):
     """Pairs in ``left/ right/`` or ``cam0/ cam1/``, or named ``*_left.png *_right.png`` in one folder.
 
     Stamps are the names in nanoseconds (or decimal seconds), else the lines of ``times.txt`` (seconds) in the order
-    of the names, else ``rate_hz`` makes them from the number in the name. ``imu.csv`` (EuRoC columns) and
-    ``truth.tum`` (poses of the left camera as calibrated) are read where present.
+    of the names, else ``rate_hz`` makes them from the number in the name; those of a pair may differ by
+    ``tolerance_s``. ``imu.csv`` (EuRoC columns) and ``truth.tum`` (poses of the left camera as calibrated) are read
+    where present.
     """
 
     format = "folder"
@@ -41,6 +42,7 @@ class FolderSource(FileSource):
         *,
         calibration: str | Path | None = None,
         rate_hz: float | None = None,
+        tolerance_s: float = PAIR_TOLERANCE_S,
         truth_noise: TruthNoise = UNKNOWN,
         **options: Any,
     ) -> None:
@@ -53,7 +55,9 @@ class FolderSource(FileSource):
             )
         rig = read_stereo_yaml(chain)
         known = SourceReport()
-        super().__init__(path, path.resolve().name, rig, _list_pairs(path, rate_hz, known), known, **options)
+        super().__init__(
+            path, path.resolve().name, rig, _list_pairs(path, rate_hz, tolerance_s, known), known, **options
+        )
         if (path / "imu.csv").is_file():
             noise = path / "imu.yaml"
             self.imu = read_imu_csv(
@@ -82,7 +86,7 @@ def _is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES
 
 
-def _list_pairs(path: Path, rate_hz: float | None, known: SourceReport) -> list[PairFiles]:
+def _list_pairs(path: Path, rate_hz: float | None, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
     left, right = _find_images(path)
     if not left or not right:
         raise SourceError(
@@ -92,7 +96,8 @@ def _list_pairs(path: Path, rate_hz: float | None, known: SourceReport) -> list[
     lists = [
         [(stamps[key], key) for key in sorted(side, key=stamps.__getitem__) if key in stamps] for side in (left, right)
     ]
-    return [PairFiles(t, left[a], right[b]) for t, a, b in match_equal(lists[0], lists[1], known)]
+    pairs = match_nearest(lists[0], lists[1], round(tolerance_s * 1e9), known, path)
+    return [PairFiles(t, left[a], right[b]) for t, a, b in pairs]
 
 
 def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:

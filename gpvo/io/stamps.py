@@ -8,11 +8,13 @@ from decimal import Decimal, InvalidOperation
 from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.io.source import SourceReport
 
 GAP_FACTOR = 1.75
+PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
 _WINDOW = 51
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
@@ -132,33 +134,59 @@ def check_interval(t_ns: Iterable[int], where: object, cure: str) -> None:
     raise SourceError(text, where=where, cure=cure)
 
 
-def match_equal(
-    left: list[tuple[int, str]], right: list[tuple[int, str]], report: SourceReport
-) -> Iterator[tuple[int, str, str]]:
-    """Pairs of (stamp, name) lists by equal stamp, in the order of the left list.
+def match_nearest(
+    left: list[tuple[int, str]], right: list[tuple[int, str]], tolerance_ns: int, report: SourceReport, where: object
+) -> list[tuple[int, str, str]]:
+    """(left stamp, left name, right name) of images each other's nearest and at most ``tolerance_ns`` apart.
 
-    Stamps that one camera alone has are counted as missing, repeated ones as duplicate; order is judged later, when
-    the frames run.
+    In order of time. Images that stay alone are counted as missing, repeated stamps as duplicate.
+
+    Raises
+    ------
+    SourceError
+        Where no image has a partner.
     """
-    by_stamp: dict[int, str] = {}
-    for t_ns, name in right:
-        if t_ns in by_stamp:
-            report.duplicate += 1
-            report.note(f"right stamp {t_ns} ns twice")
-        else:
-            by_stamp[t_ns] = name
-    seen: set[int] = set()
-    for t_ns, name in left:
-        if t_ns in seen:
-            report.duplicate += 1
-            report.note(f"left stamp {t_ns} ns twice")
-            continue
-        seen.add(t_ns)
-        if t_ns in by_stamp:
-            yield t_ns, name, by_stamp[t_ns]
-        else:
-            report.missing += 1
-            report.note(f"no right image for {t_ns} ns")
-    for t_ns in by_stamp.keys() - seen:
+    names = [_by_stamp(images, side, report) for images, side in ((left, "left"), (right, "right"))]
+    t_left, t_right = (np.array(sorted(n), dtype=np.int64) for n in names)
+    if len(t_left) == 0 or len(t_right) == 0:
+        return []
+    partner = _nearest(t_left, t_right)
+    apart = np.abs(t_right[partner] - t_left)
+    paired = (apart <= tolerance_ns) & (_nearest(t_right, t_left)[partner] == np.arange(len(t_left)))
+    if not paired.any():
+        raise no_pair(tolerance_ns, int(apart.min()), where)
+    for t in t_left[~paired]:
         report.missing += 1
-        report.note(f"no left image for {t_ns} ns")
+        report.note(f"no right image for {t} ns")
+    for t in np.delete(t_right, partner[paired]):
+        report.missing += 1
+        report.note(f"no left image for {t} ns")
+    both = zip(t_left[paired].tolist(), t_right[partner[paired]].tolist(), strict=True)
+    return [(a, names[0][a], names[1][b]) for a, b in both]
+
+
+def no_pair(tolerance_ns: int, nearest_ns: int, where: object) -> SourceError:
+    """What to raise where both cameras have images and none of them belong together."""
+    return SourceError(
+        f"no pair within {tolerance_ns * 1e-6:g} ms; the nearest are {nearest_ns * 1e-6:.6g} ms apart",
+        where=where,
+        cure="put both cameras on one clock, or allow more with --pair-tolerance SECONDS",
+    )
+
+
+def _by_stamp(images: list[tuple[int, str]], side: str, report: SourceReport) -> dict[int, str]:
+    """Name by stamp, the first of those that repeat."""
+    names: dict[int, str] = {}
+    for t_ns, name in images:
+        if t_ns in names:
+            report.duplicate += 1
+            report.note(f"{side} stamp {t_ns} ns twice")
+        names.setdefault(t_ns, name)
+    return names
+
+
+def _nearest(t: NDArray[np.int64], among: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Index of the nearest of the sorted stamps ``among``, for each of ``t``."""
+    after = np.searchsorted(among, t).clip(max=len(among) - 1)
+    before = (after - 1).clip(min=0)
+    return np.where(np.abs(among[before] - t) <= np.abs(among[after] - t), before, after)

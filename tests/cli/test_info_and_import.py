@@ -264,3 +264,14 @@ def test_run_says_what_the_source_remarks(gpvo, tmp_path):
     assert err.count("poses on '/vicon/head/head' not used as truth") == 1
     code, _, err = gpvo("run", path, "-o", tmp_path / "run", "--preset", "thesis", "--truth-topic", "none")
     assert (code, err) == (0, "")
+
+
+def test_pair_tolerance(gpvo, tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    late = [f"{t + 4_000_000},{t}.png" for t in seq.stamps(12)]
+    (path / "mav0" / "cam1" / "data.csv").write_text("\n".join(late))
+    code, _, err = gpvo("info", path)
+    assert code == 2
+    assert "the nearest are 4 ms apart" in err
+    code, out, _ = gpvo("info", path, "--pair-tolerance", "0.005", "--json")
+    assert (code, json.loads(out)["frames"]) == (0, 12)

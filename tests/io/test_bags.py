@@ -57,6 +57,12 @@ def test_lone_camera_does_not_pile_up(tmp_path):
     assert source.report.missing == 40
 
 
+def test_cameras_that_never_meet(tmp_path):
+    path = _write(tmp_path, "ros1")
+    with pytest.raises(SourceError, match=r"no pair within 0\.1 ms; the nearest are 0\.3 ms apart .*--pair-tolerance"):
+        list(open_source(path, tolerance_s=1e-4))
+
+
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "bgra8", "mono16", "8UC1", "bayer_rggb8"])
 def test_encodings(tmp_path, encoding):
     maker = BagMaker(ros1=True)

@@ -94,6 +94,30 @@ def test_euroc_lists_and_imu_in_any_order(tmp_path):
     assert len(source.imu.t_ns) == 400
 
 
+def _delay_the_right(path, kind: str, delay_ns: int) -> None:
+    if kind == "folder":
+        for file in (path / "right").iterdir():
+            file.rename(file.with_stem(str(int(file.stem) + delay_ns)))
+        return
+    lines = [f"{t + delay_ns},{t}.png" for t in seq.stamps(12) if t != seq.stamps(12)[5]]
+    (path / "mav0/cam1/data.csv").write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize("kind", ["euroc", "folder"])
+def test_the_right_camera_a_little_late(tmp_path, kind):
+    path = MAKERS[kind](tmp_path / "s")
+    _delay_the_right(path, kind, 1_500_000)
+    source = open_source(path)
+    expected = [(t, k) for k, t in enumerate(seq.stamps(12)) if kind == "folder" or k != 5]
+    assert seq.frames_of(source) == expected
+    assert source.report.missing == 12 - len(expected)
+    with pytest.raises(SourceError, match=r"no pair within 1 ms; the nearest are 1\.5 ms apart") as caught:
+        open_source(path, tolerance_s=1e-3)
+    assert "--pair-tolerance" in _one_line(caught)
+    # However much is allowed, each image has one partner.
+    assert seq.frames_of(open_source(path, tolerance_s=1.0)) == expected
+
+
 def test_kitti_times_with_disorder(tmp_path):
     path = seq.write_kitti(tmp_path / "s")
     times = [0.0, 0.1, 0.2, 0.2, 0.4, 99.0, 0.6, 0.7, 0.65, 0.9, 1.0, 1.1]
