@@ -55,9 +55,8 @@ class FolderSource(FileSource):
             )
         rig = read_stereo_yaml(chain)
         known = SourceReport()
-        super().__init__(
-            path, path.resolve().name, rig, _list_pairs(path, rate_hz, tolerance_s, known), known, **options
-        )
+        pairs = _list_pairs(path, rate_hz, tolerance_s, known)
+        super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         if (path / "imu.csv").is_file():
             noise = path / "imu.yaml"
             self.imu = read_imu_csv(
@@ -93,9 +92,7 @@ def _list_pairs(path: Path, rate_hz: float | None, tolerance_s: float, known: So
             "holds no image pairs", where=path, cure="left/ and right/ with equal names, or names ending _left, _right"
         )
     stamps = _stamps(path, sorted({*left, *right}), rate_hz, known)
-    lists = [
-        [(stamps[key], key) for key in sorted(side, key=stamps.__getitem__) if key in stamps] for side in (left, right)
-    ]
+    lists = [[(stamps[key], key) for key in side if key in stamps] for side in (left, right)]
     pairs = match_nearest(lists[0], lists[1], round(tolerance_s * 1e9), known, path)
     return [PairFiles(t, left[a], right[b]) for t, a, b in pairs]
 

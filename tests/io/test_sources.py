@@ -208,6 +208,9 @@ def test_one_folder_with_sides_and_times(tmp_path):
     assert [k for _, k in frames] == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
     assert [t for t, _ in frames] == [10_000_000_000 + 50_000_000 * k for _, k in frames]
     assert source.report.missing == 2
+    # The last two frames without a line.
+    (tmp_path / "times.txt").write_text("".join(f"{10 + 0.05 * k:.3f}\n" for k in range(10)))
+    assert [k for _, k in seq.frames_of(open_source(tmp_path))] == [0, 1, 2, 4, 5, 6, 7, 9]
 
 
 def test_folder_with_truth_and_imu(tmp_path):
