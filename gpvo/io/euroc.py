@@ -18,7 +18,7 @@ from gpvo.geometry.se3 import Array
 from gpvo.io.images import FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, match_nearest
+from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest
 from gpvo.io.trajectory import read_euroc_csv
 from gpvo.io.truth import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap
 from gpvo.types import ImuLog, ImuNoise, TruthLog
@@ -136,11 +136,13 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
             continue
         stamp, _, name = (part.strip() for part in text.partition(","))
         name = name or f"{stamp}.png"
-        if not stamp.isdigit() or not _is_plain_name(name):
+        try:
+            if not _is_plain_name(name):
+                raise ValueError
+            out.append((integer_ns(stamp), name))
+        except ValueError:
             known.unreadable += 1
             known.note(f"{path.parent.name}/{path.name} line {number} is no 'stamp_ns,file'")
-            continue
-        out.append((int(stamp), name))
     if not out:
         raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
     in_time = sorted(out, key=lambda line: line[0])

@@ -14,7 +14,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, match_nearest, seconds_text_to_ns
+from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns
 from gpvo.io.trajectory import read_times, read_tum
 from gpvo.io.truth import UNKNOWN, TruthNoise, carry, check_overlap
 
@@ -122,7 +122,10 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
     """Stamp [ns] of each key."""
     numbers = {k: found[-1] for k in keys if (found := _DIGITS.findall(k))}
     if len(numbers) == len(keys) and all(_is_stamp(n) for n in numbers.values()):
-        return {k: seconds_text_to_ns(n) if "." in n else int(n) for k, n in numbers.items()}
+        try:
+            return {k: seconds_text_to_ns(n) if "." in n else integer_ns(n) for k, n in numbers.items()}
+        except ValueError as error:
+            raise SourceError(f"image names: {error}", where=path, cure="name them by nanoseconds") from None
     times = path / "times.txt"
     if times.is_file():
         return _stamps_by_line(path, keys, numbers, known)

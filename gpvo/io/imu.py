@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import SourceError
+from gpvo.io.stamps import integer_ns
 from gpvo.types import ImuLog, ImuNoise
 
 
@@ -38,7 +39,7 @@ def read_imu_csv(
                     continue
                 try:
                     fields = text.split(",")
-                    stamps.append(int(fields[0]))
+                    stamps.append(integer_ns(fields[0].strip()))
                     rows.append([float(f) for f in fields[1:7]])
                     if len(rows[-1]) != 6 or not np.isfinite(rows[-1]).all():
                         raise ValueError

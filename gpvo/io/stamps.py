@@ -45,6 +45,20 @@ def text_to_ns(text: str, unit: str) -> int:
     return int((value * factor).to_integral_value())
 
 
+def integer_ns(text: str) -> int:
+    """A whole number of nanoseconds.
+
+    Raises
+    ------
+    ValueError
+        Where the text is something else, or not of the years 0 to 2262.
+    """
+    # Some exporters write stamps like 1.4036365e+18; those digits are lost for good.
+    if not text.lstrip("-").isdigit():
+        raise ValueError(f"'{text}' is not a whole number of nanoseconds")
+    return text_to_ns(text, "ns")
+
+
 def ns_to_seconds_text(t_ns: int) -> str:
     """Nanoseconds as decimal seconds with nine digits."""
     sign, t = ("-", -int(t_ns)) if t_ns < 0 else ("", int(t_ns))

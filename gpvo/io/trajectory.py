@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import Array
-from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns
+from gpvo.io.stamps import integer_ns, ns_to_seconds_text, seconds_text_to_ns
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
@@ -53,7 +53,7 @@ def read_euroc_csv(path: str | Path) -> Trajectory:
         As :func:`read_tum`.
     """
     p = Path(path)
-    rows = _rows(p, ",", at_least=8, stamp=_integer_ns, what="t[ns],px,py,pz,qw,qx,qy,qz")
+    rows = _rows(p, ",", at_least=8, stamp=integer_ns, what="t[ns],px,py,pz,qw,qx,qy,qz")
     return _from_rows(p, rows, q_columns=(4, 5, 6, 3))
 
 
@@ -162,13 +162,6 @@ def _floats(path: Path, number: int, fields: list[str]) -> Array:
             f"line {number} holds NaN or infinity", where=path, cure="remove the line: a gap is better than a lie"
         )
     return values
-
-
-def _integer_ns(text: str) -> int:
-    # Some exporters write stamps like 1.4036365e+18; those digits are lost for good.
-    if not text.lstrip("-").isdigit():
-        raise ValueError(f"'{text}' is not a whole number of nanoseconds")
-    return int(text)
 
 
 def _rows(

@@ -384,6 +384,40 @@ def test_names_in_another_unit(tmp_path, factor, unit):
     assert "nanoseconds" in _one_line(caught)
 
 
+FAR = "99999999999999999999"  # beyond 64 bit
+
+
+@pytest.mark.parametrize(
+    ("file", "reason"),
+    [
+        ("imu0", r"imu0/data\.csv: line 3: expected t\[ns\]"),
+        ("state_groundtruth_estimate0", r"data\.csv: line 3: '9{20}' is not a stamp in nanoseconds"),
+        ("cam0", None),
+    ],
+)
+def test_stamps_beyond_64_bit(tmp_path, file, reason):
+    path = seq.write_euroc(tmp_path / "s")
+    table = path / "mav0" / file / "data.csv"
+    lines = table.read_text().splitlines()
+    lines[2] = FAR + lines[2][19:]
+    table.write_text("\n".join(lines))
+    if reason is None:
+        assert len(seq.frames_of(open_source(path))) == 11
+        return
+    with pytest.raises(SourceError, match=reason) as caught:
+        open_source(path)
+    _one_line(caught)
+
+
+def test_names_beyond_64_bit(tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    for side in ("left", "right"):
+        file = next((path / side).iterdir())
+        file.rename(file.with_stem(FAR))
+    with pytest.raises(SourceError, match="'9{20}' is not a stamp in nanoseconds"):
+        open_source(path)
+
+
 def test_times_in_microseconds(tmp_path):
     path = seq.write_kitti(tmp_path / "s")
     (path / "times.txt").write_text("".join(f"{k * 100_000}\n" for k in range(12)))
