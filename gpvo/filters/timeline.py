@@ -46,12 +46,13 @@ class Step:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A used record with the filter, clock and reference as they were before it."""
+    """A used record with the filter, clocks and reference as they were before it."""
 
     record: VoRecord
     noise: MotionNoise | None
     filter: ErrorStateFilter
     t_ns: int
+    bias_ns: int
     reference_ns: int | None
     wait: Wait
 
@@ -87,6 +88,7 @@ class Timeline:
         self._with_imu = with_imu
         self._history_ns = round(history_s * 1e9)
         self._history: deque[_Entry] = deque()
+        self._bias_ns = self.t_ns
         self._reference_ns: int | None = self.t_ns
         self._wait = Wait.since(self.t_ns, filter.batch)
         self._newest_ns: int | None = None
@@ -141,10 +143,11 @@ class Timeline:
     def _step(self, record: VoRecord, noise: MotionNoise | None) -> Step:
         self._remember(record, noise)
         self._propagate(self.filter, self.t_ns, record.t_ns, self.counts)
-        elapsed = (record.t_ns - self.t_ns) * 1e-9
         self.t_ns = self._newest_ns = record.t_ns
         if noise is not None and noise.bias_tau_s is not None:
-            self.filter.decay_bias(elapsed, noise.bias_tau_s)
+            # Since it last did, not since the last record: VO's bias goes on changing while frames are lost.
+            self.filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.bias_tau_s)
+            self._bias_ns = record.t_ns
         step = self._measure(record, noise)
         judged = step.innovation
         passed, own_fault = (True, False) if judged is None else (judged.passed, judged.own_fault)
@@ -175,7 +178,7 @@ class Timeline:
         if self._history_ns <= 0:
             self._drop_imu_before(self.t_ns)
             return
-        state = (self.filter.copy(), self.t_ns, self._reference_ns, self._wait)
+        state = (self.filter.copy(), self.t_ns, self._bias_ns, self._reference_ns, self._wait)
         self._history.append(_Entry(record, noise, *state))
         while self._history[0].record.t_ns < record.t_ns - self._history_ns:
             self._history.popleft()
@@ -187,7 +190,7 @@ class Timeline:
         if not later or later[0].t_ns > t_ns:
             return None
         first = later[0]
-        self.filter, self.t_ns = first.filter, first.t_ns
+        self.filter, self.t_ns, self._bias_ns = first.filter, first.t_ns, first.bias_ns
         self._reference_ns, self._wait = first.reference_ns, first.wait
         for entry in later:
             self._history.remove(entry)

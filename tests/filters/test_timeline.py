@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
+from gpvo.filters.measurement import BIAS
 from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.propagation import BA
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
 from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, ErrorLaw, Events, synthetic_flight
 from gpvo.filters.timeline import Timeline
@@ -134,6 +136,23 @@ def test_darkness_frozen_frames_and_bursts_do_not_diverge() -> None:
         assert run.scores is not None
         assert not run.scores.diverged
         assert run.scores.final_error_m < 2.0
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_bias_of_vo_is_forgotten_over_lost_frames(late: bool) -> None:
+    """What the filter's biases share with VO's falls by exp(-t / tau), however many of the frames were measured."""
+    dark = synthetic_flight(8, duration_s=6, law=ErrorLaw(bias_tau_s=2.0), events=Events(dark=(0.3, 5.0)))
+    timeline = _timeline(dark, history_s=10.0)
+    _feed_imu(timeline, dark)
+    _feed(timeline, dark, list(range(6)))
+    before = timeline.filter.P[0, BIAS, BA].copy()
+    after = replace(dark.records[100], T_prev_cur=np.full((4, 4), np.nan))  # one that moves nothing
+    lost = list(range(6, 100))
+    _feed(timeline, dark, [] if late else lost)
+    timeline.add_vo(after, dark.predictions[after.t_ns])
+    _feed(timeline, dark, lost if late else [])
+    assert np.abs(before).max() > 0
+    np.testing.assert_allclose(timeline.filter.P[0, BIAS, BA], np.exp(-4.75 / 2.0) * before, rtol=1e-9)
 
 
 def test_a_record_from_an_unknown_reference_is_skipped_and_counted(flight: Flight) -> None:
