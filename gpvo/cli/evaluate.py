@@ -45,9 +45,10 @@ def evaluate(
 
     found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
     if plots is not None:
+        from gpvo.evaluation.evaluate import distinct
         from gpvo.evaluation.plots import save_all
 
-        for evaluation, name in zip(found, _distinct([e.run.name for e in found]), strict=True):
+        for evaluation, name in zip(found, distinct([e.run.name for e in found]), strict=True):
             save_all(evaluation, plots, name)
     if json_:
         print_json(document(found))
@@ -137,17 +138,6 @@ def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options:
     if given is not None:
         loaded = [replace(run, truth=given) for run in loaded]
     return [evaluate_run(run, predictor, options) for run in loaded]
-
-
-def _distinct(names: list[str]) -> list[str]:
-    """The names, later ones of a kind numbered: ``a``, ``a-2``."""
-    out: list[str] = []
-    for name in names:
-        k, candidate = 2, name
-        while candidate in out:
-            candidate, k = f"{name}-{k}", k + 1
-        out.append(candidate)
-    return out
 
 
 def _print(e: Evaluation) -> None:

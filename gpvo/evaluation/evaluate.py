@@ -144,6 +144,17 @@ def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
     return truth, float(offset_s)
 
 
+def distinct(names: Sequence[str]) -> list[str]:
+    """Names of runs, later ones of a kind numbered: ``a``, ``a-2``."""
+    out: list[str] = []
+    for name in names:
+        k, candidate = 2, name
+        while candidate in out:
+            candidate, k = f"{name}-{k}", k + 1
+        out.append(candidate)
+    return out
+
+
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """The result as scripts read it; what could not be computed is None. SI units; the names are part of the interface.
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
+from gpvo.evaluation.evaluate import distinct
 from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
@@ -151,7 +152,10 @@ def fuse_runs(
     tell: Callable[[str], None] | None = None,
     on_run: Callable[[FusedRun], None] | None = None,
 ) -> FusionReport:
-    """Fuse run folders under every policy that has what it needs; ``on_run`` sees each filtered run whole."""
+    """Fuse run folders under every policy that has what it needs; ``on_run`` sees each filtered run whole.
+
+    Runs of one name are told apart by numbers: ``run``, ``run-2``.
+    """
     tell = tell or (lambda _: None)
     unknown = [p for p in settings.policies if p not in POLICIES]
     if unknown:
@@ -160,8 +164,8 @@ def fuse_runs(
     runs = [read_run(path) for path in paths]
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
-    for run in runs:
-        flight = flight_of(run, predictor, use_imu=settings.use_imu)
+    for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
+        flight = replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name)
         warnings += [f"{flight.name}: {finding}" for finding in require_sane(flight)]
         flights.append(flight)
     constants = _constants(settings, predictor, flights, options, tell)

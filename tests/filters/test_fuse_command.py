@@ -11,6 +11,7 @@ import pytest
 import yaml
 from gpvo.cli import app
 from gpvo.errors import GpvoError
+from gpvo.evaluation.fusion import FusionSettings, fuse_runs
 from gpvo.filters.policies import POLICIES
 from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
@@ -72,6 +73,17 @@ def test_json_holds_every_policy(runs: list[Path], tmp_path: Path) -> None:
             assert scores["diverged"] is False
     assert out["mean"]["triangulation"] is None
     assert out["mean"]["learned"]["ate_rmse_m"] < out["mean"]["constant"]["ate_rmse_m"]
+
+
+def test_two_runs_of_one_name_are_told_apart(runs: list[Path], tmp_path: Path) -> None:
+    flight = _write(tmp_path / "flight0", 1)
+    report = fuse_runs([runs[0], flight], FusionSettings(policies=("learned",)))
+    assert [t.run for t in report.traces] == ["flight0", "flight0-2"]
+    out = json.loads(_run("fuse", runs[0], flight, "--policies", "learned", "--log", tmp_path / "log", "--json"))
+    assert [r["run"] for r in out["runs"]] == ["flight0", "flight0-2"]
+    logs = {p.name: p.read_text() for p in (tmp_path / "log").iterdir()}
+    assert set(logs) == {"flight0_learned.csv", "flight0-2_learned.csv"}
+    assert len(set(logs.values())) == 2
 
 
 def test_table_without_model_or_training(runs: list[Path]) -> None:
