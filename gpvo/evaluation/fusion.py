@@ -188,7 +188,8 @@ def fuse_runs(
         progress=tell,
         on_run=keep,
     )
-    warnings += [f"{name}: {_why_not(name)}" for name, row in result.scores.items() if not any(row)]
+    filtered = {t.policy for t in traces}
+    warnings += [f"{name}: {_why_not(name)}" for name in result.scores if name not in filtered]
     return FusionReport(result, tuple(traces), tuple(warnings))
 
 
@@ -216,7 +217,7 @@ def _constants(
             training = [flight_of(run, use_imu=settings.use_imu) for run in runs]
             best = fit_scalars(training, constants, options, progress=lambda n: tell(f"constant_best on {n}"))
             constants = replace(constants, best=best)
-    if constants and CONSTANT_HINDSIGHT in settings.policies and all(f.T_world_cam is not None for f in flights):
+    if constants and CONSTANT_HINDSIGHT in settings.policies and all(f.has_truth for f in flights):
         tuned = fit_scalars(flights, constants, options, progress=lambda n: tell(f"constant_hindsight on {n}"))
         constants = replace(constants, hindsight=tuned)
     return constants
@@ -226,9 +227,10 @@ def trace_of(flight: Flight, fused: FusedRun) -> Trace:
     position = fused.T_world_cam[:, :3, 3]
     truth = None
     error = np.full(len(position), np.nan)
-    if flight.T_world_cam is not None:
+    if flight.T_world_cam is not None and flight.has_truth:
         index = {r.t_ns: i for i, r in enumerate(flight.records)}
-        truth = flight.T_world_cam[[index[int(t)] for t in fused.t_ns], :3, 3]
+        rows = [index[int(t)] for t in fused.t_ns]
+        truth = np.where(flight.known[rows, None], flight.T_world_cam[rows, :3, 3], np.nan)
         error = np.linalg.norm(position - truth, axis=1)
     return Trace(
         run=flight.name,

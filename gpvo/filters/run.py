@@ -61,9 +61,18 @@ class Flight:
         return (t_ns >= self.imu.t_ns.min() - _IMU_MARGIN_NS) & (t_ns <= self.imu.t_ns.max() + _IMU_MARGIN_NS)
 
     @property
+    def has_truth(self) -> bool:
+        """Whether any record that the IMU reaches has truth; truth elsewhere says nothing of what is filtered."""
+        if self.T_world_cam is None:
+            return False
+        return self.truth_valid is None or bool((self.covered & self.truth_valid).any())
+
+    @property
     def known(self) -> NDArray[np.bool_]:
         """(N,) which of these have truth, where there is any."""
-        return self.covered if self.truth_valid is None else self.covered & self.truth_valid
+        if self.truth_valid is None or not self.has_truth:
+            return self.covered
+        return self.covered & self.truth_valid
 
     @property
     def first(self) -> int:
@@ -104,18 +113,17 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     """The start that every policy shares, and the gravity vector where it is not the usual one."""
     k = flight.first
     t0 = flight.records[k].t_ns
-    known = flight.T_world_cam is not None
     if options.init == "static":
         if flight.imu is None:
             raise GpvoError("a static start needs an IMU", where=flight.name, cure="use --init truth")
         still = StaticTest(sigmas=options.sigmas)
-        if not known:
+        if not flight.has_truth:
             return from_rest(flight.imu, t0, still), None
         rest = from_rest(flight.imu, t0, still).nominal.R_world_imu[0]
         yaw = heading(flight.T_world_imu[k, :3, :3], rest.T @ np.array([0.0, 0.0, 1.0]))
         return from_rest(flight.imu, t0, still, yaw_rad=yaw, position=flight.T_world_imu[k, :3, 3]), None
-    if not known:
-        raise GpvoError("--init truth needs ground truth", where=flight.name, cure="use --init static")
+    if not flight.has_truth:
+        raise GpvoError("--init truth needs ground truth of the frames", where=flight.name, cure="use --init static")
     valid = np.flatnonzero(flight.known)
     if len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
@@ -232,7 +240,7 @@ def _member(
     failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
     counts = {**timeline.counts, "rejected": failed}
     scores = None
-    if flight.T_world_cam is not None:
+    if flight.has_truth:
         scores = _score(flight, t_ns, T_imu, T_cam, covariance, nis, failed, options.score_gap_s)
     return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, note)
 

@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 def check_flight(flight: Flight) -> list[Finding]:
     """Everything that looks wrong with a flight's inputs, the worst first."""
     found = list(_covariances(flight))
+    if flight.T_world_cam is not None and not flight.has_truth:
+        text = "no frame that the IMU reaches has ground truth; the run is not scored"
+        found.append(Finding("truth", text, fatal=False))
     if flight.imu is not None:
         clocks = list(_clocks(flight, flight.imu))
         found += clocks

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.errors import GpvoError
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import (
     CONSTANT,
@@ -72,9 +73,13 @@ def fit_scalars(
 ) -> tuple[float, float]:
     """One translation and one rotation scalar on the variances that minimise the mean ATE over ``flights``.
 
-    On training runs this is ``constant_best``; on the test runs themselves, ``constant_hindsight``.
+    On training runs this is ``constant_best``; on the test runs themselves, ``constant_hindsight``. Flights without
+    truth are passed over; raises ``GpvoError`` where all are.
     """
     options = options or FuseOptions()
+    flights = [f for f in flights if f.has_truth]
+    if not flights:
+        raise GpvoError("no run has ground truth to tune a constant on", cure="give other runs to --train")
     with np.errstate(all="ignore"):
         coarse = _pairs(_COARSE, _COARSE)
         some = flights[:: -(-len(flights) // _COARSE_FLIGHTS)]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy, split_noise
 from gpvo.filters.run import FuseOptions, fuse_flight
@@ -39,6 +40,15 @@ def test_nees_of_honest_and_of_overconfident_states() -> None:
     assert metrics.position_nees(np.zeros((20000, 3)), error, C).mean() == pytest.approx(1.0, abs=0.03)
     R = se3.so3_exp(error)
     assert metrics.attitude_nees(np.tile(np.eye(3), (20000, 1, 1)), R, C / 4).mean() == pytest.approx(4.0, abs=0.15)
+
+
+def test_constants_are_tuned_on_flights_with_truth() -> None:
+    flights = [synthetic_flight(seed, duration_s=4) for seed in (1, 2)]
+    blind = replace(flights[0], truth_valid=np.zeros(len(flights[0].records), bool))
+    constants, options = Constants(np.full(6, 1e-4), 0.05), FuseOptions(history_s=0.0)
+    assert fit_scalars([blind, flights[1]], constants, options) == fit_scalars(flights[1:], constants, options)
+    with pytest.raises(GpvoError, match="no run has ground truth"):
+        fit_scalars([blind], constants, options)
 
 
 def test_divergence() -> None:

@@ -13,6 +13,7 @@ from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionSettings, fuse_runs
 from gpvo.filters.policies import POLICIES
+from gpvo.filters.run import FuseOptions
 from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
@@ -162,3 +163,24 @@ def test_a_run_whose_imu_log_is_elsewhere_in_time(tmp_path: Path) -> None:
     write_run(tmp_path / "late", VoLog(flight.records), mounting=MOUNTING, truth=truth, imu=imu)
     with pytest.raises(GpvoError, match="do not overlap"):
         _run("fuse", tmp_path / "late")
+
+
+def test_truth_where_there_is_no_imu_is_no_truth(tmp_path: Path) -> None:
+    """At rest, with an IMU in the first half and truth in the second: a start from rest at the origin, and no score."""
+    flight = with_geometric(synthetic_flight(1, duration_s=4), np.diag([4e-4] * 3 + [4e-6] * 3), "pointing_matching")
+    assert flight.imu is not None
+    records = [replace(r, T_prev_cur=np.eye(4)) for r in flight.records]
+    imu = ImuLog(flight.imu.t_ns[:400], np.zeros((400, 3)), np.tile([0.0, 0.0, 9.81], (400, 1)), flight.imu.noise)
+    away = se3.from_rt(np.eye(3), np.array([50.0, 0.0, 0.0]))
+    truth = TruthLog(np.array([r.t_ns for r in records[45:]]), np.tile(away, (36, 1, 1)))
+    write_run(tmp_path / "apart", VoLog(records), mounting=MOUNTING, truth=truth, imu=imu)
+    with pytest.raises(GpvoError, match="needs ground truth.*--init static"):
+        _run("fuse", tmp_path / "apart")
+    settings = FusionSettings(policies=("pointing_matching",), options=FuseOptions(init="static"))
+    report = fuse_runs([tmp_path / "apart"], settings)
+    (trace,) = report.traces
+    assert report.study.scores == {"pointing_matching": (None,)}
+    assert trace.truth is None
+    assert np.linalg.norm(trace.position, axis=1).max() < 1.0
+    assert "no frame that the IMU reaches has ground truth" in "".join(report.warnings)
+    assert "pointing_matching" not in "".join(report.warnings)
