@@ -14,7 +14,7 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation import accumulate
 from gpvo.geometry import se3
 from gpvo.runner import Step
-from gpvo.types import Array, Prediction, StereoCamera, StereoFrame, VoRecord
+from gpvo.types import Array, Prediction, Status, StereoCamera, StereoFrame, VoRecord
 
 _GOOD, _BAD, _PATH, _DOUBT = (40, 200, 80), (230, 60, 50), (90, 150, 240), (240, 190, 60)
 
@@ -56,11 +56,11 @@ class LiveView:
         rr.log("plots/inliers", rr.Scalars(record.n_inliers))
         if prediction is not None:
             rr.log("plots/sigma_mm", rr.Scalars(1e3 * np.sqrt(np.trace(prediction.covariance[:3, :3]))))
-        if record.usable:
+        if record.status is not Status.START:
             self._move(record, prediction)
 
     def _move(self, record: VoRecord, prediction: Prediction | None) -> None:
-        rr = self._rr
+        """Go on from the reference. A lost frame's motion is a guess: not drawn, but what follows may build on it."""
         T_world_ref, error = self._reference
         T_world_cam, error = T_world_ref @ record.T_prev_cur, error.copy()
         C = error.add(
@@ -68,6 +68,14 @@ class LiveView:
             if prediction is not None
             else accumulate.Step.independent(record.T_prev_cur, next(iter(record.covariances.values())))
         )
+        if record.usable:
+            self._draw(T_world_cam, C)
+        if record.is_reference:
+            self._reference = (T_world_cam, error)
+
+    def _draw(self, T_world_cam: Array, C: Array) -> None:
+        """The camera, the path up to it, and three sigma of its position by its covariance ``C`` (6, 6)."""
+        rr = self._rr
         self._path.append(T_world_cam[:3, 3])
         variances, axes = np.linalg.eigh(T_world_cam[:3, :3] @ C[:3, :3] @ T_world_cam[:3, :3].T)
         axes = axes * np.linalg.det(axes)  # a rotation, not a reflection
@@ -82,5 +90,3 @@ class LiveView:
                 colors=[_DOUBT],
             ),
         )
-        if record.is_reference:
-            self._reference = (T_world_cam, error)

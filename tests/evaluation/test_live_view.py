@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import builtins
+import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
+from gpvo.evaluation.accumulate import Step, along
 from gpvo.io import open_source
+from gpvo.io.run import read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
-from gpvo.types import StereoCamera
+from gpvo.types import Status, StereoCamera
 
 
 def test_without_rerun_one_line_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,3 +44,22 @@ def test_a_run_lands_in_the_file(tmp_path: Path) -> None:
     assert (tmp_path / "flight.rrd").stat().st_size > 10_000
     assert len(view._path) == 51
     assert np.isfinite(view._path).all()
+
+
+def test_the_path_goes_on_over_a_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where VO begins anew after darkness the pose is a guess, and what is drawn later is of it and of its doubt."""
+    from gpvo.evaluation.live_view import LiveView
+
+    viewer = MagicMock()
+    monkeypatch.setitem(sys.modules, "rerun", viewer)
+    flight = simulate_points("tunnel-clean", 0, duration_s=8.0, rate_hz=10.0, dark=(1.0, 7.0)).save(tmp_path / "f.npz")
+    source = open_source(flight)
+    view = LiveView(source.camera, "flight", tmp_path / "flight.rrd")
+    run(source, tmp_path / "run", on_frame=view.show)
+    log = read_run(tmp_path / "run").log
+    assert any(r.status is Status.LOST and r.is_reference for r in log)
+    assert len(view._path) == 1 + log.usable.sum()
+    np.testing.assert_allclose(view._path[-1], log.trajectory()[-1, :3, 3], atol=1e-9)
+    steps = [Step.independent(r.T_prev_cur, C) for r, C in zip(log, log.covariance(log.methods[0]), strict=True)]
+    sigma = np.sqrt(np.linalg.eigvalsh(along(steps, log.parent)[-1, :3, :3]))
+    np.testing.assert_allclose(viewer.Ellipsoids3D.call_args.kwargs["half_sizes"], [3 * sigma], rtol=1e-6)
