@@ -25,10 +25,11 @@ from gpvo.filters.policies import (
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
 from gpvo.filters.sanity import require_sane
-from gpvo.filters.start import StartSigmas
+from gpvo.filters.start import StartSigmas, slope_sigma
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
+from gpvo.types import TruthLog
 
 Array = NDArray[np.float64]
 
@@ -74,16 +75,22 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
 
 
 def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
-    """Initial covariance that is no smaller than the noise of the truth it starts from."""
+    """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope."""
     base = StartSigmas()
     position = max((r.truth.sigma_translation_m for r in runs if r.truth), default=0.0)
+    velocity = max((_slope_sigma(r, r.truth) for r in runs if r.truth), default=0.0)
     rotation = max((r.truth.sigma_rotation_rad for r in runs if r.truth), default=0.0)
     return replace(
         base,
         position_m=max(base.position_m, position),
+        velocity_mps=max(base.velocity_mps, velocity),
         tilt_rad=max(base.tilt_rad, rotation),
         yaw_rad=max(base.yaw_rad, rotation),
     )
+
+
+def _slope_sigma(run: Run, truth: TruthLog) -> float:
+    return slope_sigma(truth.sigma_translation_m, float(np.median(np.diff(run.log.t_ns))) * 1e-9)
 
 
 def constants_of(runs: Sequence[Run]) -> Constants:
@@ -162,12 +169,12 @@ def fuse_runs(
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
     predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
-    options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
         flight = replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name)
         warnings += [f"{flight.name}: {finding}" for finding in require_sane(flight)]
         flights.append(flight)
+    options = replace(settings.options, sigmas=start_sigmas(runs))
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
     # What a run stores has the predicted mean, which is not for filters.

@@ -16,6 +16,8 @@ from gpvo.types import ImuLog
 
 Array = NDArray[np.float64]
 
+_SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
+
 
 @dataclass(frozen=True)
 class StartSigmas:
@@ -69,10 +71,9 @@ def from_truth(
     sigmas = sigmas or StartSigmas()
     if len(t_ns) < 2:
         raise GpvoError("a start from truth needs true poses of the first two frames", cure="use --init static")
-    n = min(len(t_ns), 5)
+    n = min(len(t_ns), _SLOPE_POSES)
     s = (np.asarray(t_ns[:n]) - t_ns[0]) * 1e-9
-    design = np.vander(s, min(3, n), increasing=True)
-    slope = np.linalg.lstsq(design, T_world_imu[:n, :3, 3], rcond=None)[0][1]
+    slope = np.linalg.lstsq(_parabola(s), T_world_imu[:n, :3, 3], rcond=None)[0][1]
     R = T_world_imu[0, :3, :3]
     rate = np.zeros(3) if with_imu else se3.so3_log(R.T @ T_world_imu[1, :3, :3]) / s[1]
     C = _diagonal(sigmas, with_imu)
@@ -81,6 +82,19 @@ def from_truth(
     C[TH, TH] = R.T @ world @ R
     note = f"truth: position {sigmas.position_m:g} m, velocity {sigmas.velocity_mps:g} m/s (1 sigma)"
     return Start(_member(T_world_imu[0, :3, 3], slope, R, np.zeros(3), rate), C, note)
+
+
+def slope_sigma(position_m: float, dt_s: float) -> float:
+    """Standard deviation [m/s] per axis of :func:`from_truth`'s velocity: of true poses every ``dt_s``, with white
+    noise of ``position_m`` per axis each."""
+    t_s = dt_s * np.arange(_SLOPE_POSES, dtype=np.float64)
+    weights = np.linalg.lstsq(_parabola(t_s), np.eye(_SLOPE_POSES), rcond=None)[0][1]
+    return position_m * float(np.linalg.norm(weights))
+
+
+def _parabola(t_s: Array) -> Array:
+    """Design matrix of a parabola through poses at ``t_s`` (n,) [s]; of a line through two."""
+    return np.vander(t_s, min(3, len(t_s)), increasing=True)
 
 
 def from_rest(

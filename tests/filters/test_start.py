@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
+from gpvo.evaluation.fusion import start_sigmas
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
 from gpvo.filters.run import FuseOptions, begin, fuse_flight
 from gpvo.filters.start import StartSigmas, StaticTest, from_rest, from_truth, heading
 from gpvo.filters.synthetic import synthetic_flight
 from gpvo.geometry import se3
-from gpvo.types import ImuLog
+from gpvo.io.run import read_run, write_run
+from gpvo.types import ImuLog, TruthLog, VoLog
 
 
 def _rest(rng: np.random.Generator, R: np.ndarray, bias: np.ndarray, n: int = 100) -> ImuLog:
@@ -59,6 +62,27 @@ def test_truth_start_finds_velocity() -> None:
     np.testing.assert_allclose(start.nominal.velocity[0], [2, -1, 0], atol=1e-9)
     with pytest.raises(GpvoError, match="first two frames"):
         from_truth(t[:1], poses[:1])
+
+
+def test_the_velocity_of_a_noisy_truth_is_as_unsure_as_it_says(tmp_path: Path) -> None:
+    """The noise of five poses through a parabola's slope; without noise, what the start always says."""
+    rng = np.random.default_rng(2)
+    flight = synthetic_flight(3, duration_s=2)
+    assert flight.T_world_cam is not None
+    t_ns = np.array([r.t_ns for r in flight.records])
+    write_run(tmp_path / "run", VoLog(flight.records), truth=TruthLog(t_ns, flight.T_world_cam))
+    run = read_run(tmp_path / "run")
+    assert run.truth is not None
+    assert start_sigmas([run]) == StartSigmas()
+    stated = start_sigmas([replace(run, truth=replace(run.truth, sigma_translation_m=0.01))])
+    assert stated.position_m == 0.01
+    still = np.tile(np.eye(4), (5, 1, 1))
+    velocities = []
+    for _ in range(2000):
+        still[:, :3, 3] = 0.01 * rng.standard_normal((5, 3))
+        velocities.append(from_truth(t_ns[:5], still).nominal.velocity[0])
+    assert stated.velocity_mps == pytest.approx(np.std(velocities), rel=0.03)
+    assert stated.velocity_mps == pytest.approx(1.1 * 0.01 / 0.05, rel=0.02)
 
 
 def test_a_world_whose_z_is_not_up() -> None:
