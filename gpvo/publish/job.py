@@ -120,6 +120,8 @@ def _require(settings: PublishSettings) -> None:
         raise GpvoError(f"--to is '{settings.to}'", cure=f"choose {', '.join(TARGETS)}")
     if settings.consumer is not None and settings.consumer not in consumers.CONSUMERS:
         raise GpvoError(f"--consumer is '{settings.consumer}'", cure=f"choose {', '.join(consumers.CONSUMERS)}")
+    if not 1 <= settings.system <= 255:
+        raise GpvoError(f"--system is {settings.system}", cure="give an id of 1 to 255")
     if settings.link is not None and settings.to != "mavlink":
         raise GpvoError("--link sends MAVLink", cure="add --to mavlink")
     if settings.to == "mavlink":
@@ -132,6 +134,8 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
     if settings.to == "mavlink":
         out = settings.out or Path(f"{run.name}.tlog")
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
+    if all(o.twist_body is None for o in odometry):
+        raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
     kind = settings.to or "bag"
     out = settings.out or Path(f"{run.name}_{kind}")
     ros1 = kind == "bag" and out.suffix == ".bag"

@@ -158,6 +158,8 @@ def stream(odometry: Iterable[Odometry], sender: Sender, emit: Callable[[int, by
 def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
     """Write a telemetry log: every message after its time, 8 bytes big-endian microseconds. Returns frames."""
     path = Path(path)
+    if path.is_dir():
+        raise GpvoError("is a folder, and a telemetry log is a file", where=path, cure="choose another -o")
     sender = Sender(system)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -191,8 +193,10 @@ class Link:
         self._next_beat = 0
         kind, _, rest = self.address.partition(":")
         place, _, number = rest.rpartition(":")
-        if kind not in ("udp", "serial") or not place or not number.isdigit():
+        if kind not in ("udp", "serial") or not place or not number.isdecimal():
             raise GpvoError(f"'{self.address}' is no address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
+        if kind == "udp" and not 1 <= int(number) <= 65535:
+            raise GpvoError(f"'{self.address}' has no port of UDP", cure="give one of 1 to 65535")
         self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))
 
     def send(self, odometry: Odometry) -> None:

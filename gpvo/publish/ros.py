@@ -73,6 +73,8 @@ def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPI
 
 def write_ros2(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, *, mcap: bool = False) -> int:
     """Write a ROS 2 bag folder, sqlite3 or MCAP; returns the number of messages."""
+    if Path(path).is_file():
+        raise GpvoError("is a file, and a ROS 2 bag is a folder", where=path, cure="choose another -o")
     store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
 

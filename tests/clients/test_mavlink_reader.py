@@ -131,7 +131,17 @@ def test_udp(odometry: list[Odometry]) -> None:
     assert names == ["HEARTBEAT", "VISION_SPEED_ESTIMATE", "ODOMETRY", "ODOMETRY"]
 
 
-@pytest.mark.parametrize("address", ["udp:localhost", "tcp:localhost:1", "serial::9600", "serial:/nowhere:57600"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "udp:localhost",
+        "tcp:localhost:1",
+        "serial::9600",
+        "serial:/nowhere:57600",
+        "udp:localhost:0",
+        "udp:localhost:99999",
+    ],
+)
 def test_a_bad_address_is_one_line(address: str) -> None:
     with pytest.raises(GpvoError):
         Link(address)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.errors import ModelError
+from gpvo.errors import GpvoError, ModelError
 from gpvo.evaluation.fusion import load_predictor
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from gpvo.publish.job import PublishSettings, odometry_of, predictions_of, publish_run
-from gpvo.types import Prediction
+from gpvo.types import Prediction, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
 
@@ -51,6 +51,42 @@ def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -
     other = tmp_path / "windows"
     write_run(other, run.log, predictions=windows, truth=run.truth, meta={"source": "made"})
     assert publish_run(other, replace(settings, out=tmp_path / "other")).source == "pointing_matching"
+
+
+@pytest.mark.parametrize(
+    "to, name, words",
+    [
+        ("bag", "file", "file: is a file, and a ROS 2 bag is a folder"),
+        ("mcap", "file", "file: is a file"),
+        ("bag", "folder.bag", "folder.bag: is a folder"),
+        ("mavlink", "folder.bag", "folder.bag: is a folder"),
+    ],
+)
+def test_what_lies_where_it_should_be_written_is_left_alone(
+    predicted: Path, tmp_path: Path, to: str, name: str, words: str
+) -> None:
+    if to == "mavlink":
+        pytest.importorskip("pymavlink")
+    (tmp_path / "file").write_bytes(b"mine")
+    (tmp_path / "folder.bag").mkdir()
+    with pytest.raises(GpvoError, match=words):
+        publish_run(predicted, replace(GEOMETRY, to=to, out=tmp_path / name))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.bag"]
+    assert (tmp_path / "file").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("system", [0, 256, -1])
+def test_the_system_is_a_byte(predicted: Path, tmp_path: Path, system: int) -> None:
+    with pytest.raises(GpvoError, match=f"--system is {system}.*1 to 255"):
+        publish_run(predicted, replace(GEOMETRY, out=tmp_path / "out", system=system))
+
+
+def test_a_run_without_a_motion_makes_no_bag(predicted: Path, tmp_path: Path) -> None:
+    run = read_run(predicted)
+    write_run(tmp_path / "one", VoLog(run.log.records[:1], run.log.camera), meta={"source": "made"})
+    with pytest.raises(GpvoError, match="one: no frame has a motion"):
+        publish_run(tmp_path / "one", replace(GEOMETRY, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) -> None:
