@@ -147,7 +147,7 @@ def _print(e: Evaluation) -> None:
     from gpvo.evaluation.evaluate import document
 
     d: dict[str, Any] = document([e])["runs"][0]
-    console = Console(width=max(Console().width, 130), highlight=False)
+    console = Console(width=max(Console().width, 130), highlight=False, markup=False)
     console.print(
         f"{d['run']}: {d['frames']} frames, {d['lost']} lost, {d['path_length_m']:.1f} m; ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"

@@ -48,6 +48,10 @@ def fuse(
         raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
     if mean not in get_args(MeanUse):
         raise GpvoError(f"--mean is '{mean}'", cure=f"choose one of: {', '.join(get_args(MeanUse))}")
+    if plot is not None:
+        from gpvo.evaluation.fusion_plot import plot_fusion, require_picture
+
+        require_picture(plot)  # before the work, not after it
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
     settings = FusionSettings(
         policies=wanted,
@@ -69,8 +73,6 @@ def fuse(
     for warning in report.warnings:
         print(f"gpvo: {warning}", file=sys.stderr)
     if plot is not None:
-        from gpvo.evaluation.fusion_plot import plot_fusion
-
         plot_fusion(report.traces, plot)
     if json_:
         print_json(document(report))

@@ -161,7 +161,7 @@ def _print_table(document: dict[str, Any]) -> None:
         rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"], mean["nll_per_dim"]]
         if any(v is not None for v in (*per_fold, *rest)):
             table.add_row(method, *(_text(v) for v in (*per_fold, *rest)))
-    console = Console(width=max(Console().width, 120), highlight=False)
+    console = Console(width=max(Console().width, 120), highlight=False, markup=False)
     console.print("NEES per degree of freedom on each run left out (1 is right), then means over the runs")
     console.print(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     console.print(table)

@@ -6,16 +6,27 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
+from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import Trace
 from gpvo.evaluation.fusion_report import nis_band, nis_over_runs
 
 
+def require_picture(path: Path) -> None:
+    """Raise GpvoError where the name's ending is no format that can be drawn."""
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        raise GpvoError("is no picture by its ending", where=path, cure=f"choose from {', '.join(known)}")
+
+
 def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
     """Draw the first run's path and errors and all runs' innovations to an image file."""
-    figure = figure_of(traces)
     target = Path(path)
+    require_picture(target)
+    figure = figure_of(traces)
+    target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.stem}.part{target.suffix}")
     try:
         figure.savefig(temporary, dpi=120, bbox_inches="tight")

@@ -104,6 +104,15 @@ def test_the_table_names_the_methods(capsys, run_folder):
         assert word in out
 
 
+@pytest.mark.parametrize("name", ["flight[red]", "[dim]"])
+def test_a_name_is_printed_as_it_is(capsys, run_folder, tmp_path, name):
+    run = read_run(run_folder)
+    write_run(tmp_path / name, run.log, truth=run.truth)
+    code, out, _ = _main(capsys, "evaluate", tmp_path / name)
+    assert code == 0
+    assert out.startswith(f"{name}: 301 frames")
+
+
 def test_what_the_model_calls_lost_is_lost_for_every_method(run_folder):
     run = read_run(run_folder)
     plain = evaluate_run(run)

@@ -54,7 +54,7 @@ def _run(*arguments: object) -> str:
 
 
 def test_json_holds_every_policy(runs: list[Path], tmp_path: Path) -> None:
-    picture = tmp_path / "fuse.png"
+    picture = tmp_path / "pictures" / "fuse.png"
     out = json.loads(_run("fuse", *runs[:2], "--train", runs[2], "--plot", picture, "--log", tmp_path, "--json"))
     lines = (tmp_path / "flight0_learned.csv").read_text().splitlines()
     assert len(lines) == 162
@@ -125,6 +125,8 @@ def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
         (("--mean", "magic"), "steady, predicted, absorb"),
         (("--policies", "best"), "unknown policy"),
         (("--model", "nowhere.gpvo"), "nowhere.gpvo"),
+        (("--plot", "fuse.xyz"), "fuse.xyz: is no picture.*png"),
+        (("--plot", "fuse"), "fuse: is no picture.*png"),
     ],
 )
 def test_bad_options_are_one_line(runs: list[Path], arguments: tuple[str, str], words: str) -> None:

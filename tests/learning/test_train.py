@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 from gpvo.cli import app
-from gpvo.cli.learn import _train
+from gpvo.cli.learn import _print_table, _train
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
@@ -336,6 +336,12 @@ def test_runs_of_different_rate_are_refused():
     sets = [*training_sets([0], n=100), *training_sets([1], n=100, rate_hz=60.0)]
     with pytest.raises(GpvoError, match="rate"):
         train_sets(sets, QUICK)
+
+
+def test_the_table_prints_names_as_they_are(capsys):
+    document = {"folds": [{"held_out": "[/red]", "rows": 3, "methods": {}}], "mean": {}, "comparison": None}
+    _print_table(document)
+    assert "1: [/red] (3 rows)" in capsys.readouterr().out
 
 
 @pytest.mark.slow
