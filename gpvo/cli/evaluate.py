@@ -130,6 +130,8 @@ def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options:
     from gpvo.types import TruthLog
 
     predictor = None if model is None else Predictor.load(model)
+    if predictor is not None:
+        predictor.require_motions(model)
     given = None
     if truth is not None:
         trajectory = read_tum(truth)

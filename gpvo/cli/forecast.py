@@ -39,6 +39,7 @@ def forecast(
     if out is not None and out.suffix not in (".parquet", ".csv"):
         raise GpvoError("is no kind of table", where=out, cure="give -o a name that ends in .parquet or .csv")
     predictor = Predictor.load(model)
+    predictor.require_motions(model)
     found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
     if out is not None:
         _write(out, found)

@@ -82,17 +82,17 @@ class Predictor:
         arrays = arrays_for_filter(arrays) if for_filter else dict(arrays)
         self.header, self.digest, self.arrays = dict(header), digest, arrays
         _check_schema(header)
+        if header.get("target") == "position":
+            raise ModelError(
+                "this model predicts the residual of a position, not the error of a motion",
+                cure="use PositionPredictor, or train with --target frame",
+            )
         try:
             self.features = tuple(header["features"])
             method, target = header["base_method"], header["target"]
             dt_s, camera = float(header["dt_s"]), header["camera"]
         except (KeyError, TypeError, ValueError) as problem:
             raise ModelError(f"the model's header is incomplete: {problem}") from None
-        if target == "position":
-            raise ModelError(
-                "this model predicts the residual of a position, not the error of a motion",
-                cure="use PositionPredictor, or train with --target frame",
-            )
         _check_known(self.features)
         self.model = ErrorModelArrays.from_arrays(arrays, self.features, method, dt_s)
         self.camera = None if camera is None else StereoCamera(**camera)

@@ -20,6 +20,7 @@ from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import thesis_gp
 from gpvo.learning.scores import score
 from gpvo.learning.store import save_model
+from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from gpvo.types import Mounting, Prediction, Status, TruthLog, VoLog
 from small_model import small_model
@@ -271,6 +272,12 @@ def test_the_model_file_gives_constant_and_the_thesis_row(capsys, tmp_path):
         evaluate_run(read_run(tmp_path / "flight"), Predictor(damaged, trained.header))
     with pytest.raises(ModelError, match="newer gpvo"):
         Predictor(trained.arrays, {**trained.header, "model_schema": 2})
+
+
+def test_a_model_of_windows_is_refused_by_name(capsys, run_folder, tmp_path):
+    trained, model = small_model(), tmp_path / "windows.gpvo"
+    modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
+    _assert_refused(capsys, run_folder, "--model", model, says="windows.gpvo: this model predicts the error over")
 
 
 def test_constant_is_said_of_one_frame():

@@ -14,6 +14,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.trajectory import Trajectory, write_tum
 from gpvo.learning.store import save_model
+from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from small_model import small_model
 from synthetic_runs import make_run
@@ -154,6 +155,14 @@ def test_what_cannot_be_forecast_is_one_line(capsys, tmp_path, model_file):
     predictor.target = "window:1s"
     with pytest.raises(ModelError, match="window:1s"):
         forecast(predictor, truth_plan(7, n=60))
+
+
+def test_a_model_of_windows_is_refused_by_name(capsys, tmp_path):
+    predictor = small_model().predictor()
+    modelfile.save(tmp_path / "windows.gpvo", predictor.arrays, {**predictor.header, "target": "window:1s"})
+    code, _, err = _main(capsys, tmp_path / "windows.gpvo", "--path", tmp_path / "plan.tum")
+    assert code == 2
+    assert "windows.gpvo: this model predicts the error over window:1s" in err
 
 
 @pytest.mark.slow

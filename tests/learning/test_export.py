@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.cli import app
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry.covariance import turn_first_root
 from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
@@ -270,6 +270,14 @@ def test_onnx_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> Non
         expected = Predictor.load(model, for_filter=wanted).model.estimate(X, geometry, dt_s)
         assert np.abs((out - expected.mean) / expected.sigma).max() < 1e-5
         assert bool(expected.mean.any()) == wanted
+
+
+def test_no_filter_takes_a_model_of_windows(tmp_path: Path) -> None:
+    trained, model = small_model(), tmp_path / "windows.gpvo"
+    modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
+    with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s"):
+        export_model(model, tmp_path / "out.h", "c", for_filter=True)
+    export_model(model, tmp_path / "out.h", "c")
 
 
 def test_c_names_must_be_identifiers(tmp_path: Path) -> None:

@@ -25,13 +25,16 @@ def export_model(
     """Write the model file ``model`` as ``to`` ("onnx" or "c").
 
     ``for_filter``: its model for filters, as ``Predictor.load`` would. ``prefix``: of every symbol in C, so that one
-    program can hold several models. GpvoError for other formats, a prefix that is no C identifier, or a bad file.
+    program can hold several models. GpvoError for other formats, a prefix that is no C identifier, a bad file, or a
+    model for filters that predicts the error over windows of motions.
     """
     if to not in FORMATS:
         raise GpvoError(f"cannot export to '{to}'", cure=f"one of: {', '.join(FORMATS)}")
     if prefix != PREFIX and to != "c":
         raise GpvoError(f"{to} has no symbols that a prefix '{prefix}' could go before", cure="give it with c alone")
     predictor = Predictor.load(model, for_filter=for_filter)
+    if for_filter:
+        predictor.require_motions(model)
     units = tuple(str(u) for u in predictor.header.get("units") or ())
     purpose = "filters" if for_filter else "prediction"
     if to == "c":
