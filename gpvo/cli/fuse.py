@@ -5,11 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
 from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from gpvo.filters.study import Comparison
 
 
 def fuse(
@@ -23,7 +26,9 @@ def fuse(
     gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
     mean: Annotated[
         str,
-        typer.Option(help="The mean error to take off: steady (in all frames alike), predicted, or none (absorb)."),
+        typer.Option(
+            help="The mean error to take off: steady (in all frames alike), predicted, or absorb (take none)."
+        ),
     ] = "steady",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
@@ -83,7 +88,7 @@ def fuse(
         for other in (p for p in report.study.scores if p != LEARNED):
             compared = report.study.compare(LEARNED, other)
             if compared.gain_percent == compared.gain_percent:
-                print(compared)
+                print(_line(compared))
 
 
 def publish(
@@ -131,6 +136,15 @@ def publish(
         print_json(result.document())
     else:
         print(result)
+
+
+def _line(compared: Comparison) -> str:
+    """A comparison in words; over one run it has no interval."""
+    difference = compared.difference_m
+    if difference.high < float("inf"):
+        return str(compared)
+    change = f"ATE {difference.mean:+.4f} m, gain {compared.gain_percent:.1f} %"
+    return f"{compared.policy} less {compared.against}: {change} (one run: no interval)"
 
 
 def _teller() -> Callable[[str], None] | None:

@@ -13,6 +13,7 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
+from gpvo.filters.metrics import Scores, nis_interval
 from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
@@ -23,7 +24,7 @@ from gpvo.filters.policies import (
     MeanUse,
     constant_from_errors,
 )
-from gpvo.filters.run import Flight, FusedRun, FuseOptions
+from gpvo.filters.run import Flight, FusedRun, FuseOptions, begin
 from gpvo.filters.sanity import require_sane
 from gpvo.filters.start import StartSigmas, slope_sigma
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
@@ -169,21 +170,23 @@ def fuse_runs(
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
     predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
+    options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
-        flight = replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name)
-        warnings += [f"{flight.name}: {finding}" for finding in require_sane(flight)]
-        flights.append(flight)
-    options = replace(settings.options, sigmas=start_sigmas(runs))
+        flights.append(replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name))
+        warnings += _findings(run, flights[-1], options)
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
     # What a run stores has the predicted mean, which is not for filters.
     mean = "absorb" if predictor is None and settings.mean == "steady" else settings.mean
     policies = make_policies(constants, names=settings.policies, learned=learned, mean=mean)
     traces: list[Trace] = []
+    unscored: dict[tuple[str, str], Scores] = {}
 
     def keep(flight: Flight, fused: FusedRun) -> None:
         traces.append(trace_of(flight, fused))
+        if fused.scores is None:
+            unscored[flight.name, fused.policy] = _without_truth(fused)
         if on_run:
             on_run(fused)
 
@@ -195,18 +198,55 @@ def fuse_runs(
         progress=tell,
         on_run=keep,
     )
-    filtered = {t.policy for t in traces}
-    warnings += [f"{name}: {_why_not(name)}" for name in result.scores if name not in filtered]
-    return FusionReport(result, tuple(traces), tuple(warnings))
+    rows = {
+        name: tuple(score or unscored.get((flight.name, name)) for flight, score in zip(flights, row, strict=True))
+        for name, row in result.scores.items()
+    }
+    failed = [f"{name}: {_why_not(name, constants)}" for name, row in rows.items() if not any(row)]
+    if len(failed) == len(rows):
+        raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
+    return FusionReport(replace(result, scores=rows), tuple(traces), tuple(warnings + failed))
 
 
-def _why_not(policy: str) -> str:
+def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:
+    """What looks wrong with a run that can be filtered. Raises GpvoError, with its path, where it cannot."""
+    try:
+        findings = require_sane(flight)
+        begin(flight, options)
+    except GpvoError as error:
+        raise GpvoError(error.what, where=run.path, cure=error.cure) from None
+    unjudged = [] if run.truth is not None else ["no ground truth: nothing to score"]
+    return [f"{flight.name}: {line}" for line in (*findings, *unjudged)]
+
+
+def _without_truth(fused: FusedRun) -> Scores:
+    """What a run without truth can still say: NIS and rejections."""
+    measured, unknown = fused.nis[np.isfinite(fused.nis)] / 6.0, float("nan")
+    return Scores(
+        ate_rmse_m=unknown,
+        final_error_m=unknown,
+        drift_percent=unknown,
+        nees_position=unknown,
+        nees_attitude=unknown,
+        nis_dof=float(measured.mean()) if len(measured) else unknown,
+        nis_interval=nis_interval(measured),
+        rejected=fused.counts["rejected"],
+        diverged=False,
+        frames=0,
+    )
+
+
+def _why_not(policy: str, constants: Constants | None) -> str:
     """Why a policy could not run at all, and the cure."""
     if policy == LEARNED:
         return "the runs hold no predictions of single motions; give --model"
     if policy in (TRIANGULATION, POINTING_MATCHING):
         return f"the runs hold too few usable covariances; run VO with --methods {policy}"
-    return "no training errors to take a constant from; give --train, or a --model that carries them"
+    if policy == CONSTANT_BEST:
+        return "it is tuned on training runs; give --train RUN"
+    if policy == CONSTANT_HINDSIGHT and constants is not None:
+        return "it is tuned on the truth of all these runs, and one has none"
+    return "no training errors to take a constant from; give --train RUN, or a --model that carries them"
 
 
 def _constants(

@@ -71,7 +71,7 @@ def _score(scores: Scores | None) -> dict[str, Any] | None:
         "nis_dof": scores.nis_dof,
         "nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high],
         "rejected": scores.rejected,
-        "diverged": scores.diverged,
+        "diverged": scores.diverged if scores.frames else None,
     }
 
 
@@ -82,7 +82,8 @@ def _mean(result: Study, name: str, traces: Sequence[Trace]) -> dict[str, Any] |
     out: dict[str, Any] = {key: result.mean(name, key) for key in keys}
     nees = {part: result.mean(name, f"nees_{part}") for part in ("position", "attitude")}
     out["nis_in_band_percent"] = nis_in_band_percent([t for t in traces if t.policy == name])
-    return {**out, "nees_dof": nees, "diverged": int(np.nansum(result.column(name, "diverged")))}
+    judged = [s.diverged for s in result.scores[name] if s is not None and s.frames]
+    return {**out, "nees_dof": nees, "diverged": sum(judged) if judged else None}
 
 
 def _comparison(result: Study, policy: str, against: str) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight, w
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.run import read_run, write_run
-from gpvo.types import ImuLog, Mounting, TruthLog, VoLog
+from gpvo.types import ImuLog, Mounting, Status, TruthLog, VoLog, VoRecord
 from typer.testing import CliRunner
 
 MOUNTING = Mounting(se3.from_rt(R_FLU_OPTICAL, np.array([0.3, 0.0, 0.1])), FORWARD_CAMERA)
@@ -132,6 +132,55 @@ def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_bad_options_are_one_line(runs: list[Path], arguments: tuple[str, str], words: str) -> None:
     with pytest.raises(GpvoError, match=words):
         _run("fuse", runs[0], *arguments)
+
+
+def _write_at_rest(path: Path) -> Path:
+    """A run without truth whose camera and IMU stand still."""
+    rng, C = np.random.default_rng(0), np.diag([1e-6] * 6)
+    t_ns = np.arange(61, dtype=np.int64) * 50_000_000
+    motions = se3.exp(1e-3 * rng.standard_normal((60, 6)))
+    records = [
+        VoRecord(int(t), int(t) - 50_000_000, Status.OK, T, covariances={"triangulation": C})
+        for t, T in zip(t_ns[1:], motions, strict=True)
+    ]
+    stamps = np.arange(601, dtype=np.int64) * 5_000_000
+    gyro, acc = 1e-3 * rng.standard_normal((2, 601, 3))
+    imu = ImuLog(stamps, gyro, acc + [0.0, 0.0, 9.80665])
+    write_run(path, VoLog([VoRecord(0, 0, Status.START, np.eye(4)), *records]), mounting=MOUNTING, imu=imu)
+    return path
+
+
+def test_a_run_without_truth_shows_what_it_can(tmp_path: Path) -> None:
+    still = _write_at_rest(tmp_path / "still")
+    command = ("fuse", still, "--init", "static", "--policies", "triangulation,constant_best")
+    out = json.loads(_run(*command, "--json"))
+    assert out["warnings"] == [
+        "still: no ground truth: nothing to score",
+        "constant_best: it is tuned on training runs; give --train RUN",
+    ]
+    scores = out["runs"][0]["policies"]["triangulation"]
+    assert scores["nis_dof"] == out["mean"]["triangulation"]["nis_dof"] == pytest.approx(1.0, abs=0.3)
+    assert scores["rejected"] < 3
+    assert scores["ate_rmse_m"] is scores["diverged"] is out["mean"]["triangulation"]["diverged"] is None
+    assert "triangulation" in _run(*command)
+
+
+def test_one_run_has_no_interval(runs: list[Path]) -> None:
+    out = _run("fuse", runs[0], "--policies", "pointing_matching,learned")
+    assert "% (one run: no interval)" in out
+    assert "inf" not in out
+
+
+@pytest.mark.parametrize("policy, words", [("constant", "--train RUN"), ("triangulation", "--methods triangulation")])
+def test_nothing_to_fuse_with_is_an_error(runs: list[Path], policy: str, words: str) -> None:
+    with pytest.raises(GpvoError, match=f"nothing to fuse with: {policy}: .*{words}"):
+        _run("fuse", runs[0], "--policies", policy)
+
+
+def test_errors_name_the_path_of_a_run(runs: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").symlink_to(runs[0])
+    with pytest.raises(GpvoError, match="elsewhere: the vehicle is not at rest"):
+        _run("fuse", tmp_path / "elsewhere", "--init", "static")
 
 
 @pytest.mark.parametrize("to, name", [("bag", "x.bag"), ("bag", "x"), ("mcap", "y"), ("mavlink", "z.tlog")])
