@@ -95,16 +95,20 @@ def build(
     name: str,
     columns: Sequence[str] | None = None,
     target: str = "frame",
+    where: object = None,
 ) -> TrainingSet:
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
-    ``columns``: by default all of ``full`` and the residual. Raises GpvoError where nothing is left to learn from.
+    ``columns``: by default all of ``full`` and the residual. Raises GpvoError where nothing is left to learn from,
+    which names ``where``, by default ``name``.
     """
     check_target(target)
     names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
         raise GpvoError(
-            "has no ground truth to learn from", where=name, cure="run a source that has it, or gpvo import --truth"
+            "has no ground truth to learn from",
+            where=where or name,
+            cure="run a source that has it, or gpvo import --truth",
         )
     records, X = observe(log, names, target)
     if target == "position":
@@ -115,7 +119,7 @@ def build(
     if known.sum() < MIN_ROWS:
         raise GpvoError(
             f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed",
-            where=name,
+            where=where or name,
             cure="check that log and truth share one clock",
         )
     kept = [r for r, k in zip(records, known) if k]
@@ -166,7 +170,7 @@ def build_run(
         truth = align_rotation(run.log, truth)
     elif align not in ("none", "rotation"):
         raise GpvoError(f"there is no alignment '{align}'", cure="none or rotation")
-    return build(run.log, truth, name=run.name, columns=columns, target=target)
+    return build(run.log, truth, name=run.name, columns=columns, target=target, where=run.path)
 
 
 def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:

@@ -78,9 +78,8 @@ def _samples(imu: ImuLog) -> Iterator[Finding]:
     bad = ~np.isfinite(np.concatenate([imu.gyro_radps, imu.acc_mps2], axis=1)).all(axis=1)
     if bad.any():
         every = bool(bad.mean() > 0.5)
-        yield Finding(
-            "imu", f"{int(bad.sum())} of {len(imu.t_ns)} IMU samples are not finite and are dropped", fatal=every
-        )
+        text = f"{int(bad.sum())} of {len(imu.t_ns)} IMU samples are not finite and are dropped"
+        yield Finding("imu", text, "run without it: --no-imu" if every else "", fatal=every)
 
 
 # -- covariances ----------------------------------------------------------------------------------------------------

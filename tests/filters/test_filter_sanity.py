@@ -78,6 +78,12 @@ def test_gaps_and_bad_samples_are_said_but_not_fatal(flight: Flight) -> None:
     assert any("1 of" in f.text and "not finite" in f.text for f in found)
 
 
+def test_an_imu_without_a_finite_sample_has_its_cure(flight: Flight) -> None:
+    wrong = _with_imu(flight, lambda i: replace(i, acc_mps2=np.full_like(i.acc_mps2, np.nan)))
+    with pytest.raises(GpvoError, match="IMU samples are not finite.*--no-imu"):
+        require_sane(wrong)
+
+
 def test_bad_covariances_are_counted(flight: Flight) -> None:
     good = np.eye(6) * 1e-4
     some = with_geometric(flight, good)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.cli.learn import _print_table, _train
+from gpvo.dataset.build import build_run
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
@@ -257,7 +259,7 @@ def test_a_model_of_positions_is_not_updated(tmp_path):
 def _as_run(log, truth, name):
     from types import SimpleNamespace
 
-    return SimpleNamespace(log=log, truth=truth, name=name)
+    return SimpleNamespace(log=log, truth=truth, name=name, path=Path("runs", name))
 
 
 def test_few_sequences_are_calibrated_by_blocks_and_marked():
@@ -330,6 +332,13 @@ def test_a_gain_must_be_sure():
     chance = [surely_positive(rng.standard_normal((5, 6))).any() for _ in range(400)]
     assert np.mean(chance) < 0.09
     assert surely_positive(1.0 + 0.1 * rng.standard_normal((5, 6))).all()
+
+
+def test_a_run_that_cannot_be_learnt_from_is_named_by_its_path():
+    log, truth = make_run(0, n=10)
+    for given, words in ((None, "has no ground truth"), (truth, "only .* motions")):
+        with pytest.raises(GpvoError, match=f"^runs/there: {words}"):
+            build_run(_as_run(log, given, "there"))
 
 
 def test_runs_of_different_rate_are_refused():
