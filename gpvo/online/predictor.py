@@ -102,6 +102,8 @@ class Predictor:
     @classmethod
     def load(cls, path: str | PathLike[str], *, for_filter: bool = False) -> Predictor:
         """From a model file. Raises ModelError, one line, where the file cannot be used."""
+        if not Path(path).exists():
+            raise ModelError("no such model file", where=path, cure="'gpvo train RUN... -o MODEL' makes one")
         arrays, header = modelfile.load(path)
         try:
             digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -221,6 +221,8 @@ def test_load_refuses_what_does_not_fit(tmp_path: Path):
     modelfile.save(path, {k: v for k, v in model.arrays.items() if k != "share"}, model.header)
     with pytest.raises(ModelError, match="share"):
         Predictor.load(path)
+    with pytest.raises(ModelError, match=r"nowhere: no such model file.*gpvo train RUN\.\.\. -o MODEL"):
+        Predictor.load(tmp_path / "nowhere")
 
 
 def test_it_flies_with_numpy_and_safetensors_alone(tmp_path: Path):
