@@ -96,7 +96,9 @@ def publish(
     to: Annotated[str | None, typer.Option(help="bag (default), mcap or mavlink.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="File or folder to write; a name that ends in .bag is a ROS 1 bag."),
+        typer.Option(
+            "-o", "--out", help="File or folder to write; .bag (ROS 1), .mcap or .tlog tell what without --to."
+        ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
     model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the run.")] = None,

@@ -202,6 +202,8 @@ def predict(
     from gpvo.io.run import read_run, write_predictions
     from gpvo.online.predictor import Predictor
 
+    if out.suffix.lower() != ".parquet":
+        raise GpvoError("is no name for a Parquet file", where=out, cure="give -o a name that ends in .parquet")
     predictions = list(Predictor.load(model).replay(read_run(run).log).values())
     write_predictions(out, predictions)
     moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
@@ -251,7 +253,7 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
 
 def export(
     model: Model,
-    to: Annotated[str, typer.Option(help="onnx or c.")],
+    to: Annotated[str | None, typer.Option(help="onnx or c; by default what --out tells: .onnx or .h.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write; by default beside the model.")] = None,
     for_filter: Annotated[
         bool, typer.Option("--for-filter", help="As a filter needs it: the mean is the one that it may take off.")
@@ -262,13 +264,12 @@ def export(
 
     Example: gpvo export errors.gpvo --to c
     """
-    from gpvo.learning.export import FORMATS, export_model
+    from gpvo.learning.export import SUFFIXES, export_model, format_of
 
-    if to not in FORMATS:
-        raise GpvoError(f"cannot export to '{to}'", cure=f"one of: {', '.join(FORMATS)}")
+    chosen = format_of(to, out)
     name = f"{model.stem}-for-filter" if for_filter else model.stem
-    target = out or model.with_name(name + {"onnx": ".onnx", "c": ".h"}[to])
-    export_model(model, target, to, for_filter=for_filter, prefix=prefix)
+    target = out or model.with_name(name + SUFFIXES[chosen])
+    export_model(model, target, chosen, for_filter=for_filter, prefix=prefix)
     print(f"{target}: {target.stat().st_size} bytes")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
+_SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 
 
 @dataclass(frozen=True)
 class PublishSettings:
-    """What ``gpvo publish`` was asked for."""
+    """What ``gpvo publish`` was asked for; without ``to`` the name ``out`` may tell it."""
 
     to: str | None = None
     out: Path | None = None
@@ -82,6 +83,7 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     GpvoError
         Where the run lacks a covariance, the target cannot be written, or an option is unknown.
     """
+    settings = replace(settings, to=_target(settings))
     _require(settings)
     run = read_run(path)
     predictions = predictions_of(run, settings.model)
@@ -106,6 +108,8 @@ def predictions_of(run: Run, model: Path | None) -> dict[int, Prediction]:
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
     """All messages of a run, with ``predictions`` by ``t_ns``; its ``odom`` starts at the body's first pose."""
+    if not predictions and not any(r.covariances for r in run.log):
+        raise GpvoError("holds neither predictions nor covariances", where=run.path, cure="give --model")
     builder = OdometryBuilder(
         T_body_cam=run.mounting.T_body_cam, method=settings.method, correct_twist=settings.correct_twist
     )
@@ -113,6 +117,16 @@ def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: Publi
         return list(messages(run.log, predictions, builder))
     except GpvoError as error:
         raise GpvoError(error.what, where=run.path, cure=error.cure) from None
+
+
+def _target(settings: PublishSettings) -> str | None:
+    """What to write: ``to``, else what the name of the output tells. GpvoError where they contradict each other."""
+    told = None if settings.out is None else _SUFFIXES.get(settings.out.suffix.lower())
+    if settings.to in TARGETS and told not in (None, settings.to):
+        raise GpvoError(
+            f"is no name for --to {settings.to}", where=settings.out, cure=f"use --to {told}, or another -o"
+        )
+    return settings.to or told
 
 
 def _require(settings: PublishSettings) -> None:
@@ -138,7 +152,7 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
         raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
     kind = settings.to or "bag"
     out = settings.out or Path(f"{run.name}_{kind}")
-    ros1 = kind == "bag" and out.suffix == ".bag"
+    ros1 = kind == "bag" and out.suffix.lower() == ".bag"
     if ros1:
         count = ros.write_ros1(out, odometry, settings.topic)
     else:

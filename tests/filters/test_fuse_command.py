@@ -198,6 +198,27 @@ def test_publish_writes(runs: list[Path], tmp_path: Path, to: str, name: str) ->
         assert np.flatnonzero(parameters["odom0_config"]).tolist() == [6, 7, 8, 9, 10, 11]
 
 
+@pytest.mark.parametrize(
+    "name, kind, ending",
+    [("x.bag", "bag", ".bag"), ("x.mcap", "mcap", ".mcap"), ("x.tlog", "mavlink", ".tlog"), ("x", None, ".db3")],
+)
+def test_the_name_tells_what_to_publish(
+    runs: list[Path], tmp_path: Path, name: str, kind: str | None, ending: str
+) -> None:
+    if kind == "mavlink":
+        pytest.importorskip("pymavlink")
+    out = json.loads(_run("publish", runs[0], "-o", tmp_path / name, "--json"))
+    assert out["to"] == kind
+    assert any(p.is_file() and p.suffix == ending for p in tmp_path.rglob("x*"))
+
+
+@pytest.mark.parametrize("to, name", [("mcap", "x.tlog"), ("bag", "x.mcap"), ("mavlink", "x.bag")])
+def test_a_name_for_something_else_is_refused(runs: list[Path], tmp_path: Path, to: str, name: str) -> None:
+    with pytest.raises(GpvoError, match=f"{name}: is no name for --to {to}"):
+        _run("publish", runs[0], "--to", to, "-o", tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
 def test_publish_check_alone_writes_nothing(runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     out = _run("publish", runs[0].resolve(), "--consumer", "px4", "--check")

@@ -285,6 +285,25 @@ def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
         to_c(CASES["own noise kernel"], tmp_path / "model.h", name="1+1")
 
 
+def test_the_name_tells_the_format_and_does_not_contradict_it(tmp_path: Path) -> None:
+    trained, model = small_model(), tmp_path / "errors.gpvo"
+    modelfile.save(model, trained.arrays, trained.header)
+    CliRunner().invoke(app, ["export", str(model), "-o", str(tmp_path / "x.h")], catch_exceptions=False)
+    assert "gpvo_predict" in (tmp_path / "x.h").read_text()
+    for words, message in (
+        (["--to", "c", "-o", str(tmp_path / "x.onnx")], "x.onnx: is no name for --to c"),
+        (["--to", "onnx", "-o", str(tmp_path / "y.h")], "y.h: is no name for --to onnx"),
+        (["-o", str(tmp_path / "z")], "the format is not given"),
+    ):
+        with pytest.raises(GpvoError, match=message):
+            CliRunner().invoke(app, ["export", str(model), *words], catch_exceptions=False)
+
+
+def test_predictions_go_to_parquet_alone(tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match=r"p\.csv: is no name for a Parquet file"):
+        CliRunner().invoke(app, ["predict", "m.gpvo", "run", "-o", str(tmp_path / "p.csv")], catch_exceptions=False)
+
+
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="one of: onnx, c"):
         export_model(tmp_path / "model", tmp_path / "out", "fortran")

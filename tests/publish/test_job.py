@@ -98,3 +98,10 @@ def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) 
         publish_run(predicted, replace(GEOMETRY, model=model))
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
         load_predictor(model)
+
+
+def test_a_run_of_poses_alone_needs_a_model(predicted: Path, tmp_path: Path) -> None:
+    bare = [replace(r, covariances={}) for r in read_run(predicted).log]
+    write_run(tmp_path / "bare", VoLog(bare), meta={"source": "made"})
+    with pytest.raises(GpvoError, match=r"bare: holds neither predictions nor covariances \(give --model\)"):
+        publish_run(tmp_path / "bare", GEOMETRY)

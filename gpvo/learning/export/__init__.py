@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from gpvo.errors import GpvoError
 from gpvo.learning.export.c import PREFIX, to_c
 from gpvo.learning.export.onnx import to_onnx
 from gpvo.online.predictor import Predictor
 
-__all__ = ["FORMATS", "PREFIX", "export_model", "to_c", "to_onnx"]
+__all__ = ["FORMATS", "PREFIX", "SUFFIXES", "export_model", "format_of", "to_c", "to_onnx"]
 
 FORMATS = ("onnx", "c")
+SUFFIXES = {"onnx": ".onnx", "c": ".h"}
+
+
+def format_of(to: str | None, path: str | os.PathLike[str] | None) -> str:
+    """The format ``to``, else that which the name ``path`` tells; GpvoError where there is none or they contradict."""
+    told = next((f for f in FORMATS if path is not None and Path(path).suffix.lower() == SUFFIXES[f]), None)
+    chosen = to or told
+    if chosen is None:
+        raise GpvoError("the format is not given", cure=f"--to with one of: {', '.join(FORMATS)}")
+    if chosen not in FORMATS:
+        raise GpvoError(f"cannot export to '{chosen}'", cure=f"one of: {', '.join(FORMATS)}")
+    if told not in (None, chosen):
+        raise GpvoError(f"is no name for --to {chosen}", where=path, cure=f"use --to {told}, or another -o")
+    return chosen
 
 
 def export_model(
@@ -25,11 +40,10 @@ def export_model(
     """Write the model file ``model`` as ``to`` ("onnx" or "c").
 
     ``for_filter``: its model for filters, as ``Predictor.load`` would. ``prefix``: of every symbol in C, so that one
-    program can hold several models. GpvoError for other formats, a prefix that is no C identifier, a bad file, or a
-    model for filters that predicts the error over windows of motions.
+    program can hold several models. GpvoError for other formats or names, a prefix that is no C identifier, a bad
+    file, or a model for filters that predicts the error over windows of motions.
     """
-    if to not in FORMATS:
-        raise GpvoError(f"cannot export to '{to}'", cure=f"one of: {', '.join(FORMATS)}")
+    to = format_of(to, path)
     if prefix != PREFIX and to != "c":
         raise GpvoError(f"{to} has no symbols that a prefix '{prefix}' could go before", cure="give it with c alone")
     predictor = Predictor.load(model, for_filter=for_filter)
