@@ -180,6 +180,9 @@ def _print(e: Evaluation) -> None:
         )
     if table.row_count:
         console.print(table)
+        console.print(
+            "over 1 s: NEES of the motion over a second. final: predicted error of the last position, 1 sigma."
+        )
         sigma = d["truth_sigma"]
         if sigma["translation_m"] or sigma["rotation_rad"]:
             noise = f"{1e3 * sigma['translation_m']:.3g} mm, {1e3 * sigma['rotation_rad']:.3g} mrad per pose"

@@ -101,7 +101,15 @@ def test_json_has_every_name_of_the_interface(capsys, run_folder):
 def test_the_table_names_the_methods(capsys, run_folder):
     code, out, _ = _main(capsys, "evaluate", run_folder, "--segments", "5,10")
     assert code == 0
-    for word in ("hall: 301 frames, 1 lost", "5 m segments", "triangulation", "learned", "NEES/dof"):
+    for word in (
+        "hall: 301 frames, 1 lost",
+        "5 m segments",
+        "triangulation",
+        "learned",
+        "NEES/dof",
+        "over 1 s: NEES",
+        "final: ",
+    ):
         assert word in out
 
 
