@@ -22,6 +22,7 @@ from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti
 from gpvo.types import Status, VoRecord
 
 FORMATS = ("tum", "kitti", "csv", "bag")
+_GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 
@@ -136,19 +137,31 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
 
     A covariance of motions becomes the method ``imported``. One of poses becomes the growth from row to row, if that
     is positive definite for nearly all rows, as for an odometry that adds up its errors; a filter's is not, and stays
-    as it is under the name ``imported_pose``, which is of the pose, not of one motion.
+    as it is under the name ``imported_pose``, which is of the pose, not of one motion. Across a gap in the log the
+    odometry was lost, whatever it says when it is there again.
     """
     T = log.trajectory.T_world_body
     motions = se3.inverse(T[:-1]) @ T[1:]
     name, cov, notes = _motion_covariances(log, motions)
     t = log.t_ns
+    gaps = _after_gaps(t)
+    if gaps:
+        notes = [*notes, f"motions that count as lost, over gaps of more than {_GAP_STEPS} usual steps: {len(gaps)}"]
     records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
     for k, motion in enumerate(motions, 1):
         stated: dict[str, Any] = {}
         if cov is not None and transport.is_positive_definite(cov[k]):
             stated = {"covariances": {name: cov[k]}, "v_t": {}}
-        records.append(VoRecord(int(t[k]), int(t[k - 1]), Status.OK, motion, **stated, **_fields(log, k)))
+        status, reason = (Status.LOST, "gap in the log") if k in gaps else (Status.OK, "")
+        record = VoRecord(int(t[k]), int(t[k - 1]), status, motion, reason=reason, **stated, **_fields(log, k))
+        records.append(record)
     return records, [*log.notes, *notes]
+
+
+def _after_gaps(t_ns: NDArray[np.int64]) -> set[int]:
+    """Rows that follow an interval far beyond the usual one."""
+    steps = np.diff(t_ns)
+    return set() if len(steps) == 0 else set((np.flatnonzero(steps > _GAP_STEPS * np.median(steps)) + 1).tolist())
 
 
 def _fields(log: ForeignLog, k: int) -> dict[str, Any]:

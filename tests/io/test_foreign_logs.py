@@ -85,6 +85,15 @@ def test_pose_covariance_of_a_filter_is_not_passed_off_as_a_motions(tmp_path):
     assert set(records[5].covariances) == {"imported_pose"}
 
 
+def test_the_motion_over_a_gap_is_lost(tmp_path):
+    stamps = T_NS.copy()
+    stamps[12:] += 20_000_000_000
+    write_tum(tmp_path / "a.tum", stamps, POSES)
+    records, notes = to_records(read_foreign(tmp_path / "a.tum"))
+    assert [k for k, r in enumerate(records) if r.status is Status.LOST] == [12]
+    assert notes[0].endswith("usual steps: 1")
+
+
 def test_rows_without_a_pose_are_left_out_and_counted(tmp_path):
     path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
     lines = path.read_text().splitlines()
