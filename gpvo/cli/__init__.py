@@ -6,6 +6,7 @@ Exit code 0, or 2 with one line that says what is wrong with which file and what
 from __future__ import annotations
 
 import sys
+from typing import NoReturn
 
 import typer
 from rich.console import Console
@@ -46,11 +47,18 @@ def main() -> None:
     try:
         app()
     except GpvoError as error:
-        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"gpvo: {error}")
-        sys.exit(2)
+        _fail(str(error))
+    except OSError as error:  # a full disk, a folder in place of a file; a broken pipe has ended inside quietly
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(place + " ".join((error.strerror or str(error)).split()))
     except KeyboardInterrupt:
         print("gpvo: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _fail(text: str) -> NoReturn:
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"gpvo: {text}")
+    sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -264,6 +265,28 @@ def test_run_says_what_the_source_remarks(gpvo, tmp_path):
     assert err.count("poses on '/vicon/head/head' not used as truth") == 1
     code, _, err = gpvo("run", path, "-o", tmp_path / "run", "--preset", "thesis", "--truth-topic", "none")
     assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "runs/a/x.parquet"), 2, "runs/a/x.parquet: No space left"),
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "out"), 2, "out: Is a directory"),
+        (OSError("two\nlines"), 2, "two lines"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 1, ""),
+    ],
+)
+def test_failures_of_the_system_in_one_line(gpvo, monkeypatch, tmp_path, error, code, line):
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("gpvo.cli.describe.describe", fail)
+    monkeypatch.setattr("sys.stdout", sys.stdout)  # put back what the command line puts before a broken pipe
+    monkeypatch.setattr("sys.stderr", sys.stderr)
+    stopped, _, err = gpvo("info", tmp_path)
+    assert stopped == code
+    assert err.startswith(f"gpvo: {line}" if line else "")
+    assert len(err.splitlines()) == (1 if line else 0)
 
 
 def test_pair_tolerance(gpvo, tmp_path):
