@@ -43,12 +43,13 @@ def read_imu(
         no_acc = bool(np.isnan(data[:, 3:]).all())
         good = np.isfinite(data[:, :3]).all(axis=1) & (no_acc | np.isfinite(data[:, 3:]).all(axis=1))
         if not good.any():
-            remark(f"'{topics[0]}' not used as IMU: it measures no rates")
+            when = f" while '{topics[1]}' runs" if len(topics) == 2 else ""
+            remark(f"'{topics[0]}' not used as IMU: it measures no rates{when}")
             continue
-        if len(topics) == 2:
-            remark(f"IMU of '{topics[0]}', with '{topics[1]}' interpolated onto its stamps")
-        elif no_acc:
+        if no_acc:
             remark(f"'{topics[0]}' is a gyroscope only: it measures no acceleration")
+        elif len(topics) == 2:
+            remark(f"IMU of '{topics[0]}', with '{topics[1]}' interpolated onto its stamps")
         return make_imu(t_ns[good], data[good], shift_s=shift_s, remark=remark)
     return None
 

@@ -127,7 +127,8 @@ class BagSource(ImageSource):
         try:
             t, T, _ = read_poses(self.path, topic)
         except SourceError as error:
-            raise SourceError(error.what, where=error.where, cure="--truth-topic none does without") from None
+            cure = error.cure or "--truth-topic none does without"
+            raise SourceError(error.what, where=error.where, cure=cure) from None
         if frame == "imu" and self.mounting.T_imu_cam is None:
             raise CalibrationError("does not say where the IMU sits", where=self.path, cure="use --truth-frame cam")
         whose = frame or ("cam" if self.mounting.T_imu_cam is None else "imu")

@@ -195,7 +195,8 @@ def _by_stamp(images: list[tuple[int, str]], side: str, report: SourceReport) ->
         if t_ns in names:
             report.duplicate += 1
             report.note(f"{side} stamp {t_ns} ns twice")
-        names.setdefault(t_ns, name)
+        else:
+            names[t_ns] = name
     return names
 
 

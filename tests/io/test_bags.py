@@ -212,6 +212,14 @@ def test_gyro_and_accelerometer_on_topics_of_their_own(tmp_path, known):
     assert any("not used as IMU" in n for n in source.report.notes)
 
 
+def test_a_gyroscope_alone_has_no_accelerometer(tmp_path):
+    streams = [("/camera/gyro/sample", 5_000_000, lambda t: {"acc": (0, 0, 0)})]
+    source = open_source(_bag_with_imus(tmp_path, *streams))
+    np.testing.assert_array_equal(source.imu.gyro_radps[0], [0.1, 0.2, 0.3])
+    assert np.isnan(source.imu.acc_mps2).all()
+    assert any("a gyroscope only" in n for n in source.report.notes)
+
+
 def test_a_whole_imu_goes_before_halves_and_before_zeros(tmp_path):
     path = _bag_with_imus(
         tmp_path,
