@@ -14,6 +14,8 @@ from gpvo.errors import GpvoError
 if TYPE_CHECKING:
     from gpvo.types import Prediction
 
+_MOST_NOTES = 5
+
 
 def run(
     source: Annotated[Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")],
@@ -94,7 +96,9 @@ def run(
                 show(step, prediction)
 
         summary = runner.run(sequence, out, config, predictor, on_frame=on_frame)
-    for note in sequence.report.notes:
+    notes = sequence.report.notes
+    more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
+    for note in (*notes[:_MOST_NOTES], *more):
         print(f"source: {note}", file=sys.stderr)
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})

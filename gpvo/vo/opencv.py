@@ -54,7 +54,10 @@ def track(
 def coarse_disparity(left: Image, right: Image, max_disparity_px: int) -> NDArray[np.float32]:
     """Block-matched disparity (H, W) of a small rectified pair [px]; negative where none was found."""
     count = int(np.ceil(max(max_disparity_px, 16) / 16)) * 16
-    matcher = cv2.StereoBM.create(numDisparities=count, blockSize=15)
+    block_px = min(15, (min(left.shape) - 1) // 2 * 2 - 1)  # odd, and smaller than the image
+    if block_px < 5:
+        return np.full(left.shape, -1.0, np.float32)
+    matcher = cv2.StereoBM.create(numDisparities=count, blockSize=block_px)
     matcher.setUniquenessRatio(5)
     matcher.setTextureThreshold(4)
     # The matcher leaves a strip of the width of its search on the left; extending the rows keeps those corners.

@@ -136,6 +136,13 @@ def test_after_a_cut_it_is_right_or_lost(clip: Clip, seed: int) -> None:
     assert records[9].status is Status.OK
 
 
+@pytest.mark.parametrize("size", [(64, 48), (24, 16)])
+def test_tiny_pictures_are_no_error(size: tuple[int, int]) -> None:
+    """Smaller than a block of the matcher: then there is nothing to see, which a record says."""
+    tiny = render_clip(pinhole(*size), wander(3, seed=2))
+    assert all(r.status in (Status.LOST, Status.OK, Status.DEGRADED) for r in run(tiny)[1:])
+
+
 def test_few_points_and_far_points_are_doubted(clip: Clip) -> None:
     rng = np.random.default_rng(0)
 
