@@ -108,7 +108,8 @@ def predictions_of(run: Run, model: Path | None) -> dict[int, Prediction]:
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
     """All messages of a run, with ``predictions`` by ``t_ns``; its ``odom`` starts at the body's first pose."""
-    if not predictions and not any(r.covariances for r in run.log):
+    usable = [r for r in run.log if r.usable]
+    if usable and not predictions and not any(r.covariances for r in usable):
         raise GpvoError("holds neither predictions nor covariances", where=run.path, cure="give --model")
     builder = OdometryBuilder(
         T_body_cam=run.mounting.T_body_cam, method=settings.method, correct_twist=settings.correct_twist

@@ -59,7 +59,7 @@ def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -
         ("bag", "file", "file: is a file, and a ROS 2 bag is a folder"),
         ("mcap", "file", "file: is a file"),
         ("bag", "folder.bag", "folder.bag: is a folder"),
-        ("mavlink", "folder.bag", "folder.bag: is a folder"),
+        ("mavlink", "folder", "folder: is a folder"),
     ],
 )
 def test_what_lies_where_it_should_be_written_is_left_alone(
@@ -68,10 +68,11 @@ def test_what_lies_where_it_should_be_written_is_left_alone(
     if to == "mavlink":
         pytest.importorskip("pymavlink")
     (tmp_path / "file").write_bytes(b"mine")
-    (tmp_path / "folder.bag").mkdir()
+    for folder in ("folder", "folder.bag"):
+        (tmp_path / folder).mkdir()
     with pytest.raises(GpvoError, match=words):
         publish_run(predicted, replace(GEOMETRY, to=to, out=tmp_path / name))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.bag"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder", "folder.bag"]
     assert (tmp_path / "file").read_bytes() == b"mine"
 
 
