@@ -168,8 +168,13 @@ def _print_table(document: dict[str, Any]) -> None:
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
+        counted_in = (
+            f"{method} {sum(s['nees_dof_with_slips'][method] for s in slips) / len(slips):.3g}"
+            for method in ("learned", "constant")
+        )
         console.print(
-            f"slips: {total['caught']} caught, {total['missed']} missed, {total['falsely_flagged']} falsely flagged"
+            f"slips: {total['caught']} caught, {total['missed']} missed, {total['falsely_flagged']} falsely flagged;"
+            f" NEES with the flagged counted in: {', '.join(counted_in)}"
         )
     c = document["comparison"]
     if c is not None:

@@ -163,6 +163,23 @@ class Predictor:
         estimate = self.predict(x, record.covariances.get(method or ""), record.dt_s)
         return self._publish(record, estimate)
 
+    def interval(self, prediction: Prediction, level: float = 0.9) -> Array:
+        """(6, 2) ends between which each axis' error lies in a share ``level`` of the motions of a new sequence.
+
+        Their width in sigma is that which covered the training sequences, each left out in turn, whatever the shape of
+        the errors' distribution: :func:`gpvo.learning.calibrate.conformal_quantiles`. The header's
+        ``interval_guaranteed`` says by axis and level whether the sequences were enough for a guarantee. Raises
+        ModelError for a level that the model does not hold.
+        """
+        calibration = self.header.get("calibration") or {}
+        levels = [float(x) for x in calibration.get("interval_levels", ())]
+        at = next((i for i, known in enumerate(levels) if abs(known - level) < 1e-3), None)
+        if at is None:
+            held = ", ".join(f"{x:g}" for x in levels) or "none"
+            raise ModelError(f"the model holds no interval of level {level:g}", cure=f"choose one of: {held}")
+        width = np.array([axis[at] for axis in calibration["interval_sigmas"]]) * prediction.sigma
+        return np.stack([prediction.mean - width, prediction.mean + width], axis=1)
+
     def observe(self, xi_true: ArrayLike, t_ns: int | None = None) -> None:
         """Late truth: the error (6,) that the motion ending at ``t_ns`` (default: the last) turned out to have.
 

@@ -353,6 +353,27 @@ def test_the_table_prints_names_as_they_are(capsys):
     assert "1: [/red] (3 rows)" in capsys.readouterr().out
 
 
+def test_the_table_says_what_slips_would_cost(capsys):
+    fold = {"held_out": "a", "rows": 3, "methods": {}}
+    counts = [(1, 2, 0, 1.5, 80.0), (3, 0, 1, 0.5, 40.0)]
+    folds = [
+        {
+            **fold,
+            "slips": {
+                "caught": caught,
+                "missed": missed,
+                "falsely_flagged": false,
+                "nees_dof_with_slips": {"learned": learned, "constant": constant},
+            },
+        }
+        for caught, missed, false, learned, constant in counts
+    ]
+    _print_table({"folds": folds, "mean": {}, "comparison": None})
+    said = " ".join(capsys.readouterr().out.split())
+    assert "slips: 4 caught, 2 missed, 1 falsely flagged" in said
+    assert "counted in: learned 1, constant 60" in said
+
+
 @pytest.mark.slow
 def test_folds_on_a_dask_cluster_of_two_processes():
     distributed = pytest.importorskip("distributed")

@@ -17,7 +17,7 @@ from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import divide, ln_faster
 from gpvo.online.predictor import Predictor
 from gpvo.types import Status
-from small_model import small_model
+from small_model import small_model, training_sets
 from synthetic_runs import CAMERA, make_run
 
 
@@ -167,6 +167,22 @@ def test_explanation_names_the_input_that_changed(predictor, flight):
     first = predictor.explain(few)[0]
     assert first.feature.startswith(("ln_var", "n_inliers"))
     assert "sigma" in str(first)
+
+
+def test_intervals_cover_flights_that_the_model_has_not_seen(predictor):
+    inside = {0.5: [], 0.9: []}
+    for s in training_sets(range(200, 206), n=300):
+        log, _ = make_run(int(s.name.removeprefix("flight")), n=300)
+        said = {p.t_ns: p for p in map(predictor.step, log) if p is not None}
+        for level, hits in inside.items():
+            ends = np.array([predictor.interval(said[t], level) for t in s.t_ns])
+            hits.append((np.abs(s.Y - ends.mean(axis=2)) <= 0.5 * np.ptp(ends, axis=2)).mean())
+        predictor.reset()
+    # Of five flights the model has seen four, and the fifth counts as if it covered nothing.
+    for level, hits in inside.items():
+        assert level - 0.05 < np.mean(hits) < min(1.25 * level, 1.0) + 0.05
+    with pytest.raises(ModelError, match="no interval of level 0.123"):
+        predictor.interval(said[s.t_ns[0]], 0.123)
 
 
 def test_late_truth_restores_coverage():
