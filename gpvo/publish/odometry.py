@@ -158,17 +158,14 @@ class OdometryBuilder:
         if dt <= 0:
             raise GpvoError(f"the frame at t_ns {record.t_ns} does not follow the one at {t_last}")
         if t_last == record.t_prev_ns:
-            xi, T_rel = se3.log(record.T_prev_cur), record.T_prev_cur
+            xi, covariance = se3.log(record.T_prev_cur), independent + 2.0 * own
+            if self.correct_twist and prediction is not None:
+                xi = se3.log(record.T_prev_cur @ se3.exp(-prediction.mean))
         else:
+            # Both motions have the mean of their reference in them: nothing is left of it to take off.
             T_rel = se3.inverse(T_last) @ chain.T_first_cam
-            xi = se3.log(T_rel)
-        if self.correct_twist and prediction is not None:
-            xi = se3.log(T_rel @ se3.exp(-prediction.mean))
-        if t_last == record.t_prev_ns:
-            covariance = independent + 2.0 * own
-        else:
             A = se3.adjoint(se3.inverse(T_rel))
-            covariance = independent + own + A @ noise_last @ A.T
+            xi, covariance = se3.log(T_rel), independent + own + A @ noise_last @ A.T
         self._speed = xi / dt
         twist = self._Ad @ xi / dt
         moved = self._Ad @ covariance @ self._Ad.T / dt**2
