@@ -39,6 +39,7 @@ __all__ = ["Run", "RunWriter", "read_predictions", "read_run", "write_prediction
 SCHEMA = 1
 _FILES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet")
 _OWN = (*_FILES, "config.toml", "run.json")
+_BEGINNING = "run.json.part"
 
 
 class RunWriter:
@@ -78,6 +79,8 @@ class RunWriter:
         self._chunk = max(1, chunk)
         self._state = _State()
         _prepare(self.path)
+        # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
+        self._write_meta(complete=False)
         self._chunks.mkdir()
         write_json(self.path / "rig.json", _rig(camera, mounting or Mounting(), calibration))
         if truth is not None:
@@ -85,7 +88,6 @@ class RunWriter:
         if imu is not None:
             write_imu(self.path / "imu.parquet", imu)
         write_toml(self.path / "config.toml", dict(config or {}))
-        self._write_meta(complete=False)
 
     def __enter__(self) -> RunWriter:
         return self
@@ -254,11 +256,11 @@ def _prepare(path: Path) -> None:
         raise SourceError("is a file, not a folder for a run", where=path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        present = {p.name for p in path.iterdir()}
+        present = {p.name for p in path.iterdir()} - {_BEGINNING}
         if present and "run.json" not in present:
             raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
         shutil.rmtree(path / "chunks", ignore_errors=True)
-        for name in _OWN:
+        for name in (_BEGINNING, *_OWN):
             (path / name).unlink(missing_ok=True)
     except OSError as error:
         raise SourceError(f"cannot be written: {error.strerror}", where=path) from None

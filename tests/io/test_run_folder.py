@@ -154,6 +154,19 @@ def test_an_exception_leaves_every_record(tmp_path):
     assert run.log.camera is None
 
 
+@pytest.mark.parametrize("at", ["os.replace", "gpvo.io.run.write_json", "gpvo.io.run.write_toml"])
+def test_a_run_that_was_killed_while_it_began_is_begun_anew(tmp_path, monkeypatch, at):
+    def killed(*_):
+        raise SystemExit
+
+    monkeypatch.setattr(at, killed)
+    with pytest.raises(SystemExit):
+        RunWriter(tmp_path / "run")
+    monkeypatch.undo()
+    write_run(tmp_path / "run", VoLog(make_records(10), CAMERA))
+    assert len(read_run(tmp_path / "run").log) == 10
+
+
 def test_foreign_folder_is_not_overwritten(tmp_path):
     (tmp_path / "precious.txt").write_text("mine")
     with pytest.raises(SourceError, match="not a run"):
