@@ -123,9 +123,7 @@ def build(
             cure="check that log and truth share one clock",
         )
     kept = [r for r, k in zip(records, known) if k]
-    # Windows leave lost frames out before they become records.
-    n_lost = sum(r.status is Status.LOST for r in flag_slips(log))
-    slips, jumps = slips_of(log)
+    n_lost, slips, jumps = lost_of(log)
     as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)
     n_usable = sum(r.usable for r in records)
     return TrainingSet(
@@ -150,15 +148,17 @@ def build(
     )
 
 
-def slips_of(log: VoLog) -> tuple[list[VoRecord], Array]:
-    """Records that are lost for their motion alone, and the distance (m, 6) of each motion from the expected one."""
-    detector, slips, jumps = SlipDetector(), [], []
+def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
+    """How many records are lost, those that are so for their motion alone, and the distance (m, 6) of each such motion
+    from the expected one. From the log itself: windows leave lost frames out before they become records."""
+    detector, n_lost, slips, jumps = SlipDetector(), 0, [], []
     for record in log.records:
         judged = detector.step(record)
+        n_lost += judged.status is Status.LOST
         if judged.status is Status.LOST and REASON in judged.reason and detector.expected is not None:
             slips.append(judged)
             jumps.append(se3.log(judged.T_prev_cur) - detector.expected * judged.dt_s)
-    return slips, np.array(jumps).reshape(-1, 6)
+    return n_lost, slips, np.array(jumps).reshape(-1, 6)
 
 
 def build_run(

@@ -12,8 +12,8 @@ from gpvo.online.predictor import Predictor
 
 __all__ = ["FORMATS", "PREFIX", "SUFFIXES", "export_model", "format_of", "to_c", "to_onnx"]
 
-FORMATS = ("onnx", "c")
 SUFFIXES = {"onnx": ".onnx", "c": ".h"}
+FORMATS = tuple(SUFFIXES)
 
 
 def format_of(to: str | None, path: str | os.PathLike[str] | None) -> str:
