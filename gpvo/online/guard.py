@@ -36,14 +36,17 @@ class Domain:
     """Where the training data lay, per feature and jointly.
 
     ``centre``, ``scale`` (d,): robust, in the features' units. ``low``, ``high`` (d,): range of the standardised
-    features. ``whitening`` (d, d): ``|u W|`` is the Mahalanobis distance, with ``radius`` (1,) its training maximum.
-    ``may_miss`` (d,) bool: features that were absent from some training rows.
+    features but for rare ones, where a model can have learnt something; ``least``, ``most`` (d,): of all of them, as no
+    training row is another place. ``whitening`` (d, d): ``|u W|`` is the Mahalanobis distance, with ``radius`` (1,) its
+    training maximum. ``may_miss`` (d,) bool: features that were absent from some training rows.
     """
 
     centre: Array
     scale: Array
     low: Array
     high: Array
+    least: Array
+    most: Array
     whitening: Array
     radius: Array
     may_miss: NDArray[np.bool_]
@@ -52,7 +55,7 @@ class Domain:
     def learn(cls, X: Array, *, margin: float = 0.02) -> Domain:
         """From training rows (n, d), NaN where a value is missing.
 
-        The range leaves out one row in five thousand at either end and adds ``margin`` of its width.
+        The narrower range leaves out one row in five thousand at either end; to both ``margin`` of its width is added.
         """
         centre = np.nanmedian(X, axis=0)
         q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
@@ -63,14 +66,15 @@ class Domain:
         U = (X - centre) / scale
         low, high = np.nanquantile(U, [_LEAST, 1.0 - _LEAST], axis=0)
         pad = margin * (high - low)
+        least, most = np.nanmin(U, axis=0), np.nanmax(U, axis=0)
         U = np.clip(np.nan_to_num(U), low - pad, high + pad)
         C = np.cov(U, rowvar=False).reshape(X.shape[1], -1)
         # Shrunk towards its diagonal, so that collinear features do not make a razor-thin domain.
         C = 0.9 * C + 0.1 * np.diag(np.diagonal(C)) + 1e-6 * np.eye(len(C))
         whitening = np.linalg.inv(np.linalg.cholesky(C)).T
-        radius = np.quantile(np.linalg.norm((U - U.mean(0)) @ whitening, axis=1), 1.0 - _LEAST, keepdims=True)
-        shift = np.linalg.norm(U.mean(0) @ whitening)
-        return cls(centre, scale, low - pad, high + pad, whitening, radius + shift, np.asarray(np.isnan(X).any(axis=0)))
+        radius = np.linalg.norm(U @ whitening, axis=1).max(keepdims=True)
+        low, high, least, most = low - pad, high + pad, least - pad, most + pad
+        return cls(centre, scale, low, high, least, most, whitening, radius, np.asarray(np.isnan(X).any(axis=0)))
 
     def locate(self, X: Array, noise: Array | float = 0.0) -> Whereabouts:
         """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it.
@@ -82,7 +86,7 @@ class Domain:
         missing = ~np.isfinite(U)
         U = np.where(missing, 0.0, U)
         inside = np.clip(U, self.low, self.high)
-        away = (U - inside) ** 2 / (1.0 + noise / self.scale**2)
+        away = (U - np.clip(U, self.least, self.most)) ** 2 / (1.0 + noise / self.scale**2)
         beyond = away.sum(1) + (missing & ~self.may_miss).sum(1)
         joint = np.maximum(np.linalg.norm(inside @ self.whitening, axis=1) - self.radius[0], 0.0)
         distance = np.sqrt(beyond + joint**2)
@@ -94,9 +98,10 @@ class Domain:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str) -> Domain:
-        """The domain from named arrays. Raises ModelError where one is missing."""
+        """The domain from named arrays. Raises ModelError where one is missing; older files have one range alone."""
         try:
-            return cls(**{f.name: arrays[prefix + f.name] for f in fields(cls)})
+            older = {prefix + "least": arrays[prefix + "low"], prefix + "most": arrays[prefix + "high"]}
+            return cls(**{f.name: {**older, **arrays}[prefix + f.name] for f in fields(cls)})
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
 

@@ -93,6 +93,8 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("scale", domain.scale),
         *_array("low", domain.low),
         *_array("high_edge", domain.high),
+        *_array("least", domain.least),
+        *_array("most", domain.most),
         *_array("whitening", domain.whitening),
         *_array("may_miss", domain.may_miss, "int"),
         *_array("input", model.inputs, "int"),

@@ -145,7 +145,7 @@ def _locate(g: _Graph, model: ErrorModelArrays, base: str) -> tuple[str, str, st
     present = g.finite(u)
     u = g("Where", present, u, 0.0)
     inside = g("Min", g("Max", u, g.constant(domain.low)), g.constant(domain.high))
-    away = g("Sub", u, inside)
+    away = g("Sub", u, g("Min", g("Max", u, g.constant(domain.least)), g.constant(domain.most)))
     charged = g("Where", present, 0.0, g.constant((~domain.may_miss).astype(np.float64)))
     beyond = g.sum(g("Add", g("Div", g("Mul", away, away), known), charged), 1)
     white = g("MatMul", inside, g.constant(domain.whitening))

@@ -21,7 +21,7 @@ static double gpvo_locate(const double *features, const double *base, double dt_
     int i, j;
     for (i = 0; i < GPVO_N_FEATURES; ++i) {
         double u = (features[i] - gpvo_centre[i]) / gpvo_scale[i];
-        double noise = 0.0, dt2 = dt_s * dt_s;
+        double noise = 0.0, dt2 = dt_s * dt_s, away;
         int missing = !isfinite(u);
         for (j = 0; j < 6; ++j) {
             int at = j * GPVO_N_FEATURES + i;
@@ -32,7 +32,8 @@ static double gpvo_locate(const double *features, const double *base, double dt_
             beyond += gpvo_may_miss[i] ? 0.0 : 1.0;
         }
         inside[i] = gpvo_clip(u, gpvo_low[i], gpvo_high_edge[i]);
-        beyond += (u - inside[i]) * (u - inside[i]) / (1.0 + noise / (gpvo_scale[i] * gpvo_scale[i]));
+        away = u - gpvo_clip(u, gpvo_least[i], gpvo_most[i]);
+        beyond += away * away / (1.0 + noise / (gpvo_scale[i] * gpvo_scale[i]));
     }
     for (j = 0; j < GPVO_N_FEATURES; ++j) {
         double w = 0.0;
