@@ -148,11 +148,10 @@ def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array
     length, lost_length = (np.linalg.norm(xi[:, :3], axis=1) for xi in (s.Y, s.lost_xi))
     gross = length > SLIP_MEDIANS * np.median(length)
     gross_lost = lost_length > SLIP_MEDIANS * np.median(length)
-    usual = learned.model.usual_rate_var * learned.model.dt_s**2
-    jump2 = s.lost_jump**2
-    lost_var = np.maximum(usual, np.repeat(np.stack([jump2[:, :3].sum(1), jump2[:, 3:].sum(1)], 1), 3, axis=1))
+    dt_s = learned.model.dt_s
+    lost_var = [learned.model.lost_variance(dt_s, dt_s, np.zeros(6), jump) for jump in s.lost_jump]
     learned_all = np.concatenate(
-        [nees(s.Y - estimate.mean, estimate.covariance), (s.lost_xi**2 / np.maximum(lost_var, 1e-12)).sum(1)]
+        [nees(s.Y - estimate.mean, estimate.covariance), (s.lost_xi**2 / np.reshape(lost_var, (-1, 6))).sum(1)]
     )
     constant_all = nees(np.concatenate([s.Y, s.lost_xi]), constant)
     return {
@@ -192,7 +191,7 @@ def _header(
 ) -> dict[str, Any]:
     model = learned.model
     domain = model.domain
-    low, high = domain.centre + domain.scale * domain.low, domain.centre + domain.scale * domain.high
+    low, high = (domain.centre + domain.scale * edge for edge in (domain.least, domain.most))
     cameras = [s.camera for s in sets if s.camera is not None]
     step = model.dt_s
     return {

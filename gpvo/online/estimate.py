@@ -21,6 +21,8 @@ from gpvo.types import Array
 PARTS = ("jitter", "white", "bias")
 _EYE = np.eye(6)
 LN_FASTEST = float(np.log(20.0))
+COASTED = (1, 2, 5, 10, 20, 50)
+"""Over so many usual motions training tells how much a velocity changes."""
 LN_LARGEST = 60.0
 """Geometric log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
 FOR_FILTER = "for_filter."
@@ -86,8 +88,9 @@ class ErrorModelArrays:
     two mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides among them at
     the log variance ``level`` (6,) and the typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6) how
     that changes (see :func:`divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
-    ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]. ``mean_in_sigma`` (1,): whether the
-    GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
+    ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]; ``rate_change_var`` (K, 6): of its
+    changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the GP's mean is in units of the base's standard
+    deviation, not the error's own at the usual duration ``dt_s``.
     ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters.
     """
 
@@ -108,6 +111,7 @@ class ErrorModelArrays:
     bias_tau_s: Array
     typical_ln_det: Array
     usual_rate_var: Array
+    rate_change_var: Array
     mean_in_sigma: NDArray[np.bool_]
     steady_mean: Array
     dt_s: float
@@ -129,7 +133,9 @@ class ErrorModelArrays:
     ) -> ErrorModelArrays:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
         try:
-            arrays = {"steady_mean": np.zeros(6), **arrays}
+            # Velocities that have nothing to do with each other, where an older file does not say.
+            unrelated = np.tile(2.0 * arrays["usual_rate_var"], (len(COASTED), 1))
+            arrays = {"steady_mean": np.zeros(6), "rate_change_var": unrelated, **arrays}
             own = {name: arrays[name] for name in _OWN}
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
@@ -145,6 +151,7 @@ class ErrorModelArrays:
             "ln_speed": (1,),
             "bias_tau_s": (6,),
             "usual_rate_var": (6,),
+            "rate_change_var": (len(COASTED), 6),
             "mean_in_sigma": (1,),
             "geometry_weight": (1,),
             "steady_mean": (6,),
@@ -244,6 +251,21 @@ class ErrorModelArrays:
         limit = np.repeat(moved.reshape(-1, 2, 3).sum(axis=2), 3, axis=1)
         return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit)
 
+    def lost_variance(self, dt_s: float, age_s: float, rate: Array, jump: Array) -> Array:
+        """(6,) variance of a lost motion of duration ``dt_s``, of which nothing was measured.
+
+        The vehicle has gone on with the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, but for what velocities
+        changed in training over such a time, and more if it is faster than was usual there; at most, and after longer
+        times than training shows, it is as wrong as the vehicle is fast. ``jump`` (6,) [m, rad]: by how much the motion
+        given differs from that velocity's.
+        """
+        lags = self.dt_s * np.array(COASTED)
+        change = np.array([np.interp(age_s, lags, of_axis, right=np.inf) for of_axis in self.rate_change_var.T])
+        speed2 = _squared_length(rate)
+        faster = np.maximum(speed2 / np.repeat(self.usual_rate_var.reshape(2, 3).sum(axis=1), 3), 1.0)
+        changed = np.minimum(change * faster, np.maximum(self.usual_rate_var, speed2))
+        return np.asarray(changed * dt_s**2 + _squared_length(jump))
+
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones typical, geometric log variances never below the training's smallest."""
         at, centre, smallest = self._base_place
@@ -279,6 +301,11 @@ class ErrorModelArrays:
         share = divide(self.share, self.growth, np.log(variance) - self.level, faster)
         sigma = np.sqrt(share * variance[:, None, :])
         return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :]
+
+
+def _squared_length(xi: Array) -> Array:
+    """(6,) of a tangent vector: squared length of its translation, three times, and of its rotation."""
+    return np.repeat((xi.reshape(2, 3) ** 2).sum(axis=1), 3)
 
 
 def within(variance: Array, limit: Array) -> Array:
@@ -342,6 +369,7 @@ _OWN = (
     "bias_tau_s",
     "typical_ln_det",
     "usual_rate_var",
+    "rate_change_var",
     "mean_in_sigma",
     "steady_mean",
 )

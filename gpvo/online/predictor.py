@@ -21,7 +21,6 @@ from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_for_f
 from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
-from gpvo.online.slip import REASON
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
@@ -207,7 +206,7 @@ class Predictor:
         ln_sigma = np.log(self.predict(typical, dt_s=dt_s or self.model.dt_s).sigma)
         gain = ln_sigma[0] - ln_sigma[1:]
         u = (x - self.model.domain.centre) / self.model.domain.scale
-        outside = np.maximum(np.maximum(self.model.domain.low - u, u - self.model.domain.high), 0.0)
+        outside = np.abs(u - np.clip(u, self.model.domain.least, self.model.domain.most))
         unit = self.header.get("units") or [""] * len(x)
         factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1))
         order = np.argsort(-np.abs(gain).sum(1), kind="stable")
@@ -232,8 +231,7 @@ class Predictor:
         if status is Status.DEGRADED:
             confidence *= 0.5
         if status is Status.LOST:
-            # What was learnt of measured motions does not apply to one that was not: it may be as wrong as the vehicle
-            # is fast, or the jump is long.
+            # What was learnt of measured motions does not apply to one that was not.
             parts = dict.fromkeys(PARTS, np.zeros((6, 6))) | {"white": np.diag(self._lost_variance(record))}
             confidence, mean = 0.0, np.zeros(6)
         covariance = parts["jitter"] + parts["white"] + parts["bias"]
@@ -256,13 +254,13 @@ class Predictor:
         )
 
     def _lost_variance(self, record: VoRecord) -> Array:
-        """(6,) variance of a lost motion: at least the training's usual motion, and the distance from what was
-        expected. What VO gives is a guess where it lost the motion itself: the vehicle may also have stopped."""
-        xi, expected = se3.log(record.T_prev_cur), self._observer.slip.expected
-        wrong_by = [] if REASON in record.reason else [xi]
-        wrong_by += [] if expected is None else [xi - expected * record.dt_s]
-        squared = [np.repeat((d.reshape(2, 3) ** 2).sum(axis=1), 3) for d in wrong_by]
-        return np.max([self.model.usual_rate_var * record.dt_s**2, *squared], axis=0)
+        """(6,) variance of a lost motion: what VO gives is the motion expected of the vehicle, or a jump away from it,
+        and the vehicle has not kept its velocity."""
+        xi, slip = se3.log(record.T_prev_cur), self._observer.slip
+        if slip.expected is None:
+            return self.model.lost_variance(record.dt_s, np.inf, xi / max(record.dt_s, 1e-6), np.zeros(6))
+        jump = xi - slip.expected * record.dt_s
+        return self.model.lost_variance(record.dt_s, slip.age_s, slip.expected, jump)
 
     def _at_rest(self, record: VoRecord) -> Prediction:
         """The first frame has no motion and hence no error to speak of."""

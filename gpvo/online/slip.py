@@ -59,15 +59,20 @@ class SlipDetector:
         self._suspect: tuple[float, Array] | None = None
         self.expected: Array | None = None
         """(6,) velocity expected of the latest motion, the last one believed; None before there is one."""
+        self.age_s = 0.0
+        """How long before the middle of the latest motion that velocity was measured."""
 
     def step(self, record: VoRecord) -> VoRecord:
         """The record, ``lost`` if its motion is impossible. Call once per record, in time order."""
         record = _unflagged(record)
-        self.expected = None if self._anchor is None else self._anchor[1]
+        middle_s = (record.t_ns + record.t_prev_ns) * 0.5e-9
+        if self._anchor is None:
+            self.expected, self.age_s = None, 0.0
+        else:
+            self.expected, self.age_s = self._anchor[1], max(middle_s - self._anchor[0], 0.0)
         if not record.usable or record.dt_s <= 0:
             return record
         now = twist(record)
-        middle_s = (record.t_ns + record.t_prev_ns) * 0.5e-9
         if self._anchor is None or middle_s - self._anchor[0] > _PATIENCE_S:
             self._believe(middle_s, now)
             return record

@@ -17,7 +17,7 @@ from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
-from gpvo.online.estimate import FOR_FILTER, PARTS, ErrorModelArrays, Estimate
+from gpvo.online.estimate import COASTED, FOR_FILTER, PARTS, ErrorModelArrays, Estimate
 from gpvo.online.guard import Domain
 from gpvo.online.predictor import Predictor
 from small_model import small_model
@@ -82,6 +82,7 @@ def some_model(
         bias_tau_s=np.ones(6),
         typical_ln_det=np.array([-60.0]),
         usual_rate_var=rng.uniform(0.5, 2.0, 6),
+        rate_change_var=rng.uniform(0.5, 2.0, (len(COASTED), 6)),
         mean_in_sigma=np.array([in_sigma]),
         steady_mean=np.zeros(6),
         dt_s=0.1,

@@ -14,6 +14,7 @@ from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.io.run import write_run
+from gpvo.learning.assemble import rate_changes
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.meantest import helps_over_distance, pose_gain, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
@@ -25,7 +26,7 @@ from gpvo.learning.train import train_sets
 from gpvo.learning.update import config_of, update
 from gpvo.online.base import OWN_MOTION, TWIST_COLUMNS
 from gpvo.online.basis import NEVER
-from gpvo.online.estimate import divide
+from gpvo.online.estimate import COASTED, divide
 from gpvo.online.predictor import Predictor
 from gpvo.stats.consistency import nees
 from gpvo.types import VoLog
@@ -49,6 +50,21 @@ def test_consistent_on_unseen_flights():
         per_flight.append(nees(s.Y - e.mean, e.covariance).mean() / 6)
         assert 0.6 < np.mean(np.abs(s.Y - e.mean) < e.sigma) < 0.77
     assert 0.8 <= np.mean(per_flight) <= 1.25
+
+
+def test_velocities_change_as_in_training():
+    """Forty flights whose turn rate is a first-order Gauss-Markov process of 0.3 rad/s, memory 0.95 per motion."""
+    found = rate_changes(Rows.stack(training_sets(range(40), n=300)))
+    expected = 2 * 0.3**2 * (1 - 0.95 ** np.array(COASTED))
+    np.testing.assert_allclose(found[:, 4], expected, rtol=0.15)
+    assert (np.diff(found, axis=0) >= 0).all()
+
+
+def test_velocities_of_short_flights_are_unrelated_after_longer_times():
+    rows = Rows.stack(training_sets(range(4), n=30))
+    usual = (rows.select(TWIST_COLUMNS) ** 2).mean(axis=0)
+    found = rate_changes(rows)
+    np.testing.assert_allclose(found[-1], np.maximum(2 * usual, found[-2]), rtol=1e-9)
 
 
 def test_consistent_over_many_frames():
