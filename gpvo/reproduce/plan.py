@@ -28,7 +28,7 @@ class Plan:
 
     seeds: int = 5
     points_seeds: int = 20
-    training: Mapping[Mode, int] = field(default_factory=lambda: {"images": 6, "points": 36})
+    training: Mapping[Mode, int] = field(default_factory=lambda: {"images": 8, "points": 36})
     duration_s: float = 60.0
     rate_hz: float = 10.0
     stretch: bool = True
