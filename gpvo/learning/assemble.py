@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.build import TrainingSet
 from gpvo.learning.calibrate import (
     LEVELS,
     Scale,
@@ -24,13 +23,12 @@ from gpvo.learning.noise import HeteroscedasticFit
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import Parts, fit_parts
 from gpvo.learning.rows import Rows
+from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import SharedBasis
-from gpvo.online.estimate import COASTED, ErrorModelArrays, divide, ln_faster
+from gpvo.online.estimate import ErrorModelArrays, divide, ln_faster
 from gpvo.online.guard import Domain
 from gpvo.types import Array
-
-_LEAST_RATE_VAR = 1e-6
 
 
 def assemble(
@@ -78,7 +76,7 @@ def assemble(
         ln_speed=sums.ln_speed,
         bias_tau_s=sums.parts.tau_s,
         typical_ln_det=np.zeros(1),
-        usual_rate_var=_usual_rate_var(rows),
+        usual_rate_var=usual_rate_var(rows),
         rate_change_var=rate_changes(rows),
         mean_in_sigma=np.array([mean_in_sigma]),
         steady_mean=np.zeros(6),
@@ -117,31 +115,6 @@ def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None) -> 
         each = divided(errors, rows.chains(sigma**2), rows.chains(share), rows.chains(geometry))
         weight = choose_geometry_weight(each, correlation, float(np.exp(-rows.step_s / parts.tau_s[0])))
     return _Sums(parts, correlation, weight, ln_speed, faster)
-
-
-def _usual_rate_var(rows: Rows) -> Array:
-    """(6,) mean square velocity of VO, sequences alike."""
-    return np.maximum(np.nanmean(rows.weight[:, None] * rows.select(TWIST_COLUMNS) ** 2, axis=0), _LEAST_RATE_VAR)
-
-
-def rate_changes(rows: Rows) -> Array:
-    """(K, 6) mean square [m^2/s^2, rad^2/s^2] by which VO's velocity changes over ``COASTED`` usual motions, sequences
-    alike; never less than over a shorter time, and that of unrelated velocities where no sequence is long enough."""
-    out = []
-    for m in COASTED:
-        seen = [c for s in rows.sets if len(c := _changes(s, m, rows.step_s))]
-        out.append(np.mean([np.mean(c**2, axis=0) for c in seen], axis=0) if seen else 2.0 * _usual_rate_var(rows))
-    return np.maximum(np.maximum.accumulate(np.array(out)), _LEAST_RATE_VAR)
-
-
-def _changes(s: TrainingSet, m: int, step_s: float) -> Array:
-    """(k, 6) changes of the velocity over m usual motions: of those between rows that lie about so far apart."""
-    later = np.searchsorted(s.t_ns, s.t_ns + round((m - 0.5) * step_s * 1e9))
-    rate = s.select(TWIST_COLUMNS)
-    first = np.flatnonzero(later < len(s))
-    first = first[s.t_ns[later[first]] - s.t_ns[first] <= (m + 0.5) * step_s * 1e9]
-    change = rate[later[first]] - rate[first]
-    return np.asarray(change[np.isfinite(change).all(axis=1)])
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:

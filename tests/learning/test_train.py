@@ -14,7 +14,6 @@ from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.io.run import write_run
-from gpvo.learning.assemble import rate_changes
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.meantest import helps_over_distance, pose_gain, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
@@ -24,6 +23,7 @@ from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, rows_path, save_model
 from gpvo.learning.train import train_sets
 from gpvo.learning.update import config_of, update
+from gpvo.learning.velocities import rate_changes
 from gpvo.online.base import OWN_MOTION, TWIST_COLUMNS
 from gpvo.online.basis import NEVER
 from gpvo.online.estimate import COASTED, divide
