@@ -53,10 +53,11 @@ class Domain:
 
     @classmethod
     def learn(cls, X: Array, *, margin: float = 0.02) -> Domain:
-        """From training rows (n, d), NaN where a value is missing.
+        """From training rows (n, d), not finite where a value is missing.
 
         The narrower range leaves out one row in five thousand at either end; to both ``margin`` of its width is added.
         """
+        X = np.where(np.isfinite(X), X, np.nan)
         centre = np.nanmedian(X, axis=0)
         q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
         spread = np.nanstd(X, axis=0)

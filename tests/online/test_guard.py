@@ -35,6 +35,15 @@ def test_beyond_all_training_rows_the_distance_grows() -> None:
     assert (place.inside[:4, 0] < 5.0).all()
 
 
+def test_what_is_not_finite_is_missing() -> None:
+    X = np.random.default_rng(0).standard_normal((500, 2))
+    X[3, 0], X[4, 0], X[5, 1] = np.inf, -np.inf, np.nan
+    domain = Domain.learn(X)
+    assert np.isfinite(np.stack([domain.least, domain.most])).all()
+    assert domain.may_miss.all()
+    assert domain.locate(np.array([[np.inf, 0.0], [9.0, 0.0]])).distance[1] > 3.0
+
+
 def test_an_older_file_has_one_range() -> None:
     domain = Domain.learn(np.random.default_rng(0).standard_normal((50, 2)))
     arrays = domain.to_arrays("d.")
