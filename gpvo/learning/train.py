@@ -149,7 +149,8 @@ def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array
     gross = length > SLIP_MEDIANS * np.median(length)
     gross_lost = lost_length > SLIP_MEDIANS * np.median(length)
     dt_s = learned.model.dt_s
-    lost_var = [learned.model.lost_variance(dt_s, dt_s, np.zeros(6), jump) for jump in s.lost_jump]
+    rate_var = np.diagonal(estimate.covariance, axis1=1, axis2=2).mean(axis=0) / dt_s**2
+    lost_var = [learned.model.lost_variance(dt_s, dt_s, np.zeros(6), rate_var, jump) for jump in s.lost_jump]
     learned_all = np.concatenate(
         [nees(s.Y - estimate.mean, estimate.covariance), (s.lost_xi**2 / np.reshape(lost_var, (-1, 6))).sum(1)]
     )

@@ -19,8 +19,9 @@ def usual_rate_var(rows: Rows) -> Array:
 
 
 def rate_changes(rows: Rows) -> Array:
-    """(K, 6) mean square [m^2/s^2, rad^2/s^2] by which VO's velocity changes over ``COASTED`` usual motions, sequences
-    alike; never less than over a shorter time, and that of unrelated velocities where no sequence is long enough."""
+    """(K, 6) mean square [m^2/s^2, rad^2/s^2] by which the true velocity changes over ``COASTED`` usual motions,
+    sequences alike; never less than over a shorter time, and that of unrelated velocities where no sequence is long
+    enough."""
     out = []
     for m in COASTED:
         seen = [c for s in rows.sets if len(c := _changes(s, m, rows.step_s))]
@@ -29,9 +30,9 @@ def rate_changes(rows: Rows) -> Array:
 
 
 def _changes(s: TrainingSet, m: int, step_s: float) -> Array:
-    """(k, 6) changes of the velocity over m usual motions: of those between rows that lie about so far apart."""
+    """(k, 6) changes of the true velocity over m usual motions: of those between rows that lie about so far apart."""
     later = np.searchsorted(s.t_ns, s.t_ns + round((m - 0.5) * step_s * 1e9))
-    rate = s.select(TWIST_COLUMNS)
+    rate = s.select(TWIST_COLUMNS) - s.Y / s.dt_s[:, None]
     first = np.flatnonzero(later < len(s))
     first = first[s.t_ns[later[first]] - s.t_ns[first] <= (m + 0.5) * step_s * 1e9]
     change = rate[later[first]] - rate[first]

@@ -88,10 +88,10 @@ class ErrorModelArrays:
     two mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides among them at
     the log variance ``level`` (6,) and the typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6) how
     that changes (see :func:`divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
-    ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]; ``rate_change_var`` (K, 6): of its
-    changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the GP's mean is in units of the base's standard
-    deviation, not the error's own at the usual duration ``dt_s``.
-    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters.
+    ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]; ``rate_change_var`` (K, 6): of the
+    true one's changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the GP's mean is in units of the base's
+    standard deviation, not the error's own at the usual duration ``dt_s``. ``steady_mean`` (6,): see :meth:`steady`;
+    zero but in a model for filters.
     """
 
     columns: tuple[str, ...]
@@ -251,20 +251,20 @@ class ErrorModelArrays:
         limit = np.repeat(moved.reshape(-1, 2, 3).sum(axis=2), 3, axis=1)
         return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit)
 
-    def lost_variance(self, dt_s: float, age_s: float, rate: Array, jump: Array) -> Array:
+    def lost_variance(self, dt_s: float, age_s: float, rate: Array, rate_var: Array, jump: Array) -> Array:
         """(6,) variance of a lost motion of duration ``dt_s``, of which nothing was measured.
 
-        The vehicle has gone on with the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, but for what velocities
-        changed in training over such a time, and more if it is faster than was usual there; at most, and after longer
-        times than training shows, it is as wrong as the vehicle is fast. ``jump`` (6,) [m, rad]: by how much the motion
-        given differs from that velocity's.
+        The vehicle has gone on with the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, known to ``rate_var``
+        (6,), but for what velocities changed in training over such a time, and more if it is faster than was usual
+        there; at most, and after longer times than training shows, it is as wrong as the vehicle is fast. ``jump`` (6,)
+        [m, rad]: by how much the motion given differs from that velocity's.
         """
         lags = self.dt_s * np.array(COASTED)
         change = np.array([np.interp(age_s, lags, of_axis, right=np.inf) for of_axis in self.rate_change_var.T])
         speed2 = _squared_length(rate)
         faster = np.maximum(speed2 / np.repeat(self.usual_rate_var.reshape(2, 3).sum(axis=1), 3), 1.0)
         changed = np.minimum(change * faster, np.maximum(self.usual_rate_var, speed2))
-        return np.asarray(changed * dt_s**2 + _squared_length(jump))
+        return np.asarray((changed + rate_var) * dt_s**2 + _squared_length(jump))
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones typical, geometric log variances never below the training's smallest."""

@@ -116,6 +116,7 @@ class Predictor:
         self._adaptive = AdaptiveScale()
         self._last: tuple[VoRecord, Array] | None = None
         self._stated: dict[int, tuple[Array, Array] | None] = {}
+        self._rate_var = np.zeros(6)
 
     def require_motions(self, where: str | PathLike[str] | None = None) -> None:
         """Raise ModelError, one line, where the model (file ``where``) predicts the error over windows of motions."""
@@ -236,6 +237,8 @@ class Predictor:
             confidence, mean = 0.0, np.zeros(6)
         covariance = parts["jitter"] + parts["white"] + parts["bias"]
         sigma = np.sqrt(np.diagonal(covariance))
+        if status is not Status.LOST and record.dt_s > 0:
+            self._rate_var = np.diagonal(covariance) / record.dt_s**2
         # What is stated of a lost motion was not learnt: truth of it says nothing of the scale of what was.
         self._stated[record.t_ns] = None if status is Status.LOST else (mean, sigma)
         if len(self._stated) > _REMEMBERED:
@@ -258,9 +261,10 @@ class Predictor:
         and the vehicle has not kept its velocity."""
         xi, slip = se3.log(record.T_prev_cur), self._observer.slip
         if slip.expected is None:
-            return self.model.lost_variance(record.dt_s, np.inf, xi / max(record.dt_s, 1e-6), np.zeros(6))
+            rate = xi / max(record.dt_s, 1e-6)
+            return self.model.lost_variance(record.dt_s, np.inf, rate, np.zeros(6), np.zeros(6))
         jump = xi - slip.expected * record.dt_s
-        return self.model.lost_variance(record.dt_s, slip.age_s, slip.expected, jump)
+        return self.model.lost_variance(record.dt_s, slip.age_s, slip.expected, self._rate_var, jump)
 
     def _at_rest(self, record: VoRecord) -> Prediction:
         """The first frame has no motion and hence no error to speak of."""

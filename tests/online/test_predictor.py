@@ -178,13 +178,24 @@ def test_a_lost_motion_is_as_wrong_as_velocities_change(predictor, gone):
 
 def test_a_lost_motion_is_at_most_as_wrong_as_the_vehicle_is_fast(predictor):
     """Longer ago than training shows, the last velocity says nothing but how fast the vehicle is."""
-    rate, jump = np.array([0.0, 0.0, 1.5, 0.0, 0.1, 0.0]), np.zeros(6)
-    variance = predictor.model.lost_variance(2.0, 1e3, rate, jump)
+    rate, none = np.array([0.0, 0.0, 1.5, 0.0, 0.1, 0.0]), np.zeros(6)
+    variance = predictor.model.lost_variance(2.0, 1e3, rate, none, none)
     most = 4.0 * np.maximum(predictor.model.usual_rate_var, np.repeat([2.25, 0.01], 3))
     np.testing.assert_allclose(variance, most)
-    ages = [predictor.model.lost_variance(2.0, age, rate, jump) for age in np.geomspace(0.01, 100.0, 40)]
+    ages = [predictor.model.lost_variance(2.0, age, rate, none, none) for age in np.geomspace(0.01, 100.0, 40)]
     assert (np.diff(ages, axis=0) >= 0).all()
     assert (ages[0] < 0.5 * most).all()
+
+
+def test_a_lost_motion_is_no_surer_than_the_velocity_that_it_goes_on_with(predictor, flight):
+    """Few inliers before the loss: what VO says of the lost motion is as poor as the motion before it."""
+    records = list(flight[0].records[:60])
+    poor = {"pointing_matching": 1e4 * records[59].covariances["pointing_matching"]}
+    records[59] = replace(records[59], covariances=poor)
+    before = [predictor.step(r) for r in records][-1]
+    lost = predictor.step(replace(flight[0].records[60], status=Status.LOST, T_prev_cur=records[59].T_prev_cur))
+    assert (lost.sigma >= before.sigma).all()
+    assert (lost.sigma < 1.5 * before.sigma).any()
 
 
 @pytest.mark.parametrize("speed_mps", [2.0, 20.0, 200.0])
