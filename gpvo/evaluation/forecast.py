@@ -134,7 +134,7 @@ def _fly(predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.rando
     like = _like(planned[:, : len(TWIST_COLUMNS)], sample, at[: len(TWIST_COLUMNS)], domain.scale, rng)
     parent, rows = _references(like, np.round(sample.dt_s / plan.step_s).astype(int))
     X = sample.X[rows].copy()
-    low, high = (domain.centre[at] + domain.scale[at] * edge[at] for edge in (domain.least, domain.most))
+    low, high = (edge[at] for edge in domain.reach)
     X[:, at] = np.where((planned < low) | (planned > high), planned, X[:, at])
     dt_s = plan.t_s[1:] - plan.t_s[parent[1:]]
     return _Flight(parent, predictor.predict(X, None if sample.geometry is None else sample.geometry[rows], dt_s), dt_s)
@@ -193,7 +193,7 @@ def _sum_up(flight: _Flight, tau_s: Array, plan: Plan) -> tuple[Array, Array, fl
 def _outside(predictor: Predictor, plan: Plan) -> tuple[Outside, ...]:
     """Planned velocities and turn rates beyond the training's range, the most frequent first."""
     domain, at = predictor.model.domain, positions(predictor.features, TWIST_COLUMNS)
-    low, high = (domain.centre + domain.scale * edge for edge in (domain.least, domain.most))
+    low, high = domain.reach
     twist = se3.log(plan.motions) / plan.step_s
     found = []
     for name, i, v in zip(TWIST_COLUMNS, at, twist.T, strict=True):

@@ -43,11 +43,9 @@ def check(predictor: Predictor, run: Run) -> Check:
     ]
     if missing:
         problems.append(f"the run lacks features the model needs: {', '.join(missing)}")
-    domain = predictor.model.domain
     place = predictor.model.locate(X[usable], np.array([r.dt_s for r in records])[usable])
     inside = float((place.in_domain > 0.5).mean()) if usable.any() else 0.0
-    U = np.nan_to_num((X[usable] - domain.centre) / domain.scale)
-    beyond = np.abs(U - np.clip(U, domain.least, domain.most)).mean(axis=0) if usable.any() else np.zeros(X.shape[1])
+    beyond = predictor.model.domain.outside(X[usable]).mean(axis=0) if usable.any() else np.zeros(X.shape[1])
     order = np.argsort(-beyond, kind="stable")[:3]
     farthest = tuple((predictor.features[i], float(beyond[i])) for i in order if beyond[i] > 0)
     if inside < _ENOUGH_INSIDE:

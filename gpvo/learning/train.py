@@ -191,8 +191,7 @@ def _header(
     sets: Sequence[TrainingSet], config: TrainConfig, learned: Learned, table: Mapping[str, Any]
 ) -> dict[str, Any]:
     model = learned.model
-    domain = model.domain
-    low, high = (domain.centre + domain.scale * edge for edge in (domain.least, domain.most))
+    low, high = model.domain.reach
     cameras = [s.camera for s in sets if s.camera is not None]
     step = model.dt_s
     return {

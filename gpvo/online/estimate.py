@@ -248,8 +248,7 @@ class ErrorModelArrays:
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
         # VO's motion less the true one is no longer than both together, whatever is said of its variance.
         moved = (columns[:, :6] ** 2 + self.usual_rate_var) * duration[:, None] ** 2
-        limit = np.repeat(moved.reshape(-1, 2, 3).sum(axis=2), 3, axis=1)
-        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit)
+        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, _block_sums(moved))
 
     def lost_variance(self, dt_s: float, age_s: float, rate: Array, rate_var: Array, jump: Array) -> Array:
         """(6,) variance of a lost motion of duration ``dt_s``, of which nothing was measured.
@@ -261,10 +260,10 @@ class ErrorModelArrays:
         """
         lags = self.dt_s * np.array(COASTED)
         change = np.array([np.interp(age_s, lags, of_axis, right=np.inf) for of_axis in self.rate_change_var.T])
-        speed2 = _squared_length(rate)
-        faster = np.maximum(speed2 / np.repeat(self.usual_rate_var.reshape(2, 3).sum(axis=1), 3), 1.0)
+        speed2 = _block_sums(rate**2)
+        faster = np.maximum(speed2 / _block_sums(self.usual_rate_var), 1.0)
         changed = np.minimum(change * faster, np.maximum(self.usual_rate_var, speed2))
-        return np.asarray((changed + rate_var) * dt_s**2 + _squared_length(jump))
+        return np.asarray((changed + rate_var) * dt_s**2 + _block_sums(jump**2))
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones typical, geometric log variances never below the training's smallest."""
@@ -303,9 +302,9 @@ class ErrorModelArrays:
         return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :]
 
 
-def _squared_length(xi: Array) -> Array:
-    """(6,) of a tangent vector: squared length of its translation, three times, and of its rotation."""
-    return np.repeat((xi.reshape(2, 3) ** 2).sum(axis=1), 3)
+def _block_sums(values: Array) -> Array:
+    """(..., 6) sums over the axes of the translation, three times, and over those of the rotation."""
+    return np.repeat(values.reshape(*values.shape[:-1], 2, 3).sum(axis=-1), 3, axis=-1)
 
 
 def within(variance: Array, limit: Array) -> Array:

@@ -15,7 +15,7 @@ from gpvo.types import Array
 
 __all__ = ["Domain", "SlipDetector", "Whereabouts", "flag_slips"]
 
-_LEAST = 0.0002
+_RARE = 0.0002
 
 DEGRADED_BELOW = 0.5
 """``in_domain`` under which a prediction is called ``degraded``."""
@@ -65,7 +65,7 @@ class Domain:
         scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
         scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, 1.0)
         U = (X - centre) / scale
-        low, high = np.nanquantile(U, [_LEAST, 1.0 - _LEAST], axis=0)
+        low, high = np.nanquantile(U, [_RARE, 1.0 - _RARE], axis=0)
         pad = margin * (high - low)
         least, most = np.nanmin(U, axis=0), np.nanmax(U, axis=0)
         U = np.clip(np.nan_to_num(U), low - pad, high + pad)
@@ -92,6 +92,17 @@ class Domain:
         joint = np.maximum(np.linalg.norm(inside @ self.whitening, axis=1) - self.radius[0], 0.0)
         distance = np.sqrt(beyond + joint**2)
         return Whereabouts(inside, distance, np.exp(-0.5 * distance**2))
+
+    def outside(self, X: Array) -> Array:
+        """How far each value of rows (n, d), or of one (d,), lies beyond all of the training, in training standard
+        deviations; 0 where it is missing."""
+        U = (X - self.centre) / self.scale
+        return np.nan_to_num(np.abs(U - np.clip(U, self.least, self.most)))
+
+    @property
+    def reach(self) -> tuple[Array, Array]:
+        """Least and most (d,) of the training, in the features' units."""
+        return self.centre + self.scale * self.least, self.centre + self.scale * self.most
 
     def to_arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file; :meth:`from_arrays` is the inverse."""

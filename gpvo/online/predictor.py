@@ -206,8 +206,7 @@ class Predictor:
         typical[np.arange(1, len(x) + 1), np.arange(len(x))] = self.model.domain.centre
         ln_sigma = np.log(self.predict(typical, dt_s=dt_s or self.model.dt_s).sigma)
         gain = ln_sigma[0] - ln_sigma[1:]
-        u = (x - self.model.domain.centre) / self.model.domain.scale
-        outside = np.abs(u - np.clip(u, self.model.domain.least, self.model.domain.most))
+        outside = self.model.domain.outside(x)
         unit = self.header.get("units") or [""] * len(x)
         factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1))
         order = np.argsort(-np.abs(gain).sum(1), kind="stable")
@@ -218,7 +217,7 @@ class Predictor:
                 unit=unit[i],
                 on_translation=float(factors[i, 0]),
                 on_rotation=float(factors[i, 1]),
-                outside=float(np.nan_to_num(outside[i])),
+                outside=float(outside[i]),
             )
             for i in order
         ]
