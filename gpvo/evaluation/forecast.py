@@ -18,7 +18,8 @@ from gpvo.evaluation.plan import Plan
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import position_in_world, symmetrise
 from gpvo.online.base import TWIST_COLUMNS, positions
-from gpvo.online.estimate import PARTS, Estimate
+from gpvo.online.division import PARTS
+from gpvo.online.estimate import Estimate
 from gpvo.online.features import FeatureStream
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.predictor import Predictor

@@ -26,7 +26,8 @@ from gpvo.learning.rows import Rows
 from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import SharedBasis
-from gpvo.online.estimate import ErrorModelArrays, divide, ln_faster
+from gpvo.online.division import divide, ln_faster
+from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.guard import Domain
 from gpvo.types import Array
 

@@ -23,7 +23,8 @@ from gpvo.learning.rows import Rows
 from gpvo.learning.steadymean import steady_mean
 from gpvo.online.base import OWN_MOTION, BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
-from gpvo.online.estimate import FOR_FILTER, ErrorModelArrays
+from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.for_filter import FOR_FILTER
 from gpvo.online.guard import Domain
 from gpvo.types import Array
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -31,7 +32,10 @@ def map_jobs(
     from joblib import Parallel, delayed
 
     calls = (delayed(function)(*arguments) for arguments in jobs_arguments)
-    return _told(Parallel(n_jobs=jobs, return_as="generator")(calls), on_done)
+    with warnings.catch_warnings():
+        # A process that has grown is renewed between two jobs: nothing is lost, and nothing is to be done about it.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+        return _told(Parallel(n_jobs=jobs, return_as="generator")(calls), on_done)
 
 
 def _told(results: Iterable[Any], on_done: Callable[[], None]) -> list[Any]:

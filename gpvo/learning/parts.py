@@ -43,7 +43,7 @@ _MAX_DOUBT = 1.0
 class Parts:
     """``share`` (3, D): jitter, white, bias of each axis at the typical log variance ``level`` (D,), summing to one.
 
-    ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.estimate.divide`).
+    ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.division.divide`).
     ``tau_s`` (D,): of the bias. ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over
     what is stated; ``doubt`` (S, D): see :class:`SpanVariances`.
     """
@@ -208,7 +208,7 @@ def _fit_shape(windows: Sequence[_Windows], shape: _Shape, widen: Array | None =
 def _terms(w: _Windows, shape: _Shape, share: Array) -> Array:
     """(w, 3, d) variance of the sum over each window of jitter, white and bias of unit share at the typical level.
 
-    The motions' variances are divided as :func:`gpvo.online.estimate.divide` does with ``share``.
+    The motions' variances are divided as :func:`gpvo.online.division.divide` does with ``share``.
     """
     each = white = bias = w.variance
     if shape.by_speed or shape.by_noise:

@@ -8,25 +8,41 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import correlation as correlation_of
 from gpvo.geometry.covariance import turn_first_root
 from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
+from gpvo.online.division import PARTS, divide, ln_faster
 from gpvo.online.guard import Domain, Whereabouts, growth
 from gpvo.types import Array
 
-PARTS = ("jitter", "white", "bias")
 _EYE = np.eye(6)
-LN_FASTEST = float(np.log(20.0))
 COASTED = (1, 2, 5, 10, 20, 50)
 """Over so many usual motions training tells how much a velocity changes."""
 LN_LARGEST = 60.0
 """Geometric log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
-FOR_FILTER = "for_filter."
-"""Prefix of the arrays in which the model for filters differs (see :func:`arrays_for_filter`)."""
+
+_SHAPES = {
+    "factor": (6,),
+    "outside_power": (1,),
+    "high": (6,),
+    "correlation": (3, 6, 6),
+    "geometry_weight": (1,),
+    "share": (3, 6),
+    "growth": (2, 6),
+    "level": (6,),
+    "ln_speed": (1,),
+    "bias_tau_s": (6,),
+    "typical_ln_det": (1,),
+    "usual_rate_var": (6,),
+    "rate_change_var": (len(COASTED), 6),
+    "mean_in_sigma": (1,),
+    "steady_mean": (6,),
+}
+_OWN = ("inputs", *_SHAPES)
 
 
 @dataclass(frozen=True)
@@ -87,11 +103,11 @@ class ErrorModelArrays:
     ratio to the base that few training rows exceeded. ``correlation`` (3, 6, 6) of jitter, white and bias, the first
     two mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides among them at
     the log variance ``level`` (6,) and the typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6) how
-    that changes (see :func:`divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over the training rows.
-    ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]; ``rate_change_var`` (K, 6): of the
-    true one's changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the GP's mean is in units of the base's
-    standard deviation, not the error's own at the usual duration ``dt_s``. ``steady_mean`` (6,): see :meth:`steady`;
-    zero but in a model for filters.
+    that changes (see :func:`gpvo.online.division.divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over
+    the training rows. ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2];
+    ``rate_change_var`` (K, 6): of the true one's changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the
+    GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
+    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters.
     """
 
     columns: tuple[str, ...]
@@ -140,23 +156,7 @@ class ErrorModelArrays:
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
-        shapes = {
-            "factor": (6,),
-            "outside_power": (1,),
-            "high": (6,),
-            "correlation": (3, 6, 6),
-            "share": (3, 6),
-            "growth": (2, 6),
-            "level": (6,),
-            "ln_speed": (1,),
-            "bias_tau_s": (6,),
-            "usual_rate_var": (6,),
-            "rate_change_var": (len(COASTED), 6),
-            "mean_in_sigma": (1,),
-            "geometry_weight": (1,),
-            "steady_mean": (6,),
-        }
-        wrong = [n for n, s in shapes.items() if own[n].shape != s]
+        wrong = [n for n, s in _SHAPES.items() if own[n].shape != s]
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
         if (
             wrong
@@ -312,63 +312,3 @@ def within(variance: Array, limit: Array) -> Array:
     # So far above, the limit it is; the square of what is farther would overflow.
     ratio = np.minimum(variance / limit, 1e8)
     return limit * ratio / np.sqrt(1.0 + ratio**2)
-
-
-def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
-    """(n, 3, D) shares of jitter, white and bias, summing to one.
-
-    ``share`` (3, D) holds at the typical speed and variance. White and bias gain on the jitter by the power
-    ``growth[0]`` of the speed, whose log over the typical one is ``faster`` (n, 1), and the bias by the power
-    ``growth[1]`` of the variance, whose log over the typical one is ``above`` (n, D); ``growth`` (2, D).
-    """
-    out = np.empty((len(above), *share.shape))
-    by_speed = growth[0] * faster
-    out[:, 0] = share[0]
-    out[:, 1] = share[1] * np.exp(by_speed)
-    # The exponent is bounded where the bias is all there is, or nothing.
-    out[:, 2] = share[2] * np.exp(by_speed + np.clip(growth[1] * above, -60.0, 60.0))
-    return out / out.sum(axis=1, keepdims=True)
-
-
-def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
-    """(n, 1) log of the speed of (n, 3) over the typical one, from 0 to that of twenty times it; 0 where unknown.
-
-    Slower than typical counts as typical: by the metre alone errors would not add up at rest, but they do with time,
-    and a filter that is told otherwise learns its biases from that.
-    """
-    speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
-    ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical
-    return np.where(np.isfinite(ratio), np.clip(ratio, 0.0, LN_FASTEST), 0.0)
-
-
-def arrays_for_filter(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The arrays of a model file with those of the model for filters in their place.
-
-    Its covariance is that of the error as it stands, and its mean the steady one alone. A GP's mean that sees VO's own
-    motion holds what was usual in training, and says "you did not really move like that" where VO sees little; one that
-    sees the conditions is right of plain sums, where bad frames count most, and too large in the good frames by which a
-    filter goes.
-    """
-    own = {name.removeprefix(FOR_FILTER): a for name, a in arrays.items() if name.startswith(FOR_FILTER)}
-    dropped = (FOR_FILTER, "basis.") if any(name.startswith("basis.") for name in own) else (FOR_FILTER,)
-    return {**{name: a for name, a in arrays.items() if not name.startswith(dropped)}, **own}
-
-
-_OWN = (
-    "inputs",
-    "factor",
-    "outside_power",
-    "high",
-    "correlation",
-    "geometry_weight",
-    "share",
-    "growth",
-    "level",
-    "ln_speed",
-    "bias_tau_s",
-    "typical_ln_det",
-    "usual_rate_var",
-    "rate_change_var",
-    "mean_in_sigma",
-    "steady_mean",
-)

@@ -17,8 +17,10 @@ from gpvo.errors import ModelError
 from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
-from gpvo.online.estimate import PARTS, ErrorModelArrays, Estimate, arrays_for_filter
+from gpvo.online.division import PARTS
+from gpvo.online.estimate import ErrorModelArrays, Estimate
 from gpvo.online.features import known_columns
+from gpvo.online.for_filter import arrays_for_filter
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord

@@ -17,7 +17,9 @@ from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
-from gpvo.online.estimate import COASTED, FOR_FILTER, PARTS, ErrorModelArrays, Estimate
+from gpvo.online.division import PARTS
+from gpvo.online.estimate import COASTED, ErrorModelArrays, Estimate
+from gpvo.online.for_filter import FOR_FILTER
 from gpvo.online.guard import Domain
 from gpvo.online.predictor import Predictor
 from small_model import small_model

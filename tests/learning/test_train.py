@@ -26,7 +26,8 @@ from gpvo.learning.update import config_of, update
 from gpvo.learning.velocities import rate_changes
 from gpvo.online.base import OWN_MOTION, TWIST_COLUMNS
 from gpvo.online.basis import NEVER
-from gpvo.online.estimate import COASTED, divide
+from gpvo.online.division import divide
+from gpvo.online.estimate import COASTED
 from gpvo.online.predictor import Predictor
 from gpvo.stats.consistency import nees
 from gpvo.types import VoLog

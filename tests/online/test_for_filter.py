@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from gpvo.geometry.covariance import turn_first_root
-from gpvo.online.estimate import FOR_FILTER, arrays_for_filter
+from gpvo.online.for_filter import FOR_FILTER, arrays_for_filter
 from gpvo.online.predictor import Predictor
 from small_model import small_model
 from synthetic_runs import make_run

@@ -14,7 +14,7 @@ from gpvo.errors import ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.adapt import AdaptiveScale
-from gpvo.online.estimate import divide, ln_faster
+from gpvo.online.division import divide, ln_faster
 from gpvo.online.predictor import Predictor
 from gpvo.types import Status, VoLog
 from small_model import small_model, training_sets

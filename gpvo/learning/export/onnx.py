@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from gpvo.errors import MissingExtraError
 from gpvo.geometry.covariance import TURN_FIRST
 from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
-from gpvo.online.estimate import LN_FASTEST, LN_LARGEST, PARTS, ErrorModelArrays
+from gpvo.online.division import LN_FASTEST, PARTS
+from gpvo.online.estimate import LN_LARGEST, ErrorModelArrays
 from gpvo.online.rowplan import stack
 from gpvo.types import Array
 
@@ -233,7 +234,7 @@ def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
 
 
 def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:
-    """Of jitter, white and bias (N, 6); line by line ``gpvo.online.estimate.divide`` and ``ln_faster``."""
+    """Of jitter, white and bias (N, 6); line by line ``gpvo.online.division.divide`` and ``ln_faster``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:3], axis=1)
     known = g.finite(g.expand(g.sum(v, 1), 1))
     v = g("Where", g.finite(v), v, 0.0)

@@ -1,0 +1,38 @@
+"""How a motion's variance divides into jitter, white and bias: the same arithmetic in training and in flight."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gpvo.types import Array
+
+PARTS = ("jitter", "white", "bias")
+LN_FASTEST = float(np.log(20.0))
+
+
+def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
+    """(n, 3, D) shares of jitter, white and bias, summing to one.
+
+    ``share`` (3, D) holds at the typical speed and variance. White and bias gain on the jitter by the power
+    ``growth[0]`` of the speed, whose log over the typical one is ``faster`` (n, 1), and the bias by the power
+    ``growth[1]`` of the variance, whose log over the typical one is ``above`` (n, D); ``growth`` (2, D).
+    """
+    out = np.empty((len(above), *share.shape))
+    by_speed = growth[0] * faster
+    out[:, 0] = share[0]
+    out[:, 1] = share[1] * np.exp(by_speed)
+    # The exponent is bounded where the bias is all there is, or nothing.
+    out[:, 2] = share[2] * np.exp(by_speed + np.clip(growth[1] * above, -60.0, 60.0))
+    return out / out.sum(axis=1, keepdims=True)
+
+
+def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
+    """(n, 1) log of the speed of (n, 3) over the typical one, from 0 to that of twenty times it; 0 where unknown.
+
+    Slower than typical counts as typical: by the metre alone errors would not add up at rest, but they do with time,
+    and a filter that is told otherwise learns its biases from that.
+    """
+    speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
+    ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical
+    return np.where(np.isfinite(ratio), np.clip(ratio, 0.0, LN_FASTEST), 0.0)
