@@ -30,6 +30,8 @@ METHODS = (
     "pointing_matching",
     "pointing_matching_scaled",
     "pointing_matching_vt",
+    "imported",
+    "imported_scaled",
     "gp_thesis",
     "learned",
 )

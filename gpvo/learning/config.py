@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import GpvoError
 from gpvo.online.base import RESIDUAL_COLUMN
-from gpvo.online.features import GEOMETRIC_METHODS, resolve
+from gpvo.online.features import AXES, GEOMETRIC_METHODS, IMPORTED, resolve
 
 FAMILIES: dict[str, tuple[str, ...]] = {
     "motion": ("velocity", "rotation"),
@@ -86,9 +86,10 @@ def guarded(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[str, ...]
 
 
 def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:
-    """Bases to choose among, of the columns that every log knows in 95 of 100 rows: geometric covariances, at one pixel
-    and at the noise of the residuals, and the motion alone."""
+    """Bases to choose among, of the columns that every log knows in 95 of 100 rows: geometric covariances and imported
+    ones, at one pixel and at the noise of the residuals, and the motion alone. A covariance that is always the same
+    says nothing of a motion."""
     known = set.intersection(*(s.supported() for s in sets))
-    methods = [m for m in GEOMETRIC_METHODS if f"ln_var_{m}_x" in known]
+    methods = [m for m in (*GEOMETRIC_METHODS, IMPORTED) if supported_columns(sets, [f"ln_var_{m}_{a}" for a in AXES])]
     noise = (False, True) if RESIDUAL_COLUMN in known else (False,)
     return [*((m, residual) for m in methods for residual in noise), (None, False)]

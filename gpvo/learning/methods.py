@@ -12,7 +12,7 @@ from gpvo.dataset.build import TrainingSet
 from gpvo.learning.config import supported_columns
 from gpvo.learning.regressors import get_regressor
 from gpvo.online.basis import SharedBasis
-from gpvo.online.features import THESIS
+from gpvo.online.features import IMPORTED, THESIS
 from gpvo.online.thesis import ThesisModel
 from gpvo.types import Array
 
@@ -20,10 +20,11 @@ Statement = Callable[[TrainingSet], tuple[Array, Array] | None]
 """Mean (n, 6) and covariance (n, 6, 6) of a sequence; None where it lacks what the method needs."""
 
 GEOMETRIC = ("triangulation", "pointing_matching")
+STATED = (*GEOMETRIC, IMPORTED)
 METHODS = (
     "constant",
-    *GEOMETRIC,
-    *(f"{m}_scaled" for m in GEOMETRIC),
+    *STATED,
+    *(f"{m}_scaled" for m in STATED),
     *(f"{m}_vt" for m in GEOMETRIC),
     "gp_thesis",
     "learned",
@@ -64,9 +65,9 @@ def best_scale(sets: Sequence[TrainingSet], method: str) -> Array | None:
 
 
 def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:
-    """What a model file keeps of the simple methods: ``method.constant`` (6, 6), ``method.<geometric>.scale`` (6,)."""
+    """What a model file keeps of the simple methods: ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,)."""
     out: dict[str, NDArray[Any]] = {"method.constant": constant_covariance(sets)}
-    for method in GEOMETRIC:
+    for method in STATED:
         scale = best_scale(sets, method)
         if scale is not None:
             out[f"method.{method}.scale"] = scale
@@ -76,10 +77,10 @@ def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:
 def simple_statements(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Statement]:
     """All rows but ``gp_thesis`` and ``learned``, from a model file's arrays."""
     out: dict[str, Statement] = {"constant": _constant(arrays["method.constant"])}
-    for method in GEOMETRIC:
-        out[method] = _geometric(method, None)
+    for method in STATED:
+        out[method] = _stated(method, None)
         scale = arrays.get(f"method.{method}.scale")
-        out[f"{method}_scaled"] = _nothing if scale is None else _geometric(method, scale)
+        out[f"{method}_scaled"] = _nothing if scale is None else _stated(method, scale)
         out[f"{method}_vt"] = _translation_only(method)
     return out
 
@@ -92,7 +93,7 @@ def _constant(C: Array) -> Statement:
     return lambda s: (np.zeros_like(s.Y), np.broadcast_to(C, (len(s), 6, 6)))
 
 
-def _geometric(method: str, scale: Array | None) -> Statement:
+def _stated(method: str, scale: Array | None) -> Statement:
     root = np.ones(6) if scale is None else np.sqrt(scale)
 
     def state(s: TrainingSet) -> tuple[Array, Array] | None:

@@ -1,9 +1,10 @@
 """The variance that is known before anything is learnt, per axis: a sum of physical parts.
 
 ``v_j = a_j g_j + b_j + c_j |t|^2 + d_j |phi|^2 + e_j r^2 g_j``: the geometric variance g (noise of one pixel carried
-through the geometry), a floor, parts that grow with the motion (S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics"
-(2005), section 5.4), and the geometry at the noise r that the motion's own residuals show (the variance of unit weight
-of least squares: W. Foerstner, B. Wrobel, "Photogrammetric Computer Vision" (2016), equation 4.90).
+through the geometry) or the one that another odometry states of its motions, a floor, parts that grow with the motion
+(S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics" (2005), section 5.4), and the geometry at the noise r that the
+motion's own residuals show (the variance of unit weight of least squares: W. Foerstner, B. Wrobel, "Photogrammetric
+Computer Vision" (2016), equation 4.90).
 Coefficients are not negative, so it never shrinks when a part grows. The GP learns the log of the ratio to it.
 """
 
@@ -37,7 +38,7 @@ class BaseVariance:
     at the residuals' noise.
 
     ``plain`` (6, 5): the same fitted to the motion alone, as what odometry says of itself means what it meant in
-    training only where the surroundings are alike. ``method``: name of the geometric covariance, None without one (its
+    training only where the surroundings are alike. ``method``: name of that covariance, None without one (its
     coefficients are then 0). ``residual``: whether it looks at the residuals.
     """
 

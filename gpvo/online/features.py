@@ -20,6 +20,8 @@ from gpvo.types import Array, StereoCamera, VoRecord
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 GEOMETRIC_METHODS = ("pointing_matching", "triangulation")
+IMPORTED = "imported"
+"""Name of the covariances that somebody else's odometry states of its own motions."""
 TREND_S = 1.0
 """Time constant of the running means that the trends are measured against [s]."""
 
@@ -88,14 +90,16 @@ def _counts(r: VoRecord, _: float) -> Sequence[float]:
 def _geometry(r: VoRecord, focal: float) -> Sequence[float]:
     disparities = [_ln(d / focal) for d in (r.disparity_p10_px, r.disparity_p50_px, r.disparity_p90_px)]
     out = [*disparities, r.spread_u, r.spread_v, _ln(r.reproj_rms_px / focal), r.log10_condition]
-    for method in GEOMETRIC_METHODS:
-        C = r.covariances.get(method)
-        if C is None or not np.isfinite(C).all():
-            out += [math.nan] * 7
-        else:
-            sign, log_det = np.linalg.slogdet(C)
-            out += [_ln(c) for c in np.diagonal(C)] + [float(log_det) if sign > 0 else math.nan]
-    return out
+    return [*out, *(value for method in GEOMETRIC_METHODS for value in _stated(r, method))]
+
+
+def _stated(r: VoRecord, method: str) -> list[float]:
+    """Logs of the variances by a method and of their covariance's determinant."""
+    C = r.covariances.get(method)
+    if C is None or not np.isfinite(C).all():
+        return [math.nan] * 7
+    sign, log_det = np.linalg.slogdet(C)
+    return [*(_ln(c) for c in np.diagonal(C)), float(log_det) if sign > 0 else math.nan]
 
 
 def _image(r: VoRecord, _: float) -> Sequence[float]:
@@ -148,10 +152,10 @@ def _columns(*pairs: str) -> tuple[Feature, ...]:
     return tuple(Feature(name, unit.rstrip("]")) for name, unit in (p.split(" [") for p in pairs))
 
 
-def _variance_columns() -> list[str]:
+def _variance_columns(*methods: str) -> list[str]:
     return [
         column
-        for method in GEOMETRIC_METHODS
+        for method in methods
         for column in (
             *(f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES),
             f"ln_det_{method} [ln]",
@@ -181,7 +185,7 @@ BUILT_IN = (
             "spread_v [focal lengths]",
             "ln_reproj_rms [ln focal lengths]",
             "log10_condition [log10]",
-            *_variance_columns(),
+            *_variance_columns(*GEOMETRIC_METHODS),
         ),
         _stateless(_geometry),
     ),
@@ -201,6 +205,7 @@ BUILT_IN = (
         ),
         _Trend,
     ),
+    FeatureGroup("imported", _columns(*_variance_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
     FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (_ln(r.reproj_rms_px),))),
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.

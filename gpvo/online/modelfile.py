@@ -15,7 +15,7 @@ files lack what is marked optional:
   ``mean_in_sigma``: see :class:`gpvo.online.estimate.ErrorModelArrays`;
 * ``steady_mean`` (6,), ``rate_change_var`` (6, 6) (both optional): the same class;
 * ``for_filter.*`` (optional): those of these arrays in which the model for filters differs;
-* ``method.constant`` (6, 6), ``method.<geometric>.scale`` (6,): the simple methods that ``evaluate`` compares with;
+* ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
 * ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.online.sample.TrainingSample`.
 """

@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.cli.learn import _print_table, _train
-from gpvo.dataset.build import build_run
+from gpvo.dataset.build import build, build_run
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.io.run import write_run
 from gpvo.learning.config import TrainConfig
+from gpvo.learning.fit import Learned
 from gpvo.learning.meantest import helps_over_distance, pose_gain, surely_positive
 from gpvo.learning.methods import METHODS, best_scale
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, rows_path, save_model
-from gpvo.learning.train import train_sets
+from gpvo.learning.train import _slips, train_sets
 from gpvo.learning.update import config_of, update
 from gpvo.learning.velocities import rate_changes
 from gpvo.online.base import OWN_MOTION, TWIST_COLUMNS
@@ -370,6 +371,18 @@ def test_the_table_prints_names_as_they_are(capsys):
     assert "1: [/red] (3 rows)" in capsys.readouterr().out
 
 
+def test_an_error_that_was_expected_is_no_missed_slip():
+    """Two errors alike, a hundred times the usual one; of the first the model says that it may be as large."""
+    trained = small_model()
+    s = training_sets(range(100, 101), n=120)[0]
+    Y = s.Y.copy()
+    Y[[30, 60], :3] = 100.0 * np.median(np.linalg.norm(Y[:, :3], axis=1)) / np.sqrt(3.0)
+    estimate = _said(trained.predictor(), s)
+    estimate.covariance[30, :3, :3] += np.outer(Y[30, :3], Y[30, :3])
+    learned = Learned(trained.predictor().model, {}, {}, np.arange(0))
+    assert _slips(replace(s, Y=Y), estimate, learned, np.eye(6))["missed"] == 1
+
+
 def test_the_table_says_what_slips_would_cost(capsys):
     fold = {"held_out": "a", "rows": 3, "methods": {}}
     counts = [(1, 2, 0, 1.5, 80.0), (3, 0, 1, 0.5, 40.0)]
@@ -402,3 +415,33 @@ def test_folds_on_a_dask_cluster_of_two_processes():
     assert [f["methods"]["learned"]["nll_per_dim"] for f in there] == pytest.approx(
         [f["methods"]["learned"]["nll_per_dim"] for f in here], abs=1e-9
     )
+
+
+def _theirs(seed: int, state=lambda C: {"imported": C}):
+    """A run of another odometry; ``state`` is given a covariance that knows of the noise and is a tenth of it."""
+    log, truth = make_run(seed, n=200)
+    own = [r.covariances.get("pointing_matching") for r in log]
+    stated = [{} if C is None else state(C) for C in own]
+    return build(VoLog([replace(r, covariances=c, n_inliers=-1, n_tracked=-1) for r, c in zip(log, stated)], None),
+                 truth, name=f"theirs{seed}")  # fmt: skip
+
+
+def test_what_another_odometry_states_is_compared_and_learnt_from():
+    config = TrainConfig(noise_inducing=32)
+    trained = train_sets([_theirs(k) for k in range(4)], config)
+    said = trained.table["mean"]
+    assert said["imported"]["nees_dof"]["joint"] > 5
+    assert 0.5 < said["imported_scaled"]["nees_dof"]["joint"] < 2
+    assert said["imported_scaled"]["nll_per_dim"] < said["constant"]["nll_per_dim"]
+    assert trained.header["base_method"] == "imported"
+    without = train_sets([_theirs(k, lambda C: {}) for k in range(4)], config).table["mean"]
+    assert without["imported"]["nees_dof"]["joint"] is None
+    assert said["learned"]["nll_per_dim"] < without["learned"]["nll_per_dim"] - 0.05
+
+
+def test_a_covariance_that_is_always_the_same_is_compared_but_says_nothing():
+    always = lambda C: {"imported": 1e-6 * np.eye(6)}  # noqa: E731
+    trained = train_sets([_theirs(k, always) for k in range(3)], TrainConfig(noise_inducing=32))
+    assert trained.header["base_method"] is None
+    assert not any("imported" in f for f in trained.header["features"])
+    assert trained.table["mean"]["imported"]["nees_dof"]["joint"] is not None
