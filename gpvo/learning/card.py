@@ -136,6 +136,6 @@ def _limits(h: Mapping[str, Any]) -> str:
             "",
             "* Outside the ranges above the covariance grows, `in_domain` falls, and the numbers are a guess.",
             "* The truth's own noise is part of the error learnt here.",
-            f"* Versions: gpvo {h['versions']['gpvo']}, NumPy {h['versions']['numpy']}.",
+            f"* Versions: {', '.join(f'{name} {number}' for name, number in h['versions'].items())}.",
         ]
     )

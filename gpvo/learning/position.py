@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from gpvo import __version__
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import leave_one_out
 from gpvo.learning.config import TrainConfig, supported_columns
 from gpvo.learning.methods import METHODS
 from gpvo.learning.regressors import get_regressor
 from gpvo.learning.scores import average, empty
-from gpvo.learning.train import TrainedModel, training_digest
+from gpvo.learning.train import TrainedModel, training_digest, versions
 from gpvo.online.basis import SharedBasis
 from gpvo.online.features import THESIS, resolve, units
 from gpvo.online.position import PositionPredictor
@@ -71,7 +70,7 @@ def _fit(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[dict[str, An
         "camera": asdict(cameras[0]) if cameras else None,
         "training_domain": {n: [float(x.min()), float(x.max())] for n, x in zip(names, X.T)},
         "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
-        "versions": {"gpvo": __version__, "numpy": np.__version__},
+        "versions": versions(),
         "training_digest": training_digest(sets),
         "config": {k: v for k, v in asdict(config).items() if k not in ("jobs", "backend", "scheduler")},
     }

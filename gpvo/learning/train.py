@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -185,6 +186,11 @@ def paired_nll(folds: Sequence[dict[str, Any]], method: str, rival: str) -> Inte
     return sequence_bootstrap(np.array([a - b for a, b in pairs if a is not None and b is not None]))
 
 
+def versions() -> dict[str, str]:
+    """Of gpvo, and of the packages on which the numbers depend."""
+    return {"gpvo": __version__, **{name: version(name) for name in ("numpy", "scipy", "torch")}}
+
+
 def training_digest(sets: Sequence[TrainingSet]) -> str:
     """SHA-256 over the rows of all sequences."""
     return hashlib.sha256("".join(sorted(s.digest() for s in sets)).encode()).hexdigest()
@@ -217,7 +223,7 @@ def _header(
         "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
         "scores": {f["held_out"]: f["methods"] for f in table.get("folds", [])},
         "comparison": table.get("comparison"),
-        "versions": {"gpvo": __version__, "numpy": np.__version__},
+        "versions": versions(),
         "training_digest": training_digest(sets),
         "config": {k: v for k, v in asdict(config).items() if k not in ("jobs", "backend", "scheduler")},
     }
