@@ -23,6 +23,7 @@ from gpvo.types import Status, VoRecord
 
 FORMATS = ("tum", "kitti", "csv", "bag")
 _GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
+_UNKNOWN_RAD = 1.0
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 
@@ -138,24 +139,35 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     A covariance of motions becomes the method ``imported``. One of poses becomes the growth from row to row, if that
     is positive definite for nearly all rows, as for an odometry that adds up its errors; a filter's is not, and stays
     as it is under the name ``imported_pose``, which is of the pose, not of one motion. Across a gap in the log the
-    odometry was lost, whatever it says when it is there again.
+    odometry was lost, whatever it says when it is there again; and of a motion whose turn it does not know to a radian
+    about any axis it knows nothing (RTAB-Map's way of saying so is a variance of 9999).
     """
     T = log.trajectory.T_world_body
     motions = se3.inverse(T[:-1]) @ T[1:]
     name, cov, notes = _motion_covariances(log, motions)
     t = log.t_ns
     gaps = _after_gaps(t)
+    unknown = _stated_unknown(cov) - {0, *gaps} if cov is not None and name == "imported" else set()
+    lost = {**dict.fromkeys(gaps, "gap in the log"), **dict.fromkeys(unknown, "stated as unknown")}
     if gaps:
         notes = [*notes, f"motions that count as lost, over gaps of more than {_GAP_STEPS} usual steps: {len(gaps)}"]
+    if unknown:
+        notes = [*notes, f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}"]
     records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
     for k, motion in enumerate(motions, 1):
         stated: dict[str, Any] = {}
         if cov is not None and transport.is_positive_definite(cov[k]):
             stated = {"covariances": {name: cov[k]}, "v_t": {}}
-        status, reason = (Status.LOST, "gap in the log") if k in gaps else (Status.OK, "")
-        record = VoRecord(int(t[k]), int(t[k - 1]), status, motion, reason=reason, **stated, **_fields(log, k))
+        status = Status.LOST if k in lost else Status.OK
+        record = VoRecord(int(t[k]), int(t[k - 1]), status, motion, reason=lost.get(k, ""), **stated, **_fields(log, k))
         records.append(record)
     return records, [*log.notes, *notes]
+
+
+def _stated_unknown(covariance: Array) -> set[int]:
+    """Rows whose rotation is stated as unknown about every axis; an odometry in the plane knows its heading."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]
+    return set(np.flatnonzero((variances > _UNKNOWN_RAD**2).all(axis=1)).tolist())
 
 
 def _after_gaps(t_ns: NDArray[np.int64]) -> set[int]:

@@ -85,6 +85,20 @@ def test_pose_covariance_of_a_filter_is_not_passed_off_as_a_motions(tmp_path):
     assert set(records[5].covariances) == {"imported_pose"}
 
 
+def test_a_motion_that_is_stated_as_unknown_is_lost(tmp_path):
+    """Three motions of which nothing is known; all of them in the plane, where roll and pitch are not known at all."""
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
+    small, some = [1e-4] * N, [25.0 if k in (0, 8, 9, 10) else 1e-4 for k in range(N)]
+    read = {"covariance_of": "motion", "covariance_axes": "body"}
+    records, notes = to_records(read_foreign(_csv(tmp_path / "a.csv", header, [some] * 6), **read))
+    assert [k for k, r in enumerate(records) if r.status is Status.LOST] == [8, 9, 10]
+    assert notes[0].endswith("unknown: 3")
+    planar = [small, small, [1e6] * N, [1e6] * N, [1e6] * N, small]
+    records, notes = to_records(read_foreign(_csv(tmp_path / "b.csv", header, planar), **read))
+    assert all(r.usable for r in records[1:])
+    assert not notes
+
+
 def test_the_motion_over_a_gap_is_lost(tmp_path):
     stamps = T_NS.copy()
     stamps[12:] += 20_000_000_000
