@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from gpvo.dataset.build import build_run
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
@@ -115,7 +113,7 @@ def markdown(outcome: Outcome) -> str:
 
 def _mean_row(result: Study, name: str) -> list[str]:
     values = [f"{result.mean(name, key):.{digits}f}" for _, key, digits in _COLUMNS]
-    return [name, *values, f"{int(np.nansum(result.column(name, 'diverged')))}"]
+    return [name, *values, f"{result.diverged(name)}"]
 
 
 def _run_rows(result: Study) -> list[list[str]]:

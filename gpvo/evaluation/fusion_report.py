@@ -82,8 +82,7 @@ def _mean(result: Study, name: str, traces: Sequence[Trace]) -> dict[str, Any] |
     out: dict[str, Any] = {key: result.mean(name, key) for key in keys}
     nees = {part: result.mean(name, f"nees_{part}") for part in ("position", "attitude")}
     out["nis_in_band_percent"] = nis_in_band_percent([t for t in traces if t.policy == name])
-    judged = [s.diverged for s in result.scores[name] if s is not None and s.frames]
-    return {**out, "nees_dof": nees, "diverged": sum(judged) if judged else None}
+    return {**out, "nees_dof": nees, "diverged": result.diverged(name)}
 
 
 def _comparison(result: Study, policy: str, against: str) -> dict[str, Any] | None:

@@ -158,6 +158,11 @@ class Study:
         values = values[~np.isnan(values)]
         return float(values.mean()) if len(values) else float("nan")
 
+    def diverged(self, policy: str) -> int | None:
+        """How many runs diverged; None where no truth tells."""
+        told = [s.diverged for s in self.scores[policy] if s is not None and s.frames]
+        return sum(told) if told else None
+
     def compare(self, policy: str, against: str) -> Comparison:
         """Paired over the runs that both have."""
         a, b = self.column(policy, "ate_rmse_m"), self.column(against, "ate_rmse_m")
@@ -212,7 +217,8 @@ def table(study: Study) -> str:
     lines = [f"{'policy':<20}" + "".join(f"{title:>10}" for title, _, _ in columns) + f"{'diverged':>10}"]
     for name in names:
         values = "".join(f"{study.mean(name, key):>10.{digits}f}" for _, key, digits in columns)
-        lines.append(f"{name:<20}{values}{int(np.nansum(study.column(name, 'diverged'))):>10d}")
+        diverged = study.diverged(name)
+        lines.append(f"{name:<20}{values}{'nan' if diverged is None else diverged:>10}")
     lines += ["", "ATE m of every run", f"{'run':<28}" + "".join(f"{n[:18]:>19}" for n in names)]
     for i, run in enumerate(study.runs):
         ate = [study.column(n, "ate_rmse_m")[i] for n in names]
