@@ -47,6 +47,7 @@ def import_(
     map_: Annotated[
         list[str] | None, typer.Option("--map", help="COLUMN=NAME of a CSV, e.g. var_x=cov_00; repeatable.")
     ] = None,
+    truth_map: Annotated[list[str] | None, typer.Option(help="The same for a CSV of the ground truth.")] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the odometry in a bag.")] = None,
     truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
     times: Annotated[Path | None, typer.Option(help="Seconds, a line per pose, for KITTI poses.")] = None,
@@ -75,7 +76,8 @@ def import_(
             truth=truth,
             kind=format_,
             truth_kind=truth_format,
-            mapping=_mapping(map_ or []),
+            mapping=_mapping("--map", map_ or []),
+            truth_mapping=_mapping("--truth-map", truth_map or []),
             topic=topic,
             truth_topic=truth_topic,
             times=times,
@@ -95,12 +97,12 @@ def import_(
         print(f"{out}: {summary}")
 
 
-def _mapping(texts: list[str]) -> dict[str, str]:
+def _mapping(option: str, texts: list[str]) -> dict[str, str]:
     out = {}
     for text in texts:
         column, _, name = text.rpartition("=")
         if not column or not name:
-            raise GpvoError(f"--map is '{text}'", cure="give COLUMN=NAME, such as var_x=cov_00")
+            raise GpvoError(f"{option} is '{text}'", cure="give COLUMN=NAME, such as var_x=cov_00")
         out[column.strip()] = name.strip()
     return out
 

@@ -29,6 +29,7 @@ class ImportSettings:
     kind: str | None = None
     truth_kind: str | None = None
     mapping: Mapping[str, str] = field(default_factory=dict)
+    truth_mapping: Mapping[str, str] = field(default_factory=dict)
     topic: str | None = None
     truth_topic: str | None = None
     times: Path | None = None
@@ -116,6 +117,7 @@ def _read_truth(settings: ImportSettings, path: Path, place: Array) -> TruthLog:
     truth = read_foreign(
         path,
         settings.truth_kind,
+        mapping=settings.truth_mapping,
         topic=settings.truth_topic,
         times=settings.times,
         rate_hz=settings.rate_hz,

@@ -147,7 +147,7 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
         raise SourceError(
             f"no column for {', '.join(absent)} (there are: {', '.join(header)})",
             where=path,
-            cure="name it with --map COLUMN=" + absent[0],
+            cure=f"name it with --map COLUMN={absent[0]}, in a ground truth with --truth-map",
         )
     return found
 

@@ -131,6 +131,24 @@ def test_import_of_a_perfect_log(gpvo, tmp_path):
     assert run.truth is not None
 
 
+def test_the_columns_of_a_truth_are_named_like_those_of_a_log(gpvo, tmp_path):
+    write_tum(tmp_path / "est.txt", T_NS, _poses())
+    write_euroc_csv(tmp_path / "gt.csv", T_NS, _poses())
+    lines = (tmp_path / "gt.csv").read_text().splitlines()
+    names = ["when", "east", "north", "up", "a", "b", "c", "d"]
+    (tmp_path / "gt.csv").write_text("\n".join([",".join(names), *(",".join(x.split(",")[:8]) for x in lines[1:])]))
+    command = ("import", tmp_path / "est.txt", "--truth", tmp_path / "gt.csv", "-o", tmp_path / "run")
+    code, _, err = gpvo(*command)
+    assert code == 2
+    assert "--truth-map" in err
+    # EuRoC's quaternion begins with its real part.
+    targets = ("t_ns", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
+    given = [word for pair in zip(names, targets) for word in ("--truth-map", "=".join(pair))]
+    code, out, err = gpvo(*command, *given, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["with_truth"] == N
+
+
 def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
     """The truth is of a body turned against the camera, and the log's clock runs 120 ms late."""
     poses = _poses()
@@ -160,6 +178,7 @@ def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
         (["{log}", "-o", "{out}", "--time-offset", "soon"], "--time-offset is 'soon'"),
         (["{log}", "-o", "{out}", "--time-offset", "auto"], "give --truth"),
         (["{log}", "-o", "{out}", "--map", "abc"], "--map is 'abc'"),
+        (["{log}", "-o", "{out}", "--truth-map", "abc"], "--truth-map is 'abc'"),
         (["{log}", "-o", "{out}", "--format", "xml"], "there is no format 'xml'"),
         (["{log}", "-o", "{out}", "--truth-sigma", "1"], "--truth-sigma is '1'"),
         (["{log}", "-o", "{out}", "--truth", "{late}"], "does not overlap"),
