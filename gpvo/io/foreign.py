@@ -140,7 +140,7 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     is positive definite for nearly all rows, as for an odometry that adds up its errors; a filter's is not, and stays
     as it is under the name ``imported_pose``, which is of the pose, not of one motion. Across a gap in the log the
     odometry was lost, whatever it says when it is there again; and of a motion whose turn it does not know to a radian
-    about any axis it knows nothing (RTAB-Map's way of saying so is a variance of 9999).
+    about any axis it knows nothing (as RTAB-Map says by a variance of 9999: introlab/rtabmap_ros, issue 80).
     """
     T = log.trajectory.T_world_body
     motions = se3.inverse(T[:-1]) @ T[1:]
