@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+IMPORTED = "imported"
+"""Name of the covariances that somebody else's odometry states of its own motions."""
+
 
 class Status(str, Enum):
     """How far a motion can be trusted. ``start`` marks the first frame, which has no motion yet."""

@@ -20,7 +20,7 @@ from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
-from gpvo.types import Array, Prediction, Status, TruthLog, VoLog
+from gpvo.types import IMPORTED, Array, Prediction, Status, TruthLog, VoLog
 
 METHODS = (
     "constant",
@@ -30,8 +30,8 @@ METHODS = (
     "pointing_matching",
     "pointing_matching_scaled",
     "pointing_matching_vt",
-    "imported",
-    "imported_scaled",
+    IMPORTED,
+    f"{IMPORTED}_scaled",
     "gp_thesis",
     "learned",
 )

@@ -19,7 +19,7 @@ from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read
 from gpvo.io.foreign_csv import Table, is_number, read_table
 from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
 from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
-from gpvo.types import Status, VoRecord
+from gpvo.types import IMPORTED, Status, VoRecord
 
 FORMATS = ("tum", "kitti", "csv", "bag")
 _GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
@@ -147,7 +147,7 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     name, cov, notes = _motion_covariances(log, motions)
     t = log.t_ns
     gaps = _after_gaps(t)
-    unknown = _stated_unknown(cov) - {0, *gaps} if cov is not None and name == "imported" else set()
+    unknown = _stated_unknown(cov) - {0, *gaps} if cov is not None and name == IMPORTED else set()
     lost = {**dict.fromkeys(gaps, "gap in the log"), **dict.fromkeys(unknown, "stated as unknown")}
     if gaps:
         notes = [*notes, f"motions that count as lost, over gaps of more than {_GAP_STEPS} usual steps: {len(gaps)}"]
@@ -190,13 +190,13 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
         return "", None, []
     C = transport.symmetrise(log.covariance)
     if log.covariance_of == "motion":
-        return "imported", C, []
+        return IMPORTED, C, []
     A = se3.adjoint(se3.inverse(motions))
     growth = np.full_like(C, np.nan)
     growth[1:] = transport.symmetrise(C[1:] - A @ C[:-1] @ np.swapaxes(A, -1, -2))
     share = float(np.mean([transport.is_positive_definite(g) for g in growth[1:]])) if len(motions) else 0.0
     if share >= 0.95:
-        return "imported", growth, []
+        return IMPORTED, growth, []
     note = (
         f"the covariances are of poses and grow in {100 * share:.0f} % of the steps only, as a filter's do: kept as"
         " 'imported_pose', which is not the covariance of one motion"

@@ -175,6 +175,7 @@ def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, NDArray[Any]
             data = {name: np.asarray(file[name]) for name in file.files}
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror or error}", where=path) from None
+    # zipfile knows not every compression (NotImplementedError), and no password (RuntimeError).
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
         raise SourceError(
             f"not readable as .npz: {str(error).splitlines()[0] if str(error) else error!r}", where=path

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import GpvoError
 from gpvo.online.base import RESIDUAL_COLUMN
-from gpvo.online.features import AXES, GEOMETRIC_METHODS, IMPORTED, resolve
+from gpvo.online.features import AXES, GEOMETRIC_METHODS, resolve
+from gpvo.types import IMPORTED
 
 FAMILIES: dict[str, tuple[str, ...]] = {
     "motion": ("velocity", "rotation"),
@@ -57,12 +58,12 @@ class TrainConfig:
 def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tuple[str, ...]:
     """Those of the wanted columns that every log knows and that are not constant."""
     known = set.intersection(*(s.supported() for s in sets))
-    varied = set()
-    for name in sorted(known):
+
+    def varies(name: str) -> bool:
         values = [s.select((name,)) for s in sets]
-        if max(float(abs(v[v == v] - v[v == v][0]).max()) for v in values if (v == v).any()) > 1e-9:
-            varied.add(name)
-    return tuple(n for n in wanted if n in known and n in varied)
+        return max(float(abs(v[v == v] - v[v == v][0]).max()) for v in values if (v == v).any()) > 1e-9
+
+    return tuple(n for n in wanted if n in known and varies(n))
 
 
 def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tuple[str, ...]]:
@@ -90,6 +91,8 @@ def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]
     ones, at one pixel and at the noise of the residuals, and the motion alone. A covariance that is always the same
     says nothing of a motion."""
     known = set.intersection(*(s.supported() for s in sets))
-    methods = [m for m in (*GEOMETRIC_METHODS, IMPORTED) if supported_columns(sets, [f"ln_var_{m}_{a}" for a in AXES])]
+    columns = {m: {f"ln_var_{m}_{a}" for a in AXES} for m in (*GEOMETRIC_METHODS, IMPORTED)}
+    tell = supported_columns(sets, sorted(set.union(*columns.values())))
+    methods = [m for m, own in columns.items() if own.intersection(tell)]
     noise = (False, True) if RESIDUAL_COLUMN in known else (False,)
     return [*((m, residual) for m in methods for residual in noise), (None, False)]

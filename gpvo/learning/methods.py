@@ -12,9 +12,9 @@ from gpvo.dataset.build import TrainingSet
 from gpvo.learning.config import supported_columns
 from gpvo.learning.regressors import get_regressor
 from gpvo.online.basis import SharedBasis
-from gpvo.online.features import IMPORTED, THESIS
+from gpvo.online.features import THESIS
 from gpvo.online.thesis import ThesisModel
-from gpvo.types import Array
+from gpvo.types import IMPORTED, Array
 
 Statement = Callable[[TrainingSet], tuple[Array, Array] | None]
 """Mean (n, 6) and covariance (n, 6, 6) of a sequence; None where it lacks what the method needs."""
@@ -81,8 +81,7 @@ def simple_statements(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Statement
         out[method] = _stated(method, None)
         scale = arrays.get(f"method.{method}.scale")
         out[f"{method}_scaled"] = _nothing if scale is None else _stated(method, scale)
-        out[f"{method}_vt"] = _translation_only(method)
-    return out
+    return out | {f"{method}_vt": _translation_only(method) for method in GEOMETRIC}
 
 
 def _nothing(_: TrainingSet) -> None:

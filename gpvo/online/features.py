@@ -16,12 +16,10 @@ import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.types import Array, StereoCamera, VoRecord
+from gpvo.types import IMPORTED, Array, StereoCamera, VoRecord
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 GEOMETRIC_METHODS = ("pointing_matching", "triangulation")
-IMPORTED = "imported"
-"""Name of the covariances that somebody else's odometry states of its own motions."""
 TREND_S = 1.0
 """Time constant of the running means that the trends are measured against [s]."""
 
@@ -205,7 +203,7 @@ BUILT_IN = (
         ),
         _Trend,
     ),
-    FeatureGroup("imported", _columns(*_variance_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
+    FeatureGroup(IMPORTED, _columns(*_variance_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
     FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (_ln(r.reproj_rms_px),))),
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.

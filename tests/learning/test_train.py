@@ -440,8 +440,8 @@ def test_what_another_odometry_states_is_compared_and_learnt_from():
 
 
 def test_a_covariance_that_is_always_the_same_is_compared_but_says_nothing():
-    always = lambda C: {"imported": 1e-6 * np.eye(6)}  # noqa: E731
-    trained = train_sets([_theirs(k, always) for k in range(3)], TrainConfig(noise_inducing=32))
+    sets = [_theirs(k, lambda C: {"imported": 1e-6 * np.eye(6)}) for k in range(3)]
+    trained = train_sets(sets, TrainConfig(noise_inducing=32))
     assert trained.header["base_method"] is None
     assert not any("imported" in f for f in trained.header["features"])
     assert trained.table["mean"]["imported"]["nees_dof"]["joint"] is not None
