@@ -231,7 +231,7 @@ def _without_truth(fused: FusedRun) -> Scores:
         nis_dof=float(measured.mean()) if len(measured) else unknown,
         nis_interval=nis_interval(measured),
         rejected=fused.counts["rejected"],
-        diverged=False,
+        diverged=None,
         frames=0,
     )
 

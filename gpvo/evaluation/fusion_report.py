@@ -71,7 +71,7 @@ def _score(scores: Scores | None) -> dict[str, Any] | None:
         "nis_dof": scores.nis_dof,
         "nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high],
         "rejected": scores.rejected,
-        "diverged": scores.diverged if scores.frames else None,
+        "diverged": scores.diverged,
     }
 
 

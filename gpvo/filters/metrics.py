@@ -19,7 +19,8 @@ DIVERGED_PATH_SHARE, DIVERGED_M = 0.2, 2.0
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of one run under one policy; NaN where truth is missing. ``nis_interval`` by block bootstrap."""
+    """Scores of one run under one policy; NaN, of ``diverged`` None, where truth is missing. ``nis_interval`` by block
+    bootstrap; ``frames`` that have truth."""
 
     ate_rmse_m: float
     final_error_m: float
@@ -29,7 +30,7 @@ class Scores:
     nis_dof: float
     nis_interval: Interval
     rejected: int
-    diverged: bool
+    diverged: bool | None
     frames: int
 
     @property

@@ -150,7 +150,7 @@ class Study:
 
     def column(self, policy: str, name: str) -> Array:
         """(runs,) of one score, NaN where missing."""
-        return np.array([np.nan if s is None else float(getattr(s, name)) for s in self.scores[policy]])
+        return np.array([None if s is None else getattr(s, name) for s in self.scores[policy]], dtype=np.float64)
 
     def mean(self, policy: str, name: str) -> float:
         """Mean over the runs that have it."""
@@ -160,7 +160,7 @@ class Study:
 
     def diverged(self, policy: str) -> int | None:
         """How many runs diverged; None where no truth tells."""
-        told = [s.diverged for s in self.scores[policy] if s is not None and s.frames]
+        told = [s.diverged for s in self.scores[policy] if s is not None and s.diverged is not None]
         return sum(told) if told else None
 
     def compare(self, policy: str, against: str) -> Comparison:

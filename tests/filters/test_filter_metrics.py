@@ -11,7 +11,7 @@ from gpvo.filters import metrics
 from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy, split_noise
 from gpvo.filters.run import FuseOptions, fuse_flight
 from gpvo.filters.side_by_side import fuse_side_by_side
-from gpvo.filters.study import Constants, fit_scalars, has_noise, make_policies, study, table
+from gpvo.filters.study import Constants, Study, fit_scalars, has_noise, make_policies, study, table
 from gpvo.filters.synthetic import ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
 from gpvo.types import Status, VoRecord
@@ -118,3 +118,13 @@ def test_policies_side_by_side_are_as_each_alone() -> None:
         np.testing.assert_allclose(together[name].T_world_cam, alone.T_world_cam, atol=1e-9)
         np.testing.assert_allclose(together[name].covariance, alone.covariance, rtol=1e-6, atol=1e-15)
         assert [s.outcome for s in together[name].steps] == [s.outcome for s in alone.steps]
+
+
+def test_a_run_without_truth_has_not_said_that_it_held() -> None:
+    """One run diverged, one did not, of one no truth tells, and in one the policy could not run."""
+    told = fuse_flight(synthetic_flight(0, duration_s=4), ConstantPolicy(np.full(6, 1e-5), 0.05))[0].scores
+    runs = [replace(told, diverged=d) for d in (True, False, None)]
+    of_all = Study(("a", "b", "c", "d"), {"constant": (*runs, None), "learned": (runs[2], None, None, None)})
+    np.testing.assert_array_equal(of_all.column("constant", "diverged"), [1.0, 0.0, np.nan, np.nan])
+    assert of_all.diverged("constant") == 1
+    assert of_all.diverged("learned") is None
