@@ -154,6 +154,10 @@ def _print(e: Evaluation) -> None:
         f"{d['run']}: {d['frames']} frames, {d['lost']} lost, {d['path_length_m']:.1f} m; ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )
+    if d["truth_moves_at_rest"]:
+        console.print(
+            f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands there, and the truth moves"
+        )
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
     relative = (f"{name} {_text(m)} m, {_text(math.degrees(rad))} deg" for name, m, rad in errors)
     console.print(f"  relative error (rms) over a {'; '.join(relative)}")

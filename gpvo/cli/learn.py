@@ -29,6 +29,9 @@ def train(
     align: Annotated[
         str, typer.Option(help="rotation: fit a fixed rotation between log and truth first; none.")
     ] = "none",
+    waits: Annotated[
+        str, typer.Option(help="drop: leave out where the vehicle stands while its truth moves; keep.")
+    ] = "drop",
     update: Annotated[
         Path | None, typer.Option(help="Add the runs to this model's own; its settings hold unless given.")
     ] = None,
@@ -53,6 +56,7 @@ def train(
         "target": target,
         "regressor": regressor,
         "align": align,
+        "waits": waits,
         "seed": seed,
         "max_rows": max_rows,
     }
@@ -103,7 +107,9 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
         from gpvo.dataset.build import build_run
         from gpvo.learning.position import train_position
 
-        return train_position([build_run(r, target="position", align=config.align) for r in runs], config)
+        return train_position(
+            [build_run(r, target="position", align=config.align, waits=config.waits) for r in runs], config
+        )
     if update is not None:
         from gpvo.learning.update import update as update_model
 
@@ -139,7 +145,9 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
 
     with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
         rows = Path(folder) / "rows.parquet"
-        write_sets(rows, (build_run(read_run(p), target=config.target, align=config.align) for p in paths))
+        write_sets(
+            rows, (build_run(read_run(p), target=config.target, align=config.align, waits=config.waits) for p in paths)
+        )
         return train_stored(rows, config)
 
 
@@ -165,6 +173,10 @@ def _print_table(document: dict[str, Any]) -> None:
     console.print("NEES per degree of freedom on each run left out (1 is right), then means over the runs")
     console.print(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     console.print(table)
+    resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
+    if resting:
+        told = ", ".join(f"{n} of {name}" for name, n in resting.items())
+        console.print(f"left out, as the vehicle stands there and the truth moves: {told}  (--waits keep)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}

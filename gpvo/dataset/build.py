@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
+from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.dataset.targets import check_target, motion_targets, position_targets
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -30,8 +31,8 @@ class TrainingSet:
 
     ``X`` (n, d) features ``columns``, NaN where unknown. ``Y`` (n, 6) errors [m, rad], or (n, 3) residuals of a
     position. ``covariances`` (n, 6, 6) and ``v_t`` (n, 3, 3) by method. ``counts``: frames, lost, slips (lost by
-    plausibility alone, also in ``lost``) and frames without truth. ``lost_xi`` (m, 6): errors of the slips that have
-    truth; ``lost_jump`` (m, 6): their distance from the motion expected.
+    plausibility alone, also in ``lost``), frames without truth, and those at rest whose truth moves. ``lost_xi``
+    (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from the motion expected.
     """
 
     name: str
@@ -95,14 +96,18 @@ def build(
     name: str,
     columns: Sequence[str] | None = None,
     target: str = "frame",
+    waits: str = "drop",
     where: object = None,
 ) -> TrainingSet:
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
-    ``columns``: by default all of ``full`` and the residual. Raises GpvoError where nothing is left to learn from,
-    which names ``where``, by default ``name``.
+    ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
+    waits in which the truth moves (:func:`gpvo.dataset.rest.wandering_waits`); "keep" learns from them. Raises
+    GpvoError where nothing is left to learn from, which names ``where``, by default ``name``.
     """
     check_target(target)
+    if waits not in ("drop", "keep"):
+        raise GpvoError(f"there is no way '{waits}' with waits", cure="drop or keep")
     names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
         raise GpvoError(
@@ -116,6 +121,9 @@ def build(
         Y, known = position_targets(log.trajectory(), log.t_ns, usable, truth)
     else:
         Y, known = motion_targets(records, truth)
+    with_truth = int(known.sum())
+    if waits == "drop":
+        known &= ~in_waits(records, wandering_waits(log, truth))
     if known.sum() < MIN_ROWS:
         raise GpvoError(
             f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed",
@@ -139,7 +147,8 @@ def build(
             "frames": len(log),
             "lost": n_lost,
             "slips": len(slips),
-            "without_truth": int(n_usable - known.sum()),
+            "without_truth": int(n_usable - with_truth),
+            "truth_moves_at_rest": int(with_truth - known.sum()),
         },
         camera=log.camera,
         target=target,
@@ -162,7 +171,12 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
 
 
 def build_run(
-    run: Run, *, columns: Sequence[str] | None = None, target: str = "frame", align: str = "none"
+    run: Run,
+    *,
+    columns: Sequence[str] | None = None,
+    target: str = "frame",
+    align: str = "none",
+    waits: str = "drop",
 ) -> TrainingSet:
     """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
     truth = run.truth
@@ -170,7 +184,7 @@ def build_run(
         truth = align_rotation(run.log, truth)
     elif align not in ("none", "rotation"):
         raise GpvoError(f"there is no alignment '{align}'", cure="none or rotation")
-    return build(run.log, truth, name=run.name, columns=columns, target=target, where=run.path)
+    return build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, where=run.path)
 
 
 def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:

@@ -14,6 +14,7 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import align_rotation
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
+from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.statements import Statement, statements
@@ -50,7 +51,8 @@ class EvaluateOptions:
 @dataclass(frozen=True)
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
-    poses made equal."""
+    poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
+    stands."""
 
     run: Run
     errors: MotionErrors
@@ -62,6 +64,7 @@ class Evaluation:
     T_true: Array
     truth_sigma: tuple[float, float]
     time_offset_s: float
+    unscored: int = 0
 
     def __str__(self) -> str:
         t = self.trajectory
@@ -92,10 +95,11 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
             cure="use --time-offset auto, or its own truth",
         )
     sigma = options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad)
-    errors = motion_errors(log, truth)
+    scored, unscored = _without_wandering_truth(log, truth)
+    errors = motion_errors(scored, truth)
     T_est = log.trajectory()
     made = statements(log, predictions, predictor)
-    found = {s.method: consistency(s, errors, log, T_true, known, sigma) for s in made}
+    found = {s.method: consistency(s, errors, scored, T_true, known, sigma) for s in made}
     first = int(np.flatnonzero(known)[0])
     lift = T_true[first] @ np.linalg.inv(T_est[first])
     return Evaluation(
@@ -111,7 +115,15 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
         T_true=T_true,
         truth_sigma=sigma,
         time_offset_s=offset_s,
+        unscored=unscored,
     )
+
+
+def _without_wandering_truth(log: VoLog, truth: TruthLog) -> tuple[VoLog, int]:
+    """The log with motions at rest while the truth moves as if lost, so that no score reaches over them; how many."""
+    wandering = in_waits(log.records, wandering_waits(log, truth)) & log.usable
+    lost = [r.with_status(Status.LOST, "truth moves at rest") if w else r for r, w in zip(log.records, wandering)]
+    return VoLog(lost, log.camera), int(wandering.sum())
 
 
 def predictions_by_stamp(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
@@ -163,6 +175,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     Of each run, beside its name, counts, path length, ATE and segments:
 
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
+    * ``truth_moves_at_rest``: motions that are not scored, as the vehicle stands and the truth moves; they count in
+      ATE, final error and RPE alone.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose and axis, as its source states
       or ``--truth-sigma`` says; 0 for a file that states none.
@@ -194,6 +208,7 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "frames": len(e.run.log),
         "lost": counts["lost"],
         "degraded": counts["degraded"],
+        "truth_moves_at_rest": e.unscored,
         "path_length_m": t.path_length_m,
         "ate_rmse_m": t.ate_rmse_m,
         "rmse_origin_m": t.rmse_origin_m,

@@ -60,7 +60,10 @@ def _data(h: Mapping[str, Any]) -> str:
 
 
 def _sequences(h: Mapping[str, Any]) -> str:
-    rows = [f"| {s['name']} | {s['rows']} | {s['lost']} | {s['without_truth']} |" for s in h["sequences"]]
+    rows = [
+        f"| {s['name']} | {s['rows']} | {s['lost']} | {s['without_truth']} | {s.get('truth_moves_at_rest', 0)} |"
+        for s in h["sequences"]
+    ]
     camera = h["camera"]
     seen = (
         "no camera known"
@@ -73,8 +76,8 @@ def _sequences(h: Mapping[str, Any]) -> str:
         "",
         f"Camera: {seen}.",
         "",
-        "| sequence | rows | lost | without truth |",
-        "| --- | --- | --- | --- |",
+        "| sequence | rows | lost | without truth | truth moves at rest |",
+        "| --- | --- | --- | --- | --- |",
     ]
     return "\n".join([*head, *rows])
 

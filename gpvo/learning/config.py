@@ -37,7 +37,8 @@ class TrainConfig:
     """``features``: ``auto`` (chosen by cross-validation over the training sequences), ``thesis``, ``full`` or a list.
 
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``:
-    ``rotation`` first fits a fixed rotation between each log and its truth. ``inducing``, ``noise_inducing``: points of
+    ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
+    which the truth moves. ``inducing``, ``noise_inducing``: points of
     the GPs. ``max_rows``: held in memory, of larger files the rest streams. ``jobs``, ``backend`` (``local`` or
     ``dask``), ``scheduler``: where folds are fitted.
     """
@@ -47,6 +48,7 @@ class TrainConfig:
     regressor: str = "auto"
     seed: int = 0
     align: str = "none"
+    waits: str = "drop"
     inducing: int = 256
     noise_inducing: int = 64
     max_rows: int = 100_000

@@ -55,7 +55,9 @@ def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedMode
     Raises GpvoError where a run has no truth, or runs do not belong together.
     """
     config = config or TrainConfig()
-    return train_sets([build_run(r, target=config.target, align=config.align) for r in runs], config)
+    return train_sets(
+        [build_run(r, target=config.target, align=config.align, waits=config.waits) for r in runs], config
+    )
 
 
 # On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.
@@ -132,6 +134,7 @@ def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainC
         "held_out": held_out.name,
         "rows": len(held_out),
         "lost": held_out.counts["lost"],
+        "truth_moves_at_rest": held_out.counts.get("truth_moves_at_rest", 0),
         "methods": methods,
         "in_domain": float((estimate.in_domain > 0.5).mean()),
         "slips": _slips(held_out, estimate, learned, arrays["method.constant"]),

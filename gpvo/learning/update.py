@@ -33,7 +33,7 @@ def update(
     old = training_rows(path)
     if old[0].target != config.target:
         raise ModelError(f"learns the target '{old[0].target}', not '{config.target}'", where=path)
-    new = [build_run(r, target=config.target, align=config.align) for r in runs]
+    new = [build_run(r, target=config.target, align=config.align, waits=config.waits) for r in runs]
     names = {s.name for s in new}
     for gone in (s.name for s in old if s.name in names):
         tell(f"sequence '{gone}' of {path} is replaced by the run of that name")

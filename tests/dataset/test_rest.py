@@ -1,0 +1,146 @@
+"""A truth that moves while the vehicle stands: found where it happens, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.dataset.build import build
+from gpvo.dataset.rest import in_waits, wandering_waits
+from gpvo.errors import GpvoError
+from gpvo.evaluation.evaluate import document, evaluate_run
+from gpvo.io import open_source
+from gpvo.io.run import read_run
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.fit import fit_model
+from gpvo.learning.train import estimate_set
+from gpvo.runner import run, steps
+from gpvo.sim.points import simulate_points
+from gpvo.stats.consistency import nll_per_dim
+from gpvo.types import TruthLog, VoLog
+from gpvo.vo.config import make_config
+
+# Simulated flights begin at rest.
+AT_REST_S = 2.8
+
+
+def fly(tmp_path, seed, scenario="tunnel-clean", duration_s=8.0):
+    source = open_source(simulate_points(scenario, seed, duration_s=duration_s).save(tmp_path / f"{seed}.npz"))
+    return VoLog([step.record for step in steps(source, make_config())], source.camera), source.truth
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    return fly(tmp_path_factory.mktemp("flight"), 3)
+
+
+def seconds(log):
+    return (log.t_ns - log.t_ns[0]) * 1e-9
+
+
+def wandering(truth: TruthLog, offset_m: float, start_s: float, end_s: float, period_s: float = 1.5) -> TruthLog:
+    """The truth with an offset that comes and goes over a stretch of time."""
+    s = (truth.t_ns - truth.t_ns[0]) * 1e-9
+    T = truth.T_world_cam.copy()
+    during = (s >= start_s) & (s <= end_s)
+    T[during, 1, 3] += offset_m * np.sin(np.pi * (s[during] - start_s) / period_s) ** 2
+    return replace(truth, T_world_cam=T)
+
+
+def test_a_truth_that_wanders_at_rest_is_found(flight):
+    log, truth = flight
+    waits = wandering_waits(log, wandering(truth, 0.2, 0.3, AT_REST_S))
+    assert len(waits) == 1
+    hit, s = in_waits(log.records, waits), seconds(log)
+    assert hit[(s > 0.3) & (s < AT_REST_S)].all()
+    assert not hit[s > AT_REST_S + 1.0].any()
+
+
+def test_an_exact_truth_is_believed(tmp_path):
+    for seed, scenario in enumerate(("tunnel-clean", "tunnel-bursts", "tunnel-noise", "lunar-straight", "room-t265")):
+        log, truth = fly(tmp_path, seed, scenario)
+        assert len(wandering_waits(log, truth)) == 0, scenario
+
+
+def test_what_the_picture_would_not_show_is_no_contradiction(flight):
+    log, truth = flight
+    assert len(wandering_waits(log, wandering(truth, 0.0005, 0.3, AT_REST_S))) == 0
+
+
+def test_a_truth_that_wanders_while_the_vehicle_moves_is_not_told(flight):
+    log, truth = flight
+    assert len(wandering_waits(log, wandering(truth, 0.2, 4.0, 7.0))) == 0
+
+
+def without_imu(r):
+    none = dict.fromkeys(("imu_gyro_mean_radps", "imu_gyro_std_radps", "imu_acc_mean_mps2", "imu_acc_std_mps2"))
+    return replace(r, **none)
+
+
+def test_odometry_that_sees_no_motion_needs_the_gyroscope_for_a_witness(flight):
+    """A lorry ahead that fills the picture: odometry stands still, truth moves, and so does the gyroscope."""
+    log, truth = flight
+    moved = wandering(truth, 0.2, 0.3, AT_REST_S)
+    rng = np.random.default_rng(0)
+    shaken = [
+        r if r.imu_gyro_mean_radps is None else replace(r, imu_gyro_mean_radps=0.01 * rng.standard_normal(3))
+        for r in log.records
+    ]
+    for records in ([without_imu(r) for r in log.records], shaken):
+        assert len(wandering_waits(VoLog(records, log.camera), moved)) == 0
+    assert len(wandering_waits(VoLog(log.records, None), moved)) == 0
+
+
+def test_rows_of_such_waits_are_left_out_and_counted(flight):
+    log, truth = flight
+    moved = wandering(truth, 0.2, 0.3, AT_REST_S)
+    dropped, kept, exact = (
+        build(log, t, name="a", waits=w) for t, w in ((moved, "drop"), (moved, "keep"), (truth, "drop"))
+    )
+    assert dropped.counts["truth_moves_at_rest"] == len(kept) - len(dropped) > 30
+    assert kept.counts["truth_moves_at_rest"] == exact.counts["truth_moves_at_rest"] == 0
+    assert dropped.counts["without_truth"] == exact.counts["without_truth"]
+    at = np.isin(exact.t_ns, dropped.t_ns)
+    np.testing.assert_allclose(dropped.Y, exact.Y[at], atol=1e-12)
+    np.testing.assert_array_equal(dropped.X, exact.X[at])
+
+
+def test_windows_that_reach_into_such_a_wait_are_left_out(flight):
+    log, truth = flight
+    moved = wandering(truth, 0.2, 0.3, AT_REST_S)
+    s = build(log, moved, name="a", target="window:0.5s")
+    exact = build(log, truth, name="a", target="window:0.5s")
+    at = np.isin(exact.t_ns, s.t_ns)
+    assert 0 < at.sum() < len(exact)
+    np.testing.assert_allclose(s.Y, exact.Y[at], atol=1e-12)
+
+
+def test_another_word_for_waits_is_refused(flight):
+    with pytest.raises(GpvoError, match="drop or keep"):
+        build(*flight, name="a", waits="leave")
+
+
+def test_consistency_is_not_judged_by_such_a_truth_but_the_path_is(tmp_path):
+    source = open_source(simulate_points("tunnel-clean", 3, duration_s=8.0).save(tmp_path / "flight.npz"))
+    run(source, tmp_path / "run")
+    flown = read_run(tmp_path / "run")
+    moved = replace(flown, truth=wandering(flown.truth, 0.2, 0.3, AT_REST_S))
+    exact, judged = (document([evaluate_run(r)])["runs"][0] for r in (flown, moved))
+    assert exact["truth_moves_at_rest"] == 0 < judged["truth_moves_at_rest"]
+    nees = [d["methods"]["triangulation"]["nees_dof"]["joint"] for d in (exact, judged)]
+    assert 0.5 < nees[1] / nees[0] < 2.0
+    assert judged["ate_rmse_m"] > 2.0 * exact["ate_rmse_m"]
+
+
+@pytest.mark.slow
+def test_waits_with_a_wandering_truth_spoil_a_model_that_learns_from_them(tmp_path):
+    """Six flights of 16 s teach, three of exact truth judge; the truth of the six wanders by 0.1 m at rest."""
+    flights = [fly(tmp_path, seed, duration_s=16.0) for seed in range(20, 29)]
+    tests = [build(*f, name=str(i)) for i, f in enumerate(flights[6:])]
+
+    def nll(waits):
+        moved = [(log, wandering(truth, 0.1, 0.3, AT_REST_S)) for log, truth in flights[:6]]
+        learned = fit_model([build(*f, name=str(i), waits=waits) for i, f in enumerate(moved)], TrainConfig())
+        said = [estimate_set(learned, s) for s in tests]
+        return np.mean([nll_per_dim(s.Y - e.mean, e.covariance).mean() for s, e in zip(tests, said, strict=True)])
+
+    assert nll("drop") < nll("keep") - 0.05
