@@ -45,7 +45,7 @@ def wandering_waits(log: VoLog, truth: TruthLog, test: RestTest | None = None) -
     T_est, (T_true, known) = log.trajectory(), interpolate_truth(truth, log.t_ns)
     for first, last in _waits(log, T_est, test):
         span = slice(first, last + 1)
-        if known[span].all() and _image_motion_px(T_true[span], log.records[last], log.camera) > test.truth_px:
+        if known[span].all() and _image_motion_px(_extent(T_true[span]), log.records[last], log.camera) > test.truth_px:
             found.append(log.t_ns[[first, last]])
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
@@ -59,48 +59,54 @@ def in_waits(records: Sequence[VoRecord], waits: NDArray[np.int64]) -> NDArray[n
 
 def _waits(log: VoLog, T_est: Array, test: RestTest) -> list[tuple[int, int]]:
     """First and last frame of the longest stretches at rest, one after the other."""
-    assert log.camera is not None
-    records, spread, found, first = log.records, _Spread(log.records), [], 0
-    while first < len(records):
-        last = first
-        while last + 1 < len(records) and records[last + 1].usable:
-            moved_px = _image_motion_px(T_est[first : last + 2], records[last + 1], log.camera)
-            gyro, acc = spread.over(first + 1, last + 1)
-            # Written so that what is unknown, NaN, is not at rest; an accelerometer may be missing.
-            if not (moved_px <= test.motion_px and gyro <= test.gyro_std_radps) or acc > test.acc_std_mps2:
-                break
-            last += 1
-        waited = (records[last].t_ns - records[first].t_ns) * 1e-9 >= test.still_s
-        if waited:
+    records, (mean, square) = log.records, _imu_moments(log.records)
+    found, first = [], 0
+    while first < len(records) - 1:
+        last = _rests_until(first, log, T_est, mean, square, test)
+        if (records[last].t_ns - records[first].t_ns) * 1e-9 >= test.still_s:
             found.append((first, last))
-        first = last + 1 if waited else first + 1
+            first = last
+        first += 1
     return found
 
 
-class _Spread:
-    """Standard deviation of the IMU over stretches of records, from the mean and deviation that each knows."""
-
-    def __init__(self, records: Sequence[VoRecord]) -> None:
-        unknown = np.full(3, np.nan)
-
-        def column(name: str) -> Array:
-            return np.array([unknown if (v := getattr(r, name)) is None else v for r in records]).reshape(-1, 3)
-
-        mean = np.hstack([column("imu_gyro_mean_radps"), column("imu_acc_mean_mps2")])
-        std = np.hstack([column("imu_gyro_std_radps"), column("imu_acc_std_mps2")])
-        self._mean, self._square = mean, mean**2 + std**2
-
-    def over(self, first: int, last: int) -> tuple[float, float]:
-        """Of gyroscope and accelerometer, the worst axis, over the records ``first`` to ``last``; NaN where unknown."""
-        span = slice(first, last + 1)
-        variance = self._square[span].mean(axis=0) - self._mean[span].mean(axis=0) ** 2
-        std = np.sqrt(np.maximum(variance, 0.0))
-        return float(std[:3].max()), float(std[3:].max())
+def _rests_until(first: int, log: VoLog, T_est: Array, mean: Array, square: Array, test: RestTest) -> int:
+    """The last frame up to which the vehicle stands from the frame ``first`` on."""
+    assert log.camera is not None
+    low, high, sums = np.zeros(3), np.zeros(3), np.zeros((2, 6))
+    for k in range(first + 1, len(log)):
+        here = (T_est[k, :3, 3] - T_est[first, :3, 3]) @ T_est[first, :3, :3]
+        low, high, sums = np.minimum(low, here), np.maximum(high, here), sums + (mean[k], square[k])
+        moments = sums / (k - first)
+        std = np.sqrt(np.maximum(moments[1] - moments[0] ** 2, 0.0))
+        moved_px = _image_motion_px(high - low, log.records[k], log.camera)
+        # Written so that what is unknown, NaN, is not at rest; an accelerometer may be missing.
+        still = moved_px <= test.motion_px and std[:3].max() <= test.gyro_std_radps
+        if not (log.records[k].usable and still) or std[3:].max() > test.acc_std_mps2:
+            return k - 1
+    return len(log) - 1
 
 
-def _image_motion_px(T_world_cam: Array, seen: VoRecord, camera: StereoCamera) -> float:
-    """Image motion [px] between the extremes of n positions (n, 4, 4), in the axes of the first, of the near points:
+def _imu_moments(records: Sequence[VoRecord]) -> tuple[Array, Array]:
+    """Mean and mean square (N, 6) of gyroscope and accelerometer over each record's motion; NaN where unknown."""
+    unknown = np.full(3, np.nan)
+
+    def column(name: str) -> Array:
+        return np.array([unknown if (v := getattr(r, name)) is None else v for r in records]).reshape(-1, 3)
+
+    mean = np.hstack([column("imu_gyro_mean_radps"), column("imu_acc_mean_mps2")])
+    std = np.hstack([column("imu_gyro_std_radps"), column("imu_acc_std_mps2")])
+    return mean, mean**2 + std**2
+
+
+def _extent(T_world_cam: Array) -> Array:
+    """(3,) how far positions (n, 4, 4) spread along the axes of the first."""
+    return np.ptp((T_world_cam[:, :3, 3] - T_world_cam[0, :3, 3]) @ T_world_cam[0, :3, :3], axis=0)
+
+
+def _image_motion_px(extent_m: Array, seen: VoRecord, camera: StereoCamera) -> float:
+    """Image motion [px] that translations (3,) along the camera's axes make of the near points seen:
     ``f / Z (t_xy - (x, y) t_z)``, in the mean square over image coordinates (x, y) of the spread seen."""
-    t = np.ptp((T_world_cam[:, :3, 3] - T_world_cam[0, :3, 3]) @ T_world_cam[0, :3, :3], axis=0)
-    forward = np.square([seen.spread_u, seen.spread_v]).sum() * t[2] ** 2
-    return float(np.sqrt(t[0] ** 2 + t[1] ** 2 + forward) * seen.disparity_p90_px / camera.baseline_m)
+    x, y, z = extent_m
+    forward = (seen.spread_u**2 + seen.spread_v**2) * z**2
+    return float(np.sqrt(x**2 + y**2 + forward) * seen.disparity_p90_px / camera.baseline_m)
