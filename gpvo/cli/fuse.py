@@ -35,7 +35,7 @@ def fuse(
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Filter VO with an IMU under constant, geometric and learned covariance, side by side.
+    """Filter VO with an IMU under constant, geometric, imported and learned covariance, side by side.
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
@@ -43,7 +43,7 @@ def fuse(
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
-    from gpvo.filters.policies import LEARNED, POLICIES, MeanUse
+    from gpvo.filters.policies import LEARNED, MeanUse
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
@@ -57,7 +57,7 @@ def fuse(
         from gpvo.evaluation.fusion_plot import plot_fusion, require_picture
 
         require_picture(plot)  # before the work, not after it
-    wanted = tuple(p.strip() for p in policies.split(",") if p.strip()) or POLICIES
+    wanted = tuple(p.strip() for p in policies.split(",") if p.strip())
     settings = FusionSettings(
         policies=wanted,
         model=model,

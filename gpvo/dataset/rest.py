@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.align import interpolate_truth
-from gpvo.types import Array, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,17 @@ def in_waits(records: Sequence[VoRecord], waits: NDArray[np.int64]) -> NDArray[n
     start = np.array([r.t_prev_ns for r in records], dtype=np.int64)[:, None]
     end = np.array([r.t_ns for r in records], dtype=np.int64)[:, None]
     return np.asarray(((start < waits[:, 1]) & (end > waits[:, 0])).any(axis=1), dtype=np.bool_)
+
+
+def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
+    """The log with what falls into such waits called lost, so that neither an error nor a sum of errors reaches over
+    it; for statistics alone."""
+    waits = wandering_waits(log, truth)
+    if not len(waits):
+        return log
+    inside = in_waits(log.records, waits)
+    marked = [r.with_status(Status.LOST, "truth moves at rest") if i else r for r, i in zip(log.records, inside)]
+    return VoLog(marked, log.camera)
 
 
 def _waits(log: VoLog, T_est: Array, test: RestTest) -> list[tuple[int, int]]:

@@ -14,7 +14,7 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import align_rotation
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
-from gpvo.dataset.rest import in_waits, wandering_waits
+from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.statements import Statement, statements
@@ -95,7 +95,7 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
             cure="use --time-offset auto, or its own truth",
         )
     sigma = options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad)
-    scored, unscored = _without_wandering_truth(log, truth)
+    scored = without_wandering_truth(log, truth)
     errors = motion_errors(scored, truth)
     T_est = log.trajectory()
     made = statements(log, predictions, predictor)
@@ -115,15 +115,8 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
         T_true=T_true,
         truth_sigma=sigma,
         time_offset_s=offset_s,
-        unscored=unscored,
+        unscored=int(log.usable.sum() - scored.usable.sum()),
     )
-
-
-def _without_wandering_truth(log: VoLog, truth: TruthLog) -> tuple[VoLog, int]:
-    """The log with motions at rest while the truth moves as if lost, so that no score reaches over them; how many."""
-    wandering = in_waits(log.records, wandering_waits(log, truth)) & log.usable
-    lost = [r.with_status(Status.LOST, "truth moves at rest") if w else r for r, w in zip(log.records, wandering)]
-    return VoLog(lost, log.camera), int(wandering.sum())
 
 
 def predictions_by_stamp(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
 from gpvo.filters.metrics import Scores, nis_interval
@@ -18,9 +19,8 @@ from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
     LEARNED,
-    POINTING_MATCHING,
     POLICIES,
-    TRIANGULATION,
+    STATED,
     MeanUse,
     constant_from_errors,
 )
@@ -30,7 +30,7 @@ from gpvo.filters.start import StartSigmas, slope_sigma
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
-from gpvo.types import TruthLog
+from gpvo.types import IMPORTED, TruthLog
 
 Array = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def constants_of(runs: Sequence[Run]) -> Constants:
     for run in runs:
         if run.truth is None:
             raise GpvoError("has no ground truth to train a constant on", where=run.path)
-        errors = motion_errors(run.log, run.truth)
+        errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
         if not len(errors.index):
             raise GpvoError("has no motion with ground truth at both ends", where=run.path)
         squares.append(constant_from_errors(errors.xi))
@@ -120,9 +120,9 @@ def constants_in(predictor: Predictor) -> Constants | None:
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """What ``gpvo fuse`` was asked for."""
+    """What ``gpvo fuse`` was asked for. ``policies``: none named stands for all, ``imported`` where a run holds one."""
 
-    policies: tuple[str, ...] = POLICIES
+    policies: tuple[str, ...] = ()
     model: Path | None = None
     training: tuple[Path, ...] = ()
     use_imu: bool = True
@@ -165,11 +165,14 @@ def fuse_runs(
     Runs of one name are told apart by numbers: ``run``, ``run-2``.
     """
     tell = tell or (lambda _: None)
-    unknown = [p for p in settings.policies if p not in POLICIES]
+    unknown = [p for p in settings.policies if p not in (*POLICIES, IMPORTED)]
     if unknown:
-        raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(POLICIES)}")
+        raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join((*POLICIES, IMPORTED))}")
     predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
+    if not settings.policies:
+        imported = any(IMPORTED in run.log.methods for run in runs)
+        settings = replace(settings, policies=(*POLICIES, IMPORTED) if imported else POLICIES)
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
@@ -240,7 +243,9 @@ def _why_not(policy: str, constants: Constants | None) -> str:
     """Why a policy could not run at all, and the cure."""
     if policy == LEARNED:
         return "the runs hold no predictions of single motions; give --model"
-    if policy in (TRIANGULATION, POINTING_MATCHING):
+    if policy == IMPORTED:
+        return "the runs hold no covariance that their odometry states itself; gpvo import makes such runs"
+    if policy in STATED:
         return f"the runs hold too few usable covariances; run VO with --methods {policy}"
     if policy == CONSTANT_BEST:
         return "it is tuned on training runs; give --train RUN"

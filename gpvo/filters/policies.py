@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from gpvo.filters.measurement import MotionNoise
 from gpvo.geometry.covariance import is_positive_definite, scaled_root
-from gpvo.types import Prediction, VoRecord
+from gpvo.types import IMPORTED, Prediction, VoRecord
 
 Array = NDArray[np.float64]
 
 CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT = "constant", "constant_best", "constant_hindsight"
 TRIANGULATION, POINTING_MATCHING, LEARNED = "triangulation", "pointing_matching", "learned"
 POLICIES = (CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT, TRIANGULATION, POINTING_MATCHING, LEARNED)
+STATED = (TRIANGULATION, POINTING_MATCHING, IMPORTED)
+"""Covariances that the records themselves hold: of VO's geometry, or another odometry's own."""
 
 MeanUse = Literal["steady", "predicted", "absorb"]
 """Which mean comes off the measurement: the one steady in good frames and bad, the predicted one, or none."""
@@ -59,7 +61,7 @@ class ConstantPolicy:
 
 @dataclass(frozen=True)
 class GeometricPolicy:
-    """The covariance that VO's geometry gives by one method, as it stands."""
+    """The covariance that a record holds by one method, as it stands: of VO's geometry, or imported."""
 
     name: str
 

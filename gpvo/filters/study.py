@@ -15,8 +15,7 @@ from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
     LEARNED,
-    POINTING_MATCHING,
-    TRIANGULATION,
+    STATED,
     ConstantPolicy,
     GeometricPolicy,
     LearnedPolicy,
@@ -107,7 +106,7 @@ def make_policies(
     out: dict[str, Policy | None] = {}
     for name in names:
         out[name] = None
-        if name in (TRIANGULATION, POINTING_MATCHING):
+        if name in STATED:
             out[name] = GeometricPolicy(name)
         elif name == LEARNED:
             out[name] = LearnedPolicy(mean=mean) if learned else None
