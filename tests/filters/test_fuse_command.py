@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 MOUNTING = Mounting(se3.from_rt(R_FLU_OPTICAL, np.array([0.3, 0.0, 0.1])), FORWARD_CAMERA)
 
 
-def _write(path: Path, seed: int, imu_scale: float = 1.0) -> Path:
+def _write(path: Path, seed: int, imu_scale: float = 1.0, method: str = "pointing_matching") -> Path:
     flight = synthetic_flight(seed, duration_s=8, law=ErrorLaw(burst_factor=10.0))
-    flight = with_geometric(flight, np.diag([4e-4] * 3 + [4e-6] * 3), "pointing_matching")
+    flight = with_geometric(flight, np.diag([4e-4] * 3 + [4e-6] * 3), method)
     assert flight.imu is not None
     assert flight.T_world_cam is not None
     t_ns = np.array([r.t_ns for r in flight.records])
@@ -74,6 +74,15 @@ def test_json_holds_every_policy(runs: list[Path], tmp_path: Path) -> None:
             assert scores["diverged"] is False
     assert out["mean"]["triangulation"] is None
     assert out["mean"]["learned"]["ate_rmse_m"] < out["mean"]["constant"]["ate_rmse_m"]
+
+
+def test_a_covariance_that_another_odometry_states_is_compared_where_there_is_one(tmp_path: Path) -> None:
+    run = _write(tmp_path / "theirs", 0, method="imported")
+    scores = json.loads(_run("fuse", run, "--json"))["runs"][0]["policies"]
+    assert set(scores) == {*POLICIES, "imported"}
+    assert scores["imported"]["ate_rmse_m"] > 0
+    with pytest.raises(GpvoError, match="gpvo import makes such runs"):
+        fuse_runs([_write(tmp_path / "ours", 0)], FusionSettings(policies=("imported",)))
 
 
 def test_two_runs_of_one_name_are_told_apart(runs: list[Path], tmp_path: Path) -> None:
