@@ -104,12 +104,9 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
         return _train_streaming(paths, config)
     runs = [read_run(p) for p in paths]
     if config.target == "position":
-        from gpvo.dataset.build import build_run
         from gpvo.learning.position import train_position
 
-        return train_position(
-            [build_run(r, target="position", align=config.align, waits=config.waits) for r in runs], config
-        )
+        return train_position([config.rows_of(r) for r in runs], config)
     if update is not None:
         from gpvo.learning.update import update as update_model
 
@@ -138,16 +135,13 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
     """Runs that do not fit into memory together: their rows go through a file, one run at a time."""
     import tempfile
 
-    from gpvo.dataset.build import build_run
     from gpvo.dataset.table import write_sets
     from gpvo.io.run import read_run
     from gpvo.learning.stream import train_stored
 
     with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
         rows = Path(folder) / "rows.parquet"
-        write_sets(
-            rows, (build_run(read_run(p), target=config.target, align=config.align, waits=config.waits) for p in paths)
-        )
+        write_sets(rows, (config.rows_of(read_run(p)) for p in paths))
         return train_stored(rows, config)
 
 

@@ -8,44 +8,35 @@ motion does not deceive a gyroscope.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.align import interpolate_truth
 from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.vo.imu_moments import ImuMoments
+
+STILL_S = 1.0
+"""So long a vehicle must stand at least for a wait."""
+STILL_PX, TRUTH_PX = 1.0, 2.0
+"""Image motion up to which a picture is at rest, and that a truth must claim to contradict it."""
+GYRO_STD_RADPS, ACC_STD_MPS2 = 0.005, 0.5
+"""Spread up to which an IMU is at rest. Small gyroscopes have 0.0015 to 0.0035 rad/s of noise at 200 Hz; on the road,
+cars are seldom below 0.007 rad/s for a second (KITTI). The limit on accelerations lets an engine idle."""
 
 
-@dataclass(frozen=True)
-class RestTest:
-    """When a vehicle counts as standing: for how long at least, the image motion [px] up to which a picture is at rest,
-    and limits on the spread of the IMU; and the image motion that a truth must claim to contradict it.
-
-    Small gyroscopes have 0.0015 to 0.0035 rad/s of noise at 200 Hz; on the road, cars are seldom below 0.007 rad/s for
-    a second (KITTI). The limit on accelerations lets an engine idle.
-    """
-
-    still_s: float = 1.0
-    motion_px: float = 1.0
-    truth_px: float = 2.0
-    gyro_std_radps: float = 0.005
-    acc_std_mps2: float = 0.5
-
-
-def wandering_waits(log: VoLog, truth: TruthLog, test: RestTest | None = None) -> NDArray[np.int64]:
+def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     """(W, 2) times [ns] of the first and the last frame of waits during which the truth moves.
 
-    Over a wait, odometry moves by less than ``motion_px`` of the picture and the IMU is still; the truth moves where
-    its motion would be more than ``truth_px``. Without a camera, or an IMU in the log, nothing is called a wait.
+    Over a wait, odometry moves by less than ``STILL_PX`` of the picture and the IMU is still; the truth moves where
+    its motion would be more than ``TRUTH_PX``. Without a camera, or an IMU in the log, nothing is called a wait.
     """
     if log.camera is None:
         return np.zeros((0, 2), dtype=np.int64)
-    test, found = test or RestTest(), []
-    T_est, (T_true, known) = log.trajectory(), interpolate_truth(truth, log.t_ns)
-    for first, last in _waits(log, T_est, test):
+    found, (T_true, known) = [], interpolate_truth(truth, log.t_ns)
+    for first, last in _waits(log, log.trajectory(), log.camera):
         span = slice(first, last + 1)
-        if known[span].all() and _image_motion_px(_extent(T_true[span]), log.records[last], log.camera) > test.truth_px:
+        if known[span].all() and _image_motion_px(_extent(T_true[span]), log.records[last], log.camera) > TRUTH_PX:
             found.append(log.t_ns[[first, last]])
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
@@ -68,46 +59,31 @@ def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
     return VoLog(marked, log.camera)
 
 
-def _waits(log: VoLog, T_est: Array, test: RestTest) -> list[tuple[int, int]]:
+def _waits(log: VoLog, T_est: Array, camera: StereoCamera) -> list[tuple[int, int]]:
     """First and last frame of the longest stretches at rest, one after the other."""
-    records, (mean, square) = log.records, _imu_moments(log.records)
-    found, first = [], 0
-    while first < len(records) - 1:
-        last = _rests_until(first, log, T_est, mean, square, test)
-        if (records[last].t_ns - records[first].t_ns) * 1e-9 >= test.still_s:
+    sensed, found, first = [ImuMoments.of_record(r) for r in log.records], [], 0
+    while first < len(log) - 1:
+        last = _rests_until(first, log, T_est, sensed, camera)
+        if (log.records[last].t_ns - log.records[first].t_ns) * 1e-9 >= STILL_S:
             found.append((first, last))
             first = last
         first += 1
     return found
 
 
-def _rests_until(first: int, log: VoLog, T_est: Array, mean: Array, square: Array, test: RestTest) -> int:
+def _rests_until(first: int, log: VoLog, T_est: Array, sensed: Sequence[ImuMoments], camera: StereoCamera) -> int:
     """The last frame up to which the vehicle stands from the frame ``first`` on."""
-    assert log.camera is not None
-    low, high, sums = np.zeros(3), np.zeros(3), np.zeros((2, 6))
+    low, high, moments = np.zeros(3), np.zeros(3), ImuMoments.of(None)
     for k in range(first + 1, len(log)):
         here = (T_est[k, :3, 3] - T_est[first, :3, 3]) @ T_est[first, :3, :3]
-        low, high, sums = np.minimum(low, here), np.maximum(high, here), sums + (mean[k], square[k])
-        moments = sums / (k - first)
-        std = np.sqrt(np.maximum(moments[1] - moments[0] ** 2, 0.0))
-        moved_px = _image_motion_px(high - low, log.records[k], log.camera)
+        low, high, moments = np.minimum(low, here), np.maximum(high, here), moments.with_later(sensed[k])
+        moved_px = _image_motion_px(high - low, log.records[k], camera)
+        gyro, acc = np.sqrt(moments.variance).reshape(2, 3).max(axis=1)
         # Written so that what is unknown, NaN, is not at rest; an accelerometer may be missing.
-        still = moved_px <= test.motion_px and std[:3].max() <= test.gyro_std_radps
-        if not (log.records[k].usable and still) or std[3:].max() > test.acc_std_mps2:
+        still = moved_px <= STILL_PX and gyro <= GYRO_STD_RADPS
+        if not (log.records[k].usable and still) or acc > ACC_STD_MPS2:
             return k - 1
     return len(log) - 1
-
-
-def _imu_moments(records: Sequence[VoRecord]) -> tuple[Array, Array]:
-    """Mean and mean square (N, 6) of gyroscope and accelerometer over each record's motion; NaN where unknown."""
-    unknown = np.full(3, np.nan)
-
-    def column(name: str) -> Array:
-        return np.array([unknown if (v := getattr(r, name)) is None else v for r in records]).reshape(-1, 3)
-
-    mean = np.hstack([column("imu_gyro_mean_radps"), column("imu_acc_mean_mps2")])
-    std = np.hstack([column("imu_gyro_std_radps"), column("imu_acc_std_mps2")])
-    return mean, mean**2 + std**2
 
 
 def _extent(T_world_cam: Array) -> Array:

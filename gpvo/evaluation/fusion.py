@@ -165,14 +165,15 @@ def fuse_runs(
     Runs of one name are told apart by numbers: ``run``, ``run-2``.
     """
     tell = tell or (lambda _: None)
-    unknown = [p for p in settings.policies if p not in (*POLICIES, IMPORTED)]
+    known = (*POLICIES, IMPORTED)
+    unknown = [p for p in settings.policies if p not in known]
     if unknown:
-        raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join((*POLICIES, IMPORTED))}")
+        raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(known)}")
     predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
     runs = [read_run(path) for path in paths]
     if not settings.policies:
         imported = any(IMPORTED in run.log.methods for run in runs)
-        settings = replace(settings, policies=(*POLICIES, IMPORTED) if imported else POLICIES)
+        settings = replace(settings, policies=known if imported else POLICIES)
     options = replace(settings.options, sigmas=start_sigmas(runs))
     flights, warnings = [], []
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gpvo.dataset.build import TrainingSet
+from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.errors import GpvoError
+from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN
 from gpvo.online.features import AXES, GEOMETRIC_METHODS, resolve
 from gpvo.types import IMPORTED
@@ -38,9 +39,8 @@ class TrainConfig:
 
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``:
     ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
-    which the truth moves. ``inducing``, ``noise_inducing``: points of
-    the GPs. ``max_rows``: held in memory, of larger files the rest streams. ``jobs``, ``backend`` (``local`` or
-    ``dask``), ``scheduler``: where folds are fitted.
+    which the truth moves. ``inducing``, ``noise_inducing``: points of the GPs. ``max_rows``: held in memory, of larger
+    files the rest streams. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
     """
 
     features: str = "auto"
@@ -55,6 +55,10 @@ class TrainConfig:
     jobs: int = 1
     backend: str = "local"
     scheduler: str | None = None
+
+    def rows_of(self, run: Run) -> TrainingSet:
+        """The training set of a run as these settings want it."""
+        return build_run(run, target=self.target, align=self.align, waits=self.waits)
 
 
 def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tuple[str, ...]:

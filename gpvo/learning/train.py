@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
-from gpvo.dataset.build import TrainingSet, build_run
+from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
@@ -55,9 +55,7 @@ def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedMode
     Raises GpvoError where a run has no truth, or runs do not belong together.
     """
     config = config or TrainConfig()
-    return train_sets(
-        [build_run(r, target=config.target, align=config.align, waits=config.waits) for r in runs], config
-    )
+    return train_sets([config.rows_of(r) for r in runs], config)
 
 
 # On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from gpvo.dataset.build import build_run
 from gpvo.errors import ModelError
 from gpvo.io.run_read import Run
 from gpvo.learning.config import TrainConfig
@@ -33,7 +32,7 @@ def update(
     old = training_rows(path)
     if old[0].target != config.target:
         raise ModelError(f"learns the target '{old[0].target}', not '{config.target}'", where=path)
-    new = [build_run(r, target=config.target, align=config.align, waits=config.waits) for r in runs]
+    new = [config.rows_of(r) for r in runs]
     names = {s.name for s in new}
     for gone in (s.name for s in old if s.name in names):
         tell(f"sequence '{gone}' of {path} is replaced by the run of that name")

@@ -13,8 +13,9 @@ from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, Frontend, Matches
+from gpvo.vo.imu_moments import ImuMoments
 from gpvo.vo.motion import Motion, refine
-from gpvo.vo.parts import ImuMoments, Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
+from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.sigmas import SigmaEstimator
