@@ -21,7 +21,8 @@ from gpvo.learning.geometryweight import choose_geometry_weight, divided
 from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
 from gpvo.learning.partcorrelation import part_correlations
-from gpvo.learning.parts import Parts, fit_parts
+from gpvo.learning.parts import MOST_ROWS, Parts, at_most, fit_parts
+from gpvo.learning.poses import Motions, added_factor, with_added
 from gpvo.learning.rows import Rows
 from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
@@ -83,12 +84,22 @@ def assemble(
         steady_mean=np.zeros(6),
         dt_s=rows.step_s,
     )
-    whole = model.split(sigma**2, sums.faster, geometry).sum(axis=1)
+    model, added, joint = _consistent(model, rows, error, sigma**2, sums, geometry)
+    return model, _calibration(rows, scale, joint, added, sums, np.abs(z) / np.sqrt(joint))
+
+
+def _consistent(
+    model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, sums: _Sums, geometry: Array | None
+) -> tuple[ErrorModelArrays, float, float]:
+    """The model made right of poses and of all six axes together, and the factors of both."""
+    added = _added_factor(model, rows, error, model.split(variance, sums.faster, geometry))
+    model = replace(model, share=with_added(model.share, added))
+    whole = model.split(variance, sums.faster, geometry).sum(axis=1)
     joint = fit_joint_factor(error, whole, rows.group)
     typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
     level = model.level + np.log(joint)
-    model = replace(model, factor=scale.factor * joint, level=level, typical_ln_det=np.array([typical]))
-    return model, _calibration(rows, scale, joint, sums, np.abs(z) / np.sqrt(joint))
+    model = replace(model, factor=model.factor * joint, level=level, typical_ln_det=np.array([typical]))
+    return model, added, joint
 
 
 @dataclass(frozen=True)
@@ -127,7 +138,16 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     return out
 
 
-def _calibration(rows: Rows, scale: Scale, joint: float, sums: _Sums, score: Array) -> dict[str, Any]:
+def _added_factor(model: ErrorModelArrays, rows: Rows, error: Array, parts: Array) -> float:
+    """What the poses show of white and bias; ``parts`` (n, 3, 6, 6) as stated of motions, up to a common factor."""
+    factor = fit_joint_factor(error, parts.sum(axis=1), rows.group)
+    T_prev_cur = rows.motions()
+    chosen = at_most(rows.chains(np.arange(len(error))), MOST_ROWS)
+    chains = [Motions(i, T_prev_cur[c], error[c], parts[c] * factor) for i, cs in enumerate(chosen) for c in cs]
+    return added_factor(chains, model.share, float(np.exp(-rows.step_s / model.bias_tau_s[0])))
+
+
+def _calibration(rows: Rows, scale: Scale, joint: float, added: float, sums: _Sums, score: Array) -> dict[str, Any]:
     axes = [conformal_quantiles(score[:, j], rows.group) for j in range(6)]
     return {
         "by": rows.grouped_by,
@@ -135,6 +155,7 @@ def _calibration(rows: Rows, scale: Scale, joint: float, sums: _Sums, score: Arr
         "scale_of_groups": scale.by_group,
         "log_scale_spread": scale.spread,
         "joint_factor": joint,
+        "added_factor": added,
         "geometry_correlation_weight": sums.geometry_weight,
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],

@@ -1,7 +1,7 @@
 """From training sequences to one error model; every choice is made by leaving whole sequences out.
 
 The steps: base variance -> inputs -> log-variance GP -> mean, where it helps -> jitter, white and bias ->
-correlation -> calibration on residuals of sequences left out.
+correlation -> calibration on residuals of sequences left out, of motions and of poses.
 """
 
 from __future__ import annotations

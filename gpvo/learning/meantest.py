@@ -12,7 +12,6 @@ from scipy.stats import t as t_distribution
 from gpvo.geometry import se3
 from gpvo.learning.parts import SPANS, span_variances
 from gpvo.learning.rows import Rows
-from gpvo.online.base import TWIST_COLUMNS
 from gpvo.types import Array
 
 _LONG = 10
@@ -44,8 +43,7 @@ def pose_gain(rows: Rows, oof_mean: Array) -> float:
     Errors of axes belong together: a sideways error goes with a turn that undoes it on the way. A mean that takes off
     the one alone makes every motion better and the path worse.
     """
-    twist = rows.select(TWIST_COLUMNS) * rows.dt_s[:, None]
-    motion = rows.chains(se3.exp(np.where(np.isfinite(twist), twist, 0.0)))
+    motion = rows.chains(rows.motions())
     plain, left = (rows.chains(e) for e in (rows.error, rows.error - oof_mean))
     gains = [g for s in zip(motion, plain, left) if (g := _log_gain(*s)) is not None]
     if not gains:

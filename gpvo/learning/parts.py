@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scipy.signal import lfilter
 
 from gpvo.types import Array
 
-Chains = Sequence[Sequence[Array]]
+Chains = Sequence[Sequence[NDArray[Any]]]
 """Per sequence its unbroken chains of motions, (n_i, D) each."""
 
 SPANS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -31,7 +32,7 @@ _WORTH = 20.0
 _MIN_WINDOWS, _MOST_WINDOWS = 3.0, 1000
 _MOST_COUNT = 60.0
 """A span counts by its windows, up to this: short spans have many, but say the same over and over."""
-_MOST_ROWS = 100_000
+MOST_ROWS = 100_000
 _MIN_SHARE = 1e-6
 _REWEIGHTINGS, _REDIVISIONS = 6, 3
 _MOST_RATIO = 16.0
@@ -112,7 +113,7 @@ def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float) -> 
     ``step_s``: usual duration of a motion. All axes have one time constant, translation and rotation (each three axes)
     a growth each; the shares are the axis' own.
     """
-    error, sigma, ln_speed = (_at_most(values, _MOST_ROWS) for values in (error, sigma, ln_speed))
+    error, sigma, ln_speed = (at_most(values, MOST_ROWS) for values in (error, sigma, ln_speed))
     found = span_variances([[e / s for e, s in zip(*pair)] for pair in zip(error, sigma)])
     ln_var = [[2.0 * np.log(s) for s in chains] for chains in sigma]
     level = np.median(np.concatenate([c for chains in ln_var for c in chains]), axis=0)
@@ -161,7 +162,7 @@ def _loss(choice: _Choice) -> float:
     return fit.loss + _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
 
 
-def _at_most(values: Chains, limit: int) -> Chains:
+def at_most(values: Chains, limit: int) -> Chains:
     """Up to so many rows, equally many of each sequence from its beginning: every place and scenario has its say."""
     out = []
     for chains in values:

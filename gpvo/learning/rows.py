@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import group_labels
+from gpvo.geometry import se3
 from gpvo.learning.parts import chains
+from gpvo.online.base import TWIST_COLUMNS
 from gpvo.types import Array
 
 
@@ -41,6 +44,11 @@ class Rows:
     def select(self, names: Sequence[str]) -> Array:
         return np.concatenate([s.select(names) for s in self.sets])
 
+    def motions(self) -> Array:
+        """(n, 4, 4) VO's motions ``T_prev_cur``; that of an unknown velocity is none."""
+        twist = self.select(TWIST_COLUMNS) * self.dt_s[:, None]
+        return se3.exp(np.where(np.isfinite(twist), twist, 0.0))
+
     def geometry(self, method: str | None) -> Array | None:
         return None if method is None else np.concatenate([s.covariances[method] for s in self.sets])
 
@@ -48,7 +56,7 @@ class Rows:
         """Means of (n, ...) over each group, (G, ...)."""
         return np.array([values[self.group == g].mean(axis=0) for g in np.unique(self.group)])
 
-    def chains(self, values: Array) -> list[list[Array]]:
+    def chains(self, values: NDArray[Any]) -> list[list[NDArray[Any]]]:
         """Rows of (n, ...) of each sequence, in unbroken chains of motions."""
         out, start = [], 0
         for s in self.sets:

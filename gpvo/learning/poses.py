@@ -1,0 +1,140 @@
+"""How much of the motions' errors adds up, by the poses that they add up to.
+
+White and bias are fitted to sums of single axes, in the camera's own frame. A pose shows more: errors are turned and
+levered along the path, and what belongs to a place, such as a turn and the shift that undoes it, takes back part of
+what the axes seem to add.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import scaled_root
+from gpvo.learning.parts import SPANS, carried, cut
+from gpvo.stats.consistency import nees
+from gpvo.types import Array
+
+_LONG, _LEAST_WINDOWS = 10, 3
+_PRIOR_SPREAD = 0.3
+"""Expected deviation of the factor's log from 0."""
+_LEAST_FACTOR, _LEAST_JITTER = 0.25, 0.01
+_MOST_NEES = 16.0
+
+
+@dataclass(frozen=True)
+class Motions:
+    """One unbroken chain of n motions of a sequence: ``T_prev_cur`` (n, 4, 4), ``error`` (n, 6), and ``parts``
+    (n, 3, 6, 6), the stated covariances of its jitter, white and bias."""
+
+    sequence: int
+    T_prev_cur: Array
+    error: Array
+    parts: Array
+
+
+def added_factor(chains: Sequence[Motions], share: Array, phi: float) -> float:
+    """The factor on white and bias, the jitter being what is left of each motion, by which poses are likeliest.
+
+    ``share`` (3, D) of the parts; ``phi``: correlation of the bias from one motion to the next. Spans of ten motions
+    and more count alike, as they count the same errors; and so do sequences. The factor is drawn towards 1, and is 1
+    unless its gain is more than the standard error of it over the sequences (L. Breiman et al., "Classification and
+    Regression Trees" (1984), section 3.4.3). No axis is left without jitter.
+    """
+    spans = [_Poses.over(chains, m, phi) for m in SPANS if m >= _LONG and _count(chains, m) >= _LEAST_WINDOWS]
+    if not spans or len({c.sequence for c in chains}) < 2:
+        return 1.0
+    most = max((1.0 - _LEAST_JITTER) / float((share[1] + share[2]).max()), 1.0)
+
+    def losses(ln_factor: float) -> Array:
+        return np.mean([poses.losses(float(np.exp(ln_factor))) for poses in spans], axis=0)
+
+    def loss(ln_factor: float) -> float:
+        return float(losses(ln_factor).sum() + 0.5 * (ln_factor / _PRIOR_SPREAD) ** 2)
+
+    bounds = (np.log(_LEAST_FACTOR), np.log(most))
+    found = float(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x)
+    gain = losses(0.0) - losses(found)
+    return float(np.exp(found)) if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)) else 1.0
+
+
+def with_added(share: Array, factor: float) -> Array:
+    """(3, D) shares with white and bias times the factor, the jitter being what is left."""
+    added = share[1:] * factor
+    return np.vstack([1.0 - added.sum(axis=0), added])
+
+
+def _count(chains: Sequence[Motions], m: int) -> int:
+    return sum(len(c.error) // m for c in chains)
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Errors (w, 6) of the poses after m motions each, in the axes of the last camera, and covariances (w, 6, 6): that
+    of ``jitter``, of what has ``added`` up, and of the first and last motion's part of that, were it ``jitter`` too
+    (``at_ends``). ``belongs`` (w, S): to which sequence, its columns summing to one: a sequence counts as one, however
+    many windows it has, as its errors go together."""
+
+    error: Array
+    jitter: Array
+    added: Array
+    at_ends: Array
+    belongs: Array
+
+    @classmethod
+    def over(cls, chains: Sequence[Motions], m: int, phi: float) -> _Poses:
+        """Of the separate windows of all chains."""
+        long = [c for c in chains if len(c.error) >= m]
+        error, jitter, added, at_ends = (np.concatenate(x) for x in zip(*(_windows(c, m, phi) for c in long)))
+        sequence = np.concatenate([np.full(len(c.error) // m, c.sequence) for c in long])
+        belongs = (sequence[:, None] == np.unique([c.sequence for c in chains])).astype(np.float64)
+        return cls(error, jitter, added, at_ends, belongs / np.maximum(belongs.sum(axis=0), 1.0))
+
+    def losses(self, factor: float) -> Array:
+        """(S,) negative log-likelihood of each sequence, without its constant; 0 of one without a window. Gross errors
+        count as those of four sigma."""
+        C = self.jitter + self.at_ends + factor * (self.added - self.at_ends)
+        squared = np.minimum(nees(self.error, C), _MOST_NEES * 6.0)
+        return np.asarray((0.5 * (np.linalg.slogdet(C)[1] + squared)) @ self.belongs)
+
+
+def _windows(c: Motions, m: int, phi: float) -> tuple[Array, Array, Array, Array]:
+    """Error, jitter, added and at_ends of :class:`_Poses`, of the windows of one chain: as
+    :class:`gpvo.evaluation.accumulate.PoseError` adds up, for all at once and with one time step."""
+    T, error, parts = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts))
+    to_end = _adjoints_to_end(T)
+    jitter, white, bias = np.moveaxis(to_end[:, :, None] @ parts @ np.swapaxes(to_end, -1, -2)[:, :, None], 2, 0)
+    root = to_end @ _roots(parts[:, :, 2])
+    lagged = np.einsum("wkij,wknj->win", root, _carried(root, phi))
+    added = (white + bias).sum(axis=1) + lagged + np.swapaxes(lagged, -1, -2)
+    ends = [0, -1]
+    return (
+        np.einsum("wkij,wkj->wi", to_end, error),
+        0.5 * jitter[:, ends].sum(axis=1),
+        added,
+        0.5 * (white + bias)[:, ends].sum(axis=1),
+    )
+
+
+def _adjoints_to_end(T: Array) -> Array:
+    """(w, m, 6, 6) that carry an error from after each motion to after the last; ``T`` (w, m, 4, 4)."""
+    since = np.empty_like(T)
+    since[:, -1] = np.eye(4)
+    for k in range(T.shape[1] - 2, -1, -1):
+        since[:, k] = T[:, k + 1] @ since[:, k + 1]
+    return se3.adjoint(se3.inverse(since))
+
+
+def _roots(C: Array) -> Array:
+    """Roots of covariances (w, m, 6, 6) that have one correlation."""
+    sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
+    return sigma[..., None] * scaled_root(C[0, 0]) / sigma[0, 0][:, None]
+
+
+def _carried(root: Array, phi: float) -> Array:
+    w, m = root.shape[:2]
+    return carried(root.reshape(w, m, -1), phi).reshape(root.shape)
