@@ -45,7 +45,7 @@ def run() -> dict[str, dict]:
     sample = _microseconds(lambda: filter.propagate_imu(0.005, gyro, acc, gyro, acc), 500)
 
     eye = np.eye(6)[None]
-    noise = MotionNoise(np.zeros((1, 6)), eye * 1e-4, eye * 1e-4, eye * 1e-2, np.ones(6))
+    noise = MotionNoise(np.zeros((1, 6)), eye * 1e-4, eye * 1e-4, 1e-2 * np.eye(6, 12)[None], np.ones(12))
     gate = Gate(on_fail="accept")
 
     def update() -> None:

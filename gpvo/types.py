@@ -274,6 +274,11 @@ class Prediction:
     ``bias`` (first-order Gauss-Markov with time constants ``bias_tau_s`` (6,)). ``epistemic`` (6,) is the share of
     each variance that comes from being away from the training data, already inside ``covariance``.
     ``confidence`` and ``in_domain`` are in [0, 1].
+
+    Of the bias, ``calibration_root`` L (6, 6) has L L^T, zero unless the model knows errors of calibration: L's rows
+    turn their sign around with a velocity, while the vector of unit variance that L acts on is Gauss-Markov with time
+    constants ``calibration_tau_s`` (6,). What is left of the bias has ``bias_tau_s``
+    (see :func:`gpvo.geometry.covariance.persistent_root`).
     """
 
     t_ns: int
@@ -286,6 +291,8 @@ class Prediction:
     confidence: float
     in_domain: float
     status: Status
+    calibration_root: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    calibration_tau_s: Array = field(default_factory=lambda: np.ones(6))
 
     @property
     def sigma(self) -> Array:

@@ -9,19 +9,20 @@ the last frame's and, from afar, the first one's.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import scaled_root, symmetrise
+from gpvo.geometry.covariance import persistent_root, symmetrise
 from gpvo.types import Array, Prediction
 
 
 @dataclass(frozen=True)
 class Step:
-    """One motion: ``T_prev_cur``, its parts (6, 6) each, the bias' time constants (6,) [s] and its duration."""
+    """One motion: ``T_prev_cur``, its parts (6, 6) each, the bias' time constants (6,) [s] and its duration; and what
+    calibration has of the bias (see :class:`gpvo.types.Prediction`)."""
 
     T_prev_cur: Array
     jitter: Array
@@ -29,6 +30,8 @@ class Step:
     bias: Array
     bias_tau_s: Array
     dt_s: float
+    calibration_root: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    calibration_tau_s: Array = field(default_factory=lambda: np.ones(6))
 
     @classmethod
     def independent(cls, T_prev_cur: Array, covariance: Array) -> Step:
@@ -39,19 +42,21 @@ class Step:
     @classmethod
     def predicted(cls, T_prev_cur: Array, prediction: Prediction) -> Step:
         """A motion with a model's prediction."""
-        parts: Mapping[str, Array] = prediction.parts
-        return cls(T_prev_cur, parts["jitter"], parts["white"], parts["bias"], prediction.bias_tau_s, prediction.dt_s)
+        p = prediction
+        jitter, white, bias = (p.parts[name] for name in ("jitter", "white", "bias"))
+        lasting = (p.calibration_root, p.calibration_tau_s)
+        return cls(T_prev_cur, jitter, white, bias, p.bias_tau_s, p.dt_s, *lasting)
 
 
 class PoseError:
     """Covariance of the pose's error along a chain, right perturbation, in the axes of the last camera.
 
-    The joint state is (e, n, u): error, jitter of the last frame, and the bias in units of its own deviation, so that a
-    bias whose size changes stays correlated with what it was.
+    The joint state is (e, n, u): error, jitter of the last frame, and the bias in units of its own deviation, that of
+    calibration last, so that a bias whose size or sign changes stays correlated with what it was.
     """
 
     def __init__(self) -> None:
-        self._P = np.zeros((18, 18))
+        self._P = np.zeros((24, 24))
         self._begun = False
 
     def copy(self) -> PoseError:
@@ -73,11 +78,12 @@ class PoseError:
             # The first frame's jitter is the other half of the first motion's; the bias starts in its steady state.
             back = se3.adjoint(step.T_prev_cur)
             self._P[6:12, 6:12] = back @ J @ back.T
-            self._P[12:, 12:] = np.eye(6)
+            self._P[12:, 12:] = np.eye(12)
             self._begun = True
-        phi = np.exp(-step.dt_s / np.maximum(step.bias_tau_s, 1e-6))
-        L = scaled_root(step.bias)
-        A = np.zeros((18, 18))
+        tau_s = np.concatenate([step.bias_tau_s, step.calibration_tau_s])
+        phi = np.exp(-step.dt_s / np.maximum(tau_s, 1e-6))
+        L = persistent_root(step.bias, step.calibration_root)
+        A = np.zeros((24, 24))
         A[:6, :6] = moved
         A[:6, 6:12] = -moved
         A[:6, 12:] = L * phi

@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import position_in_world, symmetrise
 from gpvo.online.base import TWIST_COLUMNS, positions
 from gpvo.online.division import PARTS
-from gpvo.online.estimate import Estimate
+from gpvo.online.estimate import ErrorModelArrays, Estimate
 from gpvo.online.features import FeatureStream
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.predictor import Predictor
@@ -98,7 +98,7 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
     rng = np.random.default_rng(seed)
     flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]
-    sums = [_sum_up(flight, predictor.model.bias_tau_s, plan) for flight in flown]
+    sums = [_sum_up(flight, predictor.model, plan) for flight in flown]
     C, m = np.array([c for c, _, _ in sums]), np.array([m for _, m, _ in sums])
     spread = m - m.mean(axis=0)
     return Forecast(
@@ -176,7 +176,7 @@ def _features(names: list[str], plan: Plan) -> Array:
     return np.array([stream.step(r) for r in records]).reshape(-1, len(names))
 
 
-def _sum_up(flight: _Flight, tau_s: Array, plan: Plan) -> tuple[Array, Array, float]:
+def _sum_up(flight: _Flight, model: ErrorModelArrays, plan: Plan) -> tuple[Array, Array, float]:
     """Covariance (N, 6, 6) and mean (N, 6) of every pose's error, and the last position's variance if independent."""
     parent, parts, T_world = flight.parent, flight.said.parts, plan.T_world_cam
     steps = [Step.independent(np.eye(4), np.zeros((6, 6)))]
@@ -184,7 +184,8 @@ def _sum_up(flight: _Flight, tau_s: Array, plan: Plan) -> tuple[Array, Array, fl
     for k in range(1, len(parent)):
         T = se3.inverse(T_world[parent[k]]) @ T_world[k]
         jitter, white, bias = (parts[name][k - 1] for name in PARTS)
-        steps.append(Step(T, jitter, white, bias, tau_s, float(flight.dt_s[k - 1])))
+        lasting = (flight.said.calibration_root[k - 1], model.calibration_tau_s)
+        steps.append(Step(T, jitter, white, bias, model.bias_tau_s, float(flight.dt_s[k - 1]), *lasting))
         moved = se3.adjoint(se3.inverse(T))
         mean[k] = moved @ mean[parent[k]] + flight.said.mean[k - 1]
         plain[k] = moved @ plain[parent[k]] @ moved.T + flight.said.covariance[k - 1]

@@ -115,7 +115,5 @@ def _learned(log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
         if prediction is not None and prediction.is_of(record) and record.status is not Status.START:
             mean[k], covariance[k] = prediction.mean, prediction.covariance
             last = Step.predicted(record.T_prev_cur, prediction)
-        steps.append(
-            Step(record.T_prev_cur, last.jitter, last.white, last.bias, last.bias_tau_s, record.dt_s or last.dt_s)
-        )
+        steps.append(replace(last, T_prev_cur=record.T_prev_cur, dt_s=record.dt_s or last.dt_s))
     return Statement("learned", mean, covariance, steps)

@@ -1,6 +1,6 @@
 """Error-state Kalman filter: 15 states driven by an IMU, a cloned pose, the jitter of its frame; a VO bias considered.
 
-Joint error state (39): position, velocity (world), attitude (body), accelerometer and gyroscope bias; the cloned
+Joint error state (45): position, velocity (world), attitude (body), accelerometer and gyroscope bias; the cloned
 pose of VO's reference frame; that frame's jitter; the normalised VO bias; and, while an update runs, the jitter of the
 current frame, which then replaces the reference's. So two motions that share a frame are not taken as independent.
 
@@ -100,7 +100,7 @@ class ErrorStateFilter:
         )
         self.P = np.zeros((self.batch, JOINT, JOINT))
         self.P[:, :CORE, :CORE] = covariance
-        self.P[:, BIAS, BIAS] = np.eye(6)
+        self.P[:, BIAS, BIAS] = np.eye(12)
         self.dx = np.zeros((self.batch, JOINT))
         self.clone_p: Array = self.x.position
         self.clone_R: Array = self.x.R_world_imu
@@ -157,7 +157,7 @@ class ErrorStateFilter:
         self.P[:, range(CORE), range(CORE)] += variances
 
     def decay_bias(self, dt: float, tau_s: Array) -> None:
-        """Let the normalised VO bias forget over ``dt``: phi = exp(-dt / tau), variance kept at one."""
+        """Let the normalised VO bias forget over ``dt``: phi = exp(-dt / tau (12,)), variance kept at one."""
         phi = np.exp(-dt / np.maximum(tau_s, 1e-9))
         self.P[:, BIAS, :] *= phi[:, None]
         self.P[:, :, BIAS] *= phi

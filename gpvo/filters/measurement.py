@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 # Joint error state: the core, the cloned pose of the reference frame, the reference frame's jitter, the
 # normalised VO bias, and the jitter of the current frame while an update runs.
 CLONE, CLONE_P, CLONE_TH = slice(15, 21), slice(15, 18), slice(18, 21)
-JITTER_REF, BIAS, JITTER_CUR = slice(21, 27), slice(27, 33), slice(33, 39)
-KEPT, JOINT = 33, 39
+JITTER_REF, BIAS, JITTER_CUR = slice(21, 27), slice(27, 39), slice(39, 45)
+KEPT, JOINT = 39, 45
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,9 @@ class MotionNoise:
     """What one measured motion's error looks like, for B filter members or one for all (leading axis 1).
 
     ``mean`` (b, 6) is taken off the measurement; ``jitter`` (b, 6, 6) is the covariance that both end frames share
-    half and half, ``white`` (b, 6, 6) that of the motion alone; ``bias_root`` (b, 6, 6) times a unit-variance
-    first-order Gauss-Markov 6-vector of time constants ``bias_tau_s`` (6,) is what persists. [m, rad].
+    half and half, ``white`` (b, 6, 6) that of the motion alone; ``bias_root`` (b, 6, 12) times a
+    unit-variance first-order Gauss-Markov vector of time constants ``bias_tau_s`` (12,) is what persists, errors of
+    calibration last. [m, rad].
     """
 
     mean: Array
@@ -78,7 +79,7 @@ def relative_motion(R_ref: Array, p_ref: Array, R_cur: Array, p_cur: Array) -> t
 def jacobian(
     H: Array, camera: CameraOnImu, R_ref: Array, R_cur: Array, R_rel: Array, t_rel: Array, bias_root: Array | None
 ) -> None:
-    """Write d(measured motion)/d(joint error state) into ``H`` (B, 6, 39), in the right tangent of the prediction."""
+    """Write d(measured motion)/d(joint error state) into ``H`` (B, 6, 45), in the right tangent of the prediction."""
     Rt = kernels.transpose(R_rel)
     inv_adjoint = np.zeros((len(H), 6, 6))
     inv_adjoint[:, :3, :3] = inv_adjoint[:, 3:, 3:] = Rt

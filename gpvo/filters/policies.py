@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.filters.measurement import MotionNoise
-from gpvo.geometry.covariance import is_positive_definite, scaled_root
+from gpvo.geometry.covariance import is_positive_definite, persistent_root
 from gpvo.types import IMPORTED, Prediction, VoRecord
 
 Array = NDArray[np.float64]
@@ -96,17 +95,17 @@ class LearnedPolicy:
             covariance, mean = covariance + np.outer(mean, mean), _ZERO_MEAN[0]
         if not self.use_parts:
             return MotionNoise(mean[None], covariance[None])
-        return split_noise(mean[None], covariance, prediction.parts, prediction.bias_tau_s)
+        return split_noise(mean[None], covariance, prediction)
 
 
-def split_noise(mean: Array, covariance: Array, parts: Mapping[str, Array], bias_tau_s: Array) -> MotionNoise:
-    """Filter noise from a total covariance (6, 6) and its parts; ``mean`` is (1, 6).
+def split_noise(mean: Array, covariance: Array, prediction: Prediction) -> MotionNoise:
+    """Filter noise from a total covariance (6, 6) and the prediction's parts; ``mean`` is (1, 6).
 
     What the parts leave of the total counts as white, and so does a bias without a time constant.
     """
     zero = np.zeros((6, 6))
-    jitter, bias = parts.get("jitter", zero), parts.get("bias", zero)
-    tau = np.asarray(bias_tau_s, dtype=np.float64)
+    jitter, bias = prediction.parts.get("jitter", zero), prediction.parts.get("bias", zero)
+    tau = np.concatenate([prediction.bias_tau_s, prediction.calibration_tau_s])
     if not (bias.any() and np.all(tau > 0)):
         bias = zero
     white = covariance - jitter - bias
@@ -114,7 +113,7 @@ def split_noise(mean: Array, covariance: Array, parts: Mapping[str, Array], bias
         mean,
         0.5 * (white + white.T)[None],
         jitter[None] if jitter.any() else None,
-        scaled_root(bias)[None] if bias.any() else None,
+        persistent_root(bias, prediction.calibration_root)[None] if bias.any() else None,
         tau if bias.any() else None,
     )
 

@@ -68,12 +68,9 @@ def _alike(stated: Mapping[str, Mapping[int, MotionNoise]]) -> list[str]:
 
 
 def _stack(noises: Sequence[MotionNoise]) -> MotionNoise:
-    zero = np.zeros((1, 6, 6))
-
     def stacked(parts: Sequence[Array | None]) -> Array | None:
-        if all(p is None for p in parts):
-            return None
-        return np.concatenate([zero if p is None else p for p in parts])
+        known = [p for p in parts if p is not None]
+        return np.concatenate([np.zeros_like(known[0]) if p is None else p for p in parts]) if known else None
 
     return MotionNoise(
         np.concatenate([n.mean for n in noises]),

@@ -41,6 +41,15 @@ def scaled_root(C: Array) -> Array:
     return np.asarray(sigma[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
 
 
+def persistent_root(bias: Array, calibration_root: Array) -> Array:
+    """(6, 12) root of the covariance ``bias`` (6, 6), of which ``calibration_root`` (6, 6) is that of a part.
+
+    It acts on one vector of unit variance, whatever the motion: a wrong calibration goes with the motion, and so does
+    the sign of its root.
+    """
+    return np.hstack([scaled_root(bias - calibration_root @ calibration_root.T), calibration_root])
+
+
 def turn_first_root(C: Array) -> Array:
     """U (..., 6, 6) with ``U U^T = C``: of an error ``U z`` each of rx, ry, rz, x, y, z in turn has an element of z for
     what those before it leave unexplained. Raises LinAlgError where C is not positive definite.

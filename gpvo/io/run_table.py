@@ -50,9 +50,11 @@ _IMU = {
     "imu_acc_std_mps2": "imu_acc_std_{}_mps2",
 }
 _UPPER6 = tuple((i, j) for i in range(6) for j in range(i, 6))
+_ALL6 = tuple((i, j) for i in range(6) for j in range(6))
 _UPPER3 = tuple((i, j) for i in range(3) for j in range(i, 3))
 _METHOD = re.compile(r"(cov|vt)_([A-Za-z][A-Za-z0-9_]*)_00")
 _SIGMA6 = tuple(f"{a}_m" for a in _AXES) + tuple(f"r{a}_rad" for a in _AXES)
+_SHORT6 = tuple(a.rsplit("_", 1)[0] for a in _SIGMA6)
 
 
 def pose_columns(T: Array) -> dict[str, NDArray[np.float64]]:
@@ -144,7 +146,10 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
 
 
 def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
-    """Predictions as columns: ``mean_*``, ``cov_total_<i><j>``, ``cov_<part>_<i><j>``, ``bias_tau_*_s``, ..."""
+    """Predictions as columns: ``mean_*``, ``cov_total_<i><j>``, ``cov_<part>_<i><j>``, ``bias_tau_*_s``, ...
+
+    Of models with errors of calibration, ``root_calibration_<i><j>`` and ``calibration_tau_*_s`` besides.
+    """
     out: Columns = {
         "t_ns": [p.t_ns for p in predictions],
         "dt_s": [p.dt_s for p in predictions],
@@ -154,10 +159,14 @@ def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
     }
     for i, axis in enumerate(_SIGMA6):
         out[f"mean_{axis}"] = [float(p.mean[i]) for p in predictions]
-    for i, axis in enumerate(_SIGMA6):
-        out[f"epistemic_var_{axis.rsplit('_', 1)[0]}"] = [float(p.epistemic[i]) for p in predictions]
-        out[f"bias_tau_{axis.rsplit('_', 1)[0]}_s"] = [float(p.bias_tau_s[i]) for p in predictions]
+    for i, axis in enumerate(_SHORT6):
+        out[f"epistemic_var_{axis}"] = [float(p.epistemic[i]) for p in predictions]
+        out[f"bias_tau_{axis}_s"] = [float(p.bias_tau_s[i]) for p in predictions]
     _put_matrices(out, "cov", [{"total": p.covariance, **p.parts} for p in predictions], _UPPER6)
+    if any((p.calibration_tau_s != 1.0).any() for p in predictions):
+        _put_matrices(out, "root", [{"calibration": p.calibration_root} for p in predictions], _ALL6)
+        for i, axis in enumerate(_SHORT6):
+            out[f"calibration_tau_{axis}_s"] = [float(p.calibration_tau_s[i]) for p in predictions]
     return out
 
 
@@ -170,10 +179,13 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
         Where a column is absent or a status unknown.
     """
     n = len(columns["t_ns"])
-    short = [a.rsplit("_", 1)[0] for a in _SIGMA6]
     mean = np.stack([columns[f"mean_{a}"] for a in _SIGMA6], axis=-1)
-    epistemic = np.stack([columns[f"epistemic_var_{a}"] for a in short], axis=-1)
-    tau = np.stack([columns[f"bias_tau_{a}_s"] for a in short], axis=-1)
+    epistemic = np.stack([columns[f"epistemic_var_{a}"] for a in _SHORT6], axis=-1)
+    tau = np.stack([columns[f"bias_tau_{a}_s"] for a in _SHORT6], axis=-1)
+    root, lasts = np.zeros((n, 6, 6)), np.ones((n, 6))
+    if "root_calibration_00" in columns:
+        root = np.stack([columns[f"root_calibration_{i}{j}"] for i, j in _ALL6], axis=-1).reshape(n, 6, 6)
+        lasts = np.stack([columns[f"calibration_tau_{a}_s"] for a in _SHORT6], axis=-1)
     matrices = _get_matrices(columns, "cov", _UPPER6, 6)
     total = matrices.pop("total")
     return [
@@ -188,6 +200,8 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
             confidence=float(columns["confidence"][k]),
             in_domain=float(columns["in_domain"][k]),
             status=Status(columns["status"][k]),
+            calibration_root=root[k],
+            calibration_tau_s=lasts[k],
         )
         for k in range(n)
     ]

@@ -21,13 +21,14 @@ from gpvo.learning.geometryweight import choose_geometry_weight, divided
 from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
 from gpvo.learning.partcorrelation import part_correlations
-from gpvo.learning.parts import MOST_ROWS, Parts, at_most, fit_parts
+from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
 from gpvo.learning.poses import Motions, added_factor, with_added
 from gpvo.learning.rows import Rows
+from gpvo.learning.spans import at_most
 from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import SharedBasis
-from gpvo.online.division import divide, ln_faster
+from gpvo.online.division import divide, ln_faster, of_calibration
 from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.guard import Domain
 from gpvo.types import Array
@@ -43,13 +44,17 @@ def assemble(
     variance: Array,
     *,
     mean_in_sigma: bool = True,
+    calibration: bool = False,
 ) -> tuple[ErrorModelArrays, dict[str, Any]]:
-    """Parts, correlation and calibration from the out-of-fold residuals; then everything in one place."""
+    """Parts, correlation and calibration from the out-of-fold residuals; then everything in one place.
+
+    ``calibration``: whether errors of the camera's calibration are to have a part of their own.
+    """
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     sigma = np.sqrt(variance * scale.factor)
     z = error / sigma
     geometry = rows.geometry(base.method)
-    sums = _sums_of(rows, error, sigma, geometry)
+    sums = _sums_of(rows, error, sigma, geometry, calibration)
     X = rows.select(columns)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     # Out of the domain no mean is taken off, so what is left of one says nothing of how wrong VO is there.
@@ -70,7 +75,7 @@ def assemble(
         factor=scale.factor,
         outside_power=np.array([outside_power]),
         high=high,
-        correlation=sums.correlation,
+        correlation=sums.correlation[:3],
         geometry_weight=np.array([sums.geometry_weight]),
         share=sums.parts.share,
         growth=sums.parts.growth,
@@ -82,19 +87,22 @@ def assemble(
         rate_change_var=rate_changes(rows),
         mean_in_sigma=np.array([mean_in_sigma]),
         steady_mean=np.zeros(6),
+        calibration_follows=sums.parts.calibration.follows,
+        calibration_tau_s=sums.parts.calibration.tau_s,
+        calibration_correlation=sums.correlation[3],
         dt_s=rows.step_s,
     )
-    model, added, joint = _consistent(model, rows, error, sigma**2, sums, geometry)
+    model, added, joint = _consistent(model, rows, error, sigma**2, X, geometry)
     return model, _calibration(rows, scale, joint, added, sums, np.abs(z) / np.sqrt(joint))
 
 
 def _consistent(
-    model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, sums: _Sums, geometry: Array | None
+    model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, X: Array, geometry: Array | None
 ) -> tuple[ErrorModelArrays, float, float]:
     """The model made right of poses and of all six axes together, and the factors of both."""
-    added = _added_factor(model, rows, error, model.split(variance, sums.faster, geometry))
+    added = _added_factor(model, rows, error, variance, X, geometry)
     model = replace(model, share=with_added(model.share, added))
-    whole = model.split(variance, sums.faster, geometry).sum(axis=1)
+    whole = model.split(variance, X, geometry)[0].sum(axis=1)
     joint = fit_joint_factor(error, whole, rows.group)
     typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
     level = model.level + np.log(joint)
@@ -104,29 +112,32 @@ def _consistent(
 
 @dataclass(frozen=True)
 class _Sums:
-    """How errors add up: their parts, the correlation (3, 6, 6) of each, how much of the geometry's to believe, the log
-    of the typical speed (1,) and that of each motion (n, 1) over it."""
+    """How errors add up: their parts, the correlation (4, 6, 6) of each, how much of the geometry's to believe, and the
+    log of the typical speed (1,)."""
 
     parts: Parts
     correlation: Array
     geometry_weight: float
     ln_speed: Array
-    faster: Array
 
 
-def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None) -> _Sums:
-    v_mps = rows.select(TWIST_COLUMNS[:3])
+def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None, calibration: bool) -> _Sums:
+    twist = rows.select(TWIST_COLUMNS)
+    v_mps = twist[:, :3]
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
     faster = ln_faster(v_mps, ln_speed)
     errors, sigmas = rows.chains(error), rows.chains(sigma)
-    parts = fit_parts(errors, sigmas, rows.chains(faster), rows.step_s)
+    parts = fit_parts(errors, sigmas, rows.chains(faster), rows.step_s, rows.chains(twist) if calibration else None)
     correlation = part_correlations(errors, sigmas, parts, rows.step_s)
     share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)
+    wrong, rest = of_calibration(sigma**2, parts.calibration.follows, twist)
+    deviation = np.concatenate([np.sqrt(share * rest[:, None]), wrong[:, None]], axis=1)
     weight = 0.0
     if geometry is not None:
-        each = divided(errors, rows.chains(sigma**2), rows.chains(share), rows.chains(geometry))
-        weight = choose_geometry_weight(each, correlation, float(np.exp(-rows.step_s / parts.tau_s[0])))
-    return _Sums(parts, correlation, weight, ln_speed, faster)
+        each = divided(errors, rows.chains(deviation), rows.chains(geometry))
+        phi = np.exp(-rows.step_s / np.array([parts.tau_s, parts.calibration.tau_s]))
+        weight = choose_geometry_weight(each, correlation, phi)
+    return _Sums(parts, correlation, weight, ln_speed)
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
@@ -138,13 +149,18 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     return out
 
 
-def _added_factor(model: ErrorModelArrays, rows: Rows, error: Array, parts: Array) -> float:
-    """What the poses show of white and bias; ``parts`` (n, 3, 6, 6) as stated of motions, up to a common factor."""
-    factor = fit_joint_factor(error, parts.sum(axis=1), rows.group)
+def _added_factor(
+    model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, X: Array, geometry: Array | None
+) -> float:
+    """What the poses show of white and bias, ``variance`` (n, 6) being right up to a common factor."""
+    whole, root = model.split(variance, X, geometry)
+    factor = fit_joint_factor(error, whole.sum(axis=1), rows.group)
+    parts, root = model.divided(variance, X, geometry)[0] * factor, root * np.sqrt(factor)
     T_prev_cur = rows.motions()
     chosen = at_most(rows.chains(np.arange(len(error))), MOST_ROWS)
-    chains = [Motions(i, T_prev_cur[c], error[c], parts[c] * factor) for i, cs in enumerate(chosen) for c in cs]
-    return added_factor(chains, model.share, float(np.exp(-rows.step_s / model.bias_tau_s[0])))
+    chains = [Motions(i, T_prev_cur[c], error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
+    phi = np.exp(-rows.step_s / np.array([model.bias_tau_s, model.calibration_tau_s]))
+    return added_factor(chains, model.share, phi)
 
 
 def _calibration(rows: Rows, scale: Scale, joint: float, added: float, sums: _Sums, score: Array) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -64,11 +65,12 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
     error, variance = _out_of_fold(rows, base_oof, fitted)
     in_sigma = mean.name != ALL
-    model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
+    assembled = partial(assemble, calibration=config.calibration_part)
+    model, calibration = assembled(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
     arrays, for_filter = model.to_arrays(), model
     if any(use_mean):
         error, variance = _out_of_fold(rows, base_oof, plain)
-        for_filter, _ = assemble(rows, base, columns, inputs, plain, error, variance)
+        for_filter, _ = assembled(rows, base, columns, inputs, plain, error, variance)
         arrays |= {f"{FOR_FILTER}{name}": array for name, array in for_filter.to_arrays().items()}
     arrays[f"{FOR_FILTER}steady_mean"] = steady = steady_mean(rows, for_filter, error, variance)
     choices = {

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import t as t_distribution
 
 from gpvo.geometry import se3
-from gpvo.learning.parts import SPANS, span_variances
 from gpvo.learning.rows import Rows
+from gpvo.learning.spans import SPANS, span_variances
 from gpvo.types import Array
 
 _LONG = 10

@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
-from gpvo.learning.parts import SPANS, carried, cut
+from gpvo.learning.spans import SPANS, carried, cut
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
@@ -29,21 +29,23 @@ _MOST_NEES = 16.0
 @dataclass(frozen=True)
 class Motions:
     """One unbroken chain of n motions of a sequence: ``T_prev_cur`` (n, 4, 4), ``error`` (n, 6), and ``parts``
-    (n, 3, 6, 6), the stated covariances of its jitter, white and bias."""
+    (n, 3, 6, 6), the stated covariances of its jitter, white and bias; ``calibration`` (n, 6, 6), the root of what a
+    wrong calibration adds to them."""
 
     sequence: int
     T_prev_cur: Array
     error: Array
     parts: Array
+    calibration: Array
 
 
-def added_factor(chains: Sequence[Motions], share: Array, phi: float) -> float:
+def added_factor(chains: Sequence[Motions], share: Array, phi: Array) -> float:
     """The factor on white and bias, the jitter being what is left of each motion, by which poses are likeliest.
 
-    ``share`` (3, D) of the parts; ``phi``: correlation of the bias from one motion to the next. Spans of ten motions
-    and more count alike, as they count the same errors; and so do sequences. The factor is drawn towards 1, and is 1
-    unless its gain is more than the standard error of it over the sequences (L. Breiman et al., "Classification and
-    Regression Trees" (1984), section 3.4.3). No axis is left without jitter.
+    ``share`` (3, D) of the parts; ``phi`` (2, D): correlation of bias and calibration from one motion to the next.
+    Spans of ten motions and more count alike, as they count the same errors; and so do sequences. The factor is drawn
+    towards 1, and is 1 unless its gain is more than the standard error of it over the sequences (L. Breiman et al.,
+    "Classification and Regression Trees" (1984), section 3.4.3). No axis is left without jitter.
     """
     spans = [_Poses.over(chains, m, phi) for m in SPANS if m >= _LONG and _count(chains, m) >= _LEAST_WINDOWS]
     if not spans or len({c.sequence for c in chains}) < 2:
@@ -75,9 +77,9 @@ def _count(chains: Sequence[Motions], m: int) -> int:
 @dataclass(frozen=True)
 class _Poses:
     """Errors (w, 6) of the poses after m motions each, in the axes of the last camera, and covariances (w, 6, 6): that
-    of ``jitter``, of what has ``added`` up, and of the first and last motion's part of that, were it ``jitter`` too
-    (``at_ends``). ``belongs`` (w, S): to which sequence, its columns summing to one: a sequence counts as one, however
-    many windows it has, as its errors go together."""
+    of ``jitter`` and calibration, of what has ``added`` up, and of the first and last motion's part of that, were it
+    jitter too (``at_ends``). ``belongs`` (w, S): to which sequence, its columns summing to one: a sequence counts as
+    one, however many windows it has, as its errors go together."""
 
     error: Array
     jitter: Array
@@ -86,7 +88,7 @@ class _Poses:
     belongs: Array
 
     @classmethod
-    def over(cls, chains: Sequence[Motions], m: int, phi: float) -> _Poses:
+    def over(cls, chains: Sequence[Motions], m: int, phi: Array) -> _Poses:
         """Of the separate windows of all chains."""
         long = [c for c in chains if len(c.error) >= m]
         error, jitter, added, at_ends = (np.concatenate(x) for x in zip(*(_windows(c, m, phi) for c in long)))
@@ -102,19 +104,21 @@ class _Poses:
         return np.asarray((0.5 * (np.linalg.slogdet(C)[1] + squared)) @ self.belongs)
 
 
-def _windows(c: Motions, m: int, phi: float) -> tuple[Array, Array, Array, Array]:
+def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array]:
     """Error, jitter, added and at_ends of :class:`_Poses`, of the windows of one chain: as
     :class:`gpvo.evaluation.accumulate.PoseError` adds up, for all at once and with one time step."""
-    T, error, parts = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts))
+    T, error, parts, calibration = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts, c.calibration))
     to_end = _adjoints_to_end(T)
     jitter, white, bias = np.moveaxis(to_end[:, :, None] @ parts @ np.swapaxes(to_end, -1, -2)[:, :, None], 2, 0)
-    root = to_end @ _roots(parts[:, :, 2])
-    lagged = np.einsum("wkij,wknj->win", root, _carried(root, phi))
-    added = (white + bias).sum(axis=1) + lagged + np.swapaxes(lagged, -1, -2)
+    added = (white + bias).sum(axis=1) + _lagged(to_end @ _roots(parts[:, :, 2]), phi[0])
+    lasting = np.zeros_like(added)
+    if calibration.any():
+        root = to_end @ calibration
+        lasting = (root @ np.swapaxes(root, -1, -2)).sum(axis=1) + _lagged(root, phi[1])
     ends = [0, -1]
     return (
         np.einsum("wkij,wkj->wi", to_end, error),
-        0.5 * jitter[:, ends].sum(axis=1),
+        0.5 * jitter[:, ends].sum(axis=1) + lasting,
         added,
         0.5 * (white + bias)[:, ends].sum(axis=1),
     )
@@ -135,6 +139,7 @@ def _roots(C: Array) -> Array:
     return sigma[..., None] * scaled_root(C[0, 0]) / sigma[0, 0][:, None]
 
 
-def _carried(root: Array, phi: float) -> Array:
-    w, m = root.shape[:2]
-    return carried(root.reshape(w, m, -1), phi).reshape(root.shape)
+def _lagged(root: Array, phi: Array) -> Array:
+    """(w, 6, 6) what the motions of each window have in common with those before, and those with them."""
+    lagged = np.einsum("wkij,wknj->win", root, carried(root, phi))
+    return np.asarray(lagged + np.swapaxes(lagged, -1, -2))

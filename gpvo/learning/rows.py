@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import group_labels
 from gpvo.geometry import se3
-from gpvo.learning.parts import chains
+from gpvo.learning.spans import chains
 from gpvo.online.base import TWIST_COLUMNS
 from gpvo.types import Array
 

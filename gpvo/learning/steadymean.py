@@ -22,7 +22,7 @@ def steady_mean(rows: Rows, model: ErrorModelArrays, error: Array, variance: Arr
     if rows.grouped_by != "sequences":
         return np.zeros(6)
     X = rows.select(model.columns)
-    covariance = model.split(variance * model.factor, model.faster(X), rows.geometry(model.base.method)).sum(axis=1)
+    covariance = model.split(variance * model.factor, X, rows.geometry(model.base.method))[0].sum(axis=1)
     z = np.linalg.solve(turn_first_root(covariance), error[:, :, None])[:, :, 0]
     noise = model.residual_px(model.domain.locate(X).inside)[:, None]
     # Per sequence, the sums of the normal equations.

@@ -27,6 +27,18 @@ def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
     return out / out.sum(axis=1, keepdims=True)
 
 
+def of_calibration(variance: Array, follows: Array, twist: Array) -> tuple[Array, Array]:
+    """What a wrong calibration has of variances (n, D): its deviation with its sign (n, D), and what is left (n, D).
+
+    A wrong baseline, focal length or rectification makes errors that go with a velocity, and turn around with it: a
+    scale that is 1 % off adds on the way out what it takes back on the way home. ``follows`` (D, 6): the ratio of that
+    deviation to that of all else at unit velocity; ``twist`` (n, 6), unknown ones bring nothing [m/s, rad/s].
+    """
+    ratio = np.where(np.isfinite(twist), twist, 0.0) @ follows.T
+    rest = variance / (1.0 + ratio**2)
+    return ratio * np.sqrt(rest), rest
+
+
 def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
     """(n, 1) log of the speed of (n, 3) over the typical one, from 0 to that of twenty times it; 0 where unknown.
 

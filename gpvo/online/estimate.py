@@ -12,14 +12,20 @@ from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import correlation as correlation_of
-from gpvo.geometry.covariance import turn_first_root
+from gpvo.geometry.covariance import scaled_root, turn_first_root
 from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
-from gpvo.online.division import PARTS, divide, ln_faster
+from gpvo.online.division import PARTS, divide, ln_faster, of_calibration
 from gpvo.online.guard import Domain, Whereabouts, growth
 from gpvo.types import Array
 
 _EYE = np.eye(6)
+NO_CALIBRATION: Mapping[str, Array] = {
+    "calibration_follows": np.zeros((6, 6)),
+    "calibration_tau_s": np.ones(6),
+    "calibration_correlation": _EYE,
+}
+"""Arrays of a model without a part of its own for errors of calibration."""
 COASTED = (1, 2, 5, 10, 20, 50)
 """Over so many usual motions training tells how much a velocity changes."""
 LN_LARGEST = 60.0
@@ -41,6 +47,9 @@ _SHAPES = {
     "rate_change_var": (len(COASTED), 6),
     "mean_in_sigma": (1,),
     "steady_mean": (6,),
+    "calibration_follows": (6, 6),
+    "calibration_tau_s": (6,),
+    "calibration_correlation": (6, 6),
 }
 _OWN = ("inputs", *_SHAPES)
 
@@ -49,13 +58,14 @@ _OWN = ("inputs", *_SHAPES)
 class Estimate:
     """The error's distribution for n rows; see ``gpvo.types.Prediction`` for the words.
 
-    ``mean`` (n, 6); ``covariance`` (n, 6, 6); ``parts``: name to (n, 6, 6); ``epistemic`` (n, 6); ``in_domain``,
-    ``confidence``, ``distance`` (n,). For a single row all without the first axis.
+    ``mean`` (n, 6); ``covariance`` (n, 6, 6); ``parts``: name to (n, 6, 6); ``calibration_root`` (n, 6, 6);
+    ``epistemic`` (n, 6); ``in_domain``, ``confidence``, ``distance`` (n,). For a single row all without the first axis.
     """
 
     mean: Array
     covariance: Array
     parts: dict[str, Array]
+    calibration_root: Array
     epistemic: Array
     in_domain: Array
     confidence: Array
@@ -73,6 +83,7 @@ class Estimate:
             self.mean[k],
             self.covariance[k],
             parts,
+            self.calibration_root[k],
             self.epistemic[k],
             self.in_domain[k],
             self.confidence[k],
@@ -107,7 +118,9 @@ class ErrorModelArrays:
     the training rows. ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2];
     ``rate_change_var`` (K, 6): of the true one's changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the
     GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
-    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters.
+    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``calibration_follows`` (6, 6): what
+    errors of calibration go with (see :func:`gpvo.online.division.of_calibration`), ``calibration_tau_s`` (6,) how long
+    they last, and ``calibration_correlation`` (6, 6).
     """
 
     columns: tuple[str, ...]
@@ -130,11 +143,15 @@ class ErrorModelArrays:
     rate_change_var: Array
     mean_in_sigma: NDArray[np.bool_]
     steady_mean: Array
+    calibration_follows: Array
+    calibration_tau_s: Array
+    calibration_correlation: Array
     dt_s: float
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file."""
-        own = {name: np.asarray(getattr(self, name)) for name in _OWN}
+        left_out = () if self.calibration_follows.any() else NO_CALIBRATION
+        own = {name: np.asarray(getattr(self, name)) for name in _OWN if name not in left_out}
         return {
             **own,
             "theta": self.base.theta,
@@ -151,7 +168,7 @@ class ErrorModelArrays:
         try:
             # Velocities that have nothing to do with each other, where an older file does not say.
             unrelated = np.tile(2.0 * arrays["usual_rate_var"], (len(COASTED), 1))
-            arrays = {"steady_mean": np.zeros(6), "rate_change_var": unrelated, **arrays}
+            arrays = {"steady_mean": np.zeros(6), "rate_change_var": unrelated, **NO_CALIBRATION, **arrays}
             own = {name: arrays[name] for name in _OWN}
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
@@ -173,7 +190,7 @@ class ErrorModelArrays:
         place = v.place
         unlimited = v.total + v.mean_var
         variance = within(unlimited * self.factor, v.limit)
-        each = self.split(variance, self.faster(X), geometry)
+        each, root = self.split(variance, X, geometry)
         parts = {name: each[:, i] for i, name in enumerate(PARTS)}
         covariance = each.sum(axis=1)
         _, ln_det = np.linalg.slogdet(covariance)
@@ -186,6 +203,7 @@ class ErrorModelArrays:
             mean,
             covariance,
             parts,
+            root,
             variance * (1.0 - v.known / unlimited),
             place.in_domain,
             place.in_domain * precision,
@@ -285,11 +303,24 @@ class ErrorModelArrays:
         at = self._base_place[0][:3]
         return ln_faster(X[:, at], self.ln_speed)
 
-    def split(self, variance: Array, faster: Array, geometry: Array | None) -> Array:
-        """(n, 3, 6, 6) covariances of jitter, white and bias, from variances (n, 6) and :meth:`faster`.
+    def split(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
+        """(n, 3, 6, 6) covariances of jitter, white and bias of rows X, from variances (n, 6); and the root (n, 6, 6)
+        of what a wrong calibration has of the bias.
 
         Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own pattern.
         """
+        each, sigma = self.divided(variance, X, geometry)
+        root = sigma[:, :, None] * self._calibration_root
+        if self.calibration_follows.any():
+            each[:, 2] += root @ np.swapaxes(root, -1, -2)
+        return each, root
+
+    @cached_property
+    def _calibration_root(self) -> Array:
+        return scaled_root(self.calibration_correlation)
+
+    def divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
+        """As :meth:`split`, but the bias without that of calibration, whose deviations (n, 6) have their sign."""
         out = np.repeat(self.correlation[None], len(variance), axis=0)
         w = float(self.geometry_weight[0])
         if geometry is not None and w > 0:
@@ -297,9 +328,10 @@ class ErrorModelArrays:
             known = np.isfinite(R).all(axis=(1, 2))
             out[known, :2] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
-        share = divide(self.share, self.growth, np.log(variance) - self.level, faster)
-        sigma = np.sqrt(share * variance[:, None, :])
-        return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :]
+        share = divide(self.share, self.growth, np.log(variance) - self.level, self.faster(X))
+        calibration, rest = of_calibration(variance, self.calibration_follows, X[:, self._base_place[0][:6]])
+        sigma = np.sqrt(share * rest[:, None, :])
+        return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :], calibration
 
 
 def _block_sums(values: Array) -> Array:

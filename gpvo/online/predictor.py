@@ -228,6 +228,7 @@ class Predictor:
         status, confidence, mean = record.status, float(estimate.confidence), estimate.mean
         scale = self._adaptive.scale
         parts = {name: C * np.outer(scale, scale) for name, C in estimate.parts.items()}
+        root = estimate.calibration_root * scale[:, None]
         if estimate.in_domain < DEGRADED_BELOW and status is Status.OK:
             status = Status.DEGRADED
         if status is Status.DEGRADED:
@@ -235,7 +236,7 @@ class Predictor:
         if status is Status.LOST:
             # What was learnt of measured motions does not apply to one that was not.
             parts = dict.fromkeys(PARTS, np.zeros((6, 6))) | {"white": np.diag(self._lost_variance(record))}
-            confidence, mean = 0.0, np.zeros(6)
+            confidence, mean, root = 0.0, np.zeros(6), np.zeros((6, 6))
         covariance = parts["jitter"] + parts["white"] + parts["bias"]
         sigma = np.sqrt(np.diagonal(covariance))
         if status is not Status.LOST and record.dt_s > 0:
@@ -255,6 +256,8 @@ class Predictor:
             confidence,
             float(estimate.in_domain),
             status,
+            root,
+            self.model.calibration_tau_s,
         )
 
     def _lost_variance(self, record: VoRecord) -> Array:
@@ -272,4 +275,6 @@ class Predictor:
         white = np.eye(6) * _NO_MOTION_VAR
         parts = {name: white if name == "white" else np.zeros((6, 6)) for name in PARTS}
         zero = np.zeros(6)
-        return Prediction(record.t_ns, 0.0, zero, white, parts, self.model.bias_tau_s, zero, 1.0, 1.0, record.status)
+        tau_s, lasts_s = self.model.bias_tau_s, self.model.calibration_tau_s
+        sure = (1.0, 1.0, record.status)
+        return Prediction(record.t_ns, 0.0, zero, white, parts, tau_s, zero, *sure, calibration_tau_s=lasts_s)

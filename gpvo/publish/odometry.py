@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise
+from gpvo.geometry.covariance import is_positive_definite, persistent_root, symmetrise
 from gpvo.geometry.frames import R_FLU_OPTICAL, rotate_covariance
 from gpvo.types import Prediction, Status, VoRecord
 
 Array = NDArray[np.float64]
+
+
+_NO_BIAS = (np.zeros((6, 12)), np.full(12, np.inf))
+"""Root of a bias, and its time constants [s], where there is none."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ class OdometryBuilder:
         base = self._chain.get(record.t_prev_ns)
         if base is None:
             self._resets += bool(self._chain)
-            base = self._latest() or _Chain(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), record.t_prev_ns)
+            base = self._latest() or _Chain(np.eye(4), np.zeros((6, 6)), np.zeros((6, 12)), record.t_prev_ns)
             self._last = None
         if not record.usable or _status(record, prediction) is Status.LOST:
             return self._lost(record, prediction, base)
@@ -127,8 +131,8 @@ class OdometryBuilder:
         return self._message(record, prediction, chain, total, twist, twist_covariance)
 
     def _parts(self, record: VoRecord, prediction: Prediction | None) -> tuple[Array, Array, Array, Array]:
-        """White and jitter covariance, root of the bias' covariance and its time constants."""
-        zero, forever = np.zeros((6, 6)), np.full(6, np.inf)
+        """White and jitter covariance, root (6, 12) of the bias' covariance and its time constants (12,)."""
+        zero = np.zeros((6, 6))
         if prediction is not None:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
@@ -136,14 +140,15 @@ class OdometryBuilder:
             white = prediction.covariance - jitter - bias
             if not self.correct_twist:  # what is not taken off remains part of the error
                 white = white + np.outer(prediction.mean, prediction.mean)
-            return white, jitter, scaled_root(bias), prediction.bias_tau_s
+            tau_s = np.concatenate([prediction.bias_tau_s, prediction.calibration_tau_s])
+            return white, jitter, persistent_root(bias, prediction.calibration_root), tau_s
         covariance = record.covariances.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
             raise GpvoError(
                 f"the frame at t_ns {record.t_ns} has neither a prediction nor a '{self.method}' covariance",
                 cure=f"give --model, or --method with one of {', '.join(record.covariances) or 'what the run holds'}",
             )
-        return np.asarray(covariance, dtype=np.float64), zero, zero, forever
+        return np.asarray(covariance, dtype=np.float64), zero, *_NO_BIAS
 
     def _twist(
         self, record: VoRecord, prediction: Prediction | None, chain: _Chain, own: Array, independent: Array
@@ -177,7 +182,7 @@ class OdometryBuilder:
         if stated is None or not is_positive_definite(stated):
             dt = (record.t_ns - base.t_ns) * 1e-9
             stated = np.diag((np.abs(self._speed) * dt) ** 2)
-        chain = _extend(base, record, stated, np.zeros((6, 6)), np.full(6, np.inf))
+        chain = _extend(base, record, stated, *_NO_BIAS)
         self._remember(record, chain)
         if record.is_reference and _status(record, prediction) is Status.LOST:
             # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone,

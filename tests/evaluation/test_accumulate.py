@@ -113,3 +113,15 @@ def test_a_copy_branches():
     twin = error.copy()
     twin.add(steps[2])
     np.testing.assert_allclose(error.covariance, C, atol=1e-18)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 8])
+def test_what_calibration_adds_on_the_way_out_it_takes_back_on_the_way_home(frames):
+    """There and back, always turned by the same: of a lasting error nothing is left after an even number of motions."""
+    rng = np.random.default_rng(0)
+    L, white, zero = rng.standard_normal((6, 6)), 0.1 * np.eye(6), np.zeros((6, 6))
+    pose = PoseError()
+    for k in range(frames):
+        root = L if k % 2 == 0 else -L
+        pose.add(Step(np.eye(4), zero, white, L @ L.T, np.ones(6), 0.05, root, np.full(6, np.inf)))
+    np.testing.assert_allclose(pose.covariance, frames * white + frames % 2 * L @ L.T, atol=1e-9)

@@ -42,7 +42,7 @@ def test_jacobian_of_the_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     camera = me.CameraOnImu.of(FORWARD_CAMERA @ se3.exp(rng.standard_normal(6) * 0.3))
     R0, p0, R1, p1 = _random_poses(rng)
-    bias_root = rng.standard_normal((1, 6, 6)) * 0.01
+    bias_root = rng.standard_normal((1, 6, 12)) * 0.01
 
     def motion(dx: np.ndarray) -> np.ndarray:
         """``Exp(-n_ref) T Exp(n_cur + b)`` of the perturbed state, as the measurement's law has it."""
@@ -135,7 +135,7 @@ def test_a_considered_bias_counts_but_is_not_estimated() -> None:
         filters.append(timeline.filter)
     sure, unsure = filters
     for filter in filters:
-        np.testing.assert_allclose(filter.P[0, me.BIAS, me.BIAS], np.eye(6), atol=1e-9)
+        np.testing.assert_allclose(filter.P[0, me.BIAS, me.BIAS], np.eye(12), atol=1e-9)
     seconds = flights[0].records[-1].t_ns * 1e-9 - flights[0].records[0].t_ns * 1e-9
     # Six seconds of a bias that lasts ten: what is stated per motion adds up nearly as it stands.
     added = 5e-3 * 20.0 * seconds

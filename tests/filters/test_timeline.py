@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
-from gpvo.filters.measurement import BIAS
+from gpvo.filters.measurement import BIAS, JOINT
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
@@ -256,7 +256,7 @@ def test_whose_fault_a_failure_is(flight: Flight, seed: int, log_ratio: float) -
     filter = make_filter(flight, start, gravity, 1, FuseOptions())
     A, B = rng.standard_normal((2, 21, 21))
     filter.P[0, :21, :21] = A @ A.T
-    H = np.zeros((1, 6, 39))
+    H = np.zeros((1, 6, JOINT))
     H[0, :, :21] = B[:6]
     N = 10.0**log_ratio * np.einsum("ij,kj->ik", A[:6], A[:6])
     r = rng.standard_normal((1, 6))

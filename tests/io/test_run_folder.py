@@ -58,11 +58,11 @@ def make_records(n: int, seed: int = 0) -> list[VoRecord]:
     return out
 
 
-def make_prediction(record: VoRecord, rng: np.random.Generator) -> Prediction:
+def make_prediction(record: VoRecord, rng: np.random.Generator, calibration: bool = False) -> Prediction:
     parts = {name: _spd(rng, 6) for name in ("jitter", "white", "bias")}
     return Prediction(
         record.t_ns, record.dt_s, rng.normal(size=6), sum(parts.values()), parts, np.full(6, 10.0), rng.uniform(size=6),
-        0.7, 0.9, Status.OK,
+        0.7, 0.9, Status.OK, calibration * rng.normal(size=(6, 6)), 1.0 + calibration * rng.uniform(size=6),
     )  # fmt: skip
 
 
@@ -236,9 +236,10 @@ def test_a_reference_lasts_as_long_as_rest(tmp_path):
     assert json.loads((tmp_path / "run" / "run.json").read_text())["frames"] == 20_003
 
 
-def test_predictions_file(tmp_path):
+@pytest.mark.parametrize("calibration", [False, True])
+def test_predictions_file(tmp_path, calibration):
     rng = np.random.default_rng(3)
-    predictions = [make_prediction(r, rng) for r in make_records(5)[1:]]
+    predictions = [make_prediction(r, rng, calibration) for r in make_records(5)[1:]]
     write_predictions(tmp_path / "p.parquet", predictions)
     for p, q in zip(predictions, read_predictions(tmp_path / "p.parquet"), strict=True):
         assert_same(p, q)

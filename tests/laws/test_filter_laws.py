@@ -43,7 +43,7 @@ def _noise(rng: np.random.Generator, scale: float = 1e-3, parts: bool = True) ->
 
     if not parts:
         return MotionNoise(np.zeros((1, 6)), spd(scale))
-    return MotionNoise(np.zeros((1, 6)), spd(scale), spd(scale), np.diag(np.full(6, scale))[None], np.full(6, 5.0))
+    return MotionNoise(np.zeros((1, 6)), spd(scale), spd(scale), scale * np.eye(6, 12)[None], np.full(12, 5.0))
 
 
 @settings(max_examples=25, deadline=None)
@@ -89,7 +89,7 @@ def _long_run(steps: int) -> None:
             R_ref, p_ref = filter.camera.pose(filter.clone_p, filter.clone_R)
             R, t = me.relative_motion(R_ref, p_ref, *filter.camera.pose(filter.x.position, filter.x.R_world_imu))
             T = se3.from_rt(R[0], t[0]) @ se3.exp(1e-3 * rng.standard_normal(6))
-            filter.decay_bias(0.05, np.full(6, 5.0))
+            filter.decay_bias(0.05, np.full(12, 5.0))
             filter.update_motion(T, _noise(rng), ACCEPT)
             filter.clone(measured=True)
     C = filter.covariance[0]
@@ -213,7 +213,7 @@ def _linear_regime(batch: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     noise = _noise(np.random.default_rng(2), 1e-3)
     white, jitter = (np.linalg.cholesky(C[0]) for C in (noise.white, 0.5 * noise.jitter))
     n_ref = rng.standard_normal((batch, 6)) @ jitter.T
-    beta = rng.standard_normal((batch, 6))
+    beta = rng.standard_normal((batch, 12))
     T_ref = FORWARD_CAMERA
     nis = []
 
@@ -233,7 +233,7 @@ def _linear_regime(batch: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         if (k + 1) % every == 0:
             T_cam = se3.from_rt(truth.R_world_imu[0], truth.position[0]) @ FORWARD_CAMERA
             phi = np.exp(-every / rate / 5.0)
-            beta = phi * beta + np.sqrt(1 - phi**2) * rng.standard_normal((batch, 6))
+            beta = phi * beta + np.sqrt(1 - phi**2) * rng.standard_normal((batch, 12))
             n_cur = rng.standard_normal((batch, 6)) @ jitter.T
             error = rng.standard_normal((batch, 6)) @ white.T + beta @ noise.bias_root[0].T
             T = se3.exp(-n_ref) @ (se3.inverse(T_ref) @ T_cam) @ se3.exp(n_cur) @ se3.exp(error)

@@ -18,7 +18,7 @@ from gpvo.online import modelfile
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
 from gpvo.online.division import PARTS
-from gpvo.online.estimate import COASTED, ErrorModelArrays, Estimate
+from gpvo.online.estimate import COASTED, NO_CALIBRATION, ErrorModelArrays, Estimate
 from gpvo.online.for_filter import FOR_FILTER
 from gpvo.online.guard import Domain
 from gpvo.online.predictor import Predictor
@@ -87,8 +87,21 @@ def some_model(
         rate_change_var=rng.uniform(0.5, 2.0, (len(COASTED), 6)),
         mean_in_sigma=np.array([in_sigma]),
         steady_mean=np.zeros(6),
+        **NO_CALIBRATION,
         dt_s=0.1,
     )
+
+
+def some_calibration() -> dict[str, np.ndarray]:
+    """Two axes go with one velocity and belong together, one goes with another."""
+    follows, correlation = np.zeros((6, 6)), np.eye(6)
+    follows[[0, 4, 2], [1, 1, 5]] = 2.0, -0.7, 1.1
+    correlation[[0, 4], [4, 0]] = -0.8
+    return {
+        "calibration_follows": follows,
+        "calibration_tau_s": np.where(follows.any(axis=1), 90.0, 1.0),
+        "calibration_correlation": correlation,
+    }
 
 
 CASES = {
@@ -99,6 +112,7 @@ CASES = {
     "noise of the residuals": some_model(residual=True),
     "a mean of its own": some_model(in_sigma=False),
     "a steady mean": replace(some_model(residual=True), steady_mean=np.array([0.02, -0.1, 0.3, -0.2, 0.4, 0.1])),
+    "errors of calibration": replace(some_model(), **some_calibration()),
     "a steady mean without residuals": replace(some_model(), steady_mean=np.array([0.0, 0.1, 0.0, -0.2, 0.0, 0.3])),
 }
 
@@ -166,6 +180,7 @@ class CEstimate(ctypes.Structure):
         ("jitter", ctypes.c_double * 36),
         ("white", ctypes.c_double * 36),
         ("bias", ctypes.c_double * 36),
+        ("calibration_root", ctypes.c_double * 36),
         ("epistemic", ctypes.c_double * 6),
         ("in_domain", ctypes.c_double),
         ("confidence", ctypes.c_double),

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from gpvo.evaluation.accumulate import PoseError, Step
 from gpvo.learning.partcorrelation import curves, part_correlations
-from gpvo.learning.parts import SpanVariances, chains, fit_parts, span_variances
+from gpvo.learning.parts import fit_parts
+from gpvo.learning.spans import SpanVariances, chains, span_variances
 from scipy.signal import lfilter
 
 
@@ -104,6 +106,34 @@ def test_each_part_has_its_own_correlation():
     assert np.linalg.eigvalsh(R).min() > 0.0
 
 
+def _out_and_home(rng: np.random.Generator, flights: int, wrong: bool) -> tuple[list, list]:
+    """Velocities that turn around every 100 motions; two axes are wrong by one part of them, the same all flight."""
+    error, twist = [], []
+    for _ in range(flights):
+        v = np.repeat(rng.choice([-1.0, 1.0], (20, 6)) * rng.uniform(0.5, 1.5, (20, 6)), 100, axis=0)
+        scale = 0.3 * rng.standard_normal() * np.array([0.0, -1.0, 1.0, 0.0, 0.0, 0.0]) * wrong
+        error.append([rng.standard_normal((2000, 6)) + scale * v[:, [2]]])
+        twist.append([v])
+    return error, twist
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_an_error_of_calibration_is_found_where_there_is_one(wrong):
+    """A ratio of 0.3 per unit of velocity, by 20 flights (standard error 16 %), and a tie of the axes of -1, which is
+    drawn towards that of single motions, near 0."""
+    error, twist = _out_and_home(np.random.default_rng(6), 20, wrong)
+    one = _like(error, 1.0)
+    parts = fit_parts(error, one, _same_speed(error), 0.05, twist)
+    expected = np.zeros((6, 6))
+    expected[[1, 2], 2] = 0.3 * wrong
+    np.testing.assert_allclose(parts.calibration.follows, expected, atol=0.1)
+    assert ((parts.calibration.follows > 0) == (expected > 0)).all()
+    tie = part_correlations(error, one, parts, 0.05)[3, 1, 2]
+    assert tie < -0.6 if wrong else tie == 0.0
+    if wrong:
+        assert (parts.calibration.tau_s[1:3] > 50.0).all()
+
+
 def test_what_is_stated_of_a_new_flight_is_right_on_average():
     """Biases of few flights: squared sum over stated variance has mean one for a flight not seen."""
     rng = np.random.default_rng(1)
@@ -129,7 +159,8 @@ def test_what_is_stated_along_a_path_is_what_was_fitted():
         z.append([0.5 * bias + rng.standard_normal((4000, 6))])
     parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
     R = part_correlations(z, _like(z, 1.0), parts, 0.05)
-    jitter, white, bias = R * (np.sqrt(parts.share) * sigma)[:, :, None] * (np.sqrt(parts.share) * sigma)[:, None, :]
+    of_parts = np.sqrt(parts.share) * sigma
+    jitter, white, bias = R[:3] * of_parts[:, :, None] * of_parts[:, None, :]
     error = PoseError()
     for _ in range(200):
         error.add(Step(np.eye(4), jitter, white, bias, parts.tau_s, 0.05))

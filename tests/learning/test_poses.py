@@ -10,7 +10,8 @@ from gpvo.evaluation.accumulate import PoseError, Step
 from gpvo.geometry import se3
 from gpvo.learning.poses import Motions, _windows, added_factor, with_added
 
-PHI = 0.9
+PHI, LASTING = 0.9, 0.99
+BOTH = np.repeat([[PHI], [LASTING]], 6, axis=1)
 SHARE = np.repeat([[0.6], [0.3], [0.1]], 6, axis=1)
 
 
@@ -25,10 +26,12 @@ def test_what_is_stated_of_a_pose_is_what_adds_up_along_a_path():
     rng = np.random.default_rng(0)
     n = 14
     T, parts = se3.exp(0.3 * rng.standard_normal((n, 6))), _covariances(rng, n)
-    _, jitter, added, _ = _windows(Motions(0, T, np.zeros((n, 6)), parts), n, PHI)
+    root = rng.standard_normal((n, 6, 1)) * rng.standard_normal((6, 6))
+    _, jitter, added, _ = _windows(Motions(0, T, np.zeros((n, 6)), parts, root), n, BOTH)
     pose = PoseError()
-    for T_prev_cur, each in zip(T, parts):
-        pose.add(Step(T_prev_cur, *each, np.full(6, -1.0 / np.log(PHI)), 1.0))
+    tau_s, lasting_s = -1.0 / np.log(BOTH)
+    for T_prev_cur, (jit, white, bias), L in zip(T, parts, root):
+        pose.add(Step(T_prev_cur, jit, white, bias + L @ L.T, tau_s, 1.0, L, lasting_s))
     np.testing.assert_allclose((jitter + added)[0], pose.covariance, rtol=1e-9)
 
 
@@ -44,7 +47,8 @@ def _flight(rng: np.random.Generator, sequence: int, n: int, added: float) -> Mo
         slow[k] = state
     back = se3.adjoint(se3.inverse(T)) @ frames[:-1, :, None]
     error = frames[1:] - back[..., 0] + white * rng.standard_normal((n, 6)) + bias * slow
-    return Motions(sequence, T, error, np.tile(SHARE[:, 0, None, None] * np.eye(6), (n, 1, 1, 1)))
+    parts = np.tile(SHARE[:, 0, None, None] * np.eye(6), (n, 1, 1, 1))
+    return Motions(sequence, T, error, parts, np.zeros((n, 6, 6)))
 
 
 def test_right_parts_stay_as_they_are():
@@ -52,7 +56,7 @@ def test_right_parts_stay_as_they_are():
     found = []
     for trial in range(10):
         rng = np.random.default_rng(trial)
-        found.append(added_factor([_flight(rng, i, 600, 1.0) for i in range(12)], SHARE, PHI))
+        found.append(added_factor([_flight(rng, i, 600, 1.0) for i in range(12)], SHARE, BOTH))
     np.testing.assert_allclose(found, 1.0, atol=0.15)
     assert np.median(found) == pytest.approx(1.0, abs=0.05)
 
@@ -62,7 +66,7 @@ def test_the_factor_is_found_as_far_as_flights_show_it(truth):
     """Of few flights a part, of many nearly all: on a log scale, by 64 flights at least 85 % and at most 115 %."""
     rng = np.random.default_rng(0)
     flights = [_flight(rng, i, 600, truth) for i in range(64)]
-    part = [np.log(added_factor(flights[:n], SHARE, PHI)) / np.log(truth) for n in (2, 8, 64)]
+    part = [np.log(added_factor(flights[:n], SHARE, BOTH)) / np.log(truth) for n in (2, 8, 64)]
     assert 0.0 < part[0] < part[1] < part[2]
     assert part[2] == pytest.approx(1.0, abs=0.15)
 
@@ -72,28 +76,28 @@ def test_a_flight_cut_in_two_says_more_and_a_longer_one_does_not():
     rng = np.random.default_rng(3)
     flights = [_flight(rng, i, 1200, 0.5) for i in range(4)]
     cut = [
-        Motions(2 * f.sequence + h, f.T_prev_cur[rows], f.error[rows], f.parts[rows])
+        Motions(2 * f.sequence + h, f.T_prev_cur[rows], f.error[rows], f.parts[rows], f.calibration[rows])
         for f in flights
         for h, rows in enumerate((slice(0, 600), slice(600, 1200)))
     ]
-    assert added_factor(cut, SHARE, PHI) < added_factor(flights, SHARE, PHI) < 1.0
+    assert added_factor(cut, SHARE, BOTH) < added_factor(flights, SHARE, BOTH) < 1.0
 
 
 def test_what_flights_do_not_agree_on_is_chance():
     """Half of them say that too much is stated, half that too little; of all six the likeliest factor is 0.88."""
     rng = np.random.default_rng(4)
     flights = [_flight(rng, i, 600, 0.4 if i % 2 else 1.6) for i in range(6)]
-    assert added_factor(flights, SHARE, PHI) == 1.0
-    assert added_factor(flights[::2], SHARE, PHI) > 1.0
+    assert added_factor(flights, SHARE, BOTH) == 1.0
+    assert added_factor(flights[::2], SHARE, BOTH) > 1.0
 
 
 def test_too_little_changes_nothing():
     rng = np.random.default_rng(2)
     short, long = _flight(rng, 0, 9, 0.5), _flight(rng, 0, 600, 0.5)
-    assert added_factor([], SHARE, PHI) == 1.0
-    assert added_factor([short, replace(short, sequence=1)], SHARE, PHI) == 1.0
-    assert added_factor([long], SHARE, PHI) == 1.0
-    assert added_factor([long, replace(long, sequence=1), replace(short, sequence=2)], SHARE, PHI) < 1.0
+    assert added_factor([], SHARE, BOTH) == 1.0
+    assert added_factor([short, replace(short, sequence=1)], SHARE, BOTH) == 1.0
+    assert added_factor([long], SHARE, BOTH) == 1.0
+    assert added_factor([long, replace(long, sequence=1), replace(short, sequence=2)], SHARE, BOTH) < 1.0
 
 
 def test_shares_still_sum_to_one():

@@ -19,7 +19,7 @@ def test_the_mean_that_errors_were_drawn_with_is_found_and_no_other(lean: tuple[
     rows, rng, c = Rows.stack(sets), np.random.default_rng(0), np.array(lean)
     variance = np.exp(rng.normal(-9.0, 1.0, (len(rows.error), 1))) * np.ones(6)
     X = rows.select(model.columns)
-    covariance = model.split(variance * model.factor, model.faster(X), rows.geometry(model.base.method)).sum(axis=1)
+    covariance = model.split(variance * model.factor, X, rows.geometry(model.base.method))[0].sum(axis=1)
     noise = model.residual_px(model.domain.locate(X).inside)[:, None]
     z = rng.standard_normal((len(X), 6)) + c * noise
     error = (turn_first_root(covariance) @ z[:, :, None])[:, :, 0]

@@ -175,3 +175,18 @@ def test_every_covariance_of_a_bursty_flight_is_positive_definite() -> None:
         np.linalg.cholesky(out.pose_covariance)
         if out.twist_covariance is not None:
             np.linalg.cholesky(out.twist_covariance)
+
+
+def test_the_pose_of_a_wrong_calibration_is_right_again_at_home() -> None:
+    rng = np.random.default_rng(4)
+    L, C, zero = rng.standard_normal((6, 6)) * 1e-2, _spd(rng, 1e-3), np.zeros((6, 6))
+    builder = OdometryBuilder(np.eye(4), floors=TINY)
+    for k in range(1, 9):
+        stated = replace(
+            _prediction(k * 10**8, zero, C, L @ L.T),
+            calibration_root=L if k % 2 else -L,
+            calibration_tau_s=np.full(6, np.inf),
+        )
+        out = builder.step(VoRecord(k * 10**8, (k - 1) * 10**8, Status.OK, np.eye(4)), stated)
+    np.testing.assert_allclose(out.pose_covariance, 8 * C, atol=1e-9)
+    np.testing.assert_allclose(out.twist_covariance, (C + L @ L.T) / 0.01, atol=1e-9)

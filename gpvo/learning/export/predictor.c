@@ -6,6 +6,7 @@ typedef struct {
     double jitter[36];     /* the three parts it is the sum of */
     double white[36];
     double bias[36];
+    double calibration_root[36]; /* L: of the bias, L L^T is what a wrong calibration makes */
     double epistemic[6]; /* share of each variance that comes from being away from the training data */
     double in_domain;    /* 0..1 */
     double confidence;   /* 0..1 */
@@ -150,16 +151,28 @@ static double gpvo_faster(const double *features) {
     return isfinite(v2) ? gpvo_clip(ratio, 0.0, log(20.0)) : 0.0;
 }
 
-/* Standard deviations of jitter, white and bias on axis j: what adds up gains on the jitter as the speed grows, the bias
+/* Deviation on axis j, with its sign, of what a wrong calibration makes; takes it off the variance. */
+static double gpvo_of_calibration(const double *features, int j, double *variance) {
+    double ratio = 0.0;
+    int i;
+    for (i = 0; i < 6; ++i) {
+        double v = features[gpvo_base_column[i]];
+        if (isfinite(v)) ratio += gpvo_calibration_follows[j * 6 + i] * v;
+    }
+    *variance /= 1.0 + ratio * ratio;
+    return ratio * sqrt(*variance);
+}
+
+/* Standard deviations of jitter, white and bias on axis j, of what calibration leaves of the variance: what adds up gains on the jitter as the speed grows, the bias
  * on the noise as the variance grows. */
-static void gpvo_divide(int j, double variance, double faster, double part[3][6]) {
+static void gpvo_divide(int j, double variance, double rest, double faster, double part[3][6]) {
     double gain = gpvo_growth[j] * faster, above = gpvo_growth[6 + j] * (log(variance) - gpvo_level[j]);
     double white = gpvo_share[6 + j] * exp(gain);
     double bias = gpvo_share[12 + j] * exp(gain + gpvo_clip(above, -60.0, 60.0));
     double whole = gpvo_share[j] + white + bias;
-    part[0][j] = sqrt(variance * gpvo_share[j] / whole);
-    part[1][j] = sqrt(variance * white / whole);
-    part[2][j] = sqrt(variance * bias / whole);
+    part[0][j] = sqrt(rest * gpvo_share[j] / whole);
+    part[1][j] = sqrt(rest * white / whole);
+    part[2][j] = sqrt(rest * bias / whole);
 }
 
 /* Lower Cholesky factor of a symmetric positive definite 6x6 matrix, the turn before the translation: row and column i are
@@ -192,7 +205,7 @@ static double gpvo_residual_px(const double *inside) {
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], limit[2], distance, outside, growth, ln_det, noise;
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], wrong[6], limit[2], distance, outside, growth, ln_det, noise;
     double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     gpvo_base(features, duration, base, plain);
@@ -206,7 +219,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     outside = 1.0 - out->in_domain;
     growth = pow(1.0 + distance, GPVO_OUTSIDE_POWER);
     for (j = 0; j < 6; ++j) {
-        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance;
+        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance, rest;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
         double unit = GPVO_MEAN_IN_SIGMA ? sqrt(base[j]) : duration / GPVO_DT_S, usual = said[0][j] * unit;
         out->mean[j] = usual * out->in_domain;
@@ -215,7 +228,9 @@ static void gpvo_predict(const double *features, const double *geometry, double 
         total += (said[1][j] * unit * unit + lost * lost) * growth;
         variance = gpvo_within(total * gpvo_factor[j], limit[j / 3]);
         out->epistemic[j] = variance * (1.0 - known / total);
-        gpvo_divide(j, variance, faster, part);
+        rest = variance;
+        wrong[j] = gpvo_of_calibration(features, j, &rest);
+        gpvo_divide(j, variance, rest, faster, part);
     }
     for (i = 0; i < 6; ++i)
         for (j = 0; j < 6; ++j) {
@@ -223,6 +238,12 @@ static void gpvo_predict(const double *features, const double *geometry, double 
             out->jitter[at] = R[0][at] * part[0][i] * part[0][j];
             out->white[at] = R[1][at] * part[1][i] * part[1][j];
             out->bias[at] = R[2][at] * part[2][i] * part[2][j];
+            out->calibration_root[at] = wrong[i] * gpvo_calibration_root[at];
+        }
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j < 6; ++j) {
+            int at = i * 6 + j, k;
+            for (k = 0; k < 6; ++k) out->bias[at] += out->calibration_root[i * 6 + k] * out->calibration_root[j * 6 + k];
             out->covariance[i * 6 + j] = out->jitter[i * 6 + j] + out->white[i * 6 + j] + out->bias[i * 6 + j];
         }
     ln_det = gpvo_turn_first_root(out->covariance, L);
