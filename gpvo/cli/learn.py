@@ -100,6 +100,7 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
+    _refuse_twice(paths)
     if update is not None and config.target == "position":
         raise GpvoError("a model of positions cannot be updated", where=update, cure="train anew from all runs")
     if any(p.is_file() for p in paths):
@@ -118,6 +119,15 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     from gpvo.learning.train import train as train_model
 
     return train_model(runs, config)
+
+
+def _refuse_twice(paths: list[Path]) -> None:
+    """A run that is left out must not be among those that are learnt from."""
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise GpvoError("is given twice, and would be judged by itself", where=path, cure="give each run once")
+        seen.add(path.resolve())
 
 
 def _train_file(paths: list[Path], config: TrainConfig, update: Path | None) -> TrainedModel:

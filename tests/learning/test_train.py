@@ -471,3 +471,10 @@ def test_a_wrong_scale_is_a_part_of_its_own_where_asked_for(tmp_path):
     assert np.linalg.eigvalsh(rest).min() > 0.0
     plain = train_sets(sets, replace(config, calibration_part=False), judge=False)
     assert not any(name.startswith("calibration") for name in plain.arrays)
+
+
+def test_a_run_given_twice_is_refused(tmp_path):
+    """Left out in turn, its copy would still be learnt from."""
+    run = tmp_path / "run"
+    with pytest.raises(GpvoError, match="run.* is given twice"):
+        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], asdict(QUICK), None)
