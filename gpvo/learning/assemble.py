@@ -153,9 +153,9 @@ def _added_factor(
     model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, X: Array, geometry: Array | None
 ) -> float:
     """What the poses show of white and bias, ``variance`` (n, 6) being right up to a common factor."""
-    whole, root = model.split(variance, X, geometry)
-    factor = fit_joint_factor(error, whole.sum(axis=1), rows.group)
-    parts, root = model.divided(variance, X, geometry)[0] * factor, root * np.sqrt(factor)
+    parts, root = model.divided(variance, X, geometry)
+    factor = fit_joint_factor(error, parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2), rows.group)
+    parts, root = parts * factor, root * np.sqrt(factor)
     T_prev_cur = rows.motions()
     chosen = at_most(rows.chains(np.arange(len(error))), MOST_ROWS)
     chains = [Motions(i, T_prev_cur[c], error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]

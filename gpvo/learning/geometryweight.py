@@ -10,7 +10,7 @@ import numpy as np
 from gpvo.geometry.covariance import correlation as correlation_of
 from gpvo.geometry.covariance import scaled_root
 from gpvo.learning.calibrate import robust_mean
-from gpvo.learning.spans import Chains, carried, cut
+from gpvo.learning.spans import Chains, cut, lagged
 from gpvo.stats.consistency import nees, nll_per_dim
 from gpvo.types import Array
 
@@ -102,8 +102,7 @@ def _persistent(sigma: Array, correlation: Array, phi: Array) -> Array:
     if not sigma.any():
         return np.zeros((len(sigma), 6, 6))
     root = sigma[..., None] * scaled_root(correlation)
-    lagged = np.einsum("wkij,wknj->win", root, carried(root, phi))
-    return _outer(sigma).sum(axis=1) * correlation + lagged + np.swapaxes(lagged, 1, 2)
+    return _outer(sigma).sum(axis=1) * correlation + lagged(root, phi)
 
 
 def _outer(sigma: Array) -> Array:

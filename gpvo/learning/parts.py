@@ -177,6 +177,8 @@ def _choose(windows: Sequence[Sequence[_Windows]]) -> list[_Shape]:
 def _with_calibration(windows: Sequence[_Windows], shape: _Shape, velocities: Sequence[int]) -> list[_Shape]:
     """The shape of each axis of a block: with an error of calibration where that is worth it, going with that of the
     velocities by which it is likeliest. What seemed to grow with the speed may be that, too."""
+    if not velocities:
+        return [shape] * windows[0].square.shape[1]
     plain = _Shape(0.0, 0.0, shape.tau)
     shapes = [
         replace(own, follows=velocity, lasts=lasts)

@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
-from gpvo.learning.spans import SPANS, carried, cut
+from gpvo.learning.spans import SPANS, cut, lagged
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
@@ -110,11 +110,11 @@ def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array
     T, error, parts, calibration = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts, c.calibration))
     to_end = _adjoints_to_end(T)
     jitter, white, bias = np.moveaxis(to_end[:, :, None] @ parts @ np.swapaxes(to_end, -1, -2)[:, :, None], 2, 0)
-    added = (white + bias).sum(axis=1) + _lagged(to_end @ _roots(parts[:, :, 2]), phi[0])
+    added = (white + bias).sum(axis=1) + lagged(to_end @ _roots(parts[:, :, 2]), phi[0])
     lasting = np.zeros_like(added)
     if calibration.any():
         root = to_end @ calibration
-        lasting = (root @ np.swapaxes(root, -1, -2)).sum(axis=1) + _lagged(root, phi[1])
+        lasting = (root @ np.swapaxes(root, -1, -2)).sum(axis=1) + lagged(root, phi[1])
     ends = [0, -1]
     return (
         np.einsum("wkij,wkj->wi", to_end, error),
@@ -137,9 +137,3 @@ def _roots(C: Array) -> Array:
     """Roots of covariances (w, m, 6, 6) that have one correlation."""
     sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
     return sigma[..., None] * scaled_root(C[0, 0]) / sigma[0, 0][:, None]
-
-
-def _lagged(root: Array, phi: Array) -> Array:
-    """(w, 6, 6) what the motions of each window have in common with those before, and those with them."""
-    lagged = np.einsum("wkij,wknj->win", root, carried(root, phi))
-    return np.asarray(lagged + np.swapaxes(lagged, -1, -2))

@@ -309,8 +309,7 @@ class ErrorModelArrays:
 
         Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own pattern.
         """
-        each, sigma = self.divided(variance, X, geometry)
-        root = sigma[:, :, None] * self._calibration_root
+        each, root = self.divided(variance, X, geometry)
         if self.calibration_follows.any():
             each[:, 2] += root @ np.swapaxes(root, -1, -2)
         return each, root
@@ -320,7 +319,7 @@ class ErrorModelArrays:
         return scaled_root(self.calibration_correlation)
 
     def divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
-        """As :meth:`split`, but the bias without that of calibration, whose deviations (n, 6) have their sign."""
+        """As :meth:`split`, but the bias without that of calibration."""
         out = np.repeat(self.correlation[None], len(variance), axis=0)
         w = float(self.geometry_weight[0])
         if geometry is not None and w > 0:
@@ -330,8 +329,8 @@ class ErrorModelArrays:
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
         share = divide(self.share, self.growth, np.log(variance) - self.level, self.faster(X))
         calibration, rest = of_calibration(variance, self.calibration_follows, X[:, self._base_place[0][:6]])
-        sigma = np.sqrt(share * rest[:, None, :])
-        return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :], calibration
+        sigma, root = np.sqrt(share * rest[:, None, :]), calibration[:, :, None] * self._calibration_root
+        return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :], root
 
 
 def _block_sums(values: Array) -> Array:

@@ -275,6 +275,8 @@ class Predictor:
         white = np.eye(6) * _NO_MOTION_VAR
         parts = {name: white if name == "white" else np.zeros((6, 6)) for name in PARTS}
         zero = np.zeros(6)
-        tau_s, lasts_s = self.model.bias_tau_s, self.model.calibration_tau_s
-        sure = (1.0, 1.0, record.status)
-        return Prediction(record.t_ns, 0.0, zero, white, parts, tau_s, zero, *sure, calibration_tau_s=lasts_s)
+        m, no_root = self.model, np.zeros((6, 6))
+        return Prediction(
+            record.t_ns, 0.0, zero, white, parts, m.bias_tau_s, zero, 1.0, 1.0, record.status, no_root,
+            m.calibration_tau_s,
+        )  # fmt: skip

@@ -163,8 +163,8 @@ static double gpvo_of_calibration(const double *features, int j, double *varianc
     return ratio * sqrt(*variance);
 }
 
-/* Standard deviations of jitter, white and bias on axis j, of what calibration leaves of the variance: what adds up gains on the jitter as the speed grows, the bias
- * on the noise as the variance grows. */
+/* Standard deviations of jitter, white and bias on axis j, of what calibration leaves of the variance: what adds up gains
+ * on the jitter as the speed grows, the bias on the noise as the variance grows. */
 static void gpvo_divide(int j, double variance, double rest, double faster, double part[3][6]) {
     double gain = gpvo_growth[j] * faster, above = gpvo_growth[6 + j] * (log(variance) - gpvo_level[j]);
     double white = gpvo_share[6 + j] * exp(gain);
