@@ -275,9 +275,9 @@ class Prediction:
     each variance that comes from being away from the training data, already inside ``covariance``.
     ``confidence`` and ``in_domain`` are in [0, 1].
 
-    Of the bias, ``calibration_root`` L (6, 6) has L L^T, zero unless the model knows errors of calibration: L's rows
-    turn their sign around with a velocity, while the vector of unit variance that L acts on is Gauss-Markov with time
-    constants ``calibration_tau_s`` (6,). What is left of the bias has ``bias_tau_s``
+    Of the bias, ``calibration_root`` L (6, 6) has L L^T, zero unless the model knows errors of calibration: L turns its
+    sign around with the motion, while the vector of unit variance that L acts on is Gauss-Markov with time constants
+    ``calibration_tau_s`` (6,). What is left of the bias has ``bias_tau_s``
     (see :func:`gpvo.geometry.covariance.persistent_root`).
     """
 

@@ -32,9 +32,6 @@ def train(
     waits: Annotated[
         str, typer.Option(help="drop: leave out where the vehicle stands while its truth moves; keep.")
     ] = "drop",
-    calibration_part: Annotated[
-        bool, typer.Option("--calibration-part", help="Learn apart what a wrong calibration of the camera makes.")
-    ] = False,
     update: Annotated[
         Path | None, typer.Option(help="Add the runs to this model's own; its settings hold unless given.")
     ] = None,
@@ -60,7 +57,6 @@ def train(
         "regressor": regressor,
         "align": align,
         "waits": waits,
-        "calibration_part": calibration_part,
         "seed": seed,
         "max_rows": max_rows,
     }

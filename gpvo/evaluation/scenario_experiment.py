@@ -107,9 +107,9 @@ def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRS
     return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
 
 
-def judge(flown: ScenarioFlights, config: TrainConfig) -> dict[str, MethodScores]:
+def judge(flown: ScenarioFlights) -> dict[str, MethodScores]:
     """Train on the scenario's training flights and score the unseen ones."""
-    model = train_sets(flown.training, config, judge=False)
+    model = train_sets(flown.training, TrainConfig(), judge=False)
     return score_flights(flown.test, model.predictor())
 
 
@@ -155,7 +155,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="seed of the first test flight")
     parser.add_argument("--duration", type=float, help="of a flight [s]; default: far enough for 100 m")
     parser.add_argument("--together", action="store_true", help="also one model of all scenarios of equal rate")
-    parser.add_argument("--calibration-part", action="store_true", help="as of gpvo train")
     parser.add_argument("--jobs", type=int, default=1, help="processes that fly")
     parser.add_argument("-o", "--out", type=Path, default=Path("scenarios"), help="folder for runs and results")
     given = parser.parse_args(arguments)
@@ -164,25 +163,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise GpvoError(f"cannot judge {unknown or 'so few flights'}", cure="names of --help; two flights at least")
     refuse_training_seeds(given.train, given.test, given.test_seed)
     results: dict[str, Mapping[str, MethodScores]] = {}
-    flown, config = [], TrainConfig(calibration_part=given.calibration_part)
+    flown = []
     for name in given.scenarios:
         flown.append(
             fly(name, given.out, given.train, given.test, test_seed=given.test_seed, jobs=given.jobs,
                 duration_s=given.duration)
         )  # fmt: skip
-        results[name] = judge(flown[-1], config)
+        results[name] = judge(flown[-1])
         print(markdown({name: results[name]}), flush=True)
     if given.together:
-        results |= _together(flown, config)
+        results |= _together(flown)
     write_json(given.out / "scenarios.json", document(results))
     print(markdown(results))
 
 
-def _together(flown: Sequence[ScenarioFlights], config: TrainConfig) -> dict[str, Mapping[str, MethodScores]]:
+def _together(flown: Sequence[ScenarioFlights]) -> dict[str, Mapping[str, MethodScores]]:
     """One model of all scenarios that share the first one's rate, judged on each."""
     step = float(np.median(flown[0].training[0].dt_s))
     alike = [f for f in flown if abs(float(np.median(f.training[0].dt_s)) / step - 1) < 0.01]
-    model = train_sets([s for f in alike for s in f.training], config, judge=False)
+    model = train_sets([s for f in alike for s in f.training], TrainConfig(), judge=False)
     predictor = model.predictor()
     return {f"{f.name}, model of all": score_flights(f.test, predictor) for f in alike}
 

@@ -22,14 +22,16 @@ from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
-from gpvo.learning.poses import Motions, added_factor, with_added
+from gpvo.learning.patterns import LASTING_FRAMES, Patterns, learn_patterns
+from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
 from gpvo.learning.rows import Rows
+from gpvo.learning.scores import beyond_chance
 from gpvo.learning.spans import at_most
 from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import SharedBasis
 from gpvo.online.division import divide, ln_faster, of_calibration
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import NO_CALIBRATION, ErrorModelArrays
 from gpvo.online.guard import Domain
 from gpvo.types import Array
 
@@ -44,18 +46,14 @@ def assemble(
     variance: Array,
     *,
     mean_in_sigma: bool = True,
-    calibration: bool = False,
 ) -> tuple[ErrorModelArrays, dict[str, Any]]:
     """Parts, correlation and calibration from the out-of-fold residuals; then everything in one place.
 
-    ``calibration``: whether errors of the camera's calibration are to have a part of their own.
+    Errors of the camera's calibration have a part of their own where the poses of flights ask for it.
     """
     scale = fit_scale(error / np.sqrt(variance), rows.group)
-    sigma = np.sqrt(variance * scale.factor)
-    z = error / sigma
-    geometry = rows.geometry(base.method)
-    sums = _sums_of(rows, error, sigma, geometry, calibration)
-    X = rows.select(columns)
+    of = _Residuals(rows, error, variance * scale.factor, rows.select(columns), rows.geometry(base.method))
+    z = error / np.sqrt(of.variance)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     # Out of the domain no mean is taken off, so what is left of one says nothing of how wrong VO is there.
     plain = np.ones(6, dtype=bool)
@@ -65,79 +63,175 @@ def assemble(
     else:
         basis, plain = fitted.basis, ~fitted.use_mean if not fitted.use_mean.all() else plain
         high = np.quantile(fitted.oof_log_noise_var, 0.95, axis=0)
-    outside_power = fit_outside_power(_distance(X, noise, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)
+    outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)
+    sums = _sums_of(of)
     model = ErrorModelArrays(
         columns=columns,
         inputs=np.array([columns.index(n) for n in inputs], dtype=np.int64),
         basis=basis,
-        domain=Domain.learn(X),
+        domain=Domain.learn(of.X),
         base=base,
         factor=scale.factor,
         outside_power=np.array([outside_power]),
         high=high,
-        correlation=sums.correlation[:3],
-        geometry_weight=np.array([sums.geometry_weight]),
-        share=sums.parts.share,
-        growth=sums.parts.growth,
-        level=sums.parts.level,
-        ln_speed=sums.ln_speed,
-        bias_tau_s=sums.parts.tau_s,
         typical_ln_det=np.zeros(1),
         usual_rate_var=usual_rate_var(rows),
         rate_change_var=rate_changes(rows),
         mean_in_sigma=np.array([mean_in_sigma]),
         steady_mean=np.zeros(6),
-        calibration_follows=sums.parts.calibration.follows,
-        calibration_tau_s=sums.parts.calibration.tau_s,
-        calibration_correlation=sums.correlation[3],
         dt_s=rows.step_s,
+        **sums.arrays(rows.step_s),
     )
-    model, added, joint = _consistent(model, rows, error, sigma**2, X, geometry)
-    return model, _calibration(rows, scale, joint, added, sums, np.abs(z) / np.sqrt(joint))
+    sums, found = _with_calibration(model, of, (sums, _consistent(model, of)))
+    return found.model, _calibration(rows, scale, found, sums, np.abs(z) / np.sqrt(found.joint))
 
 
-def _consistent(
-    model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, X: Array, geometry: Array | None
-) -> tuple[ErrorModelArrays, float, float]:
-    """The model made right of poses and of all six axes together, and the factors of both."""
-    added = _added_factor(model, rows, error, variance, X, geometry)
-    model = replace(model, share=with_added(model.share, added))
-    whole = model.split(variance, X, geometry)[0].sum(axis=1)
-    joint = fit_joint_factor(error, whole, rows.group)
-    typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
-    level = model.level + np.log(joint)
-    model = replace(model, factor=model.factor * joint, level=level, typical_ln_det=np.array([typical]))
-    return model, added, joint
+@dataclass(frozen=True)
+class _Residuals:
+    """Out of fold, of all rows: ``error`` (n, 6), its ``variance`` (n, 6) right by the axis, features ``X`` (n, d), the
+    geometric covariance (n, 6, 6), and ``patterns`` where calibration has a part of its own."""
+
+    rows: Rows
+    error: Array
+    variance: Array
+    X: Array
+    geometry: Array | None
+    patterns: Patterns | None = None
+
+    def of_calibration(self) -> tuple[Array, Array, Array]:
+        """The root (n, 6, 6) of what a wrong calibration has of the variance, by the patterns of other flights; what is
+        left of the variance, and of the errors."""
+        if self.patterns is None:
+            return np.zeros((len(self.error), 6, 6)), self.variance, self.error
+        twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.error), 6, 6)), self.variance.copy()
+        for k, patterns in enumerate(self.patterns.without):
+            fold = self.patterns.fold == k
+            root[fold], rest[fold] = of_calibration(self.variance[fold], patterns, twist[fold])
+        return root, rest, self.error - self.patterns.error
+
+    def divided(self, model: ErrorModelArrays) -> tuple[Array, Array]:
+        """Covariances of the parts and root of the calibration, as :meth:`ErrorModelArrays.divided`; the latter by the
+        patterns of the other flights."""
+        if self.patterns is None:
+            return model.divided(self.variance, self.X, self.geometry)
+        parts, root = np.empty((len(self.error), 3, 6, 6)), np.empty((len(self.error), 6, 6))
+        for k, patterns in enumerate(self.patterns.without):
+            fold = self.patterns.fold == k
+            geometry = None if self.geometry is None else self.geometry[fold]
+            of_fold = replace(model, calibration_patterns=patterns)
+            parts[fold], root[fold] = of_fold.divided(self.variance[fold], self.X[fold], geometry)
+        return parts, root
 
 
 @dataclass(frozen=True)
 class _Sums:
-    """How errors add up: their parts, the correlation (4, 6, 6) of each, how much of the geometry's to believe, and the
-    log of the typical speed (1,)."""
+    """How errors add up: their parts, the correlation (3, 6, 6) of each, how much of the geometry's to believe, the log
+    of the typical speed (1,), and the patterns of wrong calibration."""
 
     parts: Parts
     correlation: Array
     geometry_weight: float
     ln_speed: Array
+    patterns: Patterns | None
+
+    def arrays(self, step_s: float) -> dict[str, Any]:
+        """The model's arrays that say so."""
+        of_calibration = NO_CALIBRATION
+        if self.patterns is not None:
+            tau_s = np.full(6, LASTING_FRAMES * step_s)
+            of_calibration = {"calibration_patterns": self.patterns.usual, "calibration_tau_s": tau_s}
+        return {
+            "correlation": self.correlation,
+            "geometry_weight": np.array([self.geometry_weight]),
+            "share": self.parts.share,
+            "growth": self.parts.growth,
+            "level": self.parts.level,
+            "ln_speed": self.ln_speed,
+            "bias_tau_s": self.parts.tau_s,
+            **of_calibration,
+        }
 
 
-def _sums_of(rows: Rows, error: Array, sigma: Array, geometry: Array | None, calibration: bool) -> _Sums:
-    twist = rows.select(TWIST_COLUMNS)
-    v_mps = twist[:, :3]
+@dataclass(frozen=True)
+class _Consistent:
+    """A model that is right of poses and of all six axes together, the factors of both, and how likely the poses of
+    each sequence are by it (S,)."""
+
+    model: ErrorModelArrays
+    added: float
+    joint: float
+    losses: Array
+
+
+def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
+    """The model made right of poses and of all six axes together."""
+    factor = fit_joint_factor(of.error, _whole(model, of), of.rows.group)
+    added = added_factor(*_motions(model, of, factor), model.share)
+    model = replace(model, share=with_added(model.share, added))
+    whole = _whole(model, of)
+    joint = fit_joint_factor(of.error, whole, of.rows.group)
+    losses = pose_losses(*_motions(model, of, joint))
+    typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
+    model = replace(
+        model,
+        factor=model.factor * joint,
+        level=model.level + np.log(joint),
+        typical_ln_det=np.array([typical]),
+        calibration_patterns=model.calibration_patterns * np.sqrt(joint),
+    )
+    return _Consistent(model, added, joint, losses)
+
+
+def _whole(model: ErrorModelArrays, of: _Residuals) -> Array:
+    """(n, 6, 6) covariances of all motions."""
+    parts, root = of.divided(model)
+    return np.asarray(parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2))
+
+
+def _motions(model: ErrorModelArrays, of: _Residuals, factor: float) -> tuple[list[Motions], Array]:
+    """All chains with what the model states of them, times a common factor; and the correlations (2, 6) of bias and
+    calibration from one motion to the next."""
+    parts, root = of.divided(model)
+    parts, root = parts * factor, root * np.sqrt(factor)
+    T_prev_cur = of.rows.motions()
+    chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
+    chains = [Motions(i, T_prev_cur[c], of.error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
+    return chains, np.exp(-of.rows.step_s / np.array([model.bias_tau_s, model.calibration_tau_s]))
+
+
+_Found = tuple[_Sums, _Consistent]
+
+
+def _with_calibration(bare: ErrorModelArrays, of: _Residuals, plain: _Found) -> _Found:
+    """The same with a part of wrong calibration, where by the patterns of other flights the poses are likelier, beyond
+    chance."""
+    patterns = learn_patterns(of.rows, of.error, of.variance)
+    if patterns is None:
+        return plain
+    of = replace(of, patterns=patterns)
+    sums = _sums_of(of)
+    found = _consistent(replace(bare, **sums.arrays(of.rows.step_s)), of)
+    return (sums, found) if beyond_chance(plain[1].losses - found.losses) else plain
+
+
+def _sums_of(of: _Residuals) -> _Sums:
+    rows = of.rows
+    v_mps = rows.select(TWIST_COLUMNS[:3])
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
     faster = ln_faster(v_mps, ln_speed)
-    errors, sigmas = rows.chains(error), rows.chains(sigma)
-    parts = fit_parts(errors, sigmas, rows.chains(faster), rows.step_s, rows.chains(twist) if calibration else None)
+    root, rest, left = of.of_calibration()
+    sigma = np.sqrt(rest)
+    errors, sigmas = rows.chains(left), rows.chains(sigma)
+    lasting = None if of.patterns is None else rows.chains(root)
+    parts = fit_parts(rows.chains(of.error), sigmas, rows.chains(faster), rows.step_s, lasting)
     correlation = part_correlations(errors, sigmas, parts, rows.step_s)
     share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)
-    wrong, rest = of_calibration(sigma**2, parts.calibration.follows, twist)
-    deviation = np.concatenate([np.sqrt(share * rest[:, None]), wrong[:, None]], axis=1)
     weight = 0.0
-    if geometry is not None:
-        each = divided(errors, rows.chains(deviation), rows.chains(geometry))
-        phi = np.exp(-rows.step_s / np.array([parts.tau_s, parts.calibration.tau_s]))
+    if of.geometry is not None:
+        each = divided(errors, rows.chains(rest), rows.chains(share), rows.chains(of.geometry))
+        phi = float(np.exp(-rows.step_s / parts.tau_s[0]))
         weight = choose_geometry_weight(each, correlation, phi)
-    return _Sums(parts, correlation, weight, ln_speed)
+    return _Sums(parts, correlation, weight, ln_speed, of.patterns)
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
@@ -149,29 +243,16 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     return out
 
 
-def _added_factor(
-    model: ErrorModelArrays, rows: Rows, error: Array, variance: Array, X: Array, geometry: Array | None
-) -> float:
-    """What the poses show of white and bias, ``variance`` (n, 6) being right up to a common factor."""
-    parts, root = model.divided(variance, X, geometry)
-    factor = fit_joint_factor(error, parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2), rows.group)
-    parts, root = parts * factor, root * np.sqrt(factor)
-    T_prev_cur = rows.motions()
-    chosen = at_most(rows.chains(np.arange(len(error))), MOST_ROWS)
-    chains = [Motions(i, T_prev_cur[c], error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
-    phi = np.exp(-rows.step_s / np.array([model.bias_tau_s, model.calibration_tau_s]))
-    return added_factor(chains, model.share, phi)
-
-
-def _calibration(rows: Rows, scale: Scale, joint: float, added: float, sums: _Sums, score: Array) -> dict[str, Any]:
+def _calibration(rows: Rows, scale: Scale, found: _Consistent, sums: _Sums, score: Array) -> dict[str, Any]:
     axes = [conformal_quantiles(score[:, j], rows.group) for j in range(6)]
     return {
         "by": rows.grouped_by,
         "groups": len(np.unique(rows.group)),
         "scale_of_groups": scale.by_group,
         "log_scale_spread": scale.spread,
-        "joint_factor": joint,
-        "added_factor": added,
+        "joint_factor": found.joint,
+        "added_factor": found.added,
+        "calibration_part": sums.patterns is not None,
         "geometry_correlation_weight": sums.geometry_weight,
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],

@@ -39,9 +39,8 @@ class TrainConfig:
 
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``:
     ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
-    which the truth moves. ``calibration_part``: errors that a wrong calibration makes, which go with a velocity, may
-    have a part of their own. ``inducing``, ``noise_inducing``: points of the GPs. ``max_rows``: held in memory, of
-    larger files the rest streams. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
+    which the truth moves. ``inducing``, ``noise_inducing``: points of the GPs. ``max_rows``: held in memory, of larger
+    files the rest streams. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
     """
 
     features: str = "auto"
@@ -50,7 +49,6 @@ class TrainConfig:
     seed: int = 0
     align: str = "none"
     waits: str = "drop"
-    calibration_part: bool = False
     inducing: int = 256
     noise_inducing: int = 64
     max_rows: int = 100_000

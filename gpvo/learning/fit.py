@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from gpvo.learning.config import TrainConfig, base_candidates, candidates, guard
 from gpvo.learning.meantest import helps_over_distance, pose_gain
 from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic
 from gpvo.learning.rows import Rows
+from gpvo.learning.scores import beyond_chance
 from gpvo.learning.steadymean import steady_mean
 from gpvo.online.base import OWN_MOTION, BaseVariance, base_columns
 from gpvo.online.basis import SharedBasis
@@ -65,12 +65,11 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     use_mean = [False] * 6 if fitted is None else fitted.use_mean.tolist()
     error, variance = _out_of_fold(rows, base_oof, fitted)
     in_sigma = mean.name != ALL
-    assembled = partial(assemble, calibration=config.calibration_part)
-    model, calibration = assembled(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
+    model, calibration = assemble(rows, base, columns, inputs, fitted, error, variance, mean_in_sigma=in_sigma)
     arrays, for_filter = model.to_arrays(), model
     if any(use_mean):
         error, variance = _out_of_fold(rows, base_oof, plain)
-        for_filter, _ = assembled(rows, base, columns, inputs, plain, error, variance)
+        for_filter, _ = assemble(rows, base, columns, inputs, plain, error, variance)
         arrays |= {f"{FOR_FILTER}{name}": array for name, array in for_filter.to_arrays().items()}
     arrays[f"{FOR_FILTER}steady_mean"] = steady = steady_mean(rows, for_filter, error, variance)
     choices = {
@@ -91,8 +90,7 @@ def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
     """The base variance, with geometry or without, that predicts left-out groups best; and the same out of fold.
 
     One that trusts the residuals must beat the best that does not by more than the standard error of its gain over the
-    groups (L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3): where a moving object is
-    all there is to see, residuals are small and the motion wrong.
+    groups: where a moving object is all there is to see, residuals are small and the motion wrong.
     """
     tried = {choice: _base_out_of_fold(rows, *choice) for choice in base_candidates(rows.sets)}
     losses = {choice: _losses(rows, rows.error**2, oof) for choice, oof in tried.items()}
@@ -100,8 +98,7 @@ def choose_base(rows: Rows) -> tuple[BaseVariance, Array]:
     best = min(simple, key=lambda c: losses[c].mean())
     if trusting:
         rival = min(trusting, key=lambda c: losses[c].mean())
-        gain = losses[best] - losses[rival]
-        if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
+        if beyond_chance(losses[best] - losses[rival]):
             best = rival
     method, residual = best
     C = _base_inputs(rows, base_columns(method, residual))

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.geometry.covariance import correlation as correlation_of
-from gpvo.geometry.covariance import scaled_root
 from gpvo.learning.calibrate import robust_mean
-from gpvo.learning.spans import Chains, cut, lagged
+from gpvo.learning.spans import Chains, carried, cut
 from gpvo.stats.consistency import nees, nll_per_dim
 from gpvo.types import Array
 
@@ -22,32 +21,31 @@ _EYE = np.eye(6)
 
 @dataclass(frozen=True)
 class Divided:
-    """One chain of n motions: ``error`` (n, 6), deviations ``jitter``, ``white``, ``bias`` (n, 6) of its parts, that of
-    ``calibration`` with its sign, and the geometry's correlation (n, 6, 6), NaN where unknown."""
+    """One chain of n motions: ``error`` (n, 6), deviations ``jitter``, ``white``, ``bias`` (n, 6) of its parts, and the
+    geometry's correlation (n, 6, 6), NaN where unknown."""
 
     error: Array
     jitter: Array
     white: Array
     bias: Array
-    calibration: Array
     geometry: Array
 
 
-def divided(error: Chains, deviation: Chains, geometry: Chains) -> list[Divided]:
-    """The chains of all sequences, from deviations (n_i, 4, 6) of the parts, and covariances (n_i, 6, 6)."""
+def divided(error: Chains, variance: Chains, share: Chains, geometry: Chains) -> list[Divided]:
+    """The chains of all sequences, from variances (n_i, 6), shares (n_i, 3, 6) and covariances (n_i, 6, 6)."""
     out = []
-    for of_sequence in zip(error, deviation, geometry):
-        for e, parts, C in zip(*of_sequence):
-            jitter, white, bias, calibration = np.moveaxis(parts, 1, 0)
-            out.append(Divided(e, jitter, white, bias, calibration, correlation_of(C)))
+    for of_sequence in zip(error, variance, share, geometry):
+        for e, v, s, C in zip(*of_sequence):
+            jitter, white, bias = np.moveaxis(np.sqrt(s * v[:, None, :]), 1, 0)
+            out.append(Divided(e, jitter, white, bias, correlation_of(C)))
     return out
 
 
-def choose_geometry_weight(chains: Sequence[Divided], correlation: Array, phi: Array) -> float:
+def choose_geometry_weight(chains: Sequence[Divided], correlation: Array, phi: float) -> float:
     """How much of the geometry's correlation to believe of jitter and white: the weight by which single motions and
     sums over ten and a hundred are likeliest, all alike. 0 where the geometry is mostly unknown.
 
-    ``correlation`` (4, 6, 6) of the parts; ``phi`` (2, 6): that of bias and calibration from one motion to the next.
+    ``correlation`` (3, 6, 6) of the parts; ``phi``: that of the bias from one motion to the next.
     """
     known = np.concatenate([np.isfinite(c.geometry).all(axis=(1, 2)) for c in chains])
     if known.mean() < _LEAST_KNOWN:
@@ -68,7 +66,7 @@ class _Sums:
     bias: Array
 
     @classmethod
-    def over(cls, chains: Sequence[Divided], correlation: Array, phi: Array, m: int) -> _Sums:
+    def over(cls, chains: Sequence[Divided], correlation: Array, phi: float, m: int) -> _Sums:
         """Of the separate windows of all chains."""
         parts = [_windows(c, correlation, phi, m) for c in chains if len(c.error) >= m]
         return cls(*(np.concatenate(values) for values in zip(*parts)))
@@ -81,28 +79,20 @@ class _Sums:
         return float(np.mean(nll_per_dim(self.error, C * scale)))
 
 
-def _windows(c: Divided, correlation: Array, phi: Array, m: int) -> tuple[Array, ...]:
+def _windows(c: Divided, correlation: Array, phi: float, m: int) -> tuple[Array, ...]:
     """What :class:`_Sums` holds, of each separate window of a chain."""
-    error, geometry, jitter, white = (cut(v, m) for v in (c.error, c.geometry, c.jitter, c.white))
-    bias = [_persistent(cut(v, m), R, p) for v, R, p in zip((c.bias, c.calibration), correlation[2:], phi)]
+    error, geometry, jitter, white, bias = (cut(v, m) for v in (c.error, c.geometry, c.jitter, c.white, c.bias))
     known = np.isfinite(geometry).all(axis=(2, 3), keepdims=True)
     of_jitter, of_white = (np.where(known, geometry, R) for R in correlation[:2])
     ends = 0.5 * _outer(jitter[:, [0, -1]])
     white = _outer(white)
+    lagged = np.einsum("wmi,wmj->wij", bias, carried(bias, np.full(6, phi)))
     return (
         error.sum(axis=1),
         (ends * of_jitter[:, [0, -1]]).sum(axis=1) + (white * of_white).sum(axis=1),
         ends.sum(axis=1) * correlation[0] + white.sum(axis=1) * correlation[1],
-        bias[0] + bias[1],
+        (_outer(bias).sum(axis=1) + lagged + np.swapaxes(lagged, 1, 2)) * correlation[2],
     )
-
-
-def _persistent(sigma: Array, correlation: Array, phi: Array) -> Array:
-    """(w, 6, 6) covariance of the sums of what persists with deviations (w, m, 6)."""
-    if not sigma.any():
-        return np.zeros((len(sigma), 6, 6))
-    root = sigma[..., None] * scaled_root(correlation)
-    return _outer(sigma).sum(axis=1) * correlation + lagged(root, phi)
 
 
 def _outer(sigma: Array) -> Array:

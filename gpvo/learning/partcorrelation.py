@@ -24,28 +24,24 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
 
 
 def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
-    """(4, 6, 6) correlations of jitter, white, bias and calibration, from those of the errors summed over each span.
+    """(3, 6, 6) correlations of jitter, white and bias, from those of the errors summed over each span.
 
     Each sum is over its own stated deviation: among the motions that it sums the worst decide, as they do of the pose,
     and their axes may go together more closely than those of the others.
-    Of each pair of axes four numbers are sought whose mixture, by what each part contributes to the sum, is the
-    correlation seen over every span; all are drawn towards that of single motions, as few windows show little. Errors
-    of calibration that go with different velocities have nothing to do with each other.
+    Of each pair of axes three numbers are sought whose mixture, by what each part contributes to the sum, is the
+    correlation seen over every span; all are drawn towards that of single motions, as few windows show little.
     """
     part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
-    wrong = split.calibration
-    part = np.concatenate([part * (1.0 - wrong.share)[:, None, None], wrong.sums.T[:, :, None]], axis=2)
     whole = part.sum(axis=2).T
     measured = np.array([residual_correlation(_scaled_sums(error, sigma, m)) for m in split.spans])
     windows = 2.0 / split.doubt
-    out = np.tile(np.eye(6), (4, 1, 1))
+    out = np.tile(np.eye(6), (3, 1, 1))
     for i, j in zip(*np.triu_indices(6, 1)):
         mixture = np.sqrt(part[i] * part[j] / (whole[:, i] * whole[:, j])[:, None])
         weight = np.sqrt(np.minimum(windows[:, i], windows[:, j]))
-        n = 4 if (wrong.follows[i] * wrong.follows[j]).any() else 3
-        A = np.vstack([mixture[:, :n] * weight[:, None], _PRIOR * np.eye(n)])
-        b = np.concatenate([measured[:, i, j] * weight, np.full(n, _PRIOR * measured[0, i, j])])
-        out[:n, i, j] = out[:n, j, i] = np.linalg.lstsq(A, b, rcond=None)[0]
+        A = np.vstack([mixture * weight[:, None], _PRIOR * np.eye(3)])
+        b = np.concatenate([measured[:, i, j] * weight, np.full(3, _PRIOR * measured[0, i, j])])
+        out[:, i, j] = out[:, j, i] = np.linalg.lstsq(A, b, rcond=None)[0]
     return np.array([_nearest_correlation(R) for R in out])
 
 

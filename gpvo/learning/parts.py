@@ -10,7 +10,7 @@ L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from gpvo.learning.spans import Chains, at_most, carried, cut, span_variances
 from gpvo.types import Array
 
 _TAU_FRAMES = (4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
-_LASTING_FRAMES = (1024.0, 16384.0)
 _NOISE_GROWTHS = (0.0, 0.5, 1.0)
 _SPEED_GROWTHS = (1.0, 2.0)
 _WORTH = 20.0
@@ -35,32 +34,18 @@ _MOST_RATIO = 16.0
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """What a wrong calibration adds: its ``share`` (D,) of the variance at the usual velocity, ``follows`` (D, 6) (see
-    :func:`gpvo.online.division.of_calibration`), how long it lasts ``tau_s`` (D,), and its mean part of the sums over
-    each span ``sums`` (S, D), in variances of a motion."""
-
-    share: Array
-    follows: Array
-    tau_s: Array
-    sums: Array
-
-
-@dataclass(frozen=True)
 class Parts:
     """``share`` (3, D): jitter, white, bias of each axis at the typical log variance ``level`` (D,), summing to one.
 
     ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.division.divide`).
-    ``tau_s`` (D,): of the bias. They divide what ``calibration`` leaves of the variance. ``spans`` (S,) frames;
-    ``ratio`` (S, D): mean square of sums over so many frames, over what is stated; ``doubt`` (S, D): see
-    :class:`SpanVariances`.
+    ``tau_s`` (D,): of the bias. ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over
+    what is stated; ``doubt`` (S, D): see :class:`gpvo.learning.spans.SpanVariances`.
     """
 
     share: Array
     growth: Array
     level: Array
     tau_s: Array
-    calibration: Calibration
     spans: NDArray[np.int64]
     ratio: Array
     doubt: Array
@@ -69,97 +54,65 @@ class Parts:
 @dataclass(frozen=True)
 class _Windows:
     """Of one span and block of axes: squared sums (w, d); stated variances (w, m, d), their logs above the typical
-    level and those of the speed (w, m, 1); velocities over the usual ones (w, m, 6); what a window counts."""
+    level and those of the speed (w, m, 1); what is known to add up besides (w, d); what a window counts."""
 
     square: Array
     variance: Array
     above: Array
     faster: Array
-    twist: Array
+    known: Array
     count: float
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """What is chosen for a block of axes, or for an axis: see :class:`Parts`. ``follows``: the velocity with which a
-    wrong calibration goes, ``lasts``: its time constant."""
+    """What is chosen for a block of axes: see :class:`Parts`."""
 
     by_speed: float
     by_noise: float
     tau: float
-    follows: int | None = None
-    lasts: float = 1.0
-
-    @property
-    def longest(self) -> float:
-        """The longer time constant [frames]."""
-        return self.tau if self.follows is None else self.lasts
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """``share`` (4, d) of a shape, mean ratio of squared sums to what is stated (S, d), and the loss (d,)."""
+    """``share`` (3, d) of a shape, mean ratio of squared sums to what is stated (S, d), and the loss."""
 
-    loss: Array
+    loss: float
     share: Array
     ratio: Array
 
 
-def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float, twist: Chains | None = None) -> Parts:
+def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float, lasting: Chains | None = None) -> Parts:
     """From errors, their stated standard deviations, and the logs (n_i, 1) of the speed over the typical one.
 
-    ``step_s``: usual duration of a motion. All axes have one time constant, translation and rotation (each three axes)
-    a growth each; the shares are the axis' own. Given velocities ``twist`` (n_i, 6), so is a part of wrong calibration.
+    ``step_s``: usual duration of a motion. ``lasting``: roots (n_i, D, P) of what else adds up, by constants of unit
+    variance; ``sigma`` is what is stated without it. All axes have one time constant, translation and rotation (each
+    three axes) a growth each; the shares are the axis' own.
     """
-    velocities = range(6 if twist else 0)
-    twist = twist or [[np.zeros((len(c), 6)) for c in chains] for chains in ln_speed]
-    error, sigma, ln_speed, twist = (at_most(values, MOST_ROWS) for values in (error, sigma, ln_speed, twist))
-    usual = _usual(twist)
+    lasting = lasting or [[np.zeros((*c.shape, 1)) for c in chains] for chains in error]
+    error, sigma, ln_speed, lasting = (at_most(x, MOST_ROWS) for x in (error, sigma, ln_speed, lasting))
     found = span_variances([[e / s for e, s in zip(*pair)] for pair in zip(error, sigma)])
     ln_var = [[2.0 * np.log(s) for s in chains] for chains in sigma]
     level = np.median(np.concatenate([c for chains in ln_var for c in chains]), axis=0)
     D = len(level)
-    share, growth, ratio = np.empty((4, D)), np.empty((2, D)), np.empty((len(found.spans), D))
-    tau, lasts, follows, carried_on = np.empty(D), np.ones(D), np.zeros((D, 6)), np.zeros((len(found.spans), D))
+    share, growth, ratio = np.empty((3, D)), np.empty((2, D)), np.empty((len(found.spans), D))
     blocks = [slice(start, min(start + 3, D)) for start in range(0, D, 3)]
-    given = (error, ln_var, ln_speed, [[_relative(c, usual) for c in chains] for chains in twist])
-    windows = [[_windows(*given, m, block, level) for m in found.spans] for block in blocks]
-    for block, seen, shape in zip(blocks, windows, _choose(windows)):
-        of_axes = _with_calibration(seen, shape, velocities)
-        fits = {s: _fit_shape(seen, s, found.widening(s.longest)[:, block]) for s in set(of_axes)}
-        for i, s in zip(range(block.start, block.stop), of_axes):
-            j = i - block.start
-            share[:, i], ratio[:, i] = fits[s].share[:, j], fits[s].ratio[:, j]
-            growth[:, i], tau[i], lasts[i] = (s.by_speed, s.by_noise), s.tau, s.lasts
-            if s.follows is not None:
-                follows[i, s.follows] = np.sqrt(share[3, i] / (1.0 - share[3, i])) / usual[s.follows]
-                carried_on[:, i] = [_of_calibration(w, s, fits[s].share)[j] for w in seen]
-    rest = share[:3] / (1.0 - share[3])
-    lasts = np.where(follows.any(axis=1), lasts * step_s, 1.0)
-    calibration = Calibration(share[3], follows, lasts, carried_on)
-    return Parts(rest, growth, level, tau * step_s, calibration, found.spans, ratio, found.doubt)
-
-
-def _usual(twist: Chains) -> Array:
-    """(6,) root mean squares of the velocities."""
-    squares = np.nan_to_num(np.concatenate([c for chains in twist for c in chains])) ** 2
-    return np.sqrt(np.maximum(squares.mean(axis=0), 1e-12))
-
-
-def _relative(twist: Array, usual: Array) -> Array:
-    return np.asarray(np.nan_to_num(twist) / usual)
-
-
-def _of_calibration(w: _Windows, shape: _Shape, share: Array) -> Array:
-    """(d,) mean of what is stated of sums for a wrong calibration, in variances of a motion."""
-    return np.asarray((_terms(w, shape, share)[:, 3] * share[3]).mean(axis=0) / w.variance.mean(axis=(0, 1)))
+    given = (error, ln_var, ln_speed, lasting)
+    windows = [[_windows(given, m, block, level) for m in found.spans] for block in blocks]
+    tau, shapes = _choose(windows)
+    widening = found.widening(tau)
+    for block, seen, shape in zip(blocks, windows, shapes):
+        fit = _fit_shape(seen, shape, widening[:, block])
+        share[:, block], ratio[:, block] = fit.share, fit.ratio
+        growth[:, block] = [[shape.by_speed], [shape.by_noise]]
+    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio, found.doubt)
 
 
 _Choice = tuple[_Shape, _Fit]
 
 
-def _choose(windows: Sequence[Sequence[_Windows]]) -> list[_Shape]:
-    """The shape of each block, with one time constant [frames].
+def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Shape]]:
+    """The time constant [frames] of all blocks, and the shape of each.
 
     Sideways errors go with the turns that undo them; with time constants of their own they would part on the way.
     """
@@ -171,22 +124,7 @@ def _choose(windows: Sequence[Sequence[_Windows]]) -> list[_Shape]:
 
     found = min(_TAU_FRAMES, key=loss)
     found = min((found, found / 2.0, found * 2.0), key=loss)
-    return [shape for shape, _ in tried[found]]
-
-
-def _with_calibration(windows: Sequence[_Windows], shape: _Shape, velocities: Sequence[int]) -> list[_Shape]:
-    """The shape of each axis of a block: with an error of calibration where that is worth it, going with that of the
-    velocities by which it is likeliest. What seemed to grow with the speed may be that, too."""
-    if not velocities:
-        return [shape] * windows[0].square.shape[1]
-    plain = _Shape(0.0, 0.0, shape.tau)
-    shapes = [
-        replace(own, follows=velocity, lasts=lasts)
-        for own in dict.fromkeys((shape, plain)) for lasts in _LASTING_FRAMES for velocity in velocities
-    ]  # fmt: skip
-    loss = np.array([_fit_shape(windows, s).loss for s in (shape, *shapes)])
-    loss[1:] += _WORTH
-    return [(shape, *shapes)[i] for i in loss.argmin(axis=0)]
+    return found, [shape for shape, _ in tried[found]]
 
 
 def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
@@ -199,17 +137,15 @@ def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
 
 def _loss(choice: _Choice) -> float:
     shape, fit = choice
-    return float(fit.loss.sum()) + _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
+    return fit.loss + _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
 
 
-def _windows(
-    error: Chains, ln_var: Chains, ln_speed: Chains, twist: Chains, m: int, block: slice, level: Array
-) -> _Windows:
-    given = (error, ln_var, ln_speed, twist)
-    e, v, u, t = (np.concatenate([cut(c, m) for chains in x for c in chains]) for x in given)
+def _windows(given: Sequence[Chains], m: int, block: slice, level: Array) -> _Windows:
+    e, v, u, root = (np.concatenate([cut(c, m) for chains in x for c in chains]) for x in given)
     some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
-    e, v, u, t = e[some, :, block], v[some, :, block], u[some], t[some]
-    return _Windows(e.sum(axis=1) ** 2, np.exp(v), v - level[block], u, t, min(len(e), _MOST_COUNT) / len(e))
+    e, v, u, root = e[some, :, block], v[some, :, block], u[some], root[some, :, block]
+    known = (root.sum(axis=1) ** 2).sum(axis=-1)
+    return _Windows(e.sum(axis=1) ** 2, np.exp(v), v - level[block], u, known, min(len(e), _MOST_COUNT) / len(e))
 
 
 def _fit_shape(windows: Sequence[_Windows], shape: _Shape, widen: Array | None = None) -> _Fit:
@@ -220,60 +156,46 @@ def _fit_shape(windows: Sequence[_Windows], shape: _Shape, widen: Array | None =
     """
     d = windows[0].square.shape[1]
     widen = np.ones((len(windows), d)) if widen is None else widen
-    begin = [0.5, 0.4, 0.1, 0.0] if shape.follows is None else [0.5, 0.3, 0.1, 0.1]
-    share = np.repeat(np.array(begin)[:, None], d, axis=1)
+    share = np.repeat([[0.5], [0.4], [0.1]], d, axis=1)
     count = np.concatenate([np.full(len(w.square), w.count) for w in windows])
     square = np.concatenate([w.square * more for w, more in zip(windows, widen)])
-    changes = shape.by_speed > 0 or shape.by_noise > 0 or shape.follows is not None
+    known = np.concatenate([w.known for w in windows])
+    changes = shape.by_speed > 0 or shape.by_noise > 0
     for k in range(_REWEIGHTINGS):
         if k == 0 or (changes and k <= _REDIVISIONS):
             A = np.concatenate([_terms(w, shape, share) for w in windows])
-        stated = np.einsum("wpd,pd->wd", A, share[: A.shape[1]])
-        seen = np.minimum(square, _MOST_RATIO * stated)
+        stated = known + np.einsum("wpd,pd->wd", A, share)
+        seen = np.minimum(square, _MOST_RATIO * stated) - known
         share = np.stack([_solve(A[:, :, j], seen[:, j], count / stated[:, j] ** 2) for j in range(d)], axis=1)
-    stated = np.einsum("wpd,pd->wd", A, share[: A.shape[1]])
+    stated = known + np.einsum("wpd,pd->wd", A, share)
     ratio = np.minimum(square / stated, _MOST_RATIO)
-    loss = (count[:, None] * (np.log(stated) + ratio)).sum(axis=0)
+    loss = float((count[:, None] * (np.log(stated) + ratio)).sum())
     edges = np.cumsum([len(w.square) for w in windows])[:-1]
     return _Fit(loss, share, np.array([r.mean(axis=0) for r in np.split(ratio, edges)]) / widen)
 
 
 def _terms(w: _Windows, shape: _Shape, share: Array) -> Array:
-    """(w, 4, d) variance of the sum over each window of jitter, white, bias and calibration of unit share at the
-    typical level and velocity; without the last, (w, 3, d).
+    """(w, 3, d) variance of the sum over each window of jitter, white and bias of unit share at the typical level.
 
-    The motions' variances are divided as :func:`gpvo.online.division.divide` and ``of_calibration`` do with ``share``.
+    The motions' variances are divided as :func:`gpvo.online.division.divide` does with ``share``.
     """
-    variance, calibration = w.variance, []
-    if shape.follows is not None:
-        lever = w.twist[:, :, [shape.follows]]
-        variance = w.variance / (1.0 - share[3] + share[3] * lever**2)
-        calibration = [_persistent(lever * np.sqrt(variance), shape.lasts)]
-    each = white = bias = variance
+    each = white = bias = w.variance
     if shape.by_speed or shape.by_noise:
         gain = np.exp(shape.by_speed * w.faster)
         more = gain * np.exp(shape.by_noise * w.above)
-        each = variance * (1.0 - share[3]) / (share[0] + share[1] * gain + share[2] * more)
+        each = w.variance / (share[0] + share[1] * gain + share[2] * more)
         white, bias = each * gain, each * more
+    amplitude = np.sqrt(bias)
+    before = carried(amplitude, np.full(amplitude.shape[-1], np.exp(-1.0 / shape.tau)))
     jitter = 0.5 * (each[:, 0] + each[:, -1])
-    return np.stack([jitter, white.sum(axis=1), _persistent(np.sqrt(bias), shape.tau), *calibration], axis=1)
-
-
-def _persistent(amplitude: Array, tau: float) -> Array:
-    """(w, d) variance of the sum over each window of a bias of such signed deviations (w, m, d)."""
-    before = carried(amplitude, np.full(amplitude.shape[-1], np.exp(-1.0 / tau)))
-    return np.asarray((amplitude**2).sum(axis=1) + 2.0 * (amplitude * before).sum(axis=1))
+    return np.stack([jitter, white.sum(axis=1), bias.sum(axis=1) + 2.0 * (amplitude * before).sum(axis=1)], axis=1)
 
 
 def _solve(A: Array, square: Array, weight: Array) -> Array:
-    """Shares (4,), not negative and of sum one, that explain squared sums (w,) best; white where nothing shows.
-
-    ``A`` (w, 4), or (w, 3) without calibration, whose share is then zero.
-    """
-    M = np.delete(A, 1, axis=1) - A[:, 1:2]
-    gram = (M * weight[:, None]).T @ M + 1e-9 * (weight @ A[:, 1] ** 2) * np.eye(M.shape[1])
+    """Shares (3,), not negative and of sum one, that explain squared sums (w,) best; white where nothing shows."""
+    M = A[:, [0, 2]] - A[:, 1:2]
+    gram = (M * weight[:, None]).T @ M + 1e-9 * (weight @ A[:, 1] ** 2) * np.eye(2)
     L = np.linalg.cholesky(gram)
-    jitter, *persistent = nnls(L.T, np.linalg.solve(L, (M * weight[:, None]).T @ (square - A[:, 1])))[0]
-    share = np.maximum([jitter, 1.0 - jitter - sum(persistent), *persistent], _MIN_SHARE)
-    share /= share.sum()
-    return share if len(share) == 4 else np.append(share, 0.0)
+    jitter, bias = nnls(L.T, np.linalg.solve(L, (M * weight[:, None]).T @ (square - A[:, 1])))[0]
+    share = np.maximum([jitter, 1.0 - jitter - bias, bias], _MIN_SHARE)
+    return share / share.sum()

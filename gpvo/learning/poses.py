@@ -15,6 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
+from gpvo.learning.scores import beyond_chance
 from gpvo.learning.spans import SPANS, cut, lagged
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
@@ -39,29 +40,43 @@ class Motions:
     calibration: Array
 
 
-def added_factor(chains: Sequence[Motions], share: Array, phi: Array) -> float:
+def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
     """The factor on white and bias, the jitter being what is left of each motion, by which poses are likeliest.
 
     ``share`` (3, D) of the parts; ``phi`` (2, D): correlation of bias and calibration from one motion to the next.
     Spans of ten motions and more count alike, as they count the same errors; and so do sequences. The factor is drawn
-    towards 1, and is 1 unless its gain is more than the standard error of it over the sequences (L. Breiman et al.,
-    "Classification and Regression Trees" (1984), section 3.4.3). No axis is left without jitter.
+    towards 1, and is 1 unless its gain is beyond chance. No axis is left without jitter.
     """
-    spans = [_Poses.over(chains, m, phi) for m in SPANS if m >= _LONG and _count(chains, m) >= _LEAST_WINDOWS]
-    if not spans or len({c.sequence for c in chains}) < 2:
+    spans = _spans(chains, phi)
+    if not spans:
         return 1.0
     most = max((1.0 - _LEAST_JITTER) / float((share[1] + share[2]).max()), 1.0)
 
-    def losses(ln_factor: float) -> Array:
-        return np.mean([poses.losses(float(np.exp(ln_factor))) for poses in spans], axis=0)
-
     def loss(ln_factor: float) -> float:
-        return float(losses(ln_factor).sum() + 0.5 * (ln_factor / _PRIOR_SPREAD) ** 2)
+        return float(_losses(spans, float(np.exp(ln_factor))).sum() + 0.5 * (ln_factor / _PRIOR_SPREAD) ** 2)
 
     bounds = (np.log(_LEAST_FACTOR), np.log(most))
-    found = float(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x)
-    gain = losses(0.0) - losses(found)
-    return float(np.exp(found)) if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)) else 1.0
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x
+    factor = float(np.exp(found))
+    return factor if beyond_chance(_losses(spans, 1.0) - _losses(spans, factor)) else 1.0
+
+
+def pose_losses(chains: Sequence[Motions], phi: Array) -> Array:
+    """(S,) mean negative log-likelihood of a sequence's poses after ten motions and more, without its constant; empty
+    where there are too few."""
+    spans = _spans(chains, phi)
+    return _losses(spans, 1.0) if spans else np.empty(0)
+
+
+def _spans(chains: Sequence[Motions], phi: Array) -> list[_Poses]:
+    """The poses over each span that has windows enough; none of fewer than two sequences."""
+    if len({c.sequence for c in chains}) < 2:
+        return []
+    return [_Poses.over(chains, m, phi) for m in SPANS if m >= _LONG and _count(chains, m) >= _LEAST_WINDOWS]
+
+
+def _losses(spans: Sequence[_Poses], factor: float) -> Array:
+    return np.asarray(np.mean([poses.losses(factor) for poses in spans], axis=0))
 
 
 def with_added(share: Array, factor: float) -> Array:

@@ -27,16 +27,19 @@ def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
     return out / out.sum(axis=1, keepdims=True)
 
 
-def of_calibration(variance: Array, follows: Array, twist: Array) -> tuple[Array, Array]:
-    """What a wrong calibration has of variances (n, D): its deviation with its sign (n, D), and what is left (n, D).
+def of_calibration(variance: Array, patterns: Array, twist: Array) -> tuple[Array, Array]:
+    """What a wrong calibration has of variances (n, D): its root (n, D, P), and what is left of them (n, D).
 
-    A wrong baseline, focal length or rectification makes errors that go with a velocity, and turn around with it: a
-    scale that is 1 % off adds on the way out what it takes back on the way home. ``follows`` (D, 6): the ratio of that
-    deviation to that of all else at unit velocity; ``twist`` (n, 6), unknown ones bring nothing [m/s, rad/s].
+    A wrong baseline, focal length or rectification makes errors that are linear in the motion, and turn around with it:
+    a scale that is 1 % off adds on the way out what it takes back on the way home. Each of ``patterns`` (P, D, 6) is
+    such a way to be wrong, by its usual amount: the error of a motion at unit velocities. ``twist`` (n, 6), unknown
+    ones bring nothing [m/s, rad/s]. It takes no more than all of the variance, however fast the motion.
     """
-    ratio = np.where(np.isfinite(twist), twist, 0.0) @ follows.T
-    rest = variance / (1.0 + ratio**2)
-    return ratio * np.sqrt(rest), rest
+    P, D, _ = patterns.shape
+    known = np.where(np.isfinite(twist), twist, 0.0)
+    root = (known @ patterns.reshape(P * D, 6).T).reshape(-1, P, D).swapaxes(1, 2)
+    left = variance / (variance + (root**2).sum(axis=-1))
+    return root * np.sqrt(left)[..., None], variance * left
 
 
 def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import correlation as correlation_of
-from gpvo.geometry.covariance import scaled_root, turn_first_root
+from gpvo.geometry.covariance import turn_first_root
 from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
 from gpvo.online.division import PARTS, divide, ln_faster, of_calibration
@@ -21,9 +21,8 @@ from gpvo.types import Array
 
 _EYE = np.eye(6)
 NO_CALIBRATION: Mapping[str, Array] = {
-    "calibration_follows": np.zeros((6, 6)),
+    "calibration_patterns": np.zeros((6, 6, 6)),
     "calibration_tau_s": np.ones(6),
-    "calibration_correlation": _EYE,
 }
 """Arrays of a model without a part of its own for errors of calibration."""
 COASTED = (1, 2, 5, 10, 20, 50)
@@ -47,9 +46,8 @@ _SHAPES = {
     "rate_change_var": (len(COASTED), 6),
     "mean_in_sigma": (1,),
     "steady_mean": (6,),
-    "calibration_follows": (6, 6),
+    "calibration_patterns": (6, 6, 6),
     "calibration_tau_s": (6,),
-    "calibration_correlation": (6, 6),
 }
 _OWN = ("inputs", *_SHAPES)
 
@@ -118,9 +116,9 @@ class ErrorModelArrays:
     the training rows. ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2];
     ``rate_change_var`` (K, 6): of the true one's changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the
     GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
-    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``calibration_follows`` (6, 6): what
-    errors of calibration go with (see :func:`gpvo.online.division.of_calibration`), ``calibration_tau_s`` (6,) how long
-    they last, and ``calibration_correlation`` (6, 6).
+    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``calibration_patterns`` (6, 6, 6):
+    the ways of a calibration to be wrong (see :func:`gpvo.online.division.of_calibration`), and ``calibration_tau_s``
+    (6,), how long each stays the same.
     """
 
     columns: tuple[str, ...]
@@ -143,14 +141,13 @@ class ErrorModelArrays:
     rate_change_var: Array
     mean_in_sigma: NDArray[np.bool_]
     steady_mean: Array
-    calibration_follows: Array
+    calibration_patterns: Array
     calibration_tau_s: Array
-    calibration_correlation: Array
     dt_s: float
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file."""
-        left_out = () if self.calibration_follows.any() else NO_CALIBRATION
+        left_out = () if self._calibrated else NO_CALIBRATION
         own = {name: np.asarray(getattr(self, name)) for name in _OWN if name not in left_out}
         return {
             **own,
@@ -310,13 +307,13 @@ class ErrorModelArrays:
         Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own pattern.
         """
         each, root = self.divided(variance, X, geometry)
-        if self.calibration_follows.any():
+        if self._calibrated:
             each[:, 2] += root @ np.swapaxes(root, -1, -2)
         return each, root
 
     @cached_property
-    def _calibration_root(self) -> Array:
-        return scaled_root(self.calibration_correlation)
+    def _calibrated(self) -> bool:
+        return bool(self.calibration_patterns.any())
 
     def divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
         """As :meth:`split`, but the bias without that of calibration."""
@@ -326,10 +323,12 @@ class ErrorModelArrays:
             R = correlation_of(geometry)
             known = np.isfinite(R).all(axis=(1, 2))
             out[known, :2] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
+        root, rest = np.zeros((len(variance), 6, 6)), variance
+        if self._calibrated:
+            root, rest = of_calibration(variance, self.calibration_patterns, X[:, self._base_place[0][:6]])
         # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
-        share = divide(self.share, self.growth, np.log(variance) - self.level, self.faster(X))
-        calibration, rest = of_calibration(variance, self.calibration_follows, X[:, self._base_place[0][:6]])
-        sigma, root = np.sqrt(share * rest[:, None, :]), calibration[:, :, None] * self._calibration_root
+        share = divide(self.share, self.growth, np.log(rest) - self.level, self.faster(X))
+        sigma = np.sqrt(share * rest[:, None, :])
         return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :], root
 
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 FOR_FILTER = "for_filter."
 """Prefix of the arrays in which the model for filters differs."""
+_ONLY_SOME = ("basis.", "calibration_")
+"""Of these a model may have fewer than the other."""
 
 
 def arrays_for_filter(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -20,5 +22,5 @@ def arrays_for_filter(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[A
     filter goes.
     """
     own = {name.removeprefix(FOR_FILTER): a for name, a in arrays.items() if name.startswith(FOR_FILTER)}
-    dropped = (FOR_FILTER, "basis.") if any(name.startswith("basis.") for name in own) else (FOR_FILTER,)
+    dropped = (FOR_FILTER, *_ONLY_SOME) if any(name.startswith("basis.") for name in own) else (FOR_FILTER,)
     return {**{name: a for name, a in arrays.items() if not name.startswith(dropped)}, **own}

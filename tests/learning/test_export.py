@@ -93,15 +93,11 @@ def some_model(
 
 
 def some_calibration() -> dict[str, np.ndarray]:
-    """Two axes go with one velocity and belong together, one goes with another."""
-    follows, correlation = np.zeros((6, 6)), np.eye(6)
-    follows[[0, 4, 2], [1, 1, 5]] = 2.0, -0.7, 1.1
-    correlation[[0, 4], [4, 0]] = -0.8
-    return {
-        "calibration_follows": follows,
-        "calibration_tau_s": np.where(follows.any(axis=1), 90.0, 1.0),
-        "calibration_correlation": correlation,
-    }
+    """Two ways to be wrong, in each of which axes go together."""
+    patterns = np.zeros((6, 6, 6))
+    patterns[0, [0, 4], 1] = 2.0, -0.7
+    patterns[1, [2, 3, 2], [5, 5, 0]] = 1.1, 0.2, -0.4
+    return {"calibration_patterns": patterns, "calibration_tau_s": np.full(6, 90.0)}
 
 
 CASES = {

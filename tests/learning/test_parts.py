@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from gpvo.evaluation.accumulate import PoseError, Step
 from gpvo.learning.partcorrelation import curves, part_correlations
 from gpvo.learning.parts import fit_parts
@@ -106,32 +105,20 @@ def test_each_part_has_its_own_correlation():
     assert np.linalg.eigvalsh(R).min() > 0.0
 
 
-def _out_and_home(rng: np.random.Generator, flights: int, wrong: bool) -> tuple[list, list]:
-    """Velocities that turn around every 100 motions; two axes are wrong by one part of them, the same all flight."""
-    error, twist = [], []
-    for _ in range(flights):
-        v = np.repeat(rng.choice([-1.0, 1.0], (20, 6)) * rng.uniform(0.5, 1.5, (20, 6)), 100, axis=0)
-        scale = 0.3 * rng.standard_normal() * np.array([0.0, -1.0, 1.0, 0.0, 0.0, 0.0]) * wrong
-        error.append([rng.standard_normal((2000, 6)) + scale * v[:, [2]]])
-        twist.append([v])
-    return error, twist
-
-
-@pytest.mark.parametrize("wrong", [False, True])
-def test_an_error_of_calibration_is_found_where_there_is_one(wrong):
-    """A ratio of 0.3 per unit of velocity, by 20 flights (standard error 16 %), and a tie of the axes of -1, which is
-    drawn towards that of single motions, near 0."""
-    error, twist = _out_and_home(np.random.default_rng(6), 20, wrong)
+def test_what_is_known_to_add_up_besides_is_no_share():
+    """Errors of a constant that turns around with the motion: taken for known, white is all that is left."""
+    rng = np.random.default_rng(6)
+    error, root = [], []
+    for _ in range(20):
+        turns = 0.4 * np.repeat(rng.choice([-1.0, 1.0], (20, 3)), 100, axis=0)
+        error.append([rng.standard_normal((2000, 3)) + turns * rng.choice([-1.0, 1.0], 3)])
+        root.append([turns[:, :, None] * np.eye(3)])
     one = _like(error, 1.0)
-    parts = fit_parts(error, one, _same_speed(error), 0.05, twist)
-    expected = np.zeros((6, 6))
-    expected[[1, 2], 2] = 0.3 * wrong
-    np.testing.assert_allclose(parts.calibration.follows, expected, atol=0.1)
-    assert ((parts.calibration.follows > 0) == (expected > 0)).all()
-    tie = part_correlations(error, one, parts, 0.05)[3, 1, 2]
-    assert tie < -0.6 if wrong else tie == 0.0
-    if wrong:
-        assert (parts.calibration.tau_s[1:3] > 50.0).all()
+    found = fit_parts(error, one, _same_speed(error), 0.05, root)
+    taken_for_bias = fit_parts(error, one, _same_speed(error), 0.05)
+    assert (found.share[2] < 0.02).all()
+    assert (taken_for_bias.share[2] > 0.08).all()
+    assert (np.abs(np.log(found.ratio)) < 0.6).all()
 
 
 def test_what_is_stated_of_a_new_flight_is_right_on_average():

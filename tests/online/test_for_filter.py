@@ -25,6 +25,16 @@ def test_a_filter_has_the_model_fitted_without_a_mean() -> None:
         np.testing.assert_allclose(b.covariance, 1.01 * a.covariance, rtol=1e-4)
 
 
+def test_the_model_for_filters_has_a_part_of_calibration_of_its_own_or_none() -> None:
+    patterns, other = np.ones((6, 6, 6)), np.full((6, 6, 6), 2.0)
+    own = {f"{FOR_FILTER}basis.centre": np.zeros(3)}
+    kept = arrays_for_filter({"calibration_patterns": patterns, f"{FOR_FILTER}steady_mean": np.zeros(6)})
+    assert kept["calibration_patterns"] is patterns
+    assert "calibration_patterns" not in arrays_for_filter({"calibration_patterns": patterns, **own})
+    own[f"{FOR_FILTER}calibration_patterns"] = other
+    assert arrays_for_filter({"calibration_patterns": patterns, **own})["calibration_patterns"] is other
+
+
 def test_a_steady_mean_is_the_root_of_the_covariance_times_the_noise() -> None:
     trained = small_model()
     c = np.array([0.0, 0.0, -0.1, 0.0, 0.2, 0.0])

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import GpvoError
-from gpvo.geometry.covariance import scaled_root
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import LN_LARGEST, ErrorModelArrays
 from gpvo.online.rowplan import StackedBasis, stack
@@ -112,8 +111,7 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("growth", model.growth),
         *_array("level", model.level),
         *_array("steady_mean", model.steady_mean),
-        *_array("calibration_follows", model.calibration_follows),
-        *_array("calibration_root", scaled_root(model.calibration_correlation)),
+        *_array("calibration_patterns", model.calibration_patterns),
         *_basis_arrays(stacked),
         "",
     ]

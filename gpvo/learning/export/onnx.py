@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
-from gpvo.geometry.covariance import TURN_FIRST, scaled_root
+from gpvo.geometry.covariance import TURN_FIRST
 from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
 from gpvo.online.division import LN_FASTEST, PARTS
 from gpvo.online.estimate import LN_LARGEST, ErrorModelArrays
@@ -125,11 +125,10 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     factor = g.constant(model.factor)
     variance = _within(g, g("Mul", total, factor), _limit(g, model))
     g("Mul", variance, g("Sub", 1.0, g("Div", known, total)), out="epistemic")
-    wrong, rest = _of_calibration(g, model, variance)
-    sigmas = [g("Sqrt", g("Mul", rest, share)) for share in _shares(g, model, variance)]
+    root, rest = _of_calibration(g, model, variance)
+    sigmas = [g("Sqrt", g("Mul", rest, share)) for share in _shares(g, model, rest)]
     each = zip(PARTS, sigmas, _correlations(g, model), strict=True)
     jitter, white, bias = (g("Mul", g.outer(sigma), R, out=None if name == "bias" else name) for name, sigma, R in each)
-    root = g("Mul", g.expand(wrong, 2), g.constant(scaled_root(model.calibration_correlation)), out="calibration_root")
     parts = [jitter, white, g("Add", bias, g("MatMul", root, g("Transpose", root, perm=[0, 2, 1])), out="bias")]
     covariance = g.add(*parts, out="covariance")
     ln_det, steady = _turn_first(g, covariance, model.steady_mean)
@@ -237,11 +236,13 @@ def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
 
 
 def _of_calibration(g: _Graph, model: ErrorModelArrays, variance: str) -> tuple[str, str]:
-    """Deviation with its sign and what is left of the variance (N, 6); ``gpvo.online.division.of_calibration``."""
+    """Its root (N, 6, 6) and what is left of the variance (N, 6); ``gpvo.online.division.of_calibration``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:6], axis=1)
-    ratio = g("MatMul", g("Where", g.finite(v), v, 0.0), g.constant(model.calibration_follows.T))
-    rest = g("Div", variance, g("Add", g("Mul", ratio, ratio), 1.0))
-    return g("Mul", ratio, g("Sqrt", rest)), rest
+    patterns = np.transpose(model.calibration_patterns, (2, 1, 0)).reshape(6, 36)
+    flat = g("MatMul", g("Where", g.finite(v), v, 0.0), g.constant(patterns))
+    root = g("Reshape", flat, g.constant([-1, 6, 6], np.int64))
+    left = g("Div", variance, g("Add", variance, g.sum(g("Mul", root, root), 2)))
+    return g("Mul", root, g.expand(g("Sqrt", left), 2), out="calibration_root"), g("Mul", variance, left)
 
 
 def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:

@@ -151,28 +151,33 @@ static double gpvo_faster(const double *features) {
     return isfinite(v2) ? gpvo_clip(ratio, 0.0, log(20.0)) : 0.0;
 }
 
-/* Deviation on axis j, with its sign, of what a wrong calibration makes; takes it off the variance. */
-static double gpvo_of_calibration(const double *features, int j, double *variance) {
-    double ratio = 0.0;
-    int i;
-    for (i = 0; i < 6; ++i) {
-        double v = features[gpvo_base_column[i]];
-        if (isfinite(v)) ratio += gpvo_calibration_follows[j * 6 + i] * v;
+/* Row j of the root of what a wrong calibration makes, of a variance; returns what is left of it. */
+static double gpvo_of_calibration(const double *features, int j, double variance, double root[6]) {
+    double sum = 0.0, left;
+    int i, p;
+    for (p = 0; p < 6; ++p) {
+        root[p] = 0.0;
+        for (i = 0; i < 6; ++i) {
+            double v = features[gpvo_base_column[i]];
+            if (isfinite(v)) root[p] += gpvo_calibration_patterns[(p * 6 + j) * 6 + i] * v;
+        }
+        sum += root[p] * root[p];
     }
-    *variance /= 1.0 + ratio * ratio;
-    return ratio * sqrt(*variance);
+    left = variance / (variance + sum);
+    for (p = 0; p < 6; ++p) root[p] *= sqrt(left);
+    return variance * left;
 }
 
-/* Standard deviations of jitter, white and bias on axis j, of what calibration leaves of the variance: what adds up gains
- * on the jitter as the speed grows, the bias on the noise as the variance grows. */
-static void gpvo_divide(int j, double variance, double rest, double faster, double part[3][6]) {
+/* Standard deviations of jitter, white and bias on axis j, of a variance: what adds up gains on the jitter as the speed
+ * grows, the bias on the noise as the variance grows. */
+static void gpvo_divide(int j, double variance, double faster, double part[3][6]) {
     double gain = gpvo_growth[j] * faster, above = gpvo_growth[6 + j] * (log(variance) - gpvo_level[j]);
     double white = gpvo_share[6 + j] * exp(gain);
     double bias = gpvo_share[12 + j] * exp(gain + gpvo_clip(above, -60.0, 60.0));
     double whole = gpvo_share[j] + white + bias;
-    part[0][j] = sqrt(rest * gpvo_share[j] / whole);
-    part[1][j] = sqrt(rest * white / whole);
-    part[2][j] = sqrt(rest * bias / whole);
+    part[0][j] = sqrt(variance * gpvo_share[j] / whole);
+    part[1][j] = sqrt(variance * white / whole);
+    part[2][j] = sqrt(variance * bias / whole);
 }
 
 /* Lower Cholesky factor of a symmetric positive definite 6x6 matrix, the turn before the translation: row and column i are
@@ -205,7 +210,7 @@ static double gpvo_residual_px(const double *inside) {
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
  * training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], wrong[6], limit[2], distance, outside, growth, ln_det, noise;
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], limit[2], distance, outside, growth, ln_det, noise;
     double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     gpvo_base(features, duration, base, plain);
@@ -219,7 +224,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     outside = 1.0 - out->in_domain;
     growth = pow(1.0 + distance, GPVO_OUTSIDE_POWER);
     for (j = 0; j < 6; ++j) {
-        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance, rest;
+        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
         double unit = GPVO_MEAN_IN_SIGMA ? sqrt(base[j]) : duration / GPVO_DT_S, usual = said[0][j] * unit;
         out->mean[j] = usual * out->in_domain;
@@ -228,9 +233,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
         total += (said[1][j] * unit * unit + lost * lost) * growth;
         variance = gpvo_within(total * gpvo_factor[j], limit[j / 3]);
         out->epistemic[j] = variance * (1.0 - known / total);
-        rest = variance;
-        wrong[j] = gpvo_of_calibration(features, j, &rest);
-        gpvo_divide(j, variance, rest, faster, part);
+        gpvo_divide(j, gpvo_of_calibration(features, j, variance, out->calibration_root + j * 6), faster, part);
     }
     for (i = 0; i < 6; ++i)
         for (j = 0; j < 6; ++j) {
@@ -238,7 +241,6 @@ static void gpvo_predict(const double *features, const double *geometry, double 
             out->jitter[at] = R[0][at] * part[0][i] * part[0][j];
             out->white[at] = R[1][at] * part[1][i] * part[1][j];
             out->bias[at] = R[2][at] * part[2][i] * part[2][j];
-            out->calibration_root[at] = wrong[i] * gpvo_calibration_root[at];
         }
     for (i = 0; i < 6; ++i)
         for (j = 0; j < 6; ++j) {

@@ -1,0 +1,175 @@
+"""The ways in which calibrations are wrong, from the errors of many flights.
+
+A wrong baseline, focal length or rectification makes errors that are linear in the motion, ``e = K v``, with another K
+in each flight. So ``vec K`` is a random effect of a linear model (N. Laird, J. Ware, "Random-effects models for
+longitudinal data" (1982)): its covariance over the flights and the noise are found by expectation-maximisation, and the
+few principal axes of that covariance are patterns, each scaled by how wrong calibrations usually are in its way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.learning.folds import group_folds
+from gpvo.learning.rows import Rows
+from gpvo.learning.spans import cut
+from gpvo.online.base import TWIST_COLUMNS
+from gpvo.types import Array
+
+LASTING_FRAMES = 16384.0
+"""Longer than any flight: nothing shows how long a calibration stays the same."""
+_WINDOW = 100
+_LEAST_FLIGHTS, _MOST_FOLDS = 4, 5
+_CLEAR = 10.0
+_ROUNDS, _BEGIN_VAR, _DIAGONAL = 60, 1e-2, 1.0
+_D = 6
+
+
+@dataclass(frozen=True)
+class Patterns:
+    """``usual`` (6, 6, 6): see :func:`gpvo.online.division.of_calibration`. ``fold`` (n,) of each row, and ``without``
+    (F, 6, 6, 6), the patterns of all flights but those of a fold. ``error`` (n, 6): what each row's own flight shows
+    of the error of its calibration."""
+
+    usual: Array
+    fold: NDArray[np.int64]
+    without: Array
+    error: Array
+
+
+def learn_patterns(rows: Rows, error: Array, variance: Array) -> Patterns | None:
+    """From errors (n, 6) of a stated variance (n, 6); None from fewer than four flights, or where no velocity is clear
+    of VO's own error of it."""
+    twist = np.nan_to_num(rows.select(TWIST_COLUMNS))
+    flights = [_sums(*x) for x in zip(*(rows.chains(v) for v in (error, variance, twist)))]
+    flown = [f for f in flights if len(f.error)]
+    clear = _clear(flown, rows.step_s) if len(flown) >= _LEAST_FLIGHTS else np.zeros(_D, dtype=bool)
+    if not clear.any():
+        return None
+    unit = _Unit.of(flown, clear)
+    evidence = [unit.evidence(f) for f in flights]
+    flight = np.repeat(np.arange(len(flights)), [len(s) for s in rows.sets])
+    folds = group_folds(np.arange(len(flights)), _MOST_FOLDS)
+    every, noise = _spread(evidence)
+    means = np.array([unit.of_flight(e.posterior(every, noise)[0]) for e in evidence])
+    without = [_spread([e for e, k in zip(evidence, folds) if k != fold])[0] for fold in range(folds.max() + 1)]
+    return Patterns(
+        unit.patterns(every),
+        folds[flight],
+        np.array([unit.patterns(S) for S in without]),
+        np.einsum("nic,nc->ni", means[flight], twist),
+    )
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Of the separate windows of a flight: sums (w, 6) of the errors and of the velocities, and the stated deviations
+    of the former, were motions independent."""
+
+    error: Array
+    sigma: Array
+    twist: Array
+
+
+def _sums(error: Sequence[Array], variance: Sequence[Array], twist: Sequence[Array]) -> _Sums:
+    """Over :data:`_WINDOW` motions, so that only what lasts adds up."""
+    e, v, t = (np.concatenate([cut(c, _WINDOW).sum(axis=1) for c in chains]) for chains in (error, variance, twist))
+    return _Sums(e, np.sqrt(v), t)
+
+
+def _clear(flights: Sequence[_Sums], step_s: float) -> NDArray[np.bool_]:
+    """(6,) which velocities add up to ten times as much as VO's own errors of them: what goes with any other goes with
+    errors."""
+    moved, wrong = (_rms(np.concatenate(x)) for x in ([f.twist for f in flights], [f.error for f in flights]))
+    return np.asarray(moved * step_s > _CLEAR * wrong)
+
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt((values**2).mean(axis=0)))
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What a flight says of its K in a least squares sense: ``gram`` (6, c, c) and ``moment`` (6, c) of each axis, sum
+    of squares ``square`` (6,), number of windows."""
+
+    gram: Array
+    moment: Array
+    square: Array
+    count: int
+
+    def posterior(self, S: Array, noise: Array) -> tuple[Array, Array]:
+        """Mean (6 c,) and covariance of ``vec K``, whose covariance over flights is S, by windows of a noise (6,)."""
+        c = self.gram.shape[-1]
+        P = np.asarray(np.linalg.inv(S), dtype=np.float64)
+        for i in range(_D):
+            P[i * c : (i + 1) * c, i * c : (i + 1) * c] += self.gram[i] / noise[i]
+        C = np.asarray(np.linalg.inv(P), dtype=np.float64)
+        return C @ (self.moment / noise[:, None]).ravel(), C
+
+    def residual(self, mean: Array, C: Array) -> Array:
+        """(6,) expected sum of squares that K leaves."""
+        c = self.gram.shape[-1]
+        K, blocks = mean.reshape(_D, c), C.reshape(_D, c, _D, c)
+        own = np.einsum("iaib->iab", blocks) + K[:, :, None] * K[:, None, :]
+        return np.asarray(self.square - 2.0 * (K * self.moment).sum(axis=1) + (self.gram * own).sum(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """Units in which all elements of K are alike: usual errors of windows (6,) and usual sums of velocities (c,), of
+    those that are clear."""
+
+    error: Array
+    twist: Array
+    clear: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, flights: Sequence[_Sums], clear: NDArray[np.bool_]) -> _Unit:
+        """By all windows."""
+        error, twist = (
+            _rms(np.concatenate([f.sigma for f in flights])),
+            _rms(np.concatenate([f.twist for f in flights])),
+        )
+        return cls(error, twist[clear], clear)
+
+    def evidence(self, f: _Sums) -> _Evidence:
+        """Of a flight, each window by its stated deviation."""
+        weight = (self.error / f.sigma) ** 2
+        e, t = f.error / self.error, f.twist[:, self.clear] / self.twist
+        gram = np.einsum("wi,wa,wb->iab", weight, t, t)
+        return _Evidence(gram, np.einsum("wi,wi,wa->ia", weight, e, t), (weight * e**2).sum(axis=0), len(e))
+
+    def of_flight(self, k: Array) -> Array:
+        """(6, 6) K from its elements (6 c,)."""
+        K = np.zeros((_D, _D))
+        K[:, self.clear] = k.reshape(_D, -1) * self.error[:, None] / self.twist
+        return K
+
+    def patterns(self, S: Array) -> Array:
+        """(6, 6, 6) from the covariance of ``vec K``: its longest principal axes."""
+        values, vectors = np.linalg.eigh(S)
+        longest = np.argsort(values)[::-1][:_D]
+        out = np.zeros((_D, _D, _D))
+        for p, i in enumerate(longest):
+            out[p] = self.of_flight(vectors[:, i] * np.sqrt(max(values[i], 0.0)))
+        return out
+
+
+def _spread(evidence: Sequence[_Evidence]) -> tuple[Array, Array]:
+    """Covariance of ``vec K`` over the flights, drawn towards its diagonal, and noise (6,) of the windows."""
+    n = _D * evidence[0].gram.shape[-1]
+    S, noise, count = _BEGIN_VAR * np.eye(n), np.ones(_D), sum(e.count for e in evidence)
+    for _ in range(_ROUNDS):
+        second, left = np.zeros((n, n)), np.zeros(_D)
+        for e in evidence:
+            mean, C = e.posterior(S, noise)
+            second += np.outer(mean, mean) + C
+            left += e.residual(mean, C)
+        S = (second + _DIAGONAL * np.diag(np.diag(second)) / len(evidence)) / (len(evidence) + _DIAGONAL)
+        noise = np.maximum(left / count, 1e-12)
+    return S, noise

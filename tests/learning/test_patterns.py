@@ -1,0 +1,106 @@
+"""Wrong calibrations: found where flights have them, and not where they have none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from gpvo.learning.patterns import learn_patterns
+from gpvo.learning.rows import Rows
+from gpvo.online.base import TWIST_COLUMNS
+from gpvo.online.division import of_calibration
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from small_model import training_sets
+
+SIGMA = np.repeat([1e-3, 1e-4], 3)
+COUPLED = np.zeros((2, 6, 6))
+"""Two ways to be wrong: a scale, and a tilt that goes with two velocities."""
+COUPLED[0, [0, 1, 2], [0, 1, 2]] = 3e-4
+COUPLED[1, 4, 2], COUPLED[1, 0, 2], COUPLED[1, 1, 5] = 3e-5, -4e-4, 2e-4
+
+
+def _flights(count: int, patterns: np.ndarray, seed: int, slow: tuple[int, ...] = ()) -> tuple[Rows, np.ndarray]:
+    """Rows of flights of 1500 motions that turn around often, hardly moving along the ``slow`` axes; the K of each."""
+    rng = np.random.default_rng(seed)
+    template, sets, K = training_sets([0], n=1501)[0], [], []
+    place = [template.columns.index(c) for c in TWIST_COLUMNS]
+    for k in range(count):
+        n = len(template)
+        twist = np.repeat(rng.standard_normal((n // 50 + 1, 6)), 50, axis=0)[:n]
+        twist[:, list(slow)] *= 1e-6
+        K.append(np.einsum("p,pic->ic", rng.standard_normal(len(patterns)), patterns))
+        X = template.X.copy()
+        X[:, place] = twist
+        Y = SIGMA * rng.standard_normal((n, 6)) + twist @ K[-1].T
+        sets.append(replace(template, name=f"flight{k}", X=X, Y=Y))
+    return Rows.stack(sets), np.array(K)
+
+
+def _spread(patterns: np.ndarray) -> np.ndarray:
+    return np.einsum("pic,pjd->icjd", patterns, patterns)
+
+
+def test_the_patterns_have_the_covariance_of_the_flights():
+    """Of 40 flights, each element by its usual deviation, to a tenth; and each flight's own errors are found."""
+    rows, K = _flights(40, COUPLED, 0)
+    found = learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape))
+    unit = np.sqrt(np.einsum("pic,pic->ic", COUPLED, COUPLED)) + SIGMA[:, None] / 10.0
+    drawn, got = (_spread(p) / unit[:, :, None, None] / unit for p in (K / np.sqrt(len(K)), found.usual))
+    np.testing.assert_allclose(got, drawn, atol=0.1)
+    twist = rows.select(TWIST_COLUMNS)
+    truth = np.einsum("nic,nc->ni", np.repeat(K, len(rows.sets[0]), axis=0), twist)
+    left = ((found.error - truth) ** 2).mean(axis=0) / (truth**2).mean(axis=0).clip(0.03 * SIGMA**2)
+    assert (left < 0.1).all()
+
+
+def test_of_no_wrong_calibration_there_is_next_to_nothing():
+    rows, _ = _flights(12, np.zeros((1, 6, 6)), 1)
+    found = learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape))
+    stated = np.einsum("nip,nip->ni", *2 * [np.einsum("pic,nc->nip", found.usual, rows.select(TWIST_COLUMNS))])
+    assert (stated.mean(axis=0) < 0.02 * SIGMA**2).all()
+
+
+def test_patterns_without_a_fold_do_not_know_its_flights():
+    rows, _ = _flights(6, COUPLED, 2)
+    variance = np.broadcast_to(SIGMA**2, rows.error.shape)
+    found = learn_patterns(rows, rows.error, variance)
+    gone = found.fold == 0
+    other = learn_patterns(rows, np.where(gone[:, None], 3.0 * rows.error, rows.error), variance)
+    np.testing.assert_allclose(_spread(other.without[0]), _spread(found.without[0]), rtol=1e-3, atol=1e-12)
+    assert not np.allclose(_spread(other.without[1]), _spread(found.without[1]), rtol=1e-2, atol=1e-12)
+
+
+def test_what_goes_with_errors_of_the_velocity_is_no_pattern():
+    """Along the slow axes odometry's velocity is little but its own error."""
+    rows, _ = _flights(8, COUPLED, 3, slow=(0, 5))
+    found = learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape))
+    assert not found.usual[:, :, [0, 5]].any()
+    assert found.usual[:, :, [1, 2]].any()
+
+
+def test_few_flights_tell_nothing_of_how_calibrations_differ():
+    rows, _ = _flights(3, COUPLED, 4)
+    assert learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape)) is None
+
+
+unit = st.floats(-1.0, 1.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(arrays(np.float64, (6, 6, 6), elements=unit), arrays(np.float64, (4, 6), elements=unit), st.floats(1e-3, 1e3))
+def test_calibration_takes_no_more_than_the_variance_and_turns_around_with_the_motion(patterns, twist, scale):
+    variance = np.full((4, 6), scale)
+    root, rest = of_calibration(variance, patterns, twist)
+    np.testing.assert_allclose((root**2).sum(axis=-1) + rest, variance)
+    assert (rest > 0.0).all()
+    back, same = of_calibration(variance, patterns, -twist)
+    np.testing.assert_allclose(back, -root)
+    np.testing.assert_allclose(same, rest)
+
+
+def test_an_unknown_velocity_brings_nothing():
+    variance, twist = np.ones((1, 6)), np.array([[np.nan, 1.0, 0.0, 0.0, 0.0, 0.0]])
+    root, _ = of_calibration(variance, np.ones((6, 6, 6)), twist)
+    np.testing.assert_allclose((root**2).sum(axis=-1), 6.0 / 7.0)
