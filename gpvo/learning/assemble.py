@@ -22,7 +22,7 @@ from gpvo.learning.meanfit import no_mean
 from gpvo.learning.noise import HeteroscedasticFit
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
-from gpvo.learning.patterns import LASTING_FRAMES, Patterns, learn_patterns
+from gpvo.learning.patterns import LASTING_S, Patterns, learn_patterns
 from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import beyond_chance
@@ -80,7 +80,7 @@ def assemble(
         mean_in_sigma=np.array([mean_in_sigma]),
         steady_mean=np.zeros(6),
         dt_s=rows.step_s,
-        **sums.arrays(rows.step_s),
+        **sums.arrays,
     )
     sums, found = _with_calibration(model, of, (sums, _consistent(model, of)))
     return found.model, _calibration(rows, scale, found, sums, np.abs(z) / np.sqrt(found.joint))
@@ -134,12 +134,15 @@ class _Sums:
     ln_speed: Array
     patterns: Patterns | None
 
-    def arrays(self, step_s: float) -> dict[str, Any]:
+    @property
+    def arrays(self) -> dict[str, Any]:
         """The model's arrays that say so."""
         of_calibration = NO_CALIBRATION
         if self.patterns is not None:
-            tau_s = np.full(6, LASTING_FRAMES * step_s)
-            of_calibration = {"calibration_patterns": self.patterns.usual, "calibration_tau_s": tau_s}
+            of_calibration = {
+                "calibration_patterns": self.patterns.usual,
+                "calibration_tau_s": np.full(6, LASTING_S),
+            }
         return {
             "correlation": self.correlation,
             "geometry_weight": np.array([self.geometry_weight]),
@@ -210,7 +213,7 @@ def _with_calibration(bare: ErrorModelArrays, of: _Residuals, plain: _Found) -> 
         return plain
     of = replace(of, patterns=patterns)
     sums = _sums_of(of)
-    found = _consistent(replace(bare, **sums.arrays(of.rows.step_s)), of)
+    found = _consistent(replace(bare, **sums.arrays), of)
     return (sums, found) if beyond_chance(plain[1].losses - found.losses) else plain
 
 

@@ -115,12 +115,14 @@ def _calibration(h: Mapping[str, Any]) -> str:
     widths = ", ".join(
         f"{100 * level:.0f} %: {w:.2f}" for level, w in zip(c["interval_levels"], c["interval_sigmas"][0])
     )
+    apart = bool(c.get("calibration_part"))
     return "\n".join(
         [
             "## Calibration",
             "",
             f"By {c['by']} ({c['groups']} left out in turn).{marked}",
             f"Half widths in sigma that covered left-out data on the first axis: {widths}.",
+            *(["These sequences differ in the camera's calibration; errors of that are a part of their own."] * apart),
         ]
     )
 

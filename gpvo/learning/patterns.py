@@ -20,8 +20,8 @@ from gpvo.learning.spans import cut
 from gpvo.online.base import TWIST_COLUMNS
 from gpvo.types import Array
 
-LASTING_FRAMES = 16384.0
-"""Longer than any flight: nothing shows how long a calibration stays the same."""
+LASTING_S = 3600.0
+"""How long a calibration stays the same: longer than the flights to learn from, which do not show it."""
 _WINDOW = 100
 _LEAST_FLIGHTS, _MOST_FOLDS = 4, 5
 _CLEAR = 10.0

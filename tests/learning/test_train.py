@@ -468,6 +468,7 @@ def test_a_wrong_scale_is_a_part_of_its_own(tmp_path):
     assert ahead @ back < -0.9 * np.linalg.norm(ahead) * np.linalg.norm(back)
     rest = said.parts["bias"] - said.calibration_root @ np.swapaxes(said.calibration_root, 1, 2)
     assert np.linalg.eigvalsh(rest).min() > 0.0
+    assert "differ in the camera's calibration" in card_path(tmp_path / "model.gpvo").read_text()
 
 
 def test_without_a_wrong_scale_there_is_no_such_part():
