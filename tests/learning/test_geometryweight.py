@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.evaluation.accumulate import PoseError, Step
-from gpvo.geometry.covariance import correlation, scaled_root
+from gpvo.geometry.covariance import correlation
 from gpvo.learning.geometryweight import Divided, _Sums, choose_geometry_weight
 
-PHI = np.repeat([[0.9], [0.99]], 6, axis=1)
+PHI = 0.9
 OWN = np.eye(6)
 TIED = np.eye(6)
 TIED[0, 4] = TIED[4, 0] = -0.8
-PARTS = np.array([OWN, OWN, OWN, OWN])
+PARTS = np.array([OWN, OWN, OWN])
 
 
 def _flight(rng: np.random.Generator, n: int, geometry: np.ndarray, truth: np.ndarray) -> Divided:
@@ -20,7 +20,7 @@ def _flight(rng: np.random.Generator, n: int, geometry: np.ndarray, truth: np.nd
     sigma = np.exp(0.3 * rng.standard_normal((n, 1))) * np.ones(6)
     error = rng.standard_normal((n, 6)) @ np.linalg.cholesky(truth).T * sigma
     small = 1e-3 * sigma
-    return Divided(error, small, sigma, small, 0.0 * sigma, np.tile(geometry, (n, 1, 1)))
+    return Divided(error, small, sigma, small, np.tile(geometry, (n, 1, 1)))
 
 
 @pytest.mark.parametrize("truth, weight", [(TIED, 1.0), (OWN, 0.0), (0.5 * TIED + 0.5 * OWN, 0.5)])
@@ -39,8 +39,7 @@ def test_sums_have_their_say():
         white = 0.5 * rng.standard_normal((4000, 6))
         one = np.ones((4000, 6))
         error = np.diff(frames, axis=0) + white
-        parts = (np.sqrt(2.0) * one, 0.5 * one, 1e-3 * one, 0.0 * one)
-        flights.append(Divided(error, *parts, np.tile(TIED, (4000, 1, 1))))
+        flights.append(Divided(error, np.sqrt(2.0) * one, 0.5 * one, 1e-3 * one, np.tile(TIED, (4000, 1, 1))))
     single = _Sums.over(flights, PARTS, PHI, 1)
     assert single.loss(1.0) < single.loss(0.0)
     hundred = _Sums.over(flights, PARTS, PHI, 100)
@@ -57,17 +56,15 @@ def test_what_is_stated_of_a_sum_is_what_adds_up_along_a_path():
     """The accumulation of a vehicle that does not move, with its own code, as the oracle."""
     rng = np.random.default_rng(3)
     n, tau_s, dt_s = 40, 0.5, 0.05
-    R = np.array([_random_correlation(rng) for _ in range(4)])
+    R = np.array([_random_correlation(rng) for _ in range(3)])
     jitter, white, bias = np.exp(0.5 * rng.standard_normal((3, n, 6)))
-    calibration, both_s = rng.standard_normal((n, 6)), np.repeat([[tau_s], [4.0]], 6, axis=1)
     unknown = np.full((n, 6, 6), np.nan)
-    chain = Divided(np.zeros((n, 6)), jitter, white, bias, calibration, unknown)
-    sums = _Sums.over([chain], R, np.exp(-dt_s / both_s), n)
-    error, unit = PoseError(), scaled_root(R[3])
-    for j, w, b, c in zip(jitter, white, bias, calibration):
-        jit, whi, per = [C * np.outer(s, s) for C, s in zip(R, (j, w, b))]
-        L = c[:, None] * unit
-        error.add(Step(np.eye(4), jit, whi, per + L @ L.T, both_s[0], dt_s, L, both_s[1]))
+    chain = Divided(np.zeros((n, 6)), jitter, white, bias, unknown)
+    sums = _Sums.over([chain], R, float(np.exp(-dt_s / tau_s)), n)
+    error = PoseError()
+    for j, w, b in zip(jitter, white, bias):
+        parts = [C * np.outer(s, s) for C, s in zip(R, (j, w, b))]
+        error.add(Step(np.eye(4), *parts, np.full(6, tau_s), dt_s))
     for stated in (sums.own, sums.by_geometry):  # where the geometry is unknown, its place is taken
         np.testing.assert_allclose((stated + sums.bias)[0], error.covariance, rtol=1e-9, atol=1e-9)
 
