@@ -98,11 +98,11 @@ class _Residuals:
     geometry: Array | None
     patterns: Patterns | None = None
 
-    def of_calibration(self) -> tuple[Array, Array, Array]:
+    def of_calibration(self) -> tuple[Array | None, Array, Array]:
         """The root (n, 6, 6) of what a wrong calibration has of the variance, by the patterns of other flights; what is
         left of the variance, and of the errors."""
         if self.patterns is None:
-            return np.zeros((len(self.error), 6, 6)), self.variance, self.error
+            return None, self.variance, self.error
         twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.error), 6, 6)), self.variance.copy()
         for k, patterns in enumerate(self.patterns.without):
             fold = self.patterns.fold == k
@@ -168,12 +168,14 @@ class _Consistent:
 
 def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
     """The model made right of poses and of all six axes together."""
-    factor = fit_joint_factor(of.error, _whole(model, of), of.rows.group)
-    added = added_factor(*_motions(model, of, factor), model.share)
+    parts, root = of.divided(model)
+    factor = fit_joint_factor(of.error, _whole(parts, root), of.rows.group)
+    added = added_factor(*_motions(model, of, parts * factor, root * np.sqrt(factor)), model.share)
     model = replace(model, share=with_added(model.share, added))
-    whole = _whole(model, of)
+    parts, root = of.divided(model)
+    whole = _whole(parts, root)
     joint = fit_joint_factor(of.error, whole, of.rows.group)
-    losses = pose_losses(*_motions(model, of, joint))
+    losses = pose_losses(*_motions(model, of, parts * joint, root * np.sqrt(joint)))
     typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
     model = replace(
         model,
@@ -185,17 +187,14 @@ def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
     return _Consistent(model, added, joint, losses)
 
 
-def _whole(model: ErrorModelArrays, of: _Residuals) -> Array:
-    """(n, 6, 6) covariances of all motions."""
-    parts, root = of.divided(model)
+def _whole(parts: Array, root: Array) -> Array:
+    """(n, 6, 6) covariances of motions from those of their parts and the root of the calibration."""
     return np.asarray(parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2))
 
 
-def _motions(model: ErrorModelArrays, of: _Residuals, factor: float) -> tuple[list[Motions], Array]:
-    """All chains with what the model states of them, times a common factor; and the correlations (2, 6) of bias and
-    calibration from one motion to the next."""
-    parts, root = of.divided(model)
-    parts, root = parts * factor, root * np.sqrt(factor)
+def _motions(model: ErrorModelArrays, of: _Residuals, parts: Array, root: Array) -> tuple[list[Motions], Array]:
+    """All chains with what is stated of them, and the correlations (2, 6) of bias and calibration from one motion to
+    the next."""
     T_prev_cur = of.rows.motions()
     chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
     chains = [Motions(i, T_prev_cur[c], of.error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
@@ -225,7 +224,7 @@ def _sums_of(of: _Residuals) -> _Sums:
     root, rest, left = of.of_calibration()
     sigma = np.sqrt(rest)
     errors, sigmas = rows.chains(left), rows.chains(sigma)
-    lasting = None if of.patterns is None else rows.chains(root)
+    lasting = None if root is None else rows.chains(root)
     parts = fit_parts(rows.chains(of.error), sigmas, rows.chains(faster), rows.step_s, lasting)
     correlation = part_correlations(errors, sigmas, parts, rows.step_s)
     share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)

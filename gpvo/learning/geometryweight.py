@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.geometry.covariance import correlation as correlation_of
+from gpvo.geometry.covariance import scaled_root
 from gpvo.learning.calibrate import robust_mean
-from gpvo.learning.spans import Chains, carried, cut
+from gpvo.learning.spans import Chains, cut, lagged
 from gpvo.stats.consistency import nees, nll_per_dim
 from gpvo.types import Array
 
@@ -86,12 +87,12 @@ def _windows(c: Divided, correlation: Array, phi: float, m: int) -> tuple[Array,
     of_jitter, of_white = (np.where(known, geometry, R) for R in correlation[:2])
     ends = 0.5 * _outer(jitter[:, [0, -1]])
     white = _outer(white)
-    lagged = np.einsum("wmi,wmj->wij", bias, carried(bias, np.full(6, phi)))
+    root = bias[..., None] * scaled_root(correlation[2])
     return (
         error.sum(axis=1),
         (ends * of_jitter[:, [0, -1]]).sum(axis=1) + (white * of_white).sum(axis=1),
         ends.sum(axis=1) * correlation[0] + white.sum(axis=1) * correlation[1],
-        (_outer(bias).sum(axis=1) + lagged + np.swapaxes(lagged, 1, 2)) * correlation[2],
+        _outer(bias).sum(axis=1) * correlation[2] + lagged(root, np.full(6, phi)),
     )
 
 
