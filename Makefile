@@ -2,12 +2,13 @@
 # make test   set up and run lint, import contracts, types and tests
 # make check  the longer tests: every README command, Monte Carlo, memory, pictures, a browser
 # make docs   the documentation, as pages in docs/_build
+# make dist   the source archive and the wheel, checked
 # make bench  speed and memory, as ratios within one run
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test check bench docs clean
+.PHONY: demo test check bench docs dist clean
 
 .venv/pip-ready:
 	$(PYTHON) -m venv .venv
@@ -17,11 +18,11 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 .venv/demo-ready: .venv/pip-ready pyproject.toml constraints.txt
 	@echo "setting up .venv (a few minutes, once)"
 	$(PIP) torch
-	$(PIP) --editable '.[sim]'
+	$(PIP) --editable '.[train,sim]'
 	@touch $@
 
 .venv/test-ready: .venv/demo-ready
-	$(PIP) --editable '.[sim,mavlink,onnx,dask]' --group dev
+	$(PIP) --editable '.[all,dask]' --group dev
 	@touch $@
 
 demo: .venv/demo-ready
@@ -44,5 +45,12 @@ docs: .venv/test-ready
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
 
+dist: .venv/test-ready
+	$(PIP) build check-wheel-contents twine
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+
 clean:
-	rm -rf .venv out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv out dist build .pytest_cache .mypy_cache .ruff_cache

@@ -9,11 +9,11 @@ from itertools import cycle
 import numpy as np
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate
-from gpvo.filters.measurement import MotionNoise
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
 from gpvo.filters.synthetic import synthetic_flight
 from gpvo.publish.odometry import OdometryBuilder
+from gpvo.types import MotionError
 
 
 def _microseconds(call: Callable[[], object], number: int, repeats: int = 7) -> float:
@@ -45,11 +45,17 @@ def run() -> dict[str, dict]:
     sample = _microseconds(lambda: filter.propagate_imu(0.005, gyro, acc, gyro, acc), 500)
 
     eye = np.eye(6)[None]
-    noise = MotionNoise(np.zeros((1, 6)), eye * 1e-4, eye * 1e-4, 1e-2 * np.eye(6, 12)[None], np.ones(12))
+    noise = MotionError(
+        mean=np.zeros((1, 6)),
+        jitter=eye * 1e-4,
+        white=eye * 1e-4,
+        persistent_root=1e-2 * np.eye(6, 12)[None],
+        persistent_tau_s=np.ones(12),
+    )
     gate = Gate(on_fail="accept")
 
     def update() -> None:
-        filter.decay_bias(0.05, noise.bias_tau_s)
+        filter.decay_bias(0.05, noise.persistent_tau_s)
         filter.update_motion(np.eye(4), noise, gate)
         filter.clone(measured=True)
 

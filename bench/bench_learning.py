@@ -9,6 +9,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,40 @@ from threadpoolctl import threadpool_limits
 _TESTS = Path(__file__).resolve().parents[1] / "tests" / "learning"
 sys.path.insert(0, str(_TESTS))
 
-from gpvo.learning.noise import HeteroscedasticFit, HeteroscedasticOptions, fit_heteroscedastic  # noqa: E402
+from gpvo.learning.logvariance import fit_log_variance  # noqa: E402
 from gpvo.learning.regressors import get_regressor  # noqa: E402
 from gpvo.online import modelfile  # noqa: E402
+from gpvo.online.basis import SharedBasis  # noqa: E402
 from synthetic_errors import Problem, gaussian_nll, make_problem  # noqa: E402
 
 Results = dict[str, dict[str, Any]]
 
 N = 2000
+
+
+@dataclass(frozen=True)
+class Fit:
+    """GPs of the mean and of the log noise variance of six outputs."""
+
+    basis: SharedBasis
+
+    def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and total variance, (n, 6) each."""
+        out = self.basis.predict(X)
+        return out.mean, np.exp(out.log_noise_var) + out.epistemic_var
+
+
+def fit_mean_and_noise(problem: Problem) -> Fit:
+    """The mean by the sparse regressor, the noise by the GP of the log variance of what it leaves."""
+    mean = get_regressor("sparse").fit(problem.X, problem.Y)
+    centre, scale = problem.X.mean(axis=0), problem.X.std(axis=0)
+    U, ones = (problem.X - centre) / scale, np.ones(len(problem.X))
+    left = (problem.Y - mean.predict(problem.X)[0]) ** 2
+    noise = fit_log_variance(U, left / left.mean(axis=0), ones, problem.run)
+    stated, spread = noise.evaluate(U)
+    level = np.log((left * np.exp(-stated - 0.5 * spread)).mean(axis=0))
+    noise = replace(noise, centre=centre, lengthscale=noise.lengthscale * scale)
+    return Fit(SharedBasis(mean.gp, noise, level))
 
 
 def entry(value: float, unit: str, peer: str | None = None, peer_value: float | None = None) -> dict[str, Any]:
@@ -46,7 +73,7 @@ def microseconds(call: Callable[[np.ndarray], Any], rows: np.ndarray, *, repeats
     return float(np.median(spent[warm_up:])) / 1e3
 
 
-def prediction(fit: HeteroscedasticFit, rows: np.ndarray) -> Results:
+def prediction(fit: Fit, rows: np.ndarray) -> Results:
     """One row: mean, aleatoric and epistemic variance of six outputs; mean and standard deviation by the peers."""
     ours = microseconds(fit.basis.predict_one, rows, repeats=5000, warm_up=500)
     few = make_problem(N, 1)
@@ -95,7 +122,7 @@ def gpytorch_predictor(few: Problem) -> Callable[[np.ndarray], Any]:
     return predict
 
 
-def loading(fit: HeteroscedasticFit) -> Results:
+def loading(fit: Fit) -> Results:
     """Import of everything that flies, the model file, and one prediction, in a fresh interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.gpvo"
@@ -155,18 +182,17 @@ def scale(n_large: int = 100_000, n_huge: int = 1_000_000) -> Results:
     """Mean and noise of six outputs: seconds at 100,000 rows, seconds and peak memory at 1,000,000."""
     code = """
 import json, sys, time
-sys.path.insert(0, {tests!r})
-from synthetic_errors import make_problem
-from gpvo.learning.noise import fit_heteroscedastic
+sys.path[:0] = [{tests!r}, {bench!r}]
+from bench_learning import fit_mean_and_noise, make_problem
 problem = make_problem({n}, 1)
 begin = time.perf_counter()
-fit_heteroscedastic(problem.X, problem.Y, problem.run)
+fit_mean_and_noise(problem)
 seconds = time.perf_counter() - begin
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
 print(json.dumps([seconds, int(peak.split()[1]) / 1024**2]))
 """
-    large = child(code.format(tests=str(_TESTS), n=n_large))
-    huge = child(code.format(tests=str(_TESTS), n=n_huge))
+    large = child(code.format(tests=str(_TESTS), bench=str(Path(__file__).parent), n=n_large))
+    huge = child(code.format(tests=str(_TESTS), bench=str(Path(__file__).parent), n=n_huge))
     return {
         "train_100k_s": entry(large[0], "s"),
         "train_100k_peak_gb": entry(large[1], "GB"),
@@ -175,7 +201,7 @@ print(json.dumps([seconds, int(peak.split()[1]) / 1024**2]))
     }
 
 
-def honesty(fit: HeteroscedasticFit, test: Problem, seconds: float) -> Results:
+def honesty(fit: Fit, test: Problem, seconds: float) -> Results:
     """20,000 rows of known truth: nats per output above the true density, and what one sigma covers."""
     mean, var = fit.predict(test.X)
     covered = float(np.mean(np.abs(test.Y - mean) < np.sqrt(var)))
@@ -200,7 +226,7 @@ def run() -> Results:
         with threadpool_limits(1):
             train, test = make_problem(20_000, 1), make_problem(20_000, 101)
             begin = time.perf_counter()
-            fit = fit_heteroscedastic(train.X, train.Y, train.run, options=HeteroscedasticOptions(inducing=256))
+            fit = fit_mean_and_noise(train)
             seconds = time.perf_counter() - begin
             rows = make_problem(500, 7).X
             out = prediction(fit, rows) | loading(fit) | honesty(fit, test, seconds)

@@ -30,10 +30,10 @@ def main() -> None:
     for seed in (*TRAINING, UNSEEN):
         simulate_points("tunnel-bursts", seed, duration_s=40.0, rate_hz=10.0).save(OUT / f"flight{seed}.npz")
     for seed in TRAINING:
-        gpvo("run", OUT / f"flight{seed}.npz", "-o", OUT / f"run{seed}")
+        gpvo("run", OUT / f"flight{seed}.npz", "-o", OUT / f"run{seed}", "--overwrite")
     model, unseen = OUT / "tunnel.gpvo", OUT / f"run{UNSEEN}"
     gpvo("train", *(OUT / f"run{s}" for s in TRAINING), "-o", model, "--jobs", 2)
-    gpvo("run", OUT / f"flight{UNSEEN}.npz", "-o", unseen, "--model", model)
+    gpvo("run", OUT / f"flight{UNSEEN}.npz", "-o", unseen, "--model", model, "--overwrite")
     gpvo("fuse", unseen, "--model", model, "--plot", OUT / "fuse.png")
     gpvo("report", unseen, "--model", model, "-o", OUT / "report.html")
     gpvo("evaluate", unseen, "--model", model, "--plots", OUT / "pictures")

@@ -2,6 +2,27 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
+_EXTRAS = {
+    "vo": ("cv2", "yaml"),
+    "runs": ("pyarrow", "pandas", "scipy", "matplotlib", "jinja2", "joblib"),
+    "train": ("torch", "gpytorch", "sklearn", "linear_operator"),
+    "sim": ("embreex", "mujoco", "numba", "pydantic"),
+    "ros": ("rosbags", "zenoh", "cyclonedds"),
+    "mavlink": ("pymavlink", "serial"),
+    "onnx": ("onnx",),
+    "dask": ("distributed",),
+    "viz": ("rerun",),
+}
+EXTRA_OF = {package: extra for extra, packages in _EXTRAS.items() for package in packages}
+"""Which extra of gpvo brings a package."""
+
+
+def printable(text: object) -> str:
+    """Text without what a terminal would obey: control and formatting characters become ``?``."""
+    return "".join(c if c.isprintable() else "?" for c in str(text))
+
 
 class GpvoError(Exception):
     """Bad input, described for the person who can mend it.
@@ -15,7 +36,7 @@ class GpvoError(Exception):
         self.cure = cure
         place = f"{self.where}: " if self.where else ""
         hint = f" ({cure})" if cure else ""
-        super().__init__(" ".join(f"{place}{what}{hint}".split()))
+        super().__init__(printable(" ".join(f"{place}{what}{hint}".split())))
 
 
 class SourceError(GpvoError):
@@ -30,11 +51,19 @@ class ModelError(GpvoError):
     """A model file is damaged, too new, or does not fit the data at hand."""
 
 
-class MissingExtraError(GpvoError):
+class MissingExtraError(GpvoError, ImportError):
     """An optional dependency is absent."""
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(
+        GpvoError.__init__(
+            self,
             f"this needs the package '{package}', which is not installed",
             cure=f"pip install 'gpvo[{extra}]'",
         )
+        self.name = package
+
+
+def require(package: str) -> None:
+    """Raise MissingExtraError where a package of one of gpvo's extras is not installed."""
+    if find_spec(package) is None:
+        raise MissingExtraError(package, EXTRA_OF[package])

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpvo.errors import SourceError
+from gpvo.errors import GpvoError, SourceError
+from gpvo.io.jsonfile import write_json
 from gpvo.io.run import RunWriter
+from gpvo.io.toml import read_toml
 from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
-from gpvo.vo.config import VoConfig
+from gpvo.vo.config import VoConfig, make_config
 from gpvo.vo.odometry import Followed, StereoOdometry
+from gpvo.vo.recorder import TrackRecorder
+from gpvo.vo.rig_error import RigState
+from gpvo.vo.rig_findings import STATE_FILE, document, findings
 
 if TYPE_CHECKING:
     from gpvo.io.source import Source
@@ -34,6 +39,7 @@ class RunSummary:
     path_length_m: float
     frames_per_s: float
     source_report: str
+    calibration: list[str] = field(default_factory=list)  # what it has wrong
 
     def __str__(self) -> str:
         parts = ", ".join(f"{n} {s}" for s, n in self.status.items() if s != Status.START.value)
@@ -46,11 +52,20 @@ def run(
     config: VoConfig | None = None,
     predictor: Predictor | None = None,
     on_frame: Callable[[Step, Prediction | None], None] | None = None,
+    *,
+    keep_tracks: bool = False,
+    overwrite: bool = True,
+    calibration_state: RigState | None = None,
+    amend: Callable[[VoRecord], VoRecord] | None = None,
+    meta: Mapping[str, object] | None = None,
 ) -> RunSummary:
     """Run stereo VO over a source and write the run folder ``out``.
 
-    ``on_frame`` is called after every frame, for progress bars and live views. An interrupted run leaves a folder that
-    can be read up to its last complete chunk.
+    ``on_frame`` is called after every frame, for progress bars and live views. ``keep_tracks``: the folder also keeps
+    what odometry saw. ``overwrite``: whether a finished run in ``out`` is replaced, once this one is whole.
+    ``calibration_state``: what is known of the calibration's errors. ``amend`` may complete a record before it is
+    written; ``meta``: further keys of ``run.json``. An interrupted run leaves a folder that can be read up to its last
+    complete chunk.
 
     Raises
     ------
@@ -58,26 +73,29 @@ def run(
         If the source holds no frames, or its left and right images look swapped.
     """
     config = config or VoConfig()
-    meta = {"source": str(source.name), "source_format": source.format, "kind": source.kind}
+    known = {"source": str(source.name), "source_format": source.format, "kind": source.kind, **(meta or {})}
     if predictor is not None:
-        meta["model_digest"] = predictor.digest
+        known["model_digest"] = predictor.digest
         predictor.reset(source.camera)
     status: Counter[str] = Counter()
     length_m = busy_s = 0.0
+    recorder = TrackRecorder() if keep_tracks else None
     with RunWriter(
         out,
+        overwrite=overwrite,
         camera=source.camera,
         mounting=source.mounting,
         truth=source.truth,
         imu=source.imu,
         config=asdict(config),
-        meta=meta,
+        meta=known,
         calibration=source.calibration,
     ) as writer:
-        for step in steps(source, config):
-            record = step.record
+        odometry = StereoOdometry(source.camera, config, source.mask, calibration_state)
+        for step in steps(source, config, odometry):
+            record = step.record if amend is None else amend(step.record)
             prediction = None if predictor is None else predictor.step(record)
-            writer.append(record, prediction)
+            writer.append(record, prediction, None if recorder is None else recorder.step(record, step.followed))
             status[record.status.value] += 1
             length_m += float(np.linalg.norm(record.T_prev_cur[:3, 3])) if record.is_reference else 0.0
             busy_s += step.seconds
@@ -86,7 +104,10 @@ def run(
         frames = sum(status.values())
         if frames == 0:
             raise SourceError("no readable stereo pair", where=source.path, cure="look at the images of both cameras")
-        summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report))
+        state = odometry.rig_error.state
+        write_json(writer.path / STATE_FILE, document(state, source.camera))
+        wrong = findings(state, source.camera)
+        summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report), wrong)
         writer.note(source_report=source.report.as_dict(), summary=asdict(summary))
     return summary
 
@@ -101,9 +122,9 @@ class Step:
     seconds: float
 
 
-def steps(source: Source, config: VoConfig) -> Iterator[Step]:
+def steps(source: Source, config: VoConfig, odometry: StereoOdometry | None = None) -> Iterator[Step]:
     """The frames of a source through odometry, one by one."""
-    odometry = StereoOdometry(source.camera, config, source.mask)
+    odometry = odometry or StereoOdometry(source.camera, config, source.mask)
     t_last_ns: int | None = None
     for k, frame in enumerate(source):
         if k < _FRAMES_BEFORE_TRUST and isinstance(frame, TrackFrame):
@@ -114,6 +135,8 @@ def steps(source: Source, config: VoConfig) -> Iterator[Step]:
         seconds = time.perf_counter() - start
         t_last_ns = frame.t_ns
         yield Step(frame, record, odometry.last, seconds)
+    for finding in odometry.pair.findings():
+        source.report.note(finding)
 
 
 def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | None:
@@ -134,3 +157,17 @@ def _refuse_swapped(frame: TrackFrame, where: object) -> None:
             where=where,
             cure="exchange uv_left and uv_right",
         )
+
+
+def config_of(run: Path) -> VoConfig:
+    """The settings a run was made with. Raises GpvoError where they cannot be read."""
+    path = run / "config.toml"
+    # What is None is left out of the file.
+    values = {"sigma_p_px": None, "sigma_m_px": None, **read_toml(path)}
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    try:
+        return make_config(values.pop("preset"), **values)
+    except (KeyError, TypeError) as problem:
+        raise GpvoError(
+            f"the settings of this run cannot be read: {problem}", where=path, cure="run it again"
+        ) from None

@@ -9,15 +9,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.errors import CalibrationError
+
 Array = NDArray[np.float64]
+"""Of double precision, any shape."""
+_Error = TypeVar("_Error", bound="MotionError")
+
+STANDARD_GRAVITY_MPS2 = 9.80665
 
 IMPORTED = "imported"
 """Name of the covariances that somebody else's odometry states of its own motions."""
+
+IMPORTED_POSE = "imported_pose"
+"""The same of its poses, where they do not grow as those of an odometry do: a filter's."""
 
 
 class Status(str, Enum):
@@ -39,7 +49,8 @@ class StereoCamera:
     """A rectified stereo pair: two identical pinhole cameras, rows aligned, the right one at +x.
 
     ``fx_px, fy_px, cx_px, cy_px``: intrinsics [px], pixel (0, 0) is the centre of the first pixel.
-    ``baseline_m``: distance of the optical centres [m], positive. ``width, height``: image size [px].
+    ``baseline_m``: distance of the optical centres [m], positive. ``width, height``: image size [px]. Raises
+    CalibrationError for a camera that cannot be.
     """
 
     fx_px: float
@@ -49,6 +60,13 @@ class StereoCamera:
     baseline_m: float
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        for name in field_names(type(self)):
+            value = getattr(self, name)
+            number = float(value) if isinstance(value, int | float | np.number) else np.nan
+            if not abs(number) < 1e9 or (number <= 0 and name not in ("cx_px", "cy_px")):
+                raise CalibrationError(f"the camera's {name} is {value!r}, which cannot be")
 
     @property
     def K(self) -> Array:
@@ -88,6 +106,30 @@ class TrackFrame:
 
 
 @dataclass(frozen=True)
+class StereoTracks:
+    """Points that odometry followed: one row per observation.
+
+    ``t_ns`` (M,) stamp of the frame; ``track`` (M,) identity of the point; ``uvd`` (M, 3) left column, row and
+    disparity [px]; ``is_inlier`` (M,) whether the observation agrees with the motion found.
+    """
+
+    t_ns: NDArray[np.int64]
+    track: NDArray[np.int64]
+    uvd: Array
+    is_inlier: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @classmethod
+    def join(cls, tables: Sequence[StereoTracks]) -> StereoTracks:
+        """All rows in order of time, then of track."""
+        t_ns, track, uvd, is_inlier = (np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(cls))
+        order = np.lexsort((track, t_ns))
+        return cls(t_ns[order], track[order], uvd[order], is_inlier[order])
+
+
+@dataclass(frozen=True)
 class ImuNoise:
     """White noise densities and random walks of an IMU, in Kalibr's units."""
 
@@ -101,7 +143,7 @@ class ImuNoise:
 class ImuLog:
     """IMU samples in the IMU's own frame, already shifted to the camera's clock.
 
-    ``t_ns`` (N,) int64; ``gyro_radps`` (N, 3); ``acc_mps2`` (N, 3) specific force (+9.81 up at rest), NaN throughout
+    ``t_ns`` (N,) int64; ``gyro_radps`` (N, 3); ``acc_mps2`` (N, 3) specific force (+9.8 up at rest), NaN throughout
     where there is a gyroscope alone.
     """
 
@@ -264,44 +306,105 @@ class VoLog:
         return out
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """The predicted error of one motion: ``xi ~ N(mean, covariance)`` with ``T_true = T_est Exp(-xi)``.
+@dataclass(frozen=True, kw_only=True)
+class MotionError:
+    """What is stated of the error of a motion, or of many along leading axes: ``T_true = T_est Exp(-xi)``.
 
-    ``mean`` (6,) and ``covariance`` (6, 6) in ``cam``, translation first [m, rad], per motion (not per second).
-    ``parts`` splits the covariance by how it accumulates and sums to it: ``jitter`` (pixel noise of a frame that
-    two motions share with opposite sign, half of it per end), ``white`` (independent from motion to motion) and
-    ``bias`` (first-order Gauss-Markov with time constants ``bias_tau_s`` (6,)). ``epistemic`` (6,) is the share of
-    each variance that comes from being away from the training data, already inside ``covariance``.
-    ``confidence`` and ``in_domain`` are in [0, 1].
+    The error ``xi`` has the mean ``mean`` (..., 6) [m, rad], in ``cam``, per motion and not per second, and three parts
+    that differ in how they accumulate (see :mod:`gpvo.accumulation`):
 
-    Of the bias, ``calibration_root`` L (6, 6) has L L^T, zero unless the model knows errors of calibration: L turns its
-    sign around with the motion, while the vector of unit variance that L acts on is Gauss-Markov with time constants
-    ``calibration_tau_s`` (6,). What is left of the bias has ``bias_tau_s``
-    (see :func:`gpvo.geometry.covariance.persistent_root`).
+    * ``jitter`` (..., 6, 6): covariance of the pixel noise of the two frames, half of it each; a frame shares its own
+      with the motion before and the motion after, with opposite sign.
+    * ``white`` (..., 6, 6): covariance of what is independent from motion to motion.
+    * ``persistent_root`` L (..., 6, P): the error ``L u`` of one vector u that all motions share. Its elements are
+      first-order Gauss-Markov, of unit variance and time constants ``persistent_tau_s`` (P,). Models have P = 12: six
+      of the bias, then six of errors of calibration, whose L changes sign with the motion.
+
+    ``dt_s`` (...): duration. ``status``: of the motion, one for all of a batch; of a ``lost`` one nothing was measured.
     """
 
-    t_ns: int
-    dt_s: float
     mean: Array
-    covariance: Array
-    parts: Mapping[str, Array]
-    bias_tau_s: Array
-    epistemic: Array
-    confidence: float
-    in_domain: float
-    status: Status
-    calibration_root: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    calibration_tau_s: Array = field(default_factory=lambda: np.ones(6))
+    jitter: Array
+    white: Array
+    persistent_root: Array
+    persistent_tau_s: Array
+    dt_s: float | Array = 0.0
+    status: Status = Status.OK
+
+    @classmethod
+    def independent(
+        cls, covariance: Array, mean: Array | None = None, *, dt_s: float | Array = 0.0, status: Status = Status.OK
+    ) -> MotionError:
+        """An error (..., 6, 6) that has nothing to do with that of any other motion; ``mean`` (..., 6) or zero."""
+        C = np.asarray(covariance, dtype=np.float64)
+        return MotionError(
+            mean=np.zeros(C.shape[:-1]) if mean is None else np.broadcast_to(mean, C.shape[:-1]),
+            jitter=np.zeros(C.shape),
+            white=C,
+            persistent_root=np.zeros((*C.shape[:-1], 0)),
+            persistent_tau_s=np.zeros(0),
+            dt_s=dt_s,
+            status=status,
+        )
+
+    @cached_property
+    def persistent(self) -> Array:
+        """(..., 6, 6) covariance of the part that persists."""
+        return np.asarray(self.persistent_root @ np.swapaxes(self.persistent_root, -1, -2))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(..., 6, 6) of all parts together."""
+        return np.asarray(self.jitter + self.white + self.persistent)
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing was measured: the motion is a guess, and its error shares nothing with its neighbours'."""
+        return self.status is Status.LOST
 
     @property
     def sigma(self) -> Array:
-        """(6,) standard deviation per axis [m, m, m, rad, rad, rad]."""
-        return np.sqrt(np.diagonal(self.covariance))
+        """(..., 6) standard deviation per axis [m, m, m, rad, rad, rad]."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
+
+    def batch(self) -> MotionError:
+        """The same of one motion as a batch of one."""
+        return MotionError(
+            mean=self.mean[None],
+            jitter=self.jitter[None],
+            white=self.white[None],
+            persistent_root=self.persistent_root[None],
+            persistent_tau_s=self.persistent_tau_s,
+            dt_s=self.dt_s,
+            status=self.status,
+        )
+
+    def row(self: _Error, k: Any) -> _Error:
+        """Row k, or the rows that an index chooses, of a batch along its first axis."""
+        chosen = object.__new__(type(self))
+        for name, value in vars(self).items():
+            batched = isinstance(value, np.ndarray) and value.ndim and name != "persistent_tau_s"
+            chosen.__dict__[name] = value[k] if batched else value
+        return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction(MotionError):
+    """A model's prediction of the error of a motion, or of many.
+
+    ``t_ns``: stamp of the frame where the motion ends (0 where rows have none). ``epistemic`` (..., 6) is the share of
+    each variance that comes from being away from the training data, already inside ``covariance``. ``confidence`` and
+    ``in_domain`` (...) are in [0, 1].
+    """
+
+    t_ns: int = 0
+    epistemic: Array
+    confidence: float | Array
+    in_domain: float | Array
 
     def is_of(self, record: VoRecord) -> bool:
         """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
-        return self.t_ns == record.t_ns and abs(self.dt_s - record.dt_s) < 1e-6
+        return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
 
 
 def field_names(cls: type) -> tuple[str, ...]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from gpvo.cameras.kalibr import make_lens
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.yamlfile import get_numbers, read_yaml
 from gpvo.errors import CalibrationError
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,55 @@ class CameraInfo:
     K: Array
     R: Array
     P: Array
+
+
+_SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("fisheye1", "fisheye2"))
+
+
+def read_camera_infos(path: Path) -> StereoRig:
+    """The rig of ROS camera_info YAML (``camera_calibration_parsers``), a file per camera, for raw images.
+
+    ``path``: of either camera, ``left.yaml`` or ``right.yaml``; the other lies beside it.
+
+    Raises
+    ------
+    CalibrationError
+        Where the other file is missing, or one of them lacks a matrix.
+    """
+    for left, right in _SIDES:
+        name = path.name.replace(right, left)
+        if left in name:
+            pair = [path.with_name(name), path.with_name(name.replace(left, right))]
+            break
+    else:
+        cure = "name the files left.yaml and right.yaml"
+        raise CalibrationError("is of one camera, and its name does not say which", where=path, cure=cure)
+    for file in pair:
+        if not file.is_file():
+            raise CalibrationError(f"the other camera's file {file.name} does not lie beside it", where=path)
+    return rig_from_camera_info(*(_read_camera_info(file) for file in pair), rectified=False, where=path)
+
+
+def _read_camera_info(path: Path) -> CameraInfo:
+    document = read_yaml(path)
+
+    def matrix(name: str, rows: int, columns: int) -> Array:
+        holder = document.get(name)
+        if not isinstance(holder, dict):
+            raise CalibrationError(f"lacks '{name}'", where=path, cure="this is no camera_info YAML of ROS")
+        return np.reshape(get_numbers(holder, "data", rows * columns, path), (rows, columns))
+
+    holder = document.get("distortion_coefficients")
+    count = len(holder.get("data", ())) if isinstance(holder, dict) else 0
+    return CameraInfo(
+        width=int(get_numbers(document, "image_width", 1, path)[0]),
+        height=int(get_numbers(document, "image_height", 1, path)[0]),
+        distortion_model=str(document.get("distortion_model", "plumb_bob")),
+        D=matrix("distortion_coefficients", 1, count)[0],
+        K=matrix("camera_matrix", 3, 3),
+        R=matrix("rectification_matrix", 3, 3),
+        P=matrix("projection_matrix", 3, 4),
+    )
 
 
 def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool, where: object = None) -> StereoRig:

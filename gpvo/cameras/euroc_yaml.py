@@ -12,7 +12,7 @@ from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.cameras.yamlfile import get_numbers, read_yaml
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 
 def read_sensor_pose(path: Path) -> Array:
@@ -59,5 +59,5 @@ def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_i
         T_right_left=se3.inverse(T_body_right) @ T_body_left,
         T_imu_left=se3.inverse(T_body_imu) @ T_body_left,
         T_body_left=T_body_left if body_is_flu else None,
-        where=f"{left.parent.name}/{left.name}",
+        where=str(left),
     )

@@ -12,8 +12,7 @@ from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.cameras.yamlfile import get_numbers, read_yaml
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import ImuNoise
+from gpvo.types import Array, ImuNoise
 
 # Chained and direct transforms of one calibration agree to the digits printed; a mistaken meaning does not.
 _CHAIN_TOLERANCE_M = 5e-3

@@ -9,7 +9,7 @@ import numpy as np
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 
 def read_projections(path: Path) -> dict[str, Array]:

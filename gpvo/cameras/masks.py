@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.cameras.imagesize import is_decodable
 from gpvo.errors import CalibrationError
 
 
@@ -24,7 +25,8 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     """
     if not path.is_file():
         raise CalibrationError("no such mask image", where=path)
-    image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    raw = np.fromfile(path, dtype=np.uint8)
+    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE) if is_decodable(raw.data) else None
     if image is None:
         raise CalibrationError("not readable as an image", where=path, cure="give the mask as PNG")
     white = image > 127

@@ -13,7 +13,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 _NEWTON_STEPS = 60
 

@@ -68,7 +68,8 @@ def _size(document: dict[str, Any], size: tuple[int, int] | None, path: Path) ->
             width, height = get_numbers(document, key, 2, path)
             return int(width), int(height)
     if "image_width" in document and "image_height" in document:
-        return int(document["image_width"]), int(document["image_height"])
+        width, height = (get_numbers(document, key, 1, path)[0] for key in ("image_width", "image_height"))
+        return int(width), int(height)
     if size is None:
         raise CalibrationError("does not give the image size", where=path, cure="add the line 'resolution: [848, 800]'")
     return size

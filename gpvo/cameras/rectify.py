@@ -10,8 +10,7 @@ from gpvo.cameras.models import CameraModel, KannalaBrandt
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import Mounting, StereoCamera
+from gpvo.types import Array, Mounting, StereoCamera
 
 # A flat image stretches a fisheye's border by 1 / cos^2: three times at 55 degrees, four at 60.
 MAX_DEFAULT_HALF_ANGLE_RAD = np.deg2rad(57.0)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.cameras.imagesize import is_plausible
 from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 # What no stereo head for odometry exceeds; beyond them the file is wrong, not the rig unusual.
 MAX_BASELINE_M = 10.0
@@ -100,7 +101,7 @@ def check_pose(T: object, name: str, where: object = None) -> Array:
     """
     try:
         M = np.asarray(T, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{name} is not a matrix of numbers", where=where) from None
     if M.shape != (4, 4):
         raise CalibrationError(f"{name} has shape {M.shape}, expected (4, 4)", where=where)
@@ -144,7 +145,7 @@ def _check_lens(lens: CameraModel, name: str, where: str | None) -> None:
     numbers = np.array([*_intrinsics(lens), *lens.distortion], dtype=np.float64)
     if not np.isfinite(numbers).all():
         raise CalibrationError(f"the {name} camera has an intrinsic that is not a finite number", where=where)
-    if not (0 < lens.width <= 16384 and 0 < lens.height <= 16384):
+    if not (lens.width > 0 < lens.height and is_plausible((lens.width, lens.height))):
         raise CalibrationError(f"the {name} camera has resolution {lens.width}x{lens.height}", where=where)
     if lens.fx_px <= 1 or lens.fy_px <= 1 or not 0.5 < lens.fx_px / lens.fy_px < 2:
         raise CalibrationError(f"the {name} camera has focal lengths {lens.fx_px:g}, {lens.fy_px:g} px", where=where)

@@ -10,13 +10,21 @@ import numpy as np
 import yaml
 
 from gpvo.errors import CalibrationError
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
-_MAX_BYTES = 4_000_000
+_MAX_BYTES = 200_000  # a calibration has a few thousand
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loader that knows OpenCV's matrices."""
+    """Safe loader that knows OpenCV's matrices, and no aliases: nested, a few of them stand for a billion nodes."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(
+                None, None, f"the alias *{event.anchor}; write its value out", event.start_mark
+            )
+        return super().compose_node(parent, index)
 
 
 def _opencv_matrix(loader: _Loader, node: yaml.Node) -> Array:
@@ -51,7 +59,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     text = re.sub(r"\A\ufeff?\s*%YAML[: ][^\n]*\n(---[^\n]*\n)?", "", text).expandtabs(4)
     try:
         document = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, KeyError, ValueError, TypeError, RecursionError) as error:
+    except (yaml.YAMLError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f" at line {mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
@@ -74,7 +82,7 @@ def get_numbers(block: dict[str, Any], key: str, count: int | tuple[int, ...], w
         raise CalibrationError(f"lacks the key '{key}'", where=where)
     try:
         values = np.asarray(block[key], dtype=np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"'{key}' is not a list of numbers", where=where) from None
     if len(values) not in allowed or not np.isfinite(values).all():
         wanted = " or ".join(str(n) for n in allowed)

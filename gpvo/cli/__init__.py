@@ -12,14 +12,27 @@ import typer
 from rich.console import Console
 
 from gpvo import __version__
-from gpvo.cli import evaluate, files, forecast, fuse, learn, reproduce, run, simulate
-from gpvo.errors import GpvoError
+from gpvo.cli import (
+    calibration,
+    evaluate,
+    files,
+    forecast,
+    fuse,
+    learn,
+    live,
+    reproduce,
+    run,
+    score,
+    selftest,
+    simulate,
+    twin,
+)
+from gpvo.errors import EXTRA_OF, GpvoError, MissingExtraError
 
 app = typer.Typer(
     name="gpvo",
     help="Tells your filter how wrong stereo visual odometry is, right now.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -38,7 +51,21 @@ def _root(
     """Options that stand before the command."""
 
 
-for group in (simulate, run, files, learn, evaluate, forecast, fuse, reproduce):
+for group in (
+    simulate,
+    run,
+    calibration,
+    files,
+    twin,
+    learn,
+    evaluate,
+    score,
+    forecast,
+    fuse,
+    live,
+    reproduce,
+    selftest,
+):
     group.register(app)
 
 
@@ -46,6 +73,11 @@ def main() -> None:
     """Entry point of the ``gpvo`` script."""
     try:
         app()
+    except ImportError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRA_OF:
+            raise
+        _fail(str(MissingExtraError(package, _extra(package))))
     except GpvoError as error:
         _fail(str(error))
     except OSError as error:  # a full disk, a folder in place of a file; a broken pipe has ended inside quietly
@@ -54,6 +86,12 @@ def main() -> None:
     except KeyboardInterrupt:
         print("gpvo: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _extra(package: str) -> str:
+    """The extra that brings all that the command at hand needs, not only the first package that it missed."""
+    of_command = {"train": "train", "simulate": "sim", "reproduce": "all"}.get(sys.argv[1] if sys.argv[1:] else "")
+    return of_command or ("runs" if EXTRA_OF[package] == "vo" else EXTRA_OF[package])
 
 
 def _fail(text: str) -> NoReturn:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, ModelError, SourceError, printable
 
 
 def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -20,19 +20,19 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
     GpvoError
         Where the path is nothing gpvo knows, or damaged.
     """
+    if not path.exists():
+        raise SourceError("no such file or folder", where=path)
+    if kind is None and path.suffix.lower() in (".safetensors", ".gpvo"):
+        return _model(path)  # before imports that a vehicle's computer need not have
     from gpvo.io.bag_reader import is_bag
     from gpvo.io.run_read import is_run
     from gpvo.io.source import guess
 
-    if not path.exists():
-        raise SourceError("no such file or folder", where=path)
     if kind is None:
         if is_run(path):
             return _run(path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _calibration(path)
-        if path.suffix.lower() in (".safetensors", ".gpvo"):
-            return _model(path)
         if path.suffix.lower() in (".txt", ".csv", ".tum"):
             return _trajectory(path)
         if is_bag(path):
@@ -82,10 +82,11 @@ def _poses(t_ns: Any, T: Any) -> dict[str, Any]:
 
 
 def _run(path: Path) -> dict[str, Any]:
-    from gpvo.io.run import read_run
+    from gpvo.io.run import read_run, read_tracks
 
     run = read_run(path)
     log = run.log
+    kept = (path / "tracks.parquet").is_file()
     return {
         "what": "run",
         "name": run.name,
@@ -99,6 +100,7 @@ def _run(path: Path) -> dict[str, Any]:
         "truth": None if run.truth is None else _poses(run.truth.t_ns, run.truth.T_world_cam),
         "imu": None if run.imu is None else _imu(run.imu),
         "predictions": len(run.predictions),
+        "tracks": {"observations": len(read_tracks(path))} if kept else None,
     }
 
 
@@ -132,6 +134,13 @@ def _model(path: Path) -> dict[str, Any]:
     from gpvo.online.modelfile import read_header
 
     header = read_header(path)
+    try:
+        return _of_header(header)
+    except (AttributeError, KeyError, TypeError):
+        raise ModelError("its header is damaged", where=path) from None
+
+
+def _of_header(header: dict[str, Any]) -> dict[str, Any]:
     scores = header.get("scores") or {}
     return {
         "what": "model",
@@ -182,7 +191,7 @@ def as_lines(document: dict[str, Any], indent: str = "") -> list[str]:
             lines.append(f"{indent}{key}: " + ", ".join(_short(v) for v in value))
         else:
             lines.append(f"{indent}{key}: {_short(value)}")
-    return lines
+    return [printable(line) for line in lines]
 
 
 def _short(value: Any) -> str:

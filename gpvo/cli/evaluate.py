@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.twin import Replicates, ToleranceOption, settings_of
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation
     from gpvo.evaluation.matches import MatchPicture
+    from gpvo.io.run import Run
+    from gpvo.online.predictor import Predictor
+    from gpvo.twin.replicate import TwinSettings
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
 Model = Annotated[Path | None, typer.Option(help="Error model: adds constant, scaled and learned.")]
@@ -21,7 +25,7 @@ Truth = Annotated[
 ]
 Segments = Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")]
 TruthSigma = Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none.")]
-Align = Annotated[str, typer.Option(help="rotation: fit a fixed rotation between log and truth; none.")]
+Align = Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth: rotation or none.")]
 TimeOffset = Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")]
 
 
@@ -33,28 +37,50 @@ def evaluate(
     truth_sigma: TruthSigma = None,
     align: Align = "none",
     time_offset: TimeOffset = "0",
-    plots: Annotated[Path | None, typer.Option(help="Folder for pictures, one set per run.")] = None,
+    plots: Annotated[Path | None, typer.Option(help="Folder for plots, one set per run.")] = None,
+    stated: Annotated[
+        Path | None, typer.Option(help="Folder for the stated covariances of each method, as files for gpvo score.")
+    ] = None,
+    twins: Annotated[
+        bool,
+        typer.Option(
+            "--twins", help="Judge by twins: each run simulated again from its own tracks, so that no truth is needed."
+        ),
+    ] = False,
+    replicates: Replicates = 8,
+    tolerance: ToleranceOption = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the twins.")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Trajectory errors, and whether each stated covariance is honest.
+    """Score the trajectory and every stated covariance.
 
     Example: gpvo evaluate runs/mh01 --plots pictures
     """
     from gpvo.cli.output import print_json
-    from gpvo.evaluation.evaluate import document
+    from gpvo.evaluation.evaluate import distinct, document
 
-    found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
+    options = options_of(segments, truth_sigma, align, time_offset)
+    if twins:
+        documents, found = _with_twins(*_loaded(runs, model, truth), options, settings_of(replicates, tolerance, seed))
+    else:
+        found = _evaluate(runs, model, truth, options)
+        documents = document(found)["runs"]
+    names = distinct([e.run.name for e in found])
+    if stated is not None:
+        from gpvo.evaluation.score import write_statements
+
+        for evaluation, name in zip(found, names, strict=True):
+            write_statements(evaluation, stated, name)
     if plots is not None:
-        from gpvo.evaluation.evaluate import distinct
         from gpvo.evaluation.plots import save_all
 
-        for evaluation, name in zip(found, distinct([e.run.name for e in found]), strict=True):
+        for evaluation, name in zip(found, names, strict=True):
             save_all(evaluation, plots, name)
     if json_:
-        print_json(document(found))
+        print_json({"schema": 1, "runs": documents})
     else:
-        for evaluation in found:
-            _print(evaluation)
+        for about in documents:
+            _print(about)
         if truth is not None and truth_sigma is None:
             print(f"{truth.name} states no noise of its own and is taken as exact; --truth-sigma says otherwise")
 
@@ -71,7 +97,7 @@ def report(
     frames: Annotated[str | None, typer.Option(help="Also show the matches of these frames, e.g. 5,80.")] = None,
     sequence: Annotated[Path | None, typer.Option(help="The sequence of the run, for --frames.")] = None,
 ) -> None:
-    """One self-contained page: trajectory, error against bounds, reliability, features, the table.
+    """Write a report: one HTML page that opens with a verdict.
 
     Example: gpvo report runs/mh01 -o report.html
     """
@@ -83,8 +109,9 @@ def report(
 
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
-    from gpvo.evaluation.matches import config_of, match_pictures
+    from gpvo.evaluation.matches import match_pictures
     from gpvo.io import open_source
+    from gpvo.runner import config_of
 
     if sequence is None or len(runs) != 1:
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
@@ -120,10 +147,9 @@ def _numbers(option: str, text: str) -> list[float]:
     return numbers
 
 
-def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions) -> list[Evaluation]:
+def _loaded(runs: list[Path], model: Path | None, truth: Path | None) -> tuple[list[Run], Predictor | None]:
     from dataclasses import replace
 
-    from gpvo.evaluation.evaluate import evaluate_run
     from gpvo.io.run import read_run
     from gpvo.io.trajectory import read_tum
     from gpvo.online.predictor import Predictor
@@ -132,28 +158,62 @@ def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options:
     predictor = None if model is None else Predictor.load(model)
     if predictor is not None:
         predictor.require_motions(model)
-    given = None
+    loaded = [read_run(path) for path in runs]
     if truth is not None:
         trajectory = read_tum(truth)
-        given = TruthLog(trajectory.t_ns, trajectory.T_world_body)
-    loaded = [read_run(path) for path in runs]
-    if given is not None:
-        loaded = [replace(run, truth=given) for run in loaded]
+        loaded = [replace(run, truth=TruthLog(trajectory.t_ns, trajectory.T_world_body)) for run in loaded]
+    return loaded, predictor
+
+
+def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions) -> list[Evaluation]:
+    from gpvo.evaluation.evaluate import evaluate_run
+
+    loaded, predictor = _loaded(runs, model, truth)
     return [evaluate_run(run, predictor, options) for run in loaded]
 
 
-def _print(e: Evaluation) -> None:
+def _with_twins(
+    runs: list[Run], predictor: Predictor | None, options: EvaluateOptions, settings: TwinSettings
+) -> tuple[list[dict[str, Any]], list[Evaluation]]:
+    """Documents of the runs, and the evaluations behind them: of a run with truth its own, else those of its twins."""
+    from tempfile import TemporaryDirectory
+
+    from gpvo.cli.twin import make_all
+    from gpvo.evaluation.by_twins import by_twins, with_twins
+    from gpvo.evaluation.evaluate import document
+    from gpvo.io.run import read_run
+
+    documents, found = [], []
+    for run in runs:
+        with TemporaryDirectory(prefix="gpvo-twins-") as folder:
+            twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
+        if run.truth is not None:
+            own = [with_twins(run, twins, predictor, options)]
+            documents += document(own)["runs"]
+        else:
+            about, own = by_twins(run, twins, predictor, options)
+            documents.append(about)
+        found += own
+    return documents, found
+
+
+def _print(d: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from gpvo.evaluation.evaluate import document
-
-    d: dict[str, Any] = document([e])["runs"][0]
     console = Console(width=max(Console().width, 130), highlight=False, markup=False)
+    if about := d.get("simulated_truth"):
+        console.print(
+            f"{d['run']} has no ground truth: means over {about['twins']} twins, whose truth is simulated"
+            f" (tolerance {about['tolerance_name']})"
+        )
     console.print(
-        f"{d['run']}: {d['frames']} frames, {d['lost']} lost, {d['path_length_m']:.1f} m; ATE {d['ate_rmse_m']:.3g} m,"
+        f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {d['path_length_m']:.1f} m;"
+        f" ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )
+    if found := d.get("verdict"):
+        console.print("\n    ".join([f"  {found['headline']}", *found["lines"]]))
     if d["truth_moves_at_rest"]:
         console.print(
             f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands there, and the truth moves"
@@ -166,6 +226,10 @@ def _print(e: Evaluation) -> None:
             f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"
             f" ({s['count']})"
         )
+    if poses := d.get("poses"):
+        blocks = ("position", "orientation", "joint")
+        shown = ", ".join(f"{b} {poses[b]['nees_dof']:.3g} (median {poses[b]['median']:.3g})" for b in blocks)
+        console.print(f"  covariances of poses, after alignment: NEES/dof {shown}")
     table = Table("method", "NEES/dof", "interval", "median", "over 1 s", "1, 2, 3 sigma [%]", "NLL", "final [m]")
     for method, m in d["methods"].items():
         block = "joint" if m["nees_dof"]["joint"] is not None else "translation"

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli import source_options as options
+from gpvo.cli.output import one_of
 from gpvo.errors import GpvoError
 
 
@@ -42,7 +43,7 @@ def import_(
     log: Annotated[Path, typer.Argument(help="Trajectory, CSV or bag of another odometry.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
     truth: Annotated[Path | None, typer.Option(help="Ground truth: a trajectory, CSV or bag.")] = None,
-    format_: Annotated[str | None, typer.Option("--format", help="tum, kitti, csv or bag; by default guessed.")] = None,
+    format_: Annotated[str | None, typer.Option("--format", help="tum, kitti, csv or bag; guessed by default.")] = None,
     truth_format: Annotated[str | None, typer.Option(help="The same for the ground truth.")] = None,
     map_: Annotated[
         list[str] | None, typer.Option("--map", help="COLUMN=NAME of a CSV, e.g. var_x=cov_00; repeatable.")
@@ -50,20 +51,25 @@ def import_(
     truth_map: Annotated[list[str] | None, typer.Option(help="The same for a CSV of the ground truth.")] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the odometry in a bag.")] = None,
     truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
-    times: Annotated[Path | None, typer.Option(help="Seconds, a line per pose, for KITTI poses.")] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Rate, for KITTI poses without times.")] = None,
-    frame: Annotated[str, typer.Option(help="cam: poses of the left optical frame; body: of a FLU body.")] = "cam",
+    times: Annotated[
+        Path | None, typer.Option(help="File of stamps in seconds, one line per pose, for KITTI poses.")
+    ] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Frame rate, for KITTI poses without stamps.")] = None,
+    frame: Annotated[str, typer.Option(help="Frame of the poses: cam (left optical frame) or body (FLU).")] = "cam",
     align: Annotated[
         str,
-        typer.Option(help="Fit what is fixed between log and truth: rotation; transform: the lever arm too; none."),
+        typer.Option(help="Fit a fixed transform between log and truth: rotation, transform (with lever arm) or none."),
     ] = "none",
-    time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's stamps, or auto.")] = "0",
+    time_offset: Annotated[str, typer.Option(help="Seconds to add to the stamps of the log, or auto.")] = "0",
     truth_sigma: Annotated[str | None, typer.Option(help="White noise of the truth per pose, METRES,RADIANS.")] = None,
-    covariance_of: Annotated[str, typer.Option(help="What a CSV's covariances are of: pose or motion.")] = "pose",
-    covariance_axes: Annotated[str, typer.Option(help="Axes of a CSV's covariances: world or body.")] = "world",
+    covariance_of: Annotated[
+        str, typer.Option(help="Whether the covariances in a CSV are of poses or motions.")
+    ] = "pose",
+    covariance_axes: Annotated[str, typer.Option(help="Axes of the covariances in a CSV: world or body.")] = "world",
+    overwrite: options.Overwrite = False,
     json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Make a run of another odometry's log, for training and evaluation.
+    """Turn another odometry's log into a run folder.
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
@@ -82,14 +88,15 @@ def import_(
             truth_topic=truth_topic,
             times=times,
             rate_hz=rate_hz,
-            frame=_one_of("--frame", frame, ("cam", "body")),
-            align=_one_of("--align", align, ("none", "rotation", "transform")),
+            frame=one_of("--frame", frame, ("cam", "body")),
+            align=one_of("--align", align, ("none", "rotation", "transform")),
             time_offset_s=None if time_offset == "auto" else _number("--time-offset", time_offset),
             truth_sigma=None if truth_sigma is None else _sigma(truth_sigma),
-            covariance_of=_one_of("--covariance-of", covariance_of, ("pose", "motion")),
-            covariance_axes=_one_of("--covariance-axes", covariance_axes, ("world", "body")),
+            covariance_of=one_of("--covariance-of", covariance_of, ("pose", "motion")),
+            covariance_axes=one_of("--covariance-axes", covariance_axes, ("world", "body")),
         ),
         out,
+        overwrite=overwrite,
     )
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
@@ -105,12 +112,6 @@ def _mapping(option: str, texts: list[str]) -> dict[str, str]:
             raise GpvoError(f"{option} is '{text}'", cure="give COLUMN=NAME, such as var_x=cov_00")
         out[column.strip()] = name.strip()
     return out
-
-
-def _one_of(option: str, value: str, choices: tuple[str, ...]) -> str:
-    if value not in choices:
-        raise GpvoError(f"{option} is '{value}'", cure=f"choose {' or '.join(choices)}")
-    return value
 
 
 def _number(option: str, text: str) -> float:

@@ -19,15 +19,17 @@ def forecast(
     model: Annotated[Path, typer.Argument(help="Model file.")],
     path: Annotated[Path, typer.Option("--path", help="Planned poses, TUM lines at any spacing.")],
     frame: Annotated[
-        str, typer.Option(help="What the poses are of: cam (left camera, z forward) or body (FLU, camera forward).")
+        str, typer.Option(help="Frame of the poses: cam (left camera, z forward) or body (FLU, camera forward).")
     ] = "cam",
-    draws: Annotated[int, typer.Option(min=1, max=1000, help="Flights of the plan, each in other conditions.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    draws: Annotated[
+        int, typer.Option(min=1, max=1000, help="Number of simulated flights along the plan, each in other conditions.")
+    ] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over the distance.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Every pose, as .parquet or .csv.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """The covariance that VO would have along a planned path, the first pose known exactly.
+    """Predict the covariance along a planned path.
 
     Example: gpvo forecast errors.gpvo --path plan.tum --plot plan.png
     """

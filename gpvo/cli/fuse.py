@@ -23,19 +23,19 @@ def fuse(
     ] = None,
     policies: Annotated[str, typer.Option(help="Comma-separated; default all.")] = "",
     init: Annotated[str, typer.Option(help="Start from truth, or from rest (static).")] = "truth",
-    gate: Annotated[str, typer.Option(help="What fails the 3-sigma gate: discard or inflate.")] = "discard",
+    gate: Annotated[
+        str, typer.Option(help="What happens to a measurement beyond 3 sigma: discard or inflate.")
+    ] = "discard",
     mean: Annotated[
         str,
-        typer.Option(
-            help="The mean error to take off: steady (in all frames alike), predicted, or absorb (take none)."
-        ),
+        typer.Option(help="Mean error to subtract: steady (one rule for all frames), predicted, or absorb (none)."),
     ] = "steady",
-    no_imu: Annotated[bool, typer.Option("--no-imu", help="Constant velocity in place of the IMU.")] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw the policies side by side to this image.")] = None,
+    no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Filter VO with an IMU under constant, geometric, imported and learned covariance, side by side.
+    """Filter VO with an IMU under each covariance.
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
@@ -97,20 +97,23 @@ def publish(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="File or folder to write; .bag (ROS 1), .mcap or .tlog tell what without --to."
+            "-o", "--out", help="File or folder to write; the suffix .bag (ROS 1), .mcap or .tlog replaces --to."
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
     model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the run.")] = None,
-    method: Annotated[str, typer.Option(help="Geometric covariance where there is no prediction.")] = (
+    method: Annotated[str, typer.Option(help="Geometric covariance to use where there is no prediction.")] = (
         "pointing_matching"
     ),
-    correct_twist: Annotated[bool, typer.Option(help="Take the mean error off the twist.")] = False,
+    correct_twist: Annotated[bool, typer.Option(help="Subtract the predicted mean error from the twist.")] = False,
     topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry",
     system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1,
-    consumer: Annotated[str | None, typer.Option(help="px4, ardupilot or robot_localization.")] = None,
+    consumer: Annotated[str | None, typer.Option(help="px4, ardupilot, robot_localization or fusioncore.")] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Say what the consumer will do; writes only with --to or -o.")
+        bool,
+        typer.Option(
+            "--check", help="Report what the consumer will do with the messages; writes a file only with --to or -o."
+        ),
     ] = False,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:

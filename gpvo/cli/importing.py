@@ -13,11 +13,10 @@ from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, read_foreign, to_records
 from gpvo.io.run import write_run
 from gpvo.io.truth import check_overlap
-from gpvo.types import Mounting, TruthLog, VoLog
+from gpvo.types import Array, Mounting, TruthLog, VoLog
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,8 @@ class ImportSummary:
         return "\n  ".join([", ".join(parts), *self.notes])
 
 
-def import_log(settings: ImportSettings, out: Path) -> ImportSummary:
-    """Make a run folder of another odometry's log.
+def import_log(settings: ImportSettings, out: Path, *, overwrite: bool = True) -> ImportSummary:
+    """Make a run folder of another odometry's log; ``overwrite``: also in place of a finished run.
 
     Raises
     ------
@@ -96,6 +95,7 @@ def import_log(settings: ImportSettings, out: Path) -> ImportSummary:
     write_run(
         out,
         VoLog(records),
+        overwrite=overwrite,
         truth=truth,
         mounting=Mounting(T_body_cam=T_FLU_OPTICAL if settings.frame == "body" else None),
         config={"import": {"frame": settings.frame, "align": settings.align, "time_offset_s": offset_s}},

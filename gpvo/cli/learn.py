@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.twin import Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -25,26 +26,40 @@ def train(
     out: Annotated[Path, typer.Option("-o", "--out", help="Model file to write.")],
     features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto",
     target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame",
-    regressor: Annotated[str, typer.Option(help="auto, exact, sparse, svgp or sklearn.")] = "auto",
+    regressor: Annotated[
+        str, typer.Option(help="Of --target position: auto, exact, sparse, svgp or sklearn.")
+    ] = "auto",
     align: Annotated[
-        str, typer.Option(help="rotation: fit a fixed rotation between log and truth first; none.")
+        str, typer.Option(help="Fit a fixed rotation between log and truth first: rotation or none.")
     ] = "none",
     waits: Annotated[
-        str, typer.Option(help="drop: leave out where the vehicle stands while its truth moves; keep.")
+        str,
+        typer.Option(
+            "--stationary", "--waits", help="Motions in which the vehicle stands while its truth wanders: drop or keep."
+        ),
     ] = "drop",
     update: Annotated[
-        Path | None, typer.Option(help="Add the runs to this model's own; its settings hold unless given.")
+        Path | None,
+        typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
     ] = None,
     max_rows: Annotated[
-        int, typer.Option(min=1000, help="Rows held in memory; of more, the noise learns from blocks.")
+        int, typer.Option(min=1000, help="Rows held in memory; longer data is streamed in blocks.")
     ] = 100_000,
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
-    jobs: Annotated[int, typer.Option(help="Folds at a time; -1 for all cores.")] = 1,
+    twins: Annotated[
+        bool,
+        typer.Option(
+            "--twins", help="Learn from twins of runs without ground truth (made with gpvo run --keep-tracks)."
+        ),
+    ] = False,
+    replicates: Replicates = 8,
+    tolerance: ToleranceOption = "none",
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
     backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
     json_: Json = False,
 ) -> None:
-    """Learn the odometry's error from runs with ground truth; judge by leaving each run out.
+    """Train an error model; score it by leaving each run out.
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
@@ -63,7 +78,8 @@ def train(
     if update is not None:
         settings = _settings_of(update) | {k: v for k, v in settings.items() if _is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
-    trained = _train(runs, settings, update)
+    with in_place_of_runs_without_truth(runs if twins else [], settings_of(replicates, tolerance, seed), jobs) as found:
+        trained = _with_origin(_train(found if twins else runs, settings, update), found if twins else runs)
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:
@@ -74,6 +90,17 @@ def train(
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", of {given} that streamed" if given > kept else ""
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
+
+
+def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:
+    """The header also says which sequences are twins, whose truth was simulated."""
+    from dataclasses import replace
+
+    from gpvo.io.jsonfile import read_json
+    from gpvo.twin.replicate import simulated_truth
+
+    origin = simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
+    return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 
 def _settings_of(model: Path) -> dict[str, Any]:
@@ -97,6 +124,10 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
 
     config = TrainConfig(**settings)
     _refuse_twice(paths)
+    if config.regressor != "auto" and config.target != "position":
+        print(
+            "gpvo: --regressor has a say with --target position alone: the log-variance GP is sparse", file=sys.stderr
+        )
     if update is not None and config.target == "position":
         raise GpvoError("a model of positions cannot be updated", where=update, cure="train anew from all runs")
     if any(p.is_file() for p in paths):
@@ -180,7 +211,7 @@ def _print_table(document: dict[str, Any]) -> None:
     resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
     if resting:
         told = ", ".join(f"{n} of {name}" for name, n in resting.items())
-        console.print(f"left out, as the vehicle stands there and the truth moves: {told}  (--waits keep)")
+        console.print(f"left out, as the vehicle stands there and the truth moves: {told}  (--stationary keep)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
@@ -194,9 +225,15 @@ def _print_table(document: dict[str, Any]) -> None:
         )
     c = document["comparison"]
     if c is not None:
-        d = c["nll_per_dim_difference"]
-        interval = f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
-        console.print(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {interval}")
+        console.print(
+            f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {_interval(c, 'nll_per_dim_difference')}"
+        )
+        console.print(f"learned minus base (what the Gaussian process adds): {_interval(c, 'learned_less_base')}")
+
+
+def _interval(comparison: dict[str, Any], name: str) -> str:
+    d = comparison[name]
+    return f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
 
 
 def _nees(block: dict[str, float | None]) -> float | None:
@@ -213,7 +250,7 @@ def predict(
     out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file of predictions to write.")],
     json_: Json = False,
 ) -> None:
-    """Predict the error of every motion of a run, as would have been done in flight.
+    """Predict the error of every motion of a run.
 
     Example: gpvo predict errors.gpvo runs/flight -o predictions.parquet
     """
@@ -245,7 +282,9 @@ def predict(
 
 
 def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")], json_: Json = False) -> None:
-    """Before flight: does this model fit this camera, rate and domain? Exits with 1 if not.
+    """Check whether a model fits a camera and its conditions.
+
+    Exits with 1 if it does not.
 
     Example: gpvo check errors.gpvo runs/hover
     """
@@ -274,14 +313,17 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
 
 def export(
     model: Model,
-    to: Annotated[str | None, typer.Option(help="onnx or c; by default what --out tells: .onnx or .h.")] = None,
+    to: Annotated[str | None, typer.Option(help="onnx or c; guessed from the suffix of --out.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write; by default beside the model.")] = None,
     for_filter: Annotated[
-        bool, typer.Option("--for-filter", help="As a filter needs it: the mean is the one that it may take off.")
+        bool,
+        typer.Option("--for-filter", help="Export the model for filters, with the mean that a filter may subtract."),
     ] = False,
-    prefix: Annotated[str, typer.Option(help="Of every symbol in C, for several models in one program.")] = "gpvo",
+    prefix: Annotated[
+        str, typer.Option(help="Prefix of every C symbol, so that several models fit into one program.")
+    ] = "gpvo",
 ) -> None:
-    """Write a model for machines without Python: ONNX, or one C header.
+    """Export a model to ONNX or to one C header.
 
     Example: gpvo export errors.gpvo --to c
     """

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from gpvo.errors import GpvoError
 
 
 def jsonable(value: Any) -> Any:
@@ -25,6 +27,13 @@ def jsonable(value: Any) -> Any:
 def print_json(document: dict[str, Any]) -> None:
     """Print a document in the form scripts read."""
     print(json.dumps(jsonable(document), indent=2))
+
+
+def one_of(option: str, value: str, choices: Iterable[str]) -> str:
+    """The value of an option. Raises GpvoError where it is none of the choices."""
+    if value not in choices:
+        raise GpvoError(f"{option} is '{value}'", cure=f"choose {' or '.join(choices)}")
+    return value
 
 
 @contextmanager

@@ -9,20 +9,27 @@ import typer
 
 
 def reproduce(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of results; its stages are kept between runs.")],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", help="Folder of results; finished stages are kept, so that a second run goes on."),
+    ],
     quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
     seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
-    points_seeds: Annotated[int | None, typer.Option(min=0, help="Further seeds without [20, quick: 6].")] = None,
+    points_seeds: Annotated[
+        int | None, typer.Option(min=0, help="Further test seeds without images [20, quick: 6].")
+    ] = None,
     data: Annotated[
         Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
     ] = None,
-    only: Annotated[str | None, typer.Option(help="Tables or rows, such as 4.3,4.1-clean; by default all.")] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Tables or rows to make, such as 4.3,4.1-clean; all by default.")
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1: one per core.")] = -1,
     backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Run every experiment of the thesis on simulated and real data; killed and started again, it goes on.
+    """Reproduce every experiment of the thesis.
 
     Example: gpvo reproduce -o out/thesis --quick
     """

@@ -20,14 +20,20 @@ _MOST_NOTES = 5
 def run(
     source: Annotated[Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
-    model: Annotated[Path | None, typer.Option(help="Error model: predict as it goes.")] = None,
-    preset: Annotated[str, typer.Option(help="fast, or thesis.")] = "fast",
+    model: Annotated[Path | None, typer.Option(help="Error model: store a prediction with each frame.")] = None,
+    preset: Annotated[str, typer.Option(help="Settings of the odometry: fast or thesis.")] = "fast",
     methods: Annotated[
         str, typer.Option(help="Covariances: triangulation, pointing_matching, spherical.")
     ] = "triangulation,pointing_matching",
-    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto: from the residuals so far.")] = "0.1",
+    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1",
     sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
+    self_calibration: Annotated[
+        bool | None, typer.Option(help="Estimate what the calibration has wrong; on, but for preset thesis.")
+    ] = None,
+    calibration_state: Annotated[
+        Path | None, typer.Option(help="Start from what an earlier run found: its folder or calibration_state.json.")
+    ] = None,
     kind: flags.Kind = None,
     calibration: flags.Calibration = None,
     hfov_deg: flags.HfovDeg = None,
@@ -42,8 +48,12 @@ def run(
     imu_topic: flags.ImuTopic = None,
     truth_topic: flags.TruthTopic = None,
     truth_frame: flags.TruthFrame = None,
+    keep_tracks: Annotated[
+        bool, typer.Option("--keep-tracks", help="Keep what odometry saw: 'gpvo twin' needs it.")
+    ] = False,
     view: Annotated[bool, typer.Option("--view", help="Watch it live in rerun (extra gpvo[viz]).")] = False,
     record_view: Annotated[Path | None, typer.Option(help="Write what --view would show to this .rrd file.")] = None,
+    overwrite: flags.Overwrite = False,
     json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Run stereo VO over a sequence: log, trajectory and covariances.
@@ -53,6 +63,7 @@ def run(
     from gpvo import runner
     from gpvo.cli.output import print_json, progress
     from gpvo.io import open_source
+    from gpvo.learning.check import ENOUGH_INSIDE, camera_problems
     from gpvo.vo.config import make_config
 
     config = make_config(
@@ -61,6 +72,7 @@ def run(
         sigma_px=sigma,
         sigma_p_px=_pixels("--sigma-p", sigma_p),
         sigma_m_px=_pixels("--sigma-m", sigma_m),
+        **({} if self_calibration is None else {"self_calibration": self_calibration}),
     )
     options = flags.source_options(
         size,
@@ -78,11 +90,18 @@ def run(
         truth_frame=truth_frame,
     )
     sequence = open_source(source, kind=kind, **options)
+    known = None
+    if calibration_state is not None:
+        from gpvo.vo.rig_findings import read_state
+
+        known = read_state(calibration_state, sequence.camera)
     predictor = None
     if model is not None:
         from gpvo.online.predictor import Predictor
 
         predictor = Predictor.load(model)
+        _warn(model, camera_problems(predictor.camera, sequence.camera))
+    inside: list[bool] = []
     show = None
     if view or record_view is not None:
         from gpvo.evaluation.live_view import LiveView
@@ -92,10 +111,24 @@ def run(
 
         def on_frame(step: runner.Step, prediction: Prediction | None) -> None:
             advance()
+            if prediction is not None:
+                inside.append(bool(prediction.in_domain > 0.5))
             if show is not None:
                 show(step, prediction)
 
-        summary = runner.run(sequence, out, config, predictor, on_frame=on_frame)
+        summary = runner.run(
+            sequence,
+            out,
+            config,
+            predictor,
+            on_frame,
+            keep_tracks=keep_tracks,
+            overwrite=overwrite,
+            calibration_state=known,
+        )
+    if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
+        share = 100 * sum(inside) / len(inside)
+        _warn(model, [f"only {share:.0f} % of the frames lie inside the training domain"])
     notes = sequence.report.notes
     more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
     for note in (*notes[:_MOST_NOTES], *more):
@@ -106,6 +139,15 @@ def run(
         print(f"{out}: {summary}")
         if summary.source_report != f"{summary.frames} frames":
             print(f"source: {summary.source_report}")
+        for line in summary.calibration:
+            print(f"calibration: {line}")
+        if summary.calibration:
+            print(f"calibration: 'gpvo calibration {out} -o FILE' writes a corrected one")
+
+
+def _warn(model: Path, problems: list[str]) -> None:
+    for problem in problems:
+        print(f"gpvo: {model.name} does not fit: {problem} (gpvo check says more)", file=sys.stderr)
 
 
 def _pixels(option: str, text: str) -> float | None:

@@ -19,28 +19,39 @@ _SEED_LIMIT = 100_000
 
 
 def simulate(
-    scenario: Annotated[str | None, typer.Argument(help="A name of --list, or a TOML file.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to write; with --points a .npz.")] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Everything random follows from it. 0, or that of the TOML file.")
+    scenario: Annotated[str | None, typer.Argument(help="Name of a scenario (see --list), or a TOML file.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder to write; with --points, a .npz file.")
     ] = None,
-    seeds: Annotated[str | None, typer.Option(help="Many: 0..9 or 1,4,7. Each goes to OUT/seed_N.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Random seed; default 0, or the one in the TOML file.")
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option(help="Several seeds, such as 0..9 or 1,4,7; each flight goes to OUT/seed_N.")
+    ] = None,
     duration: Annotated[float | None, typer.Option(help="Length of the flight [s].")] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     speed: Annotated[float | None, typer.Option(help="Speed [m/s].")] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Fly this recorded path, scaled to fit: TUM lines or EuRoC's csv, z up.")
+        Path | None, typer.Option(help="Recorded path to fly, scaled to fit the world: TUM lines or EuRoC CSV, z up.")
     ] = None,
-    camera: Annotated[str | None, typer.Option(help="pinhole, euroc or t265.")] = None,
-    points: Annotated[bool, typer.Option("--points", help="No images: landmark tracks, far faster.")] = False,
-    jobs: Annotated[int, typer.Option(help="Flights at a time, with --seeds; -1 for one per core.")] = 1,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of one flight; the files are the same.")] = 2,
+    camera: Annotated[
+        str | None, typer.Option(help="pinhole, euroc, t265, or a Kalibr or OpenCV calibration file.")
+    ] = None,
+    points: Annotated[
+        bool, typer.Option("--points", help="Landmark tracks instead of images: a thousand times faster.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(help="Flights to simulate in parallel with --seeds; -1 for one per core.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="Threads per flight; they do not change the result.")] = 2,
     backend: Annotated[str, typer.Option(help="joblib, or dask.")] = "joblib",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
     preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the pictures (PNG).")] = None,
-    list_: Annotated[bool, typer.Option("--list", help="Show the scenarios.")] = False,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="key=value; tables by dots. Repeatable.")] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Setting of the scenario as key=value, with dots for tables. Repeatable."),
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Simulate stereo sequences with IMU and exact truth.
 

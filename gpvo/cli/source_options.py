@@ -13,18 +13,19 @@ Kind = Annotated[str | None, typer.Option("--source", help="Override the guessed
 Calibration = Annotated[Path | None, typer.Option(help="Calibration file in place of the one found.")]
 HfovDeg = Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")]
 Size = Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")]
-MaskLeft = Annotated[Path | None, typer.Option(help="Image of the left lens' usable pixels.")]
-MaskRight = Annotated[Path | None, typer.Option(help="The same of the right lens.")]
+MaskLeft = Annotated[Path | None, typer.Option(help="Mask image: the pixels of the left lens that may be used.")]
+MaskRight = Annotated[Path | None, typer.Option(help="The same for the right lens.")]
 Bits = Annotated[int | None, typer.Option(help="Depth of the samples in 16-bit images, e.g. 12.")]
 RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folder whose names are numbers.")]
 PairTolerance = Annotated[
-    float | None, typer.Option(help="How far the stamps of a pair may be apart [s]; bags, EuRoC and image folders.")
+    float | None, typer.Option(help="Largest difference between the stamps of a stereo pair [s].")
 ]
 LeftTopic = Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")]
 RightTopic = Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")]
 ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")]
-TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none for no truth.")]
-TruthFrame = Annotated[str | None, typer.Option(help="Whose poses the truth topic holds: imu or cam.")]
+TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none to ignore it.")]
+TruthFrame = Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
 
 
 def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:

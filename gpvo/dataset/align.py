@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import TruthLog
+from gpvo.types import Array, TruthLog
 
 MAX_GAP_S = 0.5
 

@@ -14,13 +14,12 @@ from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.dataset.targets import check_target, motion_targets, position_targets
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
 from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer
 from gpvo.online.slip import REASON, SlipDetector, flag_slips
-from gpvo.types import Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
 
 MIN_ROWS = 30
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.align import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import TruthLog, VoLog
+from gpvo.types import Array, TruthLog, VoLog
 
 # With clocks that overlap, offsets beyond this are a mistake of the search, not of the clocks.
 MAX_OFFSET_S = 5.0

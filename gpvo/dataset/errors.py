@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.align import interpolate_truth
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import TruthLog, VoLog
+from gpvo.types import Array, TruthLog, VoLog
 
 
 @dataclass(frozen=True)

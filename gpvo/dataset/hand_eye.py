@@ -14,8 +14,7 @@ import numpy as np
 from gpvo.dataset.align import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import TruthLog, VoLog
+from gpvo.types import Array, TruthLog, VoLog
 
 # Over a second a hand-held or flying camera turns enough for its lever arm to show; its drift does not matter yet.
 WINDOW_S = 1.0

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from gpvo.dataset.align import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
 from gpvo.online.window import Window
-from gpvo.types import TruthLog, VoRecord
+from gpvo.types import Array, TruthLog, VoRecord
 
 
 def check_target(target: str) -> str:

@@ -8,14 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.accumulation import PoseError
 from gpvo.dataset.errors import MotionErrors
-from gpvo.evaluation.accumulate import PoseError, Step
 from gpvo.evaluation.statements import Statement
 from gpvo.evaluation.trajectory import path_length_m
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import Interval, block_bootstrap
-from gpvo.stats.consistency import coverage, crps_gaussian, nees, nll_per_dim
-from gpvo.types import Array, VoLog
+from gpvo.stats.consistency import (
+    by_difficulty,
+    correlation_gain,
+    coverage,
+    crps_gaussian,
+    energy_score,
+    nees,
+    nll_per_dim,
+)
+from gpvo.types import Array, MotionError, VoLog
 
 BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
 HORIZONS_M = (1.0, 10.0, 100.0)
@@ -43,6 +51,7 @@ class Consistency:
 
     ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise``: the same with the
     truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the axes.
+    ``energy_*``, ``correlation_gain_nats`` and the quartiles ``*_by_difficulty``: see :mod:`gpvo.stats.consistency`.
     ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames.
     """
 
@@ -55,6 +64,11 @@ class Consistency:
     nll_per_dim: float | None
     crps_translation_m: float
     crps_rotation_rad: float | None
+    energy_translation_m: float
+    energy_rotation_rad: float | None
+    correlation_gain_nats: float
+    nees_dof_by_difficulty: tuple[float, ...]
+    coverage_by_difficulty: tuple[float, ...]
     predicted_final_error_m: float | None
     predicted_final_error_independent_m: float | None
     one_second: Horizon | None
@@ -91,6 +105,7 @@ def consistency(
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     crps = crps_gaussian(e, sigma)
     covered = [float(c) for c in coverage(e, sigma)]
+    quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
     progress = path_length_m(T_true), (log.t_ns - log.t_ns[0]) * 1e-9
     return Consistency(
@@ -103,6 +118,11 @@ def consistency(
         nll_per_dim=float(nll_per_dim(e, C).mean()) if d == 6 else None,
         crps_translation_m=float(crps[:, :3].mean()),
         crps_rotation_rad=float(crps[:, 3:].mean()) if d == 6 else None,
+        energy_translation_m=float(energy_score(e[:, :3], C[:, :3, :3]).mean()),
+        energy_rotation_rad=float(energy_score(e[:, 3:], C[:, 3:, 3:]).mean()) if d == 6 else None,
+        correlation_gain_nats=float(correlation_gain(e, C).mean()),
+        nees_dof_by_difficulty=tuple(quartiles[0].tolist()),
+        coverage_by_difficulty=tuple(quartiles[1].tolist()),
         predicted_final_error_m=final,
         predicted_final_error_independent_m=independent,
         one_second=horizon(statement, log, T_true, known, progress[1], 1.0, noise_sigma) if d == 6 else None,
@@ -117,13 +137,13 @@ def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) ->
 
     With the parts, and taking motions as independent.
     """
-    if statement.steps is None:
+    if statement.errors is None:
         return None, None
     covered = np.flatnonzero(known)
     chain = _ancestors(int(covered[-1]), int(covered[0]), log.parent)
-    parts = [statement.steps[k] for k in chain]
-    independent = [Step.independent(s.T_prev_cur, s.jitter + s.white + s.bias) for s in parts]
-    a, b = (float(np.sqrt(np.trace(_sum_of(steps)[:3, :3]))) for steps in (parts, independent))
+    T, parts = log.T_prev_cur[chain], [statement.errors[k] for k in chain]
+    independent = [MotionError.independent(error.covariance) for error in parts]
+    a, b = (float(np.sqrt(np.trace(_sum_of(T, errors)[:3, :3]))) for errors in (parts, independent))
     return a, b
 
 
@@ -136,12 +156,12 @@ def _ancestors(frame: int, root: int, parent: NDArray[np.int64]) -> list[int]:
     return chain[::-1]
 
 
-def _sum_of(steps: Sequence[Step]) -> Array:
+def _sum_of(T_prev_cur: Sequence[Array] | Array, errors: Sequence[MotionError]) -> Array:
     """(6, 6) covariance after a chain of motions."""
-    error = PoseError()
-    for step in steps:
-        error.add(step)
-    return error.covariance
+    pose = PoseError()
+    for T, error in zip(T_prev_cur, errors, strict=True):
+        pose = pose.after(T, error)
+    return pose.covariance
 
 
 def horizon(
@@ -152,7 +172,7 @@ def horizon(
 
     Each begins where the one before has at least half passed.
     """
-    assert statement.steps is not None
+    assert statement.errors is not None
     stride = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS)
     values, t_next = [], float(progress[0])
     parent, usable = log.parent, log.usable
@@ -169,7 +189,10 @@ def horizon(
         T_est = np.eye(4)
         for k in window:
             T_est = T_est @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
-        e, C = se3.log(se3.inverse(T) @ T_est), _sum_of([statement.steps[k] for k in window])
+        e, C = (
+            se3.log(se3.inverse(T) @ T_est),
+            _sum_of([log.records[k].T_prev_cur for k in window], [statement.errors[k] for k in window]),
+        )
         values.append([float(nees(e, S)) / 6 for S in (C, C + truth_noise(T, *noise_sigma))])
     plain, noisy = np.mean(values, axis=0).tolist() if values else (float("nan"), float("nan"))
     return Horizon(span, plain, noisy, len(values))

@@ -19,12 +19,12 @@ _NEES_WINDOW_S = 0.5
 
 def full_statements(e: Evaluation) -> list[Statement]:
     """The methods that speak of all six axes of at least two motions with truth."""
-    return [s for s in e.statements if s.steps is not None and _stated(e, s).sum() >= 2]
+    return [s for s in e.statements if s.errors is not None and _stated(e, s).sum() >= 2]
 
 
 def best_statement(e: Evaluation) -> Statement | None:
     """The statement to draw bounds of: ``learned`` where there is one, else ``triangulation``, else any full one."""
-    full = {s.method: s for s in e.statements if s.steps is not None}
+    full = {s.method: s for s in e.statements if s.errors is not None}
     return full.get("learned") or full.get("triangulation") or next(iter(full.values()), None)
 
 

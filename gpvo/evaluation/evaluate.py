@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,10 @@ from gpvo.dataset.errors import MotionErrors, motion_errors
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
+from gpvo.evaluation.poses import PoseConsistency, pose_consistency, pose_document
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
+from gpvo.evaluation.verdict import verdict
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
 from gpvo.types import IMPORTED, Array, Prediction, Status, TruthLog, VoLog
@@ -34,6 +36,7 @@ METHODS = (
     IMPORTED,
     f"{IMPORTED}_scaled",
     "gp_thesis",
+    "base",
     "learned",
 )
 
@@ -52,7 +55,9 @@ class EvaluateOptions:
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands."""
+    stands. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a
+    model. ``poses``: scores of the covariances of poses, of a log that states these.
+    """
 
     run: Run
     errors: MotionErrors
@@ -65,15 +70,22 @@ class Evaluation:
     truth_sigma: tuple[float, float]
     time_offset_s: float
     unscored: int = 0
+    in_domain: float | None = None
+    poses: PoseConsistency | None = None
 
     def __str__(self) -> str:
         t = self.trajectory
         return f"{self.run.name}: ATE {t.ate_rmse_m:.3g} m over {t.path_length_m:.1f} m"
 
 
-def evaluate_run(run: Run, predictor: Predictor | None = None, options: EvaluateOptions | None = None) -> Evaluation:
+def evaluate_run(
+    run: Run,
+    predictor: Predictor | None = None,
+    options: EvaluateOptions | None = None,
+    further: Sequence[Statement] = (),
+) -> Evaluation:
     """Evaluate a run against its truth; with a predictor, predictions are made as in flight, else those of the run
-    are used. A motion that either says is lost counts as lost for every method.
+    are used. A motion that either says is lost counts as lost for every method. ``further``: methods of elsewhere.
 
     Raises
     ------
@@ -98,7 +110,7 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
     scored = without_wandering_truth(log, truth)
     errors = motion_errors(scored, truth)
     T_est = log.trajectory()
-    made = statements(log, predictions, predictor)
+    made = [*statements(log, predictions, predictor), *further]
     found = {s.method: consistency(s, errors, scored, T_true, known, sigma) for s in made}
     first = int(np.flatnonzero(known)[0])
     lift = T_true[first] @ np.linalg.inv(T_est[first])
@@ -116,6 +128,8 @@ def evaluate_run(run: Run, predictor: Predictor | None = None, options: Evaluate
         truth_sigma=sigma,
         time_offset_s=offset_s,
         unscored=int(log.usable.sum() - scored.usable.sum()),
+        poses=pose_consistency(log, T_est, T_true, known),
+        in_domain=float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None,
     )
 
 
@@ -170,6 +184,10 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
     * ``truth_moves_at_rest``: motions that are not scored, as the vehicle stands and the truth moves; they count in
       ATE, final error and RPE alone.
+    * ``in_domain``: share of the frames in the model's training domain.
+    * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
+      states (see :mod:`gpvo.evaluation.poses`); None where it states none.
+    * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers come to, in words.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose and axis, as its source states
       or ``--truth-sigma`` says; 0 for a file that states none.
@@ -181,6 +199,9 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
     * ``nees_dof_interval``: by block, 95 % interval [low, high] of ``nees_dof`` by a bootstrap over blocks of time.
     * ``nees_dof_truth_noise``: by block, ``nees_dof`` with the truth's own noise added to what the method states.
+    * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS of vectors; it rewards sharp and honest
+      statements alike. ``correlation_gain_nats``: by how much the stated correlations make the errors likelier.
+      ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.
     * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``count``}: joint, of the motion over windows of a second;
       ``horizons`` are the same over lengths of path.
     * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
@@ -202,6 +223,7 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "lost": counts["lost"],
         "degraded": counts["degraded"],
         "truth_moves_at_rest": e.unscored,
+        "in_domain": e.in_domain,
         "path_length_m": t.path_length_m,
         "ate_rmse_m": t.ate_rmse_m,
         "rmse_origin_m": t.rmse_origin_m,
@@ -213,6 +235,8 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
             key).rotation_rad)} for name, key in (("frame", "rpe_frame"), ("1s", "rpe_second"), ("10m", "rpe_10m"))
         },
         "segments": [_plain(s) for s in t.segments],
+        "poses": pose_document(e.poses),
+        "verdict": asdict(verdict(e)),
         "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
     }  # fmt: skip
 
@@ -238,7 +262,9 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
         return {
             "nees_dof": none, "nees_dof_interval": none, "nees_dof_median": none, "nees_dof_truth_noise": none,
             "coverage": dict.fromkeys("123"), "nll_per_dim": None,
-            "crps": {"translation_m": None, "rotation_rad": None}, "predicted_final_error_m": None,
+            "crps": {"translation_m": None, "rotation_rad": None},
+            "energy": {"translation_m": None, "rotation_rad": None}, "correlation_gain_nats": None,
+            "by_difficulty": {"nees_dof": None, "coverage": None}, "predicted_final_error_m": None,
             "predicted_final_error_independent_m": None, "one_second": _horizon(None),
             "horizons": [{"length_m": m, **_horizon(None)} for m in HORIZONS_M],
         }  # fmt: skip
@@ -251,6 +277,9 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
         "coverage": dict(zip("123", c.coverage, strict=True)),
         "nll_per_dim": c.nll_per_dim,
         "crps": {"translation_m": c.crps_translation_m, "rotation_rad": c.crps_rotation_rad},
+        "energy": {"translation_m": c.energy_translation_m, "rotation_rad": c.energy_rotation_rad},
+        "correlation_gain_nats": c.correlation_gain_nats,
+        "by_difficulty": {"nees_dof": c.nees_dof_by_difficulty, "coverage": c.coverage_by_difficulty},
         "predicted_final_error_m": c.predicted_final_error_m,
         "predicted_final_error_independent_m": c.predicted_final_error_independent_m,
         "one_second": _horizon(c.one_second),

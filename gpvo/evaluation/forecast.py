@@ -13,18 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.evaluation.accumulate import Step, along
+from gpvo.accumulation import along
 from gpvo.evaluation.plan import Plan
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import position_in_world, symmetrise
 from gpvo.online.base import TWIST_COLUMNS, positions
-from gpvo.online.division import PARTS
-from gpvo.online.estimate import ErrorModelArrays, Estimate
 from gpvo.online.features import FeatureStream
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.predictor import Predictor
 from gpvo.online.sample import TrainingSample
-from gpvo.types import Array, Status, VoRecord
+from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 DRAWS = 8
 PLANNED = (*TWIST_COLUMNS, "acceleration_mps2", "angular_acceleration_radps2")
@@ -98,7 +96,7 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
     rng = np.random.default_rng(seed)
     flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]
-    sums = [_sum_up(flight, predictor.model, plan) for flight in flown]
+    sums = [_sum_up(flight, plan) for flight in flown]
     C, m = np.array([c for c, _, _ in sums]), np.array([m for _, m, _ in sums])
     spread = m - m.mean(axis=0)
     return Forecast(
@@ -106,7 +104,7 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
         covariance=symmetrise(C.mean(axis=0) + np.einsum("dni,dnj->nij", spread, spread) / draws),
         mean=m.mean(axis=0),
         independent_m=float(np.sqrt(np.mean([v for _, _, v in sums]))),
-        in_domain=np.mean([f.said.in_domain for f in flown], axis=0),
+        in_domain=np.mean(np.array([f.said.in_domain for f in flown]), axis=0),
         outside=_outside(predictor, plan),
         draws=draws,
     )
@@ -118,7 +116,7 @@ class _Flight:
     that end at poses 1 to N - 1."""
 
     parent: NDArray[np.int64]
-    said: Estimate
+    said: Prediction
     dt_s: Array
 
 
@@ -176,20 +174,15 @@ def _features(names: list[str], plan: Plan) -> Array:
     return np.array([stream.step(r) for r in records]).reshape(-1, len(names))
 
 
-def _sum_up(flight: _Flight, model: ErrorModelArrays, plan: Plan) -> tuple[Array, Array, float]:
+def _sum_up(flight: _Flight, plan: Plan) -> tuple[Array, Array, float]:
     """Covariance (N, 6, 6) and mean (N, 6) of every pose's error, and the last position's variance if independent."""
-    parent, parts, T_world = flight.parent, flight.said.parts, plan.T_world_cam
-    steps = [Step.independent(np.eye(4), np.zeros((6, 6)))]
-    mean, plain = np.zeros((len(parent), 6)), np.zeros((len(parent), 6, 6))
-    for k in range(1, len(parent)):
-        T = se3.inverse(T_world[parent[k]]) @ T_world[k]
-        jitter, white, bias = (parts[name][k - 1] for name in PARTS)
-        lasting = (flight.said.calibration_root[k - 1], model.calibration_tau_s)
-        steps.append(Step(T, jitter, white, bias, model.bias_tau_s, float(flight.dt_s[k - 1]), *lasting))
-        moved = se3.adjoint(se3.inverse(T))
-        mean[k] = moved @ mean[parent[k]] + flight.said.mean[k - 1]
-        plain[k] = moved @ plain[parent[k]] @ moved.T + flight.said.covariance[k - 1]
-    return along(steps, parent), mean, float(np.trace(plain[-1, :3, :3]))
+    parent, T_world = flight.parent, plan.T_world_cam
+    T = se3.inverse(T_world[parent]) @ T_world
+    nothing = MotionError.independent(np.zeros((6, 6)))
+    errors = [nothing, *(flight.said.row(k) for k in range(len(parent) - 1))]
+    mean, covariance = along(T, errors, parent)
+    _, plain = along(T, [MotionError.independent(error.covariance) for error in errors], parent)
+    return covariance, mean, float(np.trace(plain[-1, :3, :3]))
 
 
 def _outside(predictor: Predictor, plan: Plan) -> tuple[Outside, ...]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
@@ -29,10 +28,9 @@ from gpvo.filters.sanity import require_sane
 from gpvo.filters.start import StartSigmas, slope_sigma
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run, read_run
+from gpvo.learning.check import check
 from gpvo.online.predictor import Predictor
-from gpvo.types import IMPORTED, TruthLog
-
-Array = NDArray[np.float64]
+from gpvo.types import IMPORTED, Array, TruthLog
 
 
 def load_predictor(path: str | Path, mean: MeanUse = "steady") -> Predictor:
@@ -179,6 +177,8 @@ def fuse_runs(
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
         flights.append(replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name))
         warnings += _findings(run, flights[-1], options)
+        if predictor is not None:
+            warnings += [f"{name}: the model does not fit: {problem}" for problem in check(predictor, run).problems]
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
     # What a run stores has the predicted mean, which is not for filters.

@@ -24,8 +24,7 @@ from gpvo.runner import run as run_vo
 from gpvo.sim.points import simulate_points
 from gpvo.sim.scenario import load_scenario, points_scenario
 from gpvo.sim.sequence import simulate
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 FIRST_TRAIN_SEED, FIRST_TEST_SEED = 1000, 0
 _DARK_S, _FROZEN_S, _FROZEN_SHARE = 2.0, 1.0, 0.05

@@ -16,8 +16,8 @@ from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import LEARNED
 from gpvo.filters.run import FusedRun
 from gpvo.filters.study import Constants, Study
-
-Array = NDArray[np.float64]
+from gpvo.io.atomic import write_text
+from gpvo.types import Array
 
 _AXES = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
 
@@ -32,13 +32,11 @@ def write_log(path: Path, fused: FusedRun) -> None:
             sigma = np.sqrt(np.diagonal(step.innovation.S[0]))
             values = [step.innovation.nis[0], *step.innovation.residual[0], *sigma]
         lines.append(",".join([str(step.t_ns), step.outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
-    temporary = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
-        temporary.replace(path)
     except OSError as error:
         raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+    write_text(path, "\n".join(lines) + "\n", "ascii")
 
 
 def document(report: FusionReport) -> dict[str, Any]:

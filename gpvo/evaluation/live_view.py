@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from gpvo.accumulation import PoseError
 from gpvo.errors import GpvoError
-from gpvo.evaluation import accumulate
 from gpvo.geometry import se3
 from gpvo.runner import Step
-from gpvo.types import Array, Prediction, Status, StereoCamera, StereoFrame, VoRecord
+from gpvo.types import Array, MotionError, Prediction, Status, StereoCamera, StereoFrame, VoRecord
 
 _GOOD, _BAD, _PATH, _DOUBT = (40, 200, 80), (230, 60, 50), (90, 150, 240), (240, 190, 60)
 
@@ -39,7 +39,7 @@ class LiveView:
             rerun.save(str(file))
         size = [camera.width, camera.height]
         rerun.log("world/camera/left", rerun.Pinhole(image_from_camera=camera.K, resolution=size), static=True)
-        self._reference = (np.eye(4), accumulate.PoseError())
+        self._reference = (np.eye(4), PoseError())
         self._path: list[Array] = [np.zeros(3)]
         self._t_first_ns: int | None = None
 
@@ -62,14 +62,10 @@ class LiveView:
     def _move(self, record: VoRecord, prediction: Prediction | None) -> None:
         """Go on from the reference. A lost frame's motion is a guess: not drawn, but what follows may build on it."""
         T_world_ref, error = self._reference
-        T_world_cam, error = T_world_ref @ record.T_prev_cur, error.copy()
-        C = error.add(
-            accumulate.Step.predicted(record.T_prev_cur, prediction)
-            if prediction is not None
-            else accumulate.Step.independent(record.T_prev_cur, next(iter(record.covariances.values())))
-        )
+        stated = MotionError.independent(next(iter(record.covariances.values()))) if prediction is None else prediction
+        T_world_cam, error = T_world_ref @ record.T_prev_cur, error.after(record.T_prev_cur, stated)
         if record.usable:
-            self._draw(T_world_cam, C)
+            self._draw(T_world_cam, error.covariance)
         if record.is_reference:
             self._reference = (T_world_cam, error)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,12 +16,7 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.io.source import Source
 from gpvo.runner import Step, steps
-from gpvo.vo.config import VoConfig, make_config
-
-try:
-    import tomllib
-except ModuleNotFoundError:  # Python 3.10
-    import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
+from gpvo.vo.config import VoConfig
 
 _GOOD, _BAD = (60, 200, 60), (40, 40, 230)  # blue, green, red
 
@@ -34,19 +28,6 @@ class MatchPicture:
     frame: int
     caption: str
     uri: str
-
-
-def config_of(run: Path) -> VoConfig:
-    """The settings a run was made with. Raises GpvoError where they cannot be read."""
-    path = run / "config.toml"
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return make_config(values.pop("preset"), **values)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError) as problem:
-        raise GpvoError(
-            f"the settings of this run cannot be read: {problem}", where=path, cure="run it again"
-        ) from None
 
 
 def match_pictures(source: Source, config: VoConfig, frames: Sequence[int]) -> list[MatchPicture]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.evaluation import curves
-from gpvo.evaluation.accumulate import along
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.plots import AXES, colour, level
 from gpvo.stats.series import allan_deviation, autocorrelation
@@ -35,7 +34,7 @@ def groups(e: Evaluation) -> list[dict[str, Any]]:
         {"title": "From above and from the side", "note": f"3-sigma ellipses of {method}.", "panels": views(e)},
         {
             "title": "Error of each motion against its bound",
-            "note": f"Black: error. Green: what {method} states, 3 sigma.",
+            "note": f"Line: error. Green: what {method} states, 3 sigma.",
             "panels": errors(e),
         },
         {
@@ -58,8 +57,8 @@ def views(e: Evaluation) -> list[Panel]:
     origin = e.T_true[e.covered][0, :3, 3]
     p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
     statement = curves.best_statement(e)
-    steps = None if statement is None else statement.steps
-    bounds = np.zeros((0, 6, 6)) if steps is None else along(steps, e.run.log.parent)
+    stated = None if statement is None else statement.pose_covariance(e.run.log)
+    bounds = np.zeros((0, 6, 6)) if stated is None else stated
     panels = []
     for i, j in ((0, 1), (0, 2)):
         lines = []
@@ -86,6 +85,9 @@ def errors(e: Evaluation) -> list[Panel]:
             low, high = (mean - reach)[keep], (mean + reach)[keep]
             bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6) if len(error) else 1.0
+        if bands:
+            # A bound that is far too wide still has its edges in the picture.
+            reach = max(reach, min(1.15 * float(np.nanmedian(np.abs(high))), 30.0 * reach))
         lines = [_line(*_thin(t, error), "", _BLACK, 1.0)]
         unit = "mm" if k < 3 else "mrad"
         panels.append(_panel(axis, "time [s]", f"{axis} [{unit}]", lines, bands=bands, limit=[-reach, reach]))

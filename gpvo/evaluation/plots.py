@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from gpvo.evaluation import curves
-from gpvo.evaluation.accumulate import along
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.stats.series import allan_deviation, autocorrelation
@@ -40,7 +39,7 @@ def trajectory(e: Evaluation) -> Figure:
     figure = Figure(figsize=(9, 7), layout="constrained")
     top, side = figure.subplots(2, 1, height_ratios=(2, 1))
     statement = curves.best_statement(e)
-    bounds = None if statement is None or statement.steps is None else along(statement.steps, e.run.log.parent)
+    bounds = None if statement is None else statement.pose_covariance(e.run.log)
     to_plane, names = level(e)
     p, q = e.T_est[:, :3, 3] @ to_plane.T, e.T_true[:, :3, 3] @ to_plane.T
     for axes, (i, j) in ((top, (0, 1)), (side, (0, 2))):

@@ -13,7 +13,6 @@ import numpy as np
 
 from gpvo import __version__
 from gpvo.evaluation import curves, panels, plots
-from gpvo.evaluation.accumulate import along
 from gpvo.evaluation.evaluate import Evaluation, document
 from gpvo.evaluation.matches import MatchPicture
 from gpvo.types import Array
@@ -56,9 +55,13 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
                 "groups": groups,
                 "scene": _embedded(scene(evaluation)),
                 "bounds_of": "no method" if statement is None else statement.method,
+                "verdict": _worded(entry["verdict"]),
+                "camera": _camera(evaluation),
             }
         )
-    return environment.get_template("report.html").render(runs=runs, pictures=pictures, version=__version__)
+    return environment.get_template("report.html").render(
+        runs=runs, pictures=pictures, version=__version__, made=_made(evaluations)
+    )
 
 
 def scene(e: Evaluation) -> dict[str, Any]:
@@ -71,14 +74,33 @@ def scene(e: Evaluation) -> dict[str, Any]:
     centre = (true.max(0) + true.min(0)) / 2
     statement = curves.best_statement(e)
     ellipsoids: list[dict[str, Any]] = []
-    if statement is not None and statement.steps is not None:
-        bounds = along(statement.steps, e.run.log.parent)
+    if statement is not None and (bounds := statement.pose_covariance(e.run.log)) is not None:
         for k in np.unique(np.linspace(0, len(e.T_est) - 1, 10).astype(int))[1:]:
             R = to_plane @ e.T_est[k, :3, :3]
             axes = _axes(R @ bounds[k, :3, :3] @ R.T)
             ellipsoids.append({"at": _rounded(to_plane @ e.T_est[k, :3, 3] - centre), "axes": _rounded(axes)})
-    size = max(float(np.abs(true - centre).max()), 1e-6)
+    # Whole ellipsoids lie inside the view, unless they are far larger than the path.
+    reach = [np.abs(o["at"]).max() + np.linalg.norm(o["axes"], axis=1).max() for o in ellipsoids]
+    path = max(float(np.abs(true - centre).max()), 1e-6)
+    size = max(path, min(max(map(float, reach), default=0.0), 3.0 * path))
     return {"est": _rounded(est - centre), "true": _rounded(true - centre), "ellipsoids": ellipsoids, "size": size}
+
+
+def _worded(found: dict[str, Any]) -> dict[str, Any]:
+    return {**found, "word": {"green": "true", "amber": "partly true", "red": "not true"}[found["colour"]]}
+
+
+def _camera(e: Evaluation) -> str:
+    camera = e.run.log.camera
+    if camera is None:
+        return ""
+    return f"{camera.width}x{camera.height}, {camera.fx_px:.0f} px, baseline {camera.baseline_m:.3g} m"
+
+
+def _made(evaluations: Sequence[Evaluation]) -> str:
+    """When the runs were made, so that the same runs give the same page."""
+    days = sorted({str(e.run.meta.get("finished") or e.run.meta.get("created") or "")[:10] for e in evaluations} - {""})
+    return f"runs of {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "runs of an unknown day"
 
 
 def _axes(C: Array) -> Array:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpvo.evaluation.accumulate import Step
+from gpvo.accumulation import along
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.features import FeatureStream
 from gpvo.online.thesis import ThesisModel
-from gpvo.types import Array, Prediction, Status, VoLog
+from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoLog
 
 if TYPE_CHECKING:
     from gpvo.online.predictor import Predictor
@@ -21,17 +21,21 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Statement:
     """One method over the N records of a log: ``mean`` (N, 6); ``covariance`` (N, d, d), d = 6, or 3 where the method
-    speaks of the translation alone; NaN where it says nothing. ``steps``: the same for accumulation, None for d = 3."""
+    speaks of the translation alone; NaN where it says nothing. ``errors``: N for accumulation, None for d = 3."""
 
     method: str
     mean: Array
     covariance: Array
-    steps: Sequence[Step] | None
+    errors: Sequence[MotionError] | None
 
     @property
     def dof(self) -> int:
         """3 or 6."""
         return int(self.covariance.shape[-1])
+
+    def pose_covariance(self, log: VoLog) -> Array | None:
+        """(N, 6, 6) of every pose of the log by its motions, None for d = 3."""
+        return None if self.errors is None else along(log.T_prev_cur, self.errors, log.parent)[1]
 
 
 def statements(
@@ -40,24 +44,27 @@ def statements(
     """All methods that can be stated of this log.
 
     Geometric ones from its records, each with its translation-only ``_vt``; ``constant``, ``_scaled`` and
-    ``gp_thesis`` from the model file (null where it holds none); ``learned`` from predictions by stamp.
+    ``gp_thesis`` from the model file (null where it holds none); ``base`` from the model with its GP held at its mean
+    function; ``learned`` from predictions by stamp.
     """
     out: list[Statement] = []
     arrays = predictor.arrays if predictor is not None else {}
     if "method.constant" in arrays and arrays["method.constant"].shape == (6, 6):
-        out.append(_plain(log, "constant", arrays["method.constant"] * _frames_bridged(log)[:, None, None]))
-    for method in log.methods:
+        out.append(plain_statement(log, "constant", arrays["method.constant"] * _frames_bridged(log)[:, None, None]))
+    for method in (m for m in log.methods if m != IMPORTED_POSE):
         covariance = _where_stated(log.covariance(method))
-        out.append(_plain(log, method, covariance))
+        out.append(plain_statement(log, method, covariance))
         scale = arrays.get(f"method.{method}.scale")
         if scale is not None:
-            out.append(_plain(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
+            out.append(plain_statement(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
         out.append(_translation_only(log, method))
     thesis = ThesisModel.from_arrays(arrays)
     if thesis is not None and len(thesis.axes) == 6 and predictor is not None and predictor.target == "frame":
         out.append(_thesis(log, thesis))
+    if predictions and predictor is not None:
+        out.append(_predicted("base", log, predictor.base().replay(log)))
     if predictions:
-        out.append(_learned(log, predictions))
+        out.append(_predicted("learned", log, predictions))
     return out
 
 
@@ -79,7 +86,7 @@ def _thesis(log: VoLog, model: ThesisModel) -> Statement:
     mean, covariance = model.predict(np.array([stream.step(r) for r in log]).reshape(-1, len(model.columns)))
     usable = log.usable[:, None]
     # Of a motion that was not measured it knows nothing.
-    stated = _plain(log, "gp_thesis", np.where(usable[:, None], covariance, np.nan))
+    stated = plain_statement(log, "gp_thesis", np.where(usable[:, None], covariance, np.nan))
     return replace(stated, mean=np.where(usable, mean, 0.0))
 
 
@@ -88,14 +95,15 @@ def _scaled(log: VoLog, covariance: Array, root: Array) -> Array:
     return np.where(log.usable[:, None, None], covariance * np.outer(root, root), covariance)
 
 
-def _plain(log: VoLog, method: str, covariance: Array) -> Statement:
+def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
+    """A method that takes motions as independent, without a mean: covariances (N, 6, 6), NaN where it says nothing."""
     # A motion that nobody vouches for enters the sum with what was said of the one before.
     filled, last = [], np.eye(6) * 1e-6
     for C in covariance:
         last = C if np.isfinite(C).all() else last
         filled.append(last)
-    steps = [Step.independent(r.T_prev_cur, C) for r, C in zip(log, filled, strict=True)]
-    return Statement(method, np.zeros((len(log), 6)), np.asarray(covariance), steps)
+    errors = [MotionError.independent(C, dt_s=r.dt_s) for r, C in zip(log, filled, strict=True)]
+    return Statement(method, np.zeros((len(log), 6)), np.asarray(covariance), errors)
 
 
 def _translation_only(log: VoLog, method: str) -> Statement:
@@ -106,14 +114,16 @@ def _translation_only(log: VoLog, method: str) -> Statement:
     return Statement(f"{method}_vt", np.zeros((len(log), 6)), covariance, None)
 
 
-def _learned(log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
+def _predicted(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
     mean, covariance = np.zeros((len(log), 6)), np.full((len(log), 6, 6), np.nan)
-    steps: list[Step] = []
-    last = Step.independent(np.eye(4), np.eye(6) * 1e-6)
+    errors: list[MotionError] = []
+    last = MotionError.independent(np.eye(6) * 1e-6)
     for k, record in enumerate(log):
         prediction = predictions.get(record.t_ns)
         if prediction is not None and prediction.is_of(record) and record.status is not Status.START:
             mean[k], covariance[k] = prediction.mean, prediction.covariance
-            last = Step.predicted(record.T_prev_cur, prediction)
-        steps.append(replace(last, T_prev_cur=record.T_prev_cur, dt_s=record.dt_s or last.dt_s))
-    return Statement("learned", mean, covariance, steps)
+            last = prediction
+        else:
+            last = replace(last, status=record.status)
+        errors.append(replace(last, dt_s=record.dt_s or last.dt_s))
+    return Statement(method, mean, covariance, errors)

@@ -17,10 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.accumulation import first_jitter, from_end, independent_part, persistence
 from gpvo.filters import kernels
 from gpvo.filters import measurement as me
 from gpvo.filters.gate import Gate
-from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu, MotionNoise
+from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu
 from gpvo.filters.propagation import (
     BA,
     BG,
@@ -37,14 +38,11 @@ from gpvo.filters.propagation import (
     imu_step,
     process_noise,
 )
-from gpvo.types import ImuNoise
-
-Array = NDArray[np.float64]
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _EYE = np.eye(JOINT)
-GRAVITY_MPS2 = 9.80665
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
 
 
@@ -92,7 +90,9 @@ class ErrorStateFilter:
         self.x = nominal.copy()
         self.batch = len(nominal.position)
         self.camera = CameraOnImu.of(T_imu_cam)
-        self.gravity = np.array([0.0, 0.0, -GRAVITY_MPS2]) if gravity_world is None else np.asarray(gravity_world)
+        self.gravity = (
+            np.array([0.0, 0.0, -STANDARD_GRAVITY_MPS2]) if gravity_world is None else np.asarray(gravity_world)
+        )
         self._densities = (
             constant_velocity_densities(motion_noise or ConstantVelocityNoise())
             if imu_noise is None
@@ -157,8 +157,9 @@ class ErrorStateFilter:
         self.P[:, range(CORE), range(CORE)] += variances
 
     def decay_bias(self, dt: float, tau_s: Array) -> None:
-        """Let the normalised VO bias forget over ``dt``: phi = exp(-dt / tau (12,)), variance kept at one."""
-        phi = np.exp(-dt / np.maximum(tau_s, 1e-9))
+        """Let the normalised VO bias forget over ``dt`` by its time constants (P,), variance kept at one."""
+        phi = np.ones(BIAS.stop - BIAS.start)
+        phi[: len(tau_s)] = persistence(dt, tau_s)
         self.P[:, BIAS, :] *= phi[:, None]
         self.P[:, :, BIAS] *= phi
         self.P[:, range(BIAS.start, BIAS.stop), range(BIAS.start, BIAS.stop)] += 1.0 - phi * phi
@@ -166,7 +167,7 @@ class ErrorStateFilter:
     # -- measurements ---------------------------------------------------------------------------------------------
 
     def update_motion(
-        self, T_est: Array, noise: MotionNoise, gate: Gate | None = None, recover: NDArray[np.bool_] | None = None
+        self, T_est: Array, noise: MotionError, gate: Gate | None = None, recover: NDArray[np.bool_] | None = None
     ) -> Innovation:
         """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame.
 
@@ -174,25 +175,24 @@ class ErrorStateFilter:
         fails again, the state is doubted instead: its covariance grows until the measurement can move it.
         """
         gate = gate or Gate()
-        if noise.jitter is not None:
-            half = 0.5 * noise.jitter
-            self.P[:, JITTER_CUR, JITTER_CUR] = half
-            if not self.jitter_known:
-                self.P[:, JITTER_REF, JITTER_REF] = half
-                self.jitter_known = True
+        if not (self.jitter_known or noise.lost):
+            self.P[:, JITTER_REF, JITTER_REF] = first_jitter(T_est, noise.jitter)
+            self.jitter_known = True
+        self.P[:, JITTER_CUR, JITTER_CUR] = from_end(noise)
         R_ref, p_ref = self.camera.pose(self.clone_p, self.clone_R)
         R_cur, p_cur = self.camera.pose(self.x.position, self.x.R_world_imu)
         R_rel, t_rel = me.relative_motion(R_ref, p_ref, R_cur, p_cur)
         H = self._H
-        me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise.bias_root)
+        me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise)
+        alone = independent_part(noise)
         r = me.residual(R_rel, t_rel, T_est, noise.mean)
         r = r - (H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None])[:, :, 0]
         # How the size of VO's bias follows the conditions is known only roughly. A filter that believes it to the
         # letter reads the bias off that, and is too sure: so it is considered, not estimated.
-        innovation = self.correct(H, r, noise.white, gate, consider=BIAS)
+        innovation = self.correct(H, r, alone, gate, consider=BIAS)
         if recover is not None and (stuck := recover & ~innovation.used).any():
             self._doubt(np.where(stuck, innovation.nis / gate.threshold(6), 1.0))
-            again = self.correct(H, r, noise.white, replace(gate, on_fail="inflate"), ~stuck, consider=BIAS)
+            again = self.correct(H, r, alone, replace(gate, on_fail="inflate"), ~stuck, consider=BIAS)
             innovation = replace(innovation, residual=again.residual, S=again.S, used=innovation.used | stuck)
         if innovation.used.any():
             self.inject()

@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gpvo.filters.eskf import GRAVITY_MPS2
+from gpvo.filters.plausible import MOST_MPS2, MOST_RADPS, on_one_clock
 from gpvo.filters.run import Flight
 from gpvo.geometry import se3
-from gpvo.types import ImuLog, VoRecord
-
-Array = NDArray[np.float64]
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, VoRecord
 
 # The 48 ways to call three axes by the wrong names and signs; the right one is the first.
 _RELABELLINGS = sorted(
@@ -39,10 +36,9 @@ class Finding:
 
 
 def units_and_axes(flight: Flight, imu: ImuLog) -> list[Finding]:
-    good = np.isfinite(imu.gyro_radps).all(axis=1) & np.isfinite(imu.acc_mps2).all(axis=1)
-    if good.sum() < 20:
+    clean = _in_time(imu)
+    if len(clean.t_ns) < 20:
         return []
-    clean = ImuLog(imu.t_ns[good], imu.gyro_radps[good], imu.acc_mps2[good])
     acc_unit = list(_accelerometer_unit(clean))
     gyro = list(_gyroscope(flight, clean))
     if acc_unit or gyro:
@@ -50,16 +46,31 @@ def units_and_axes(flight: Flight, imu: ImuLog) -> list[Finding]:
     return list(_accelerometer_axes(clean)) or list(_accelerometer_sign(flight, clean))
 
 
+def _in_time(imu: ImuLog) -> ImuLog:
+    """The samples by which units are told: finite, in order of time, without the single ones that stand out.
+
+    What is out of range may be so in another unit: only what is also far above the usual reading is a fault.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = [np.linalg.norm(v, axis=1) for v in (imu.gyro_radps, imu.acc_mps2)]
+    good = np.isfinite(size[0]) & np.isfinite(size[1])
+    if good.any():
+        for v, most in zip(size, (MOST_RADPS, MOST_MPS2), strict=True):
+            good = good & (v <= max(most, 30.0 * float(np.quantile(v[good], 0.9))))
+    kept = on_one_clock(imu.t_ns, good)
+    return ImuLog(imu.t_ns[kept], imu.gyro_radps[kept], imu.acc_mps2[kept])
+
+
 def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
     g = float(np.median(np.linalg.norm(imu.acc_mps2, axis=1)))
-    ratio = g / GRAVITY_MPS2
+    ratio = g / STANDARD_GRAVITY_MPS2
     # Gravity dominates and keeps its side of the vehicle; bare linear acceleration points everywhere.
     steady = float(np.linalg.norm(imu.acc_mps2.mean(axis=0)) / np.linalg.norm(imu.acc_mps2, axis=1).mean())
     if 0.6 < ratio < 1.6:
         return
-    for unit, factor in (("g", 1.0), ("mg", 1e3), ("cm/s^2", 100 * GRAVITY_MPS2)):
+    for unit, factor in (("g", 1.0), ("mg", 1e3), ("cm/s^2", 100 * STANDARD_GRAVITY_MPS2)):
         if 0.7 < g / factor < 1.4 and steady > 0.8:
-            to_si = GRAVITY_MPS2 / factor
+            to_si = STANDARD_GRAVITY_MPS2 / factor
             text = f"the accelerometer's median reading is {g:.4g} where gravity is 9.81 m/s^2: it is in {unit}"
             yield Finding("acc_unit", text, f"multiply it by {to_si:.6g}")
             return

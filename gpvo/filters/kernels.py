@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 _EYE3 = np.eye(3)
 _SMALL_ANGLE_2 = 1e-8  # squared angle below which the series are exact to rounding

@@ -1,7 +1,8 @@
 """A relative motion of the camera as a measurement of the IMU's state and of a cloned earlier pose.
 
-The measured motion is ``T_est = Exp(-n_ref) T_true Exp(n_cur + b + w)``: the noise of each frame enters the motion
-that ends there and, with opposite sign, the motion that starts there; ``b`` persists; ``w`` is independent. With
+The measured motion is ``T_est = Exp(-n_ref) T_true Exp(n_cur + b + w)`` (see :mod:`gpvo.accumulation`): the noise of
+each frame enters the motion that ends there and, with opposite sign, the motion that starts there; ``b`` persists;
+``w`` is independent. With
 ``r = Log(T_pred^-1 T_est)`` and right perturbations eta of the camera poses,
 
     r = eta_cur - Ad(T_pred^-1) (eta_ref + n_ref) + n_cur + b + w        (first order)
@@ -13,40 +14,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpvo.accumulation import carry, from_start
 from gpvo.filters import kernels
 from gpvo.filters.propagation import TH, P
-
-Array = NDArray[np.float64]
+from gpvo.geometry import se3
+from gpvo.types import Array, MotionError
 
 # Joint error state: the core, the cloned pose of the reference frame, the reference frame's jitter, the
 # normalised VO bias, and the jitter of the current frame while an update runs.
 CLONE, CLONE_P, CLONE_TH = slice(15, 21), slice(15, 18), slice(18, 21)
 JITTER_REF, BIAS, JITTER_CUR = slice(21, 27), slice(27, 39), slice(39, 45)
 KEPT, JOINT = 39, 45
-
-
-@dataclass(frozen=True)
-class MotionNoise:
-    """What one measured motion's error looks like, for B filter members or one for all (leading axis 1).
-
-    ``mean`` (b, 6) is taken off the measurement; ``jitter`` (b, 6, 6) is the covariance that both end frames share
-    half and half, ``white`` (b, 6, 6) that of the motion alone; ``bias_root`` (b, 6, 12) times a
-    unit-variance first-order Gauss-Markov vector of time constants ``bias_tau_s`` (12,) is what persists, errors of
-    calibration last. [m, rad].
-    """
-
-    mean: Array
-    white: Array
-    jitter: Array | None = None
-    bias_root: Array | None = None
-    bias_tau_s: Array | None = None
-
-    @property
-    def bias_covariance(self) -> Array | float:
-        """(b, 6, 6) covariance of the persistent part, 0 without one."""
-        return 0.0 if self.bias_root is None else self.bias_root @ kernels.transpose(self.bias_root)
 
 
 @dataclass(frozen=True)
@@ -77,13 +56,10 @@ def relative_motion(R_ref: Array, p_ref: Array, R_cur: Array, p_cur: Array) -> t
 
 
 def jacobian(
-    H: Array, camera: CameraOnImu, R_ref: Array, R_cur: Array, R_rel: Array, t_rel: Array, bias_root: Array | None
+    H: Array, camera: CameraOnImu, R_ref: Array, R_cur: Array, R_rel: Array, t_rel: Array, error: MotionError
 ) -> None:
     """Write d(measured motion)/d(joint error state) into ``H`` (B, 6, 45), in the right tangent of the prediction."""
-    Rt = kernels.transpose(R_rel)
-    inv_adjoint = np.zeros((len(H), 6, 6))
-    inv_adjoint[:, :3, :3] = inv_adjoint[:, 3:, 3:] = Rt
-    inv_adjoint[:, :3, 3:] = -Rt @ kernels.skew(t_rel)
+    moved = carry(se3.from_rt(R_rel, t_rel))
 
     eta_ref = np.zeros((len(H), 6, 6))
     eta_ref[:, :3, :3] = kernels.transpose(R_ref)
@@ -93,9 +69,11 @@ def jacobian(
     H[:, :3, P] = kernels.transpose(R_cur)
     H[:, :3, TH] = camera.lever
     H[:, 3:, TH] = camera.R_cam_imu
-    np.negative(inv_adjoint @ eta_ref, out=H[:, :, CLONE])
-    np.negative(inv_adjoint, out=H[:, :, JITTER_REF])
-    H[:, :, BIAS] = 0.0 if bias_root is None else bias_root
+    np.negative(moved @ eta_ref, out=H[:, :, CLONE])
+    H[:, :, JITTER_REF] = from_start(error, moved)
+    length = error.persistent_root.shape[-1]
+    H[:, :, BIAS.start : BIAS.start + length] = error.persistent_root
+    H[:, :, BIAS.start + length : BIAS.stop] = 0.0
 
 
 def residual(R_rel: Array, t_rel: Array, T_est: Array, mean: Array) -> Array:

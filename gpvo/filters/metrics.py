@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import Interval, block_bootstrap
 from gpvo.stats.consistency import nees
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 # A run counts as diverged where the position error passes this share of the path and this many metres.
 DIVERGED_PATH_SHARE, DIVERGED_M = 0.2, 2.0

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gpvo.filters.measurement import MotionNoise
-from gpvo.geometry.covariance import is_positive_definite, persistent_root
-from gpvo.types import IMPORTED, Prediction, VoRecord
-
-Array = NDArray[np.float64]
+from gpvo.geometry.covariance import is_positive_definite
+from gpvo.types import IMPORTED, Array, MotionError, Prediction, VoRecord
 
 CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT = "constant", "constant_best", "constant_hindsight"
 TRIANGULATION, POINTING_MATCHING, LEARNED = "triangulation", "pointing_matching", "learned"
@@ -23,17 +19,14 @@ STATED = (TRIANGULATION, POINTING_MATCHING, IMPORTED)
 MeanUse = Literal["steady", "predicted", "absorb"]
 """Which mean comes off the measurement: the one steady in good frames and bad, the predicted one, or none."""
 
-_ZERO_MEAN = np.zeros((1, 6))
-_ZERO_MEAN.setflags(write=False)
-
 
 class Policy(Protocol):
-    """Gives the noise of one measured motion, None where it has nothing to say about it."""
+    """States the error of one measured motion, for B members or one, None where it has nothing to say about it."""
 
     @property
     def name(self) -> str: ...
 
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None: ...
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None: ...
 
 
 @dataclass(frozen=True)
@@ -50,12 +43,12 @@ class ConstantPolicy:
     scalars: Array | None = None
     name: str = CONSTANT
 
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise:
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
         """The constant, widened for a motion over several frames."""
         scalars = np.ones((1, 2)) if self.scalars is None else np.atleast_2d(self.scalars)
         frames = max(1.0, round(record.dt_s / self.dt_s)) if self.dt_s > 0 else 1.0
         diagonal = np.repeat(scalars, 3, axis=1) * (np.asarray(self.mean_squares) * frames)
-        return MotionNoise(_ZERO_MEAN, diagonal[:, :, None] * np.eye(6))
+        return MotionError.independent(diagonal[:, :, None] * np.eye(6), dt_s=record.dt_s)
 
 
 @dataclass(frozen=True)
@@ -64,12 +57,12 @@ class GeometricPolicy:
 
     name: str
 
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
         """The record's own covariance; None where the method has none for this frame."""
         covariance = record.covariances.get(self.name)
         if covariance is None or not is_positive_definite(covariance):
             return None
-        return MotionNoise(_ZERO_MEAN, np.asarray(covariance, dtype=np.float64)[None])
+        return MotionError.independent(np.asarray(covariance)[None], dt_s=record.dt_s)
 
 
 @dataclass(frozen=True)
@@ -85,37 +78,17 @@ class LearnedPolicy:
     use_parts: bool = True
     mean: MeanUse = "steady"
 
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
-        """The prediction's parts as filter noise; None without a prediction for this frame."""
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
+        """The prediction in its parts; None without a prediction for this frame."""
         if prediction is None or not is_positive_definite(prediction.covariance):
             return None
-        mean = np.asarray(prediction.mean, dtype=np.float64)
-        covariance = prediction.covariance
+        error: MotionError = prediction
         if self.mean == "absorb":
-            covariance, mean = covariance + np.outer(mean, mean), _ZERO_MEAN[0]
+            squared = np.outer(error.mean, error.mean)
+            error = replace(error, mean=np.zeros(6), white=error.white + squared)
         if not self.use_parts:
-            return MotionNoise(mean[None], covariance[None])
-        return split_noise(mean[None], covariance, prediction)
-
-
-def split_noise(mean: Array, covariance: Array, prediction: Prediction) -> MotionNoise:
-    """Filter noise from a total covariance (6, 6) and the prediction's parts; ``mean`` is (1, 6).
-
-    What the parts leave of the total counts as white, and so does a bias without a time constant.
-    """
-    zero = np.zeros((6, 6))
-    jitter, bias = prediction.parts.get("jitter", zero), prediction.parts.get("bias", zero)
-    tau = np.concatenate([prediction.bias_tau_s, prediction.calibration_tau_s])
-    if not (bias.any() and np.all(tau > 0)):
-        bias = zero
-    white = covariance - jitter - bias
-    return MotionNoise(
-        mean,
-        0.5 * (white + white.T)[None],
-        jitter[None] if jitter.any() else None,
-        persistent_root(bias, prediction.calibration_root)[None] if bias.any() else None,
-        tau if bias.any() else None,
-    )
+            error = MotionError.independent(error.covariance, error.mean, dt_s=error.dt_s, status=error.status)
+        return error.batch()
 
 
 def constant_from_errors(xi: Array) -> Array:

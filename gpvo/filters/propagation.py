@@ -18,12 +18,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.filters import kernels
-from gpvo.types import ImuNoise
-
-Array = NDArray[np.float64]
+from gpvo.types import Array, ImuNoise
 
 P, V, TH, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 CORE = 15

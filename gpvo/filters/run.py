@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters import metrics
-from gpvo.filters.eskf import GRAVITY_MPS2, ErrorStateFilter
+from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate
+from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, ConstantVelocityNoise, Nominal
 from gpvo.filters.start import Start, StartSigmas, StaticTest, from_rest, from_truth, heading
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
-from gpvo.types import ImuLog, Prediction, VoRecord
-
-Array = NDArray[np.float64]
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
 
 # Truth whose vertical is further than this from +z [rad] is taken to be in another frame, and gravity is measured.
 _LEVEL_RAD = 0.17
@@ -58,7 +57,10 @@ class Flight:
         t_ns = np.array([r.t_ns for r in self.records], dtype=np.int64)
         if self.imu is None or not len(self.imu.t_ns):
             return np.ones(len(t_ns), bool)
-        return (t_ns >= self.imu.t_ns.min() - _IMU_MARGIN_NS) & (t_ns <= self.imu.t_ns.max() + _IMU_MARGIN_NS)
+        known = self.imu.t_ns[usable(self.imu)]
+        if not len(known):
+            return np.zeros(len(t_ns), bool)
+        return (t_ns >= known[0] - _IMU_MARGIN_NS) & (t_ns <= known[-1] + _IMU_MARGIN_NS)
 
     @property
     def has_truth(self) -> bool:
@@ -142,13 +144,12 @@ def _aligned_with_gravity(flight: Flight, start: Start, valid: NDArray[np.int64]
     C = start.covariance.copy()
     C[TH, TH] += np.eye(3) * 0.01**2
     note = start.note + "; truth's z axis is not up: gravity measured from the IMU"
-    return Start(start.nominal, C, note), -GRAVITY_MPS2 * up
+    return Start(start.nominal, C, note), -STANDARD_GRAVITY_MPS2 * up
 
 
 def vertical_in_world(imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array) -> Array:
     """Unit vector (3,) of the vertical: the mean specific force turned into the world, less the mean acceleration."""
-    finite = np.isfinite(imu.acc_mps2).all(axis=1)
-    imu = ImuLog(imu.t_ns[finite], imu.gyro_radps[finite], imu.acc_mps2[finite])
+    imu = cleaned(imu)
     seconds = (t_ns - t_ns[0]) * 1e-9
     force = np.stack([np.interp(seconds, (imu.t_ns - t_ns[0]) * 1e-9, imu.acc_mps2[:, i]) for i in range(3)], axis=1)
     world = (T_world_imu[:, :3, :3] @ force[:, :, None])[:, :, 0].mean(axis=0)
@@ -214,7 +215,7 @@ class _Samples:
         imu = self.imu
         if imu is None:
             return
-        while self.next < len(imu.t_ns) and (self.next == 0 or imu.t_ns[self.next - 1] < t_ns):
+        while self.next < len(imu.t_ns) and ((until_ns := timeline.imu_until_ns) is None or until_ns < t_ns):
             i = self.next
             timeline.add_imu(int(imu.t_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
             self.next += 1

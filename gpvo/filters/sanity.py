@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters.imu_sanity import Finding, units_and_axes
+from gpvo.filters.plausible import on_one_clock, usable
 from gpvo.filters.run import Flight
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.types import ImuLog
-
-Array = NDArray[np.float64]
+from gpvo.types import Array, ImuLog
 
 
 def check_flight(flight: Flight) -> list[Finding]:
@@ -48,7 +46,8 @@ def _clocks(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         yield Finding("imu", f"the IMU log holds {len(imu.t_ns)} samples", "run without it: --no-imu")
         return
     first, last = flight.records[0].t_ns, flight.records[-1].t_ns
-    begin, end = int(imu.t_ns.min()), int(imu.t_ns.max())
+    on_clock = imu.t_ns[on_one_clock(imu.t_ns, np.ones(len(imu.t_ns), bool))]
+    begin, end = int(on_clock[0]), int(on_clock[-1])
     overlap = (min(last, end) - max(first, begin)) * 1e-9
     span = (last - first) * 1e-9
     if overlap <= 0:
@@ -80,6 +79,10 @@ def _samples(imu: ImuLog) -> Iterator[Finding]:
         every = bool(bad.mean() > 0.5)
         text = f"{int(bad.sum())} of {len(imu.t_ns)} IMU samples are not finite and are dropped"
         yield Finding("imu", text, "run without it: --no-imu" if every else "", fatal=every)
+    beyond = int((~bad & ~usable(imu)).sum())
+    if 0 < beyond <= 0.5 * len(imu.t_ns):  # More than that are in another unit.
+        text = f"{beyond} of {len(imu.t_ns)} IMU samples are out of range or out of order and count as missing"
+        yield Finding("imu", text, fatal=False)
 
 
 # -- covariances ----------------------------------------------------------------------------------------------------

@@ -6,24 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gpvo.filters.measurement import MotionNoise
 from gpvo.filters.policies import Policy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
-from gpvo.types import Prediction, VoRecord
-
-Array = NDArray[np.float64]
+from gpvo.types import MotionError, Prediction, VoRecord
 
 
 @dataclass(frozen=True)
 class _Stacked:
     """The noises of several policies, one member each, by the records' stamps."""
 
-    noises: Mapping[int, MotionNoise]
+    noises: Mapping[int, MotionError]
     name: str = "side by side"
 
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionNoise | None:
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
         return self.noises.get(record.t_ns)
 
 
@@ -48,34 +44,37 @@ def fuse_side_by_side(
     return out
 
 
-def _noises(flight: Flight, policy: Policy) -> dict[int, MotionNoise]:
+def _noises(flight: Flight, policy: Policy) -> dict[int, MotionError]:
     usable = (r for r in flight.records if r.usable)
     found = ((r.t_ns, policy.noise(r, flight.predictions.get(r.t_ns))) for r in usable)
     return {t: noise for t, noise in found if noise is not None}
 
 
-def _alike(stated: Mapping[str, Mapping[int, MotionNoise]]) -> list[str]:
-    """Policies that speak for all records that any speaks for, with one set of time constants."""
+def _alike(stated: Mapping[str, Mapping[int, MotionError]]) -> list[str]:
+    """Policies that speak for all records that any speaks for, with one set of time constants and of lost motions."""
     everything = {t for noises in stated.values() for t in noises}
-    taus: set[bytes] = set()
+    shared: set[tuple[bytes, frozenset[int]]] = set()
     names = []
     for name, noises in stated.items():
-        own = {n.bias_tau_s.tobytes() for n in noises.values() if n.bias_tau_s is not None}
-        if noises.keys() == everything and len(own | taus) <= 1:
-            taus |= own
+        # What a lost motion does not share is nothing to members whose motions share nothing.
+        lost = frozenset(t for t, n in noises.items() if n.lost)
+        own = {(n.persistent_tau_s.tobytes(), lost) for n in noises.values() if len(n.persistent_tau_s)}
+        if noises.keys() == everything and len(own | shared) <= 1:
+            shared |= own
             names.append(name)
     return names
 
 
-def _stack(noises: Sequence[MotionNoise]) -> MotionNoise:
-    def stacked(parts: Sequence[Array | None]) -> Array | None:
-        known = [p for p in parts if p is not None]
-        return np.concatenate([np.zeros_like(known[0]) if p is None else p for p in parts]) if known else None
-
-    return MotionNoise(
-        np.concatenate([n.mean for n in noises]),
-        np.concatenate([n.white for n in noises]),
-        stacked([n.jitter for n in noises]),
-        stacked([n.bias_root for n in noises]),
-        next((n.bias_tau_s for n in noises if n.bias_tau_s is not None), None),
+def _stack(noises: Sequence[MotionError]) -> MotionError:
+    """One member each; what persists for some has no part in the error of the others."""
+    tau_s = next((n.persistent_tau_s for n in noises if len(n.persistent_tau_s)), np.zeros(0))
+    roots = (n.persistent_root if len(n.persistent_tau_s) else np.zeros((1, 6, len(tau_s))) for n in noises)
+    return MotionError(
+        mean=np.concatenate([n.mean for n in noises]),
+        jitter=np.concatenate([n.jitter for n in noises]),
+        white=np.concatenate([n.white for n in noises]),
+        persistent_root=np.concatenate(list(roots)),
+        persistent_tau_s=tau_s,
+        dt_s=noises[0].dt_s,
+        status=max((n.status for n in noises), key=lambda status: status.severity),
     )

@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters import kernels
-from gpvo.filters.eskf import GRAVITY_MPS2
+from gpvo.filters.plausible import usable
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V
 from gpvo.geometry import se3
-from gpvo.types import ImuLog
-
-Array = NDArray[np.float64]
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 _SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
 
@@ -107,9 +105,9 @@ def from_rest(
     """
     test = test or StaticTest()
     sigmas, span = test.sigmas, round(test.window_s * 1e9)
-    finite = np.isfinite(imu.gyro_radps).all(axis=1) & np.isfinite(imu.acc_mps2).all(axis=1)
-    window = finite & (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
-    before = finite & (imu.t_ns >= t_ns - span) & (imu.t_ns <= t_ns)
+    good = usable(imu)
+    window = good & (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
+    before = good & (imu.t_ns >= t_ns - span) & (imu.t_ns <= t_ns)
     window = before if before.sum() >= 10 else window
     if window.sum() < 10:
         raise GpvoError(f"a static start needs 10 IMU samples within {test.window_s} s of the first frame")
@@ -120,7 +118,7 @@ def from_rest(
     up = f / np.linalg.norm(f)
     R = _leveled(up, yaw_rad)
     C = _diagonal(sigmas, with_imu=True)
-    U = kernels.skew(up[None])[0] / GRAVITY_MPS2
+    U = kernels.skew(up[None])[0] / STANDARD_GRAVITY_MPS2
     cov_acc = C[BA, BA] + np.diag(acc.var(axis=0) / len(acc))
     C[TH, TH] = U @ cov_acc @ U.T + np.outer(up, up) * sigmas.yaw_rad**2
     # A little more than the model says keeps the attitude's covariance positive definite along every axis.

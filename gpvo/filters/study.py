@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters.metrics import Scores
@@ -25,8 +24,7 @@ from gpvo.filters.policies import (
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
 from gpvo.filters.side_by_side import fuse_side_by_side
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 Progress = Callable[[str], None]
 
@@ -86,13 +84,6 @@ def fit_scalars(
         fine = _pairs(_FINE * centre[0], _FINE * centre[1])
         best = fine[np.argmin(grid_scores(flights, constants, fine, options, progress))]
     return float(best[0]), float(best[1])
-
-
-def fit_constant_best(
-    training: Sequence[Flight], constants: Constants, options: FuseOptions | None = None
-) -> Constants:
-    """The constants with the scalars that are best on the training runs."""
-    return replace(constants, best=fit_scalars(training, constants, options))
 
 
 def _pairs(a: Array, b: Array) -> Array:

@@ -11,12 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.filters.eskf import GRAVITY_MPS2
 from gpvo.filters.run import Flight
 from gpvo.geometry import se3
-from gpvo.types import ImuLog, ImuNoise, Prediction, Status, VoRecord
-
-Array = NDArray[np.float64]
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, ImuNoise, Prediction, Status, VoRecord
 
 FORWARD_CAMERA = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0.02], [0, -1, 0, -0.03], [0, 0, 0, 1]])
 MEMS = ImuNoise(2e-4, 2e-3, 2e-5, 5e-4)
@@ -98,7 +95,7 @@ def synthetic_flight(
     t_imu = np.arange(0, round(duration_s * imu_hz) + 1) / imu_hz
     every = round(imu_hz / rate_hz)
     position, acceleration, R, omega = smooth_path(t_imu, rng)
-    force = (np.swapaxes(R, 1, 2) @ (acceleration + [0, 0, GRAVITY_MPS2])[:, :, None])[:, :, 0]
+    force = (np.swapaxes(R, 1, 2) @ (acceleration + [0, 0, STANDARD_GRAVITY_MPS2])[:, :, None])[:, :, 0]
     imu = _noisy_imu(t_imu, omega, force, imu_noise, turn_on, rng)
     T_world_cam = se3.from_rt(R, position)[::every] @ FORWARD_CAMERA
     t_ns = imu.t_ns[::every]
@@ -168,21 +165,20 @@ def _vo(
         if _inside(seconds[k], events.frozen):
             T_est = se3.exp(1e-3 * law.jitter * rng.standard_normal(6))
         known = scale[k] * np.exp(knowledge_error * rng.standard_normal())
-        parts = {name: np.diag((getattr(law, name) * known) ** 2) for name in ("jitter", "white", "bias")}
-        total = sum(parts.values(), np.zeros((6, 6)))
+        parts = {name: np.diag((getattr(law, name) * known) ** 2) for name in ("jitter", "white")}
         records.append(VoRecord(t, t_ref, Status.OK, T_est))
         predictions.append(
             Prediction(
-                t,
-                (t - t_ref) * 1e-9,
-                np.zeros(6),
-                total,
-                parts,
-                np.full(6, law.bias_tau_s),
-                np.zeros(6),
-                1.0,
-                1.0,
-                Status.OK,
+                mean=np.zeros(6),
+                jitter=parts["jitter"],
+                white=parts["white"],
+                persistent_root=np.diag(law.bias * known),
+                persistent_tau_s=np.full(6, law.bias_tau_s),
+                dt_s=(t - t_ref) * 1e-9,
+                t_ns=t,
+                epistemic=np.zeros(6),
+                confidence=1.0,
+                in_domain=1.0,
             )
         )
         reference = k

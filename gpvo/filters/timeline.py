@@ -12,19 +12,18 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.filters.eskf import ErrorStateFilter, Innovation
 from gpvo.filters.gate import Gate, Wait
-from gpvo.filters.measurement import MotionNoise
+from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V
-from gpvo.types import Prediction, Status, VoRecord
-
-Array = NDArray[np.float64]
+from gpvo.online.intake import LONGEST_STEP_S
+from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.
 _GAP_FACTOR, _GAP_S = 5.0, 0.05
+_LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class _Entry:
     """A used record with the filter, clocks and reference as they were before it."""
 
     record: VoRecord
-    noise: MotionNoise | None
+    noise: MotionError | None
     filter: ErrorStateFilter
     t_ns: int
     bias_ns: int
@@ -92,6 +91,8 @@ class Timeline:
         self._reference_ns: int | None = self.t_ns
         self._wait = Wait.since(self.t_ns, filter.batch)
         self._newest_ns: int | None = None
+        self._guard = ImuGuard()
+        self._odd_ns: int | None = None
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
         self._usual_ns = 0
@@ -99,23 +100,32 @@ class Timeline:
     # -- inputs -----------------------------------------------------------------------------------------------
 
     def add_imu(self, t_ns: int, gyro_radps: Array, acc_mps2: Array) -> None:
-        """Take one IMU sample: (3,) each. One that is older than the newest, or not finite, is counted and dropped."""
+        """Take one IMU sample: (3,) each. One that cannot be (:class:`ImuGuard`) is counted and dropped: missing."""
         sample = np.concatenate([gyro_radps, acc_mps2])
+        if problem := self._guard.judge(int(t_ns), sample):
+            self.counts[problem] += 1
+            return
         if self._imu_t and t_ns <= self._imu_t[-1]:
-            self.counts["imu_repeated" if t_ns == self._imu_t[-1] else "imu_out_of_order"] += 1
-        elif not np.isfinite(sample).all():
-            self.counts["imu_not_finite"] += 1
-        else:
-            if self._imu_t:
-                step = t_ns - self._imu_t[-1]
-                self._usual_ns = min(self._usual_ns or step, step)
-            self._imu_t.append(int(t_ns))
-            self._imu.append(sample)
+            # The clock was set back, and no record can be put among what came before.
+            del self._imu_t[:], self._imu[:]
+        if self._imu_t:
+            step = t_ns - self._imu_t[-1]
+            self._usual_ns = min(self._usual_ns or step, step)
+        self._imu_t.append(int(t_ns))
+        self._imu.append(sample)
+
+    @property
+    def imu_until_ns(self) -> int | None:
+        """Stamp of the newest IMU sample that was taken, None before there is one."""
+        return self._imu_t[-1] if self._imu_t else None
 
     def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
         """Take one VO record; returns the steps done, more than one where later records were used again."""
         if record.t_ns <= self.t_ns and self._already_seen(record.t_ns):
             self.counts["repeated"] += 1
+            return []
+        if self._jumps_ahead(record.t_ns):
+            self.counts["stamp_ahead"] += 1
             return []
         noise = self.policy.noise(record, prediction) if record.usable else None
         if record.t_ns >= self.t_ns:
@@ -126,6 +136,14 @@ class Timeline:
             return []
         self.counts["reordered"] += 1
         return [self._step(record, noise), *(self._step(e.record, e.noise) for e in again)]
+
+    def _jumps_ahead(self, t_ns: int) -> bool:
+        """Whether a record comes so long after the newest that its stamp is wrong, unless the next one agrees."""
+        odd, self._odd_ns = self._odd_ns, None
+        if t_ns - self.t_ns <= _LONGEST_STEP_NS or (odd is not None and 0 < t_ns - odd <= _LONGEST_STEP_NS):
+            return False
+        self._odd_ns = t_ns
+        return True
 
     def _already_seen(self, t_ns: int) -> bool:
         return t_ns == self._newest_ns or any(e.record.t_ns == t_ns for e in self._history)
@@ -140,13 +158,13 @@ class Timeline:
 
     # -- one record -------------------------------------------------------------------------------------------
 
-    def _step(self, record: VoRecord, noise: MotionNoise | None) -> Step:
+    def _step(self, record: VoRecord, noise: MotionError | None) -> Step:
         self._remember(record, noise)
         self._propagate(self.filter, self.t_ns, record.t_ns, self.counts)
         self.t_ns = self._newest_ns = record.t_ns
-        if noise is not None and noise.bias_tau_s is not None:
+        if noise is not None and len(noise.persistent_tau_s):
             # Since it last did, not since the last record: VO's bias goes on changing while frames are lost.
-            self.filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.bias_tau_s)
+            self.filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.persistent_tau_s)
             self._bias_ns = record.t_ns
         step = self._measure(record, noise)
         judged = step.innovation
@@ -154,13 +172,13 @@ class Timeline:
         self._wait = self._wait.after(record.t_ns, passed, own_fault)
         self.counts[step.outcome] += 1
         if record.is_reference:
-            self.filter.clone(measured=step.innovation is not None)
+            self.filter.clone(measured=step.innovation is not None and noise is not None and not noise.lost)
             self._reference_ns = record.t_ns
         else:
             self.filter.forget_current()
         return step
 
-    def _measure(self, record: VoRecord, noise: MotionNoise | None) -> Step:
+    def _measure(self, record: VoRecord, noise: MotionError | None) -> Step:
         if record.status in (Status.START, Status.LOST):
             return Step(record.t_ns, record.status.value)
         if record.t_prev_ns != self._reference_ns:
@@ -174,7 +192,7 @@ class Timeline:
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
         return Step(record.t_ns, _outcome(innovation), innovation)
 
-    def _remember(self, record: VoRecord, noise: MotionNoise | None) -> None:
+    def _remember(self, record: VoRecord, noise: MotionError | None) -> None:
         if self._history_ns <= 0:
             self._drop_imu_before(self.t_ns)
             return
@@ -214,7 +232,7 @@ class Timeline:
             after = self._imu[i] if inside else self._at(end_ns, i)
             dt = (t1 - t) * 1e-9
             filter.propagate_imu(dt, sample[None, :3], sample[None, 3:], after[None, :3], after[None, 3:])
-            self._widen_over_gap(filter, i, dt, counts)
+            self._widen_over_gap(filter, i, t, t1, counts)
             t, sample, i = t1, after, i + 1
 
     def _at(self, t_ns: int, i: int) -> Array:
@@ -227,17 +245,28 @@ class Timeline:
         share = (t_ns - t0) / (t1 - t0)
         return (1.0 - share) * self._imu[i - 1] + share * self._imu[i]
 
-    def _widen_over_gap(self, filter: ErrorStateFilter, i: int, dt: float, counts: Counter[str]) -> None:
-        """Across missing samples the motion is a guess: as uncertain as the samples nearby vary."""
+    def _widen_over_gap(
+        self, filter: ErrorStateFilter, i: int, start_ns: int, end_ns: int, counts: Counter[str]
+    ) -> None:
+        """Across missing samples the motion is a guess: as uncertain as the samples nearby vary.
+
+        A gap may be crossed in several steps, a record at the end of each, and the guess is wrong the same way in all:
+        what its error grew to by the end of this step, less what it was at its start.
+        """
+        last_ns = self._imu_t[i - 1] if i > 0 else start_ns
+        age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
         usual = self._usual_ns * 1e-9
-        if dt < _GAP_S or dt < _GAP_FACTOR * usual:
+        if age[1] < _GAP_S or age[1] < _GAP_FACTOR * usual:
             return
+        begun = age[0] if age[0] >= max(_GAP_S, _GAP_FACTOR * usual) else 0.0
         counts["imu_gaps"] += 1
         near = np.array(self._imu[max(0, i - 100) : i + 100])
         spread = np.maximum(near.std(axis=0), np.abs(near[-1] - near[0]))
+        dt = age[1] - begun
+        grown = age[1] ** 2 - begun**2
         variances = np.zeros(CORE)
-        variances[TH] = (spread[:3].max() * dt) ** 2
-        variances[V] = (spread[3:].max() * dt) ** 2
+        variances[TH] = spread[:3].max() ** 2 * grown
+        variances[V] = spread[3:].max() ** 2 * grown
         variances[:3] = (0.5 * spread[3:].max() * dt * dt) ** 2
         variances[BG] = 0.0
         filter.add_uncertainty(variances)

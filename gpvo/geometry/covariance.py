@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
@@ -28,26 +28,33 @@ def is_positive_definite(C: Array) -> bool:
     return True
 
 
+def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
+    """(N,) which of (N, n, n) symmetric matrices are finite and positive definite, or semidefinite, up to rounding:
+    whatever the axes' units, as it is their correlations that are judged."""
+    C = np.asarray(C, dtype=np.float64)
+    variance: Array = np.diagonal(C, axis1=1, axis2=2)
+    with np.errstate(all="ignore"):
+        positive = (variance >= 0) if semi else (variance > 0)
+        good: NDArray[np.bool_] = np.asarray(np.isfinite(C).all(axis=(1, 2)) & positive.all(axis=1))
+        sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
+        R = C / sigma[:, :, None] / sigma[:, None, :]
+    good &= np.isfinite(R).all(axis=(1, 2))
+    least = np.linalg.eigvalsh(symmetrise(np.where(good[:, None, None], R, np.eye(C.shape[1]))))
+    return np.asarray(good & (least[:, 0] > -1e-9))
+
+
 def scaled_root(C: Array) -> Array:
-    """L (n, n) with ``L L^T = C``, of a positive semi-definite C: the symmetric root of the correlation, times sigma.
+    """L (..., n, n) with ``L L^T = C``, C positive semi-definite: the symmetric root of the correlation, times sigma.
 
     Where the variances change and the correlation does not, so does L: what drives an axis stays the same, whatever
     the axes' units.
     """
     C = symmetrise(C)
-    sigma = np.sqrt(np.maximum(np.diagonal(C), 0.0))
+    sigma = np.sqrt(np.maximum(np.diagonal(C, axis1=-2, axis2=-1), 0.0))
     unit = np.where(sigma > 0.0, sigma, 1.0)
-    values, vectors = np.linalg.eigh(C / (unit[:, None] * unit))
-    return np.asarray(sigma[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
-
-
-def persistent_root(bias: Array, calibration_root: Array) -> Array:
-    """(6, 12) root of the covariance ``bias`` (6, 6), of which ``calibration_root`` (6, 6) is that of a part.
-
-    It acts on one vector of unit variance, whatever the motion: a wrong calibration goes with the motion, and so does
-    the sign of its root.
-    """
-    return np.hstack([scaled_root(bias - calibration_root @ calibration_root.T), calibration_root])
+    values, vectors = np.linalg.eigh(C / (unit[..., :, None] * unit[..., None, :]))
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(sigma[..., :, None] * root)
 
 
 def turn_first_root(C: Array) -> Array:
@@ -86,26 +93,3 @@ def position_in_world(T_world_cur: Array, covariance: Array) -> Array:
     """(..., 3, 3) covariance of the position in world axes, from the right-perturbation (..., 6, 6)."""
     R = T_world_cur[..., :3, :3]
     return R @ covariance[..., :3, :3] @ np.swapaxes(R, -1, -2)
-
-
-def accumulate(T_prev_cur: Array, covariances: Array, parent: NDArray[np.int64] | None = None) -> Array:
-    """Pose covariances along a chain of independent motions.
-
-    Parameters
-    ----------
-    T_prev_cur : (N, 4, 4) motions.
-    covariances : (N, 6, 6) of the motions, right perturbation.
-    parent : (N,) index of the pose each motion starts from, -1 for the origin; default ``arange(N) - 1``.
-
-    Returns
-    -------
-    (N, 6, 6) covariance of each pose after its motion, in the axes of that pose.
-    """
-    n = len(T_prev_cur)
-    start = np.arange(n) - 1 if parent is None else parent
-    A = se3.adjoint(se3.inverse(T_prev_cur))
-    out = np.empty((n, 6, 6))
-    for k in range(n):
-        before = out[start[k]] if start[k] >= 0 else np.zeros((6, 6))
-        out[k] = A[k] @ before @ A[k].T + covariances[k]
-    return symmetrise(out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 # Optical (x right, y down, z forward) to FLU body (x forward, y left, z up) of a forward-looking camera.
 R_FLU_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 # Below this angle the closed forms lose more digits to cancellation than the series drop.
 _SMALL_ANGLE_RAD = 1e-4

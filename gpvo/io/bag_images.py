@@ -61,40 +61,59 @@ def decode_message(message: Any, bits: int = 16) -> Image8 | None:
     return to_grey8(pixels, bgr=bgr, bits=bits)
 
 
+class PairQueue:
+    """Pairs the messages of two image topics as they come in, by stamps that agree to ``tolerance_ns``.
+
+    A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
+    ``nearest_ns``: the closest that two stamps of both sides ever were.
+    """
+
+    def __init__(self, left: str, tolerance_ns: int, report: SourceReport) -> None:
+        self._left, self._tolerance_ns, self._report = left, tolerance_ns, report
+        self._waiting: dict[bool, deque[tuple[int, Any]]] = {True: deque(), False: deque()}
+        self.nearest_ns: float = np.inf
+
+    def push(self, topic: str, message: Any) -> tuple[int, Any, Any] | None:
+        """(left stamp, left message, right message) where this message completes a pair."""
+        is_left = topic == self._left
+        t = stamp_ns(message)
+        own, others = self._waiting[is_left], self._waiting[not is_left]
+        self.nearest_ns = min([self.nearest_ns, *(abs(s - t) for s, _ in others)])
+        match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= self._tolerance_ns), None)
+        if match is None:
+            own.append((t, message))
+            if len(own) > _WAITING:
+                _drop(own, 1, self._report)
+            return None
+        _drop(others, match, self._report)
+        _drop(own, len(own), self._report)
+        s, other = others.popleft()
+        return (t, message, other) if is_left else (s, other, message)
+
+    def clear(self) -> None:
+        """Count what still waits as missing, and forget it."""
+        for queue in self._waiting.values():
+            _drop(queue, len(queue), self._report)
+
+
 def pair_streams(
     stream: Iterable[tuple[str, Any]], left: str, tolerance_ns: int, report: SourceReport, where: object
 ) -> Iterator[tuple[int, Any, Any]]:
-    """(left stamp, left message, right message) of messages whose stamps agree to ``tolerance_ns``.
-
-    A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
+    """(left stamp, left message, right message) of a whole recording: :class:`PairQueue`.
 
     Raises
     ------
     SourceError
         At the end, where no message found a partner.
     """
-    waiting: dict[bool, deque[tuple[int, Any]]] = {True: deque(), False: deque()}
-    nearest_ns: float = np.inf
+    queue = PairQueue(left, tolerance_ns, report)
     for topic, message in stream:
-        is_left = topic == left
-        t = stamp_ns(message)
-        others = waiting[not is_left]
-        nearest_ns = min([nearest_ns, *(abs(s - t) for s, _ in others)])
-        match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= tolerance_ns), None)
-        if match is None:
-            own = waiting[is_left]
-            own.append((t, message))
-            if len(own) > _WAITING:
-                _drop(own, 1, report)
-            continue
-        _drop(others, match, report)
-        _drop(waiting[is_left], len(waiting[is_left]), report)
-        s, other = others.popleft()
-        yield (t, message, other) if is_left else (s, other, message)
-    for queue in waiting.values():
-        _drop(queue, len(queue), report)
-    if tolerance_ns < nearest_ns < np.inf:
-        raise no_pair(tolerance_ns, int(nearest_ns), where)
+        pair = queue.push(topic, message)
+        if pair is not None:
+            yield pair
+    queue.clear()
+    if tolerance_ns < queue.nearest_ns < np.inf:
+        raise no_pair(tolerance_ns, int(queue.nearest_ns), where)
 
 
 def _drop(queue: deque[tuple[int, Any]], count: int, report: SourceReport) -> None:

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.geometry.se3 import Array
 from gpvo.io.bag_reader import messages, open_bag, stamp_ns
 from gpvo.io.imu import make_imu
-from gpvo.types import ImuLog
+from gpvo.types import Array, ImuLog
 
 Stamps = NDArray[np.int64]
 

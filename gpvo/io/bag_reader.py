@@ -11,7 +11,7 @@ import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
+from gpvo.types import Array
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -48,9 +48,10 @@ def open_bag(path: Path) -> Iterator[Any]:
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
-    except (GpvoError, GeneratorExit, KeyboardInterrupt, MemoryError):
+    except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
-    # The readers below raise whatever their storage does: struct, sqlite3, zstd, Unicode, index and assertion errors.
+    # The readers below raise whatever their storage does: struct, sqlite3, zstd, Unicode, index, assertion and
+    # memory errors, the last for a length that is no length.
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         cure = "the recording was cut off: 'rosbag reindex' or 'ros2 bag reindex' may mend it"
@@ -106,6 +107,8 @@ def read_poses(path: Path, topic: str) -> tuple[np.ndarray, Array, list[Any]]:
             stamps.append(stamp_ns(message))
             rows.append(pose_of(message))
             kept.append(message)
+    if not rows:
+        raise SourceError(f"holds no message on '{topic}'", where=path)
     t, data = np.array(stamps, dtype=np.int64), np.stack(rows)
     order = np.argsort(t, kind="stable")
     order = order[np.concatenate([[True], np.diff(t[order]) > 0])]

@@ -23,6 +23,7 @@ from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
+    ODOMETRY_TYPE,
     POSE_TYPES,
     is_bag,
     messages,
@@ -60,6 +61,7 @@ class _Topics:
     truth: str | None
     doubtful: str | None  # poses that may be a truth, but nobody said whose
     count: int
+    unused: tuple[str, ...] = ()  # odometry that nothing reads
 
 
 class BagSource(ImageSource):
@@ -106,6 +108,9 @@ class BagSource(ImageSource):
         if self._topics.doubtful is not None:
             whose = "whose they are is unknown; give --truth-topic and --truth-frame"
             self.remark(f"poses on '{self._topics.doubtful}' not used as truth: {whose}")
+        for topic in self._topics.unused:
+            option = f"'gpvo import {path.name} --topic {topic}' makes a run of it, --truth-topic takes it as truth"
+            self.remark(f"the odometry on '{topic}' is not used: {option}")
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -179,7 +184,8 @@ def _choose_topics(
     sensors = imu_topics(imus)
     if imu is not None:
         sensors = [s for s in sensors if s[0] == imu] or [(imu,)]
-    return _Topics(left, right, sensors, truth, doubtful, min(counts))
+    unused = tuple(t for t in topics_of(reader, (ODOMETRY_TYPE,)) if t not in (truth, doubtful))
+    return _Topics(left, right, sensors, truth, doubtful, min(counts), unused)
 
 
 def _guess_truth(poses: list[str], any_truth: bool) -> tuple[str | None, str | None]:
@@ -252,8 +258,7 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
     infos = []
     available = topics_of(reader, (INFO_TYPE,))
     for topic in (topics.left, topics.right):
-        base = re.sub(r"/(compressed|image/compressed)$", "", topic)
-        name = f"{base.rsplit('/', 1)[0]}/camera_info"
+        name = info_topic(topic)
         if name not in available:
             raise CalibrationError(
                 f"no calibration: no CameraInfo on '{name}' and no camchain.yaml beside the bag",
@@ -261,12 +266,18 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
                 cure="put Kalibr's camchain.yaml beside the bag or name one with --calibration",
             )
         _, message = next(messages(reader, [name]))
-        infos.append(_camera_info(message, path, name))
+        infos.append(camera_info_of(message, path, name))
     rectified = all("rect" in t for t in (topics.left, topics.right))
     return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
 
 
-def _camera_info(message: Any, path: Path, topic: str) -> CameraInfo:
+def info_topic(image_topic: str) -> str:
+    """Where drivers publish the CameraInfo of an image topic: beside it."""
+    base = re.sub(r"/(compressed|image/compressed)$", "", image_topic)
+    return f"{base.rsplit('/', 1)[0]}/camera_info"
+
+
+def camera_info_of(message: Any, where: object, topic: str) -> CameraInfo:
     """The message in gpvo's type; ROS 1 writes the matrices in capitals."""
 
     def numbers(name: str) -> np.ndarray:
@@ -275,7 +286,7 @@ def _camera_info(message: Any, path: Path, topic: str) -> CameraInfo:
 
     D, K, R, P = (numbers(n) for n in ("d", "k", "r", "p"))
     if not all(np.isfinite(m).all() for m in (D, K, R, P)):
-        raise CalibrationError(f"CameraInfo on '{topic}' holds NaN or infinity", where=path)
+        raise CalibrationError(f"CameraInfo on '{topic}' holds NaN or infinity", where=where)
     R = R.reshape(3, 3) if np.any(R) else np.eye(3)
     return CameraInfo(
         width=int(message.width),

@@ -14,14 +14,14 @@ from gpvo.cameras.rig import StereoRig
 from gpvo.cameras.yamlfile import read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
 from gpvo.io.images import FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
+from gpvo.io.lines import text_lines
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest
 from gpvo.io.trajectory import read_euroc_csv
 from gpvo.io.truth import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap
-from gpvo.types import ImuLog, ImuNoise, TruthLog
+from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.
 _TRUTH = (
@@ -126,13 +126,8 @@ def _list_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[Pair
 def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
     """(stamp, file name) of each line, in order of time; a line that is neither is counted and skipped."""
     out = []
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
-    for number, line in enumerate(lines, 1):
-        text = line.strip().removeprefix("\ufeff")
-        if not text or text.startswith("#"):
+    for number, text in text_lines(path):
+        if text.startswith("#"):
             continue
         stamp, _, name = (part.strip() for part in text.partition(","))
         name = name or f"{stamp}.png"
@@ -153,7 +148,7 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
 
 def _is_plain_name(name: str) -> bool:
     """Whether a name stays inside its folder."""
-    return bool(name) and name not in (".", "..") and not any(c in name for c in ("/", "\\", "\0"))
+    return 0 < len(name.encode()) <= 255 and name not in (".", "..") and not any(c in name for c in ("/", "\\", "\0"))
 
 
 def _imu_noise(path: Path, mav: Path) -> ImuNoise | None:

@@ -11,7 +11,7 @@ import numpy as np
 from gpvo.cameras.kalibr import read_imu_noise
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles
+from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, read_grey8
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns
@@ -53,9 +53,10 @@ class FolderSource(FileSource):
                 where=path,
                 cure="put Kalibr's camchain.yaml there or name one with --calibration",
             )
-        rig = read_stereo_yaml(chain)
         known = SourceReport()
         pairs = _list_pairs(path, rate_hz, tolerance_s, known)
+        first = read_grey8(pairs[0].left) if pairs else None
+        rig = read_stereo_yaml(chain, size=None if first is None else (first.shape[1], first.shape[0]))
         super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         if (path / "imu.csv").is_file():
             noise = path / "imu.yaml"
@@ -129,7 +130,7 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
     times = path / "times.txt"
     if times.is_file():
         return _stamps_by_line(path, keys, numbers, known)
-    if rate_hz is not None and rate_hz > 0 and len(numbers) == len(keys):
+    if rate_hz is not None and 1e-3 <= rate_hz <= 1e5 and len(numbers) == len(keys):
         return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
     raise SourceError(
         "the image names are no stamps and there is no times.txt",

@@ -14,16 +14,16 @@ from gpvo.errors import SourceError
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
-from gpvo.geometry.se3 import Array
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
 from gpvo.io.foreign_csv import Table, is_number, read_table
+from gpvo.io.lines import text_lines
 from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
 from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
-from gpvo.types import IMPORTED, Status, VoRecord
+from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, VoRecord
 
 FORMATS = ("tum", "kitti", "csv", "bag")
-_GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
-_UNKNOWN_RAD = 1.0
+GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
+UNKNOWN_RAD = 1.0
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 
@@ -34,6 +34,7 @@ class ForeignLog:
 
     ``covariance`` (N, 6, 6) or None: NaN where unknown, house order, axes of the moving frame. ``covariance_of``:
     ``"motion"`` from the row before, ``"pose"`` since the start. ``columns``: further fields of the records, (N,).
+    ``topic``: of a bag.
     """
 
     path: Path
@@ -42,6 +43,7 @@ class ForeignLog:
     covariance_of: str = "motion"
     columns: Mapping[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    topic: str | None = None
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
@@ -76,8 +78,7 @@ def guess_format(path: Path) -> str:
         return "bag"
     if path.is_dir():
         raise SourceError("is a folder, not a log", where=path, cure="name the trajectory file or the bag")
-    with path.open(encoding="utf-8", errors="replace") as file:
-        lines = [line.strip() for _, line in zip(range(50), file)]
+    lines = [text for _, (_, text) in zip(range(50), text_lines(path))]
     data = next((line for line in lines if line and not line.startswith("#")), "")
     words = data.split()
     if "," in data or ";" in data or (words and not all(is_number(w) for w in words)):
@@ -150,7 +151,7 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     unknown = _stated_unknown(cov) - {0, *gaps} if cov is not None and name == IMPORTED else set()
     lost = {**dict.fromkeys(gaps, "gap in the log"), **dict.fromkeys(unknown, "stated as unknown")}
     if gaps:
-        notes = [*notes, f"motions that count as lost, over gaps of more than {_GAP_STEPS} usual steps: {len(gaps)}"]
+        notes = [*notes, f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}"]
     if unknown:
         notes = [*notes, f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}"]
     records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
@@ -167,13 +168,13 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
 def _stated_unknown(covariance: Array) -> set[int]:
     """Rows whose rotation is stated as unknown about every axis; an odometry in the plane knows its heading."""
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]
-    return set(np.flatnonzero((variances > _UNKNOWN_RAD**2).all(axis=1)).tolist())
+    return set(np.flatnonzero((variances > UNKNOWN_RAD**2).all(axis=1)).tolist())
 
 
 def _after_gaps(t_ns: NDArray[np.int64]) -> set[int]:
     """Rows that follow an interval far beyond the usual one."""
     steps = np.diff(t_ns)
-    return set() if len(steps) == 0 else set((np.flatnonzero(steps > _GAP_STEPS * np.median(steps)) + 1).tolist())
+    return set() if len(steps) == 0 else set((np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1).tolist())
 
 
 def _fields(log: ForeignLog, k: int) -> dict[str, Any]:
@@ -199,9 +200,9 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
         return IMPORTED, growth, []
     note = (
         f"the covariances are of poses and grow in {100 * share:.0f} % of the steps only, as a filter's do: kept as"
-        " 'imported_pose', which is not the covariance of one motion"
+        " 'imported_pose' and scored as such by gpvo evaluate"
     )
-    return "imported_pose", C, [note]
+    return IMPORTED_POSE, C, [note]
 
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
@@ -231,8 +232,14 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (f"{lost} rows without a pose were left out",) if lost else (),
+        (*((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table)),
     )
+
+
+def _unused(table: Table) -> tuple[str, ...]:
+    """A remark on columns that state an uncertainty and that nothing reads."""
+    names = ", ".join(table.unused)
+    return (f"columns not used: {names}; --map COLUMN=cov_00 takes a variance, see --help",) if names else ()
 
 
 def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) -> Array | None:
@@ -267,7 +274,11 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
         if len(t) != len(T):
             raise SourceError(f"holds {len(t)} stamps for the {len(T)} poses of {path.name}", where=times)
         check_growing(Path(times), t, list(range(1, len(t) + 1)))
-    elif rate_hz is not None and rate_hz > 0:
+    elif rate_hz is not None:
+        if not 1e-3 <= rate_hz <= 1e5:
+            raise SourceError(
+                f"a rate of {rate_hz:g} Hz is none", where=path, cure="give --rate-hz from 0.001 to 100000"
+            )
         t = np.rint(np.arange(len(T)) * (1e9 / rate_hz)).astype(np.int64)
     else:
         raise SourceError("KITTI poses have no stamps", where=path, cure="give --times FILE or --rate-hz RATE")
@@ -275,26 +286,34 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
 
 
 def _read_bag(path: Path, topic: str | None) -> ForeignLog:
+    with open_bag(path) as reader:
+        odometry, poses = (list(topics_of(reader, kinds)) for kinds in ((ODOMETRY_TYPE,), POSE_TYPES))
     if topic is None:
-        with open_bag(path) as reader:
-            odometry = list(topics_of(reader, (ODOMETRY_TYPE,)))
-            poses = odometry or list(topics_of(reader, POSE_TYPES))
-        if len(poses) != 1:
-            found = ", ".join(poses) or "none"
+        wanted = odometry or poses
+        if len(wanted) != 1:
+            found = ", ".join(wanted) or "none"
             raise SourceError(f"which topic? (poses on: {found})", where=path, cure="name one with --topic")
-        topic = poses[0]
+        topic = wanted[0]
+    log = _read_bag_topic(path, topic)
+    unused = [t for t in poses if t != topic]
+    note = f"poses on {', '.join(unused)} are not used: --topic takes them as the odometry, --truth-topic as truth"
+    return replace(log, notes=(*log.notes, note)) if unused else log
+
+
+def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     t, T, read = read_poses(path, topic)
     trajectory = Trajectory(t, T)
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
         dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
-        return ForeignLog(path, trajectory, twist * dt[:, None, None] ** 2, "motion")
+        return ForeignLog(path, trajectory, twist * dt[:, None, None] ** 2, "motion", topic=topic)
     if pose is None:
-        return ForeignLog(path, trajectory)
+        return ForeignLog(path, trajectory, topic=topic)
     if _looks_stated(pose):
-        return ForeignLog(path, trajectory, _into_body(trajectory, pose), "pose")
-    return ForeignLog(path, trajectory, notes=("its covariances are not positive definite and were left out",))
+        return ForeignLog(path, trajectory, _into_body(trajectory, pose), "pose", topic=topic)
+    left_out = "its covariances are not positive definite and were left out"
+    return ForeignLog(path, trajectory, notes=(left_out,), topic=topic)
 
 
 def _bag_covariance(read: list[Any], name: str) -> Array | None:

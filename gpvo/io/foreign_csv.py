@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.geometry.se3 import Array
+from gpvo.io.lines import text_lines
 from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
 from gpvo.io.stamps import UNITS_NS, check_interval, text_to_ns
+from gpvo.types import Array
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
 _COV = tuple(f"cov_{i}{j}" for i in range(6) for j in range(6))
@@ -27,8 +28,17 @@ _OPENVINS = {
     **{f"p{a}{b}": f"cov_{i}{j}" for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j},
     **{f"q{a}{b}": f"cov_{i + 3}{j + 3}" for i, a in enumerate("rpy") for j, b in enumerate("rpy") if i <= j},
 }
-_MAX_BYTES = 2_000_000_000
 _MAX_ROWS = 20_000_000
+_AXES = {
+    name: i % 6
+    for i, name in enumerate(
+        ["x", "y", "z", "roll", "pitch", "yaw", "px", "py", "pz", "rx", "ry", "rz", "tx", "ty", "tz", "r", "p", "yaw"]
+    )
+}
+_AXIS = "roll|pitch|yaw|[prt]?[xyz]|r|p"
+_COVARIANCE = re.compile(rf"(?:pose_|position_)?(?:cov|covariance)_({_AXIS})_?({_AXIS})")
+_VARIANCE = re.compile(rf"(?:pose_|position_)?(?:var|variance)_({_AXIS})")
+_UNCERTAIN = re.compile(r"cov|var|sigma|std", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,7 @@ class Table:
     t_ns: NDArray[np.int64]
     columns: dict[str, Array]
     lines: list[int]
+    unused: tuple[str, ...] = ()  # columns that look like an uncertainty and were not understood
 
 
 def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
@@ -79,32 +90,27 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     column = header[targets[stamp]]
     check_interval(stamps, path, f"name the unit: --map {column}=t_us, or t_ms, t_s, t_ns")
     data = np.array(rows, dtype=np.float64)
-    return Table(np.array(stamps, dtype=np.int64), {n: data[:, i] for i, n in enumerate(order)}, numbers)
+    used = {targets[n] for n in targets}
+    unused = tuple(c for k, c in enumerate(header) if k not in used and _UNCERTAIN.search(c))
+    return Table(np.array(stamps, dtype=np.int64), {n: data[:, i] for i, n in enumerate(order)}, numbers, unused)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise SourceError("is larger than 2 GB: no log", where=path)
-        with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-            comment: tuple[int, str] | None = None
-            separator: str | None = None
-            for number, line in enumerate(file, 1):
-                text = line.strip()
-                if text.startswith("#"):
-                    comment = (number, text.lstrip("#").strip())
-                if not text or text.startswith("#"):
-                    continue
-                if separator is None:
-                    separator = next((s for s in (",", ";", "\t") if s in text), " ")
-                    if is_number(_split(text, separator)[0]):
-                        if comment is None:
-                            raise SourceError("has no header line", where=path, cure="put the column names on top")
-                        yield comment[0], _split(comment[1], separator)
-                yield number, _split(text, separator)
-    except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+        comment: tuple[int, str] | None = None
+        separator: str | None = None
+        for number, text in text_lines(path):
+            if text.startswith("#"):
+                comment = (number, text.lstrip("#").strip())
+                continue
+            if separator is None:
+                separator = next((s for s in (",", ";", "\t") if s in text), " ")
+                if is_number(_split(text, separator)[0]):
+                    if comment is None:
+                        raise SourceError("has no header line", where=path, cure="put the column names on top")
+                    yield comment[0], _split(comment[1], separator)
+            yield number, _split(text, separator)
     except csv.Error as error:
         raise SourceError(f"is no CSV: {error}", where=path) from None
 
@@ -163,6 +169,9 @@ def _suggest(column: str) -> str | None:
         return f"t_{said}" if said in UNITS_NS else "t_s"
     if name in _OPENVINS:
         return _OPENVINS[name]
+    if named := _COVARIANCE.fullmatch(name) or _VARIANCE.fullmatch(name):
+        i, j = (_AXES[named[k]] for k in (1, named.lastindex or 1))
+        return f"cov_{min(i, j)}{max(i, j)}"
     if covariance := re.fullmatch(r"(?:field_)?pose_covariance_?(\d+)_?", name):
         k = int(covariance[1])
         return f"cov_{k // 6}{k % 6}" if k < 36 else None

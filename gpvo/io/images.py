@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import struct
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.cameras.imagesize import image_size, is_decodable
 from gpvo.cameras.masks import read_mask
 from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
@@ -26,7 +26,7 @@ from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _MAX_IMAGE_BYTES = 500_000_000
-_MAX_SIDE_PX = 16384
+_MAX_HEAD_BYTES = 1 << 20  # Thumbnails and colour profiles stand before the size.
 
 Image8 = NDArray[np.uint8]
 T = TypeVar("T")
@@ -62,8 +62,8 @@ def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
 
 
 def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
-    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8, None where they are no image."""
-    if _claims_too_much(bytes(raw[:24])):
+    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8; None where they are no image, or claim to be larger than any."""
+    if not is_decodable(raw.data):
         return None
     # A damaged image is counted and reported by us; OpenCV need not warn as well.
     level = cv2.utils.logging.getLogLevel()
@@ -77,13 +77,6 @@ def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
     return to_grey8(image, bits=bits)
-
-
-def _claims_too_much(head: bytes) -> bool:
-    """Whether a PNG's header states a size that would allocate more than any camera gives."""
-    if len(head) < 24 or not head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return False
-    return max(struct.unpack(">II", head[16:24])) > _MAX_SIDE_PX
 
 
 def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
@@ -260,6 +253,15 @@ class FileSource(ImageSource):
             yield pair.t_ns, read_grey8(pair.left, self.bits), read_grey8(pair.right, self.bits)
 
 
+def _size_of(path: Path) -> tuple[int, int] | None:
+    """(width, height) by the file's header, nothing decoded; None where it is missing or no image."""
+    try:
+        with path.open("rb") as file:
+            return image_size(file.read(_MAX_HEAD_BYTES))
+    except OSError:
+        return None
+
+
 def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
     """Refuse a calibration for another resolution, judged by the first readable image of each camera.
 
@@ -271,10 +273,10 @@ def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
     for side, lens in (("left", rig.left), ("right", rig.right)):
         for pair in pairs[:20]:
             path: Path = getattr(pair, side)
-            image = read_grey8(path)
-            if image is None:
+            size = _size_of(path)
+            if size is None:
                 continue
-            height, width = image.shape
+            width, height = size
             if (width, height) != (lens.width, lens.height):
                 raise CalibrationError(
                     f"the image is {width}x{height}, its calibration is for {lens.width}x{lens.height}"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import SourceError
+from gpvo.io.lines import text_lines
 from gpvo.io.stamps import integer_ns
 from gpvo.types import ImuLog, ImuNoise
 
@@ -31,24 +32,17 @@ def read_imu_csv(
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for number, line in enumerate(file, 1):
-                text = line.strip().removeprefix("\ufeff")
-                if not text or text.startswith("#"):
-                    continue
-                try:
-                    fields = text.split(",")
-                    stamps.append(integer_ns(fields[0].strip()))
-                    rows.append([float(f) for f in fields[1:7]])
-                    if len(rows[-1]) != 6 or not np.isfinite(rows[-1]).all():
-                        raise ValueError
-                except ValueError:
-                    raise SourceError(
-                        f"line {number}: expected t[ns] and six finite numbers, gyro first", where=path
-                    ) from None
-    except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+    for number, text in text_lines(path):
+        if text.startswith("#"):
+            continue
+        try:
+            fields = text.split(",")
+            stamps.append(integer_ns(fields[0].strip()))
+            rows.append([float(f) for f in fields[1:7]])
+            if len(rows[-1]) != 6 or not np.isfinite(rows[-1]).all():
+                raise ValueError
+        except ValueError:
+            raise SourceError(f"line {number}: expected t[ns] and six finite numbers, gyro first", where=path) from None
     if not stamps:
         raise SourceError("holds no IMU samples", where=path)
     return make_imu(np.array(stamps, dtype=np.int64), np.array(rows), shift_s=shift_s, noise=noise, remark=remark)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.errors import SourceError
+from gpvo.io.atomic import write_text
 
 _MAX_BYTES = 50_000_000
 
@@ -35,9 +35,14 @@ def plain(value: Any) -> Any:
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document under a temporary name, then put it in place."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(plain(document), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, json.dumps(plain(document), indent=1, allow_nan=False) + "\n")
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no number of JSON")
+    return value
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -51,7 +56,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError("is larger than 50 MB", where=path)
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_number, parse_float=_number)
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
     except (ValueError, RecursionError) as error:

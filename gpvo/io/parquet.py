@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,23 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
+from gpvo.io.atomic import replacing
 
 MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
+_PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _INTEGERS = {"t_ns", "t_prev_ns", "n_detected", "n_stereo", "n_tracked", "n_inliers"}
-_TYPES = {"status": pa.string(), "reason": pa.string(), "is_reference": pa.bool_()}
+_TYPES = {
+    "status": pa.string(),
+    "reason": pa.string(),
+    "is_reference": pa.bool_(),
+    "track": pa.int32(),
+    "u_px": pa.float32(),
+    "v_px": pa.float32(),
+    "d_px": pa.float32(),
+    "is_inlier": pa.bool_(),
+}
 
 
 def make_table(columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> pa.Table:
@@ -33,23 +43,23 @@ def make_table(columns: Mapping[str, Any], metadata: Mapping[str, str] | None = 
 
 def write_table(path: Path, table: pa.Table) -> None:
     """Write one table in place of what was there, or not at all."""
-    temporary = path.with_name(path.name + ".part")
-    pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
 def concatenate(parts: Sequence[Path], target: Path, metadata: Mapping[str, str] | None = None) -> None:
     """Join tables of a growing set of columns into one file, a part at a time in memory."""
     schema = pa.unify_schemas([pq.read_schema(p).remove_metadata() for p in parts])
     schema = schema.with_metadata(dict(metadata or {}))
-    temporary = target.with_name(target.name + ".part")
-    with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
+    with (
+        replacing(target) as temporary,
+        pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer,
+    ):
         for part in parts:
             table = pq.read_table(part)
             n = table.num_rows
             columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
-    os.replace(temporary, target)
 
 
 def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
@@ -67,9 +77,13 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
                 raise SourceError(f"has {shape.num_rows} rows and {shape.num_columns} columns: no run's", where=path)
             if sum(shape.row_group(i).total_byte_size for i in range(shape.num_row_groups)) > MAX_BYTES:
                 raise SourceError("unpacks to more than 8 GB", where=path)
+            # What a page's run lengths stand for is in no size that the file states.
+            cells, packed = shape.num_rows * shape.num_columns, path.stat().st_size
+            if 8 * cells > _PLAIN_BYTES + _MAX_RATIO * packed:
+                raise SourceError(f"unpacks {packed} bytes to {cells} numbers: no run's", where=path)
             table = file.read()
             metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
-            return {name: _to_numpy(table[name]) for name in table.column_names}, metadata
+            return {name: _to_numpy(name, table[name]) for name in table.column_names}, metadata
     except FileNotFoundError:
         raise SourceError("is missing", where=path) from None
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -77,7 +91,11 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
         raise SourceError(f"is damaged: {reason}", where=path, cure="run the sequence again") from None
 
 
-def _to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+def _to_numpy(name: str, column: pa.ChunkedArray) -> NDArray[Any]:
+    wanted = _TYPES.get(name, pa.float64())
+    is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_null(column.type)
+    if not pa.types.is_string(wanted) and not is_number and not (pa.types.is_boolean(wanted) and column.type == wanted):
+        raise ValueError(f"the column '{name}' holds {column.type}, not {wanted}")
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type) or pa.types.is_dictionary(column.type):
         return np.array(column.to_pylist(), dtype=object)
     return np.asarray(column.to_numpy())

@@ -1,21 +1,22 @@
 """The run folder: everything later stages need, so that nothing reopens the source.
 
 ``vo_log.parquet`` (columns in :mod:`gpvo.io.run_table`), ``trajectory.tum`` (raw VO, never corrected), ``rig.json``,
-``truth.parquet``, ``imu.parquet``, ``predictions.parquet`` where there are such, ``config.toml``, ``run.json``. While a
-run is on, finished chunks of records lie in ``chunks/``; closing it joins them. A run that was killed is read from
-its chunks.
+``truth.parquet``, ``imu.parquet``, ``predictions.parquet``, ``tracks.parquet`` (what odometry saw) where there are
+such, ``config.toml``, ``run.json``. While a run is on, finished chunks of records lie in ``chunks/``; closing it joins
+them. A run that was killed is read from its chunks.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import shutil
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
@@ -25,21 +26,24 @@ import numpy as np
 
 from gpvo import __version__
 from gpvo.errors import SourceError
-from gpvo.geometry.se3 import Array
+from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_table
-from gpvo.io.jsonfile import write_json
+from gpvo.io.folder_lock import FolderLock
+from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.parquet import concatenate, make_table, write_table
-from gpvo.io.run_read import Run, read_predictions, read_run
+from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
 from gpvo.io.toml import write_toml
 from gpvo.io.trajectory import tum_line
-from gpvo.types import ImuLog, Mounting, Prediction, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
 
-__all__ = ["Run", "RunWriter", "read_predictions", "read_run", "write_predictions", "write_run"]
+__all__ = ["Run", "RunWriter", "read_predictions", "read_run", "read_tracks", "write_predictions", "write_run"]
 
 SCHEMA = 1
-_FILES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet")
-_OWN = (*_FILES, "config.toml", "run.json")
-_BEGINNING = "run.json.part"
+_FILES = (
+    "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
+    "tracks.parquet",
+)  # fmt: skip
+_OWN = (*_FILES, "config.toml", "run.json", "calibration_state.json")
 
 
 class RunWriter:
@@ -47,7 +51,8 @@ class RunWriter:
 
     Parameters
     ----------
-    path : the folder; made if need be. An older run in it is replaced, any other content refused.
+    path : the folder; made if need be. What a killed run left is replaced, anything but a run refused.
+    overwrite : whether a finished run in it is replaced: it stays as it is until the new one is whole.
     camera, mounting, truth, imu : what the source knows, None where it does not.
     config : the settings used, for ``config.toml``.
     meta : further keys of ``run.json``, such as ``name``, ``source`` and ``source_format``.
@@ -57,13 +62,15 @@ class RunWriter:
     Raises
     ------
     SourceError
-        Where the folder holds something that is not a run, or cannot be written.
+        Where the folder holds something that is not a run, or a finished one and not ``overwrite``; where it cannot be
+        written, or another process writes it.
     """
 
     def __init__(
         self,
         path: str | Path,
         *,
+        overwrite: bool = True,
         camera: StereoCamera | None = None,
         mounting: Mounting | None = None,
         truth: TruthLog | None = None,
@@ -73,11 +80,19 @@ class RunWriter:
         calibration: Mapping[str, Any] | None = None,
         chunk: int = 100,
     ) -> None:
-        self.path = Path(path)
-        self._chunks = self.path / "chunks"
+        self._target = Path(path)
         self._meta = dict(meta or {})
         self._chunk = max(1, chunk)
         self._state = _State()
+        self._lock = _claim(self._target)
+        self.path = self._target
+        if is_finished(self._target):
+            if not overwrite:
+                raise SourceError(
+                    "holds a finished run", where=path, cure="give --overwrite, or another folder with -o"
+                )
+            self.path = self._target.with_name(f".{self._target.name}.new")
+        self._chunks = self.path / "chunks"
         _prepare(self.path)
         # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
         self._write_meta(complete=False)
@@ -97,8 +112,10 @@ class RunWriter:
     ) -> None:
         self.close(complete=error is None)
 
-    def append(self, record: VoRecord, prediction: Prediction | None = None) -> None:
-        """Add one record, and what a model predicted for it.
+    def append(
+        self, record: VoRecord, prediction: Prediction | None = None, tracks: StereoTracks | None = None
+    ) -> None:
+        """Add one record, what a model predicted for it, and the observations that came with it.
 
         Raises
         ------
@@ -116,11 +133,13 @@ class RunWriter:
             state.poses.move_to_end(record.t_prev_ns)
         pose = record.T_prev_cur if T_prev is None else T_prev @ record.T_prev_cur
         state.remember(record.t_ns, pose)
-        state.records.append(record)
+        state.records.append(_with_sound_covariances(record))
         state.lines.append(tum_line(record.t_ns, pose))
         state.count(record)
         if prediction is not None:
             state.predictions.append(prediction)
+        if tracks is not None:
+            state.tracks.append(tracks)
         if len(state.records) >= self._chunk:
             self.flush()
 
@@ -137,15 +156,30 @@ class RunWriter:
             if state.predictions:
                 columns = run_table.prediction_columns(state.predictions)
                 write_table(self._chunks / f"predictions_{name}", make_table(columns))
+            if state.tracks:
+                write_table(self._chunks / f"tracks_{name}", make_table(run_table.track_columns(state.tracks)))
             with (self.path / "trajectory.tum").open("a", encoding="ascii", newline="\n") as file:
                 file.writelines(line + "\n" for line in state.lines)
             state.chunks += 1
-        state.records, state.predictions, state.lines = [], [], []
+        state.records, state.predictions, state.lines, state.tracks = [], [], [], []
 
     def close(self, *, complete: bool = True) -> None:
         """Join the chunks and finish ``run.json``; ``complete=False`` marks a run that broke off."""
+        replaces = self.path != self._target
+        try:
+            if complete or not replaces:
+                self._finish(complete)
+            if complete and replaces:
+                _put_in_place(self.path, self._target)
+        finally:
+            if replaces:
+                # Where the new run is not whole, the finished one that it was to replace is worth more.
+                shutil.rmtree(self.path, ignore_errors=True)
+            self._lock.release()
+
+    def _finish(self, complete: bool) -> None:
         self.flush()
-        for kind, target in (("log", "vo_log.parquet"), ("predictions", "predictions.parquet")):
+        for kind, target in (("log", "vo_log.parquet"), *((k, f"{k}.parquet") for k in ("predictions", "tracks"))):
             parts = sorted(self._chunks.glob(f"{kind}_*.parquet"))
             if parts:
                 concatenate(parts, self.path / target, {"schema": str(SCHEMA)})
@@ -163,7 +197,7 @@ class RunWriter:
             self.path / "run.json",
             {
                 "schema": SCHEMA,
-                "name": self.path.resolve().name,
+                "name": self._target.resolve().name,
                 **self._meta,
                 "complete": complete,
                 "frames": state.records_total,
@@ -185,6 +219,7 @@ class _State:
     records: list[VoRecord] = field(default_factory=list)
     predictions: list[Prediction] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
+    tracks: list[StereoTracks] = field(default_factory=list)
     poses: OrderedDict[int, Array] = field(default_factory=OrderedDict)
     statuses: dict[str, int] = field(default_factory=dict)
     stage_ms: dict[str, float] = field(default_factory=dict)
@@ -250,17 +285,60 @@ def _rig(camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[s
     }
 
 
-def _prepare(path: Path) -> None:
-    """Make the folder; clear an older run of exactly the files that a run has."""
+def _with_sound_covariances(record: VoRecord) -> VoRecord:
+    """The record without covariances that are none: not finite, or not positive definite."""
+    names = list(record.covariances)
+    if not names or not record.usable:
+        return record
+    good = are_positive_definite(np.array([record.covariances[name] for name in names]))
+    if good.all():
+        return record
+    return replace(
+        record, covariances={name: record.covariances[name] for name, is_good in zip(names, good) if is_good}
+    )
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a folder holds a run that was written to its end."""
+    try:
+        return read_json(path / "run.json").get("complete") is True
+    except SourceError:
+        return False
+
+
+def _claim(path: Path) -> FolderLock:
+    """Make the folder, for one writer."""
     if path.exists() and not path.is_dir():
         raise SourceError("is a file, not a folder for a run", where=path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        present = {p.name for p in path.iterdir()} - {_BEGINNING}
+        return FolderLock(path)
+    except OSError as error:
+        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
+
+
+def _put_in_place(new: Path, target: Path) -> None:
+    """Exchange a folder for a newer one; at no moment is there neither."""
+    old = target.with_name(f".{target.name}.old")
+    try:
+        shutil.rmtree(old, ignore_errors=True)
+        os.replace(target, old)
+        os.replace(new, target)
+    except OSError as error:
+        raise SourceError(f"cannot be replaced: {error.strerror}; ask for it again", where=target) from None
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _prepare(path: Path) -> None:
+    """Make the folder; clear an older run of exactly the files that a run has."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        unfinished = [p for p in path.iterdir() if p.name.startswith(".") and p.name.endswith(".part")]
+        present = {p.name for p in path.iterdir()} - {p.name for p in unfinished}
         if present and "run.json" not in present:
             raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
         shutil.rmtree(path / "chunks", ignore_errors=True)
-        for name in (_BEGINNING, *_OWN):
-            (path / name).unlink(missing_ok=True)
+        for file in (*unfinished, *(path / name for name in _OWN)):
+            file.unlink(missing_ok=True)
     except OSError as error:
         raise SourceError(f"cannot be written: {error.strerror}", where=path) from None

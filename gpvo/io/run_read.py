@@ -9,12 +9,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError
-from gpvo.geometry.se3 import Array
+from gpvo.errors import CalibrationError, SourceError, printable
+from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_table
 from gpvo.io.jsonfile import read_json
 from gpvo.io.parquet import read_columns
-from gpvo.types import ImuLog, ImuNoise, Mounting, Prediction, StereoCamera, TruthLog, VoLog, field_names
+from gpvo.types import (
+    Array,
+    ImuLog,
+    ImuNoise,
+    Mounting,
+    Prediction,
+    StereoCamera,
+    StereoTracks,
+    TruthLog,
+    VoLog,
+    field_names,
+)
 
 _MAX_SCHEMA = 1
 
@@ -73,7 +84,7 @@ def read_run(path: str | Path) -> Run:
     log = _read_log(p, camera)
     return Run(
         path=p,
-        name=str(meta.get("name") or p.resolve().name),
+        name=printable(meta.get("name") or p.resolve().name),
         log=log,
         truth=_read_truth(p / "truth.parquet"),
         imu=_read_imu(p / "imu.parquet"),
@@ -93,7 +104,36 @@ def read_predictions(path: str | Path) -> list[Prediction]:
     """
     p = Path(path)
     columns, _ = read_columns(p)
-    return _guarded(p, lambda: run_table.predictions_from(columns))
+    predictions: list[Prediction] = _guarded(p, lambda: run_table.predictions_from(columns))
+    if not predictions:
+        return []
+    numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        raise SourceError("holds a prediction that is not finite", where=p)
+    _check_covariances(np.array([q.covariance for q in predictions]), "predicted covariance", p)
+    for part in ("jitter", "white"):
+        _check_covariances(np.array([getattr(q, part) for q in predictions]), f"covariance '{part}'", p, semi=True)
+    return predictions
+
+
+def read_tracks(path: str | Path) -> StereoTracks:
+    """What odometry saw during a run, in order of time.
+
+    Raises
+    ------
+    SourceError
+        Where the run folder holds no tracks, or they are damaged.
+    """
+    p = Path(path)
+    parts = _parts(p, "tracks.parquet", "tracks")
+    if not parts:
+        raise SourceError(
+            "holds no tracks: poses alone show neither structure nor pixel noise",
+            where=p,
+            cure="run the sequence again with 'gpvo run --keep-tracks'; an imported log has none",
+        )
+    read = [_guarded(part, lambda part=part: run_table.tracks_from(read_columns(part)[0])) for part in parts]
+    return StereoTracks.join(read)
 
 
 def _guarded(path: Path, make: Any) -> Any:
@@ -138,6 +178,16 @@ def _check_log(log: VoLog, path: Path) -> None:
     if any(r.t_prev_ns not in known or r.t_prev_ns > r.t_ns for r in log.records[1:]):
         raise SourceError("a record starts from a frame that is not in it", where=path, cure="run the sequence again")
     _check_poses(log.T_prev_cur, path)
+    for method in log.methods:
+        stated = [r.covariances[method] for r in log if r.usable and method in r.covariances]
+        _check_covariances(np.array(stated).reshape(-1, 6, 6), f"{method} covariance", path)
+
+
+def _check_covariances(C: Array, what: str, path: Path, *, semi: bool = False) -> None:
+    good = are_positive_definite(C, semi=semi)
+    if not good.all():
+        word = "positive semidefinite" if semi else "positive definite"
+        raise SourceError(f"its {what} number {int(np.flatnonzero(~good)[0]) + 1} is not {word}", where=path)
 
 
 def _check_poses(T: Array, path: Path) -> None:
@@ -166,11 +216,12 @@ def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
     def make() -> tuple[StereoCamera | None, Mounting]:
         raw = document.get("camera")
         camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
-        if camera is not None and not (camera.fx_px > 0 and camera.fy_px > 0 and camera.baseline_m > 0):
-            raise ValueError("focal length or baseline is not positive")
         return camera, Mounting(T_body_cam=pose("T_body_cam"), T_imu_cam=pose("T_imu_cam"))
 
-    result: tuple[StereoCamera | None, Mounting] = _guarded(path, make)
+    try:
+        result: tuple[StereoCamera | None, Mounting] = _guarded(path, make)
+    except CalibrationError as problem:
+        raise SourceError(problem.what, where=path) from None
     return result
 
 

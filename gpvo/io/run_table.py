@@ -1,4 +1,4 @@
-"""Columns of the run folder's tables: records, truth, IMU and predictions as flat tables and back, bit for bit.
+"""Columns of the run folder's tables: records, truth, IMU and predictions as flat tables and back.
 
 Units stand in the names. A pose is ``p_x_m p_y_m p_z_m`` and ``R_00`` ... ``R_22`` (exact); ``q_x q_y q_z q_w`` repeats
 the rotation for people. A 6x6 covariance is its upper triangle, row by row, ``cov_<method>_<i><j>`` with i, j in 0..5
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
-from gpvo.types import ImuLog, Prediction, Status, TruthLog, VoRecord
+from gpvo.geometry.covariance import scaled_root
+from gpvo.types import Array, ImuLog, Prediction, Status, StereoTracks, TruthLog, VoRecord
 
 Columns = dict[str, list[Any]]
 
@@ -72,6 +72,25 @@ def poses_from(columns: Mapping[str, NDArray[Any]]) -> Array:
     R = np.stack([columns[c] for c in _ROTATION], axis=-1).reshape(-1, 3, 3)
     t = np.stack([columns[c] for c in _POSITION], axis=-1)
     return se3.from_rt(R, t)
+
+
+_TRACK_COLUMNS = ("t_ns", "track", "u_px", "v_px", "d_px", "is_inlier")
+
+
+def track_columns(tables: Sequence[StereoTracks]) -> dict[str, NDArray[Any]]:
+    """Tables of observations as columns of one."""
+    joined = StereoTracks.join(tables)
+    columns = (joined.t_ns, joined.track, *joined.uvd.T, joined.is_inlier)
+    return dict(zip(_TRACK_COLUMNS, columns, strict=True))
+
+
+def tracks_from(columns: Mapping[str, NDArray[Any]]) -> StereoTracks:
+    """Observations of :func:`track_columns`; a pixel that is not finite is refused."""
+    t_ns, track, u, v, d, is_inlier = (columns[name] for name in _TRACK_COLUMNS)
+    uvd = np.stack([u, v, d], axis=1).astype(np.float64)
+    if not np.isfinite(uvd).all():
+        raise ValueError("a pixel is not finite")
+    return StereoTracks(np.asarray(t_ns, np.int64), np.asarray(track, np.int64), uvd, np.asarray(is_inlier, bool))
 
 
 def record_columns(records: Sequence[VoRecord]) -> Columns:
@@ -148,30 +167,35 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
 def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
     """Predictions as columns: ``mean_*``, ``cov_total_<i><j>``, ``cov_<part>_<i><j>``, ``bias_tau_*_s``, ...
 
-    Of models with errors of calibration, ``root_calibration_<i><j>`` and ``calibration_tau_*_s`` besides.
+    ``cov_bias`` is all that persists. Of models with errors of calibration, ``root_calibration_<i><j>`` and
+    ``calibration_tau_*_s`` besides.
     """
     out: Columns = {
         "t_ns": [p.t_ns for p in predictions],
-        "dt_s": [p.dt_s for p in predictions],
+        "dt_s": [float(p.dt_s) for p in predictions],
         "status": [p.status.value for p in predictions],
         "confidence": [float(p.confidence) for p in predictions],
         "in_domain": [float(p.in_domain) for p in predictions],
     }
+    tau = [p.persistent_tau_s for p in predictions]
     for i, axis in enumerate(_SIGMA6):
         out[f"mean_{axis}"] = [float(p.mean[i]) for p in predictions]
     for i, axis in enumerate(_SHORT6):
         out[f"epistemic_var_{axis}"] = [float(p.epistemic[i]) for p in predictions]
-        out[f"bias_tau_{axis}_s"] = [float(p.bias_tau_s[i]) for p in predictions]
-    _put_matrices(out, "cov", [{"total": p.covariance, **p.parts} for p in predictions], _UPPER6)
-    if any((p.calibration_tau_s != 1.0).any() for p in predictions):
-        _put_matrices(out, "root", [{"calibration": p.calibration_root} for p in predictions], _ALL6)
+        out[f"bias_tau_{axis}_s"] = [float(t[i]) if len(t) else 1.0 for t in tau]
+    parts = ({"total": p.covariance, "jitter": p.jitter, "white": p.white, "bias": p.persistent} for p in predictions)
+    _put_matrices(out, "cov", list(parts), _UPPER6)
+    if any((t[6:] != 1.0).any() for t in tau):
+        _put_matrices(out, "root", [{"calibration": _wide(p.persistent_root)[:, 6:]} for p in predictions], _ALL6)
         for i, axis in enumerate(_SHORT6):
-            out[f"calibration_tau_{axis}_s"] = [float(p.calibration_tau_s[i]) for p in predictions]
+            out[f"calibration_tau_{axis}_s"] = [float(t[6 + i]) if len(t) > 6 else 1.0 for t in tau]
     return out
 
 
 def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     """Predictions of :func:`prediction_columns`.
+
+    A bias without a time constant counts as white. The root of what persists is that of its covariance, to rounding.
 
     Raises
     ------
@@ -181,30 +205,42 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     n = len(columns["t_ns"])
     mean = np.stack([columns[f"mean_{a}"] for a in _SIGMA6], axis=-1)
     epistemic = np.stack([columns[f"epistemic_var_{a}"] for a in _SHORT6], axis=-1)
-    tau = np.stack([columns[f"bias_tau_{a}_s"] for a in _SHORT6], axis=-1)
-    root, lasts = np.zeros((n, 6, 6)), np.ones((n, 6))
+    tau, root = np.ones((n, 12)), np.zeros((n, 6, 12))
+    tau[:, :6] = np.stack([columns[f"bias_tau_{a}_s"] for a in _SHORT6], axis=-1)
     if "root_calibration_00" in columns:
-        root = np.stack([columns[f"root_calibration_{i}{j}"] for i, j in _ALL6], axis=-1).reshape(n, 6, 6)
-        lasts = np.stack([columns[f"calibration_tau_{a}_s"] for a in _SHORT6], axis=-1)
-    matrices = _get_matrices(columns, "cov", _UPPER6, 6)
-    total = matrices.pop("total")
+        calibration = [columns[f"root_calibration_{i}{j}"] for i, j in _ALL6]
+        root[:, :, 6:] = np.stack(calibration, axis=-1).reshape(n, 6, 6)
+        tau[:, 6:] = np.stack([columns[f"calibration_tau_{a}_s"] for a in _SHORT6], axis=-1)
+    cov = _get_matrices(columns, "cov", _UPPER6, 6)
+    jitter, bias = (cov.get(part, np.zeros((n, 6, 6))) for part in ("jitter", "bias"))
+    white = cov["white"] if "white" in cov else cov["total"] - jitter - bias
+    finite = np.isfinite(np.concatenate([bias, root], axis=2)).all(axis=(1, 2))
+    usable = np.asarray((tau > 0).all(axis=1) & finite)
+    white = np.where(usable[:, None, None], white, white + bias)
+    root[~usable], tau[~usable] = 0.0, 1.0
+    persistent = np.where(usable[:, None, None], bias, 0.0) - root @ np.swapaxes(root, -1, -2)
+    root[:, :, :6] = scaled_root(persistent)
     return [
         Prediction(
-            t_ns=int(columns["t_ns"][k]),
-            dt_s=float(columns["dt_s"][k]),
             mean=mean[k],
-            covariance=total[k],
-            parts={name: C[k] for name, C in matrices.items()},
-            bias_tau_s=tau[k],
+            jitter=jitter[k],
+            white=white[k],
+            persistent_root=root[k],
+            persistent_tau_s=tau[k],
+            dt_s=float(columns["dt_s"][k]),
+            status=Status(columns["status"][k]),
+            t_ns=int(columns["t_ns"][k]),
             epistemic=epistemic[k],
             confidence=float(columns["confidence"][k]),
             in_domain=float(columns["in_domain"][k]),
-            status=Status(columns["status"][k]),
-            calibration_root=root[k],
-            calibration_tau_s=lasts[k],
         )
         for k in range(n)
     ]
+
+
+def _wide(root: Array) -> Array:
+    """A root (6, P) with columns of zeros up to 12."""
+    return np.pad(root, ((0, 0), (0, 12 - root.shape[-1])))
 
 
 def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:

@@ -1,24 +1,36 @@
-"""Writing settings as TOML (Python reads it, but cannot write it)."""
+"""Settings as TOML: written here, as Python only reads it."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gpvo.errors import GpvoError
+from gpvo.io.atomic import write_text
 from gpvo.io.jsonfile import plain
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
+def read_toml(path: Path) -> dict[str, Any]:
+    """Settings of a file. Raises GpvoError where it cannot be read."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as problem:
+        raise GpvoError(f"cannot be read as TOML: {problem}", where=path) from None
+
+
 def write_toml(path: Path, settings: Mapping[str, Any]) -> None:
     """Write settings; nested mappings become tables, and what is None is left out."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(to_toml(settings), encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, to_toml(settings))
 
 
 def to_toml(settings: Mapping[str, Any]) -> str:

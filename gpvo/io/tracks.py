@@ -10,6 +10,8 @@ an IMU at its own rate in body axes as ``imu_t_ns`` (K,), ``imu_gyro_radps``, ``
 
 from __future__ import annotations
 
+import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -19,18 +21,26 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.cameras.imagesize import MAX_SIDE_PX
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import in_order
 from gpvo.io.truth import GPS_INS, TruthNoise
-from gpvo.types import ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
+from gpvo.types import Array, ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
 
 _REQUIRED = ("t_s", "frame", "track", "uv_left", "uv_right", "fx", "fy", "cx", "cy", "baseline_m")
-_MAX_UNPACKED_BYTES = 4_000_000_000
+_OPTIONAL = (
+    "T_world_cam", "gyro_body_radps", "acc_body_mps2", "R_cam_body", "p_body_cam_in_body_m", "width", "height",
+    "sigma_translation_m", "sigma_rotation_rad", "imu_t_ns", "imu_gyro_radps", "imu_acc_mps2", "imu_noise",
+)  # fmt: skip
+_MAX_UNPACKED_BYTES = 1_000_000_000
+# Tracks pack to a fifth; zeros to a thousandth.
+_PLAIN_BYTES, _MAX_RATIO = 50_000_000, 50
+_MAX_STAMP_S = 9.2e9
+_MAX_PX = 1e6
 
 
 class TracksSource:
@@ -45,9 +55,9 @@ class TracksSource:
 
     def __init__(self, path: Path, *, truth_noise: TruthNoise | None = None) -> None:
         self.path, self.name = path, path.stem
-        data = load_arrays(path, _REQUIRED)
+        data = load_arrays(path, _REQUIRED, _OPTIONAL)
         self._data, self.report = data, SourceReport()
-        self._t_ns = np.rint(_shaped(data, "t_s", (None,), path) * 1e9).astype(np.int64)
+        self._t_ns = np.rint(_shaped(data, "t_s", (None,), path, most=_MAX_STAMP_S) * 1e9).astype(np.int64)
         self._observations()
         self.camera = self._make_camera()
         self.mask: NDArray[np.bool_] | None = None
@@ -80,11 +90,11 @@ class TracksSource:
     def _observations(self) -> None:
         """Sort the rows by frame and check them."""
         d, path, n = self._data, self.path, len(self._t_ns)
-        frame = _shaped(d, "frame", (None,), path).astype(np.int64)
+        frame = _shaped(d, "frame", (None,), path, most=2.0**53).astype(np.int64)
         m = len(frame)
-        self._track = _shaped(d, "track", (m,), path).astype(np.int64)
-        self._uv_left = _shaped(d, "uv_left", (m, 2), path)
-        self._uv_right = _shaped(d, "uv_right", (m, 2), path)
+        self._track = _shaped(d, "track", (m,), path, most=2.0**62).astype(np.int64)
+        self._uv_left = _shaped(d, "uv_left", (m, 2), path, most=_MAX_PX)
+        self._uv_right = _shaped(d, "uv_right", (m, 2), path, most=_MAX_PX)
         if n == 0 or m == 0:
             raise SourceError("holds no observations", where=path)
         if frame.min() < 0 or frame.max() >= n:
@@ -98,7 +108,7 @@ class TracksSource:
         )
         both = np.concatenate([self._uv_left, self._uv_right])
         if "width" in self._data and "height" in self._data:
-            width, height = int(self._data["width"]), int(self._data["height"])
+            width, height = (int(_shaped(self._data, k, (), self.path, most=MAX_SIDE_PX)) for k in ("width", "height"))
         else:
             # Not stated: large enough for every observation and for a principal point in the middle.
             width = max(int(np.ceil(both[:, 0].max())) + 1, round(2 * cx) + 1)
@@ -133,8 +143,8 @@ class TracksSource:
 
     def _full_imu(self) -> ImuLog:
         t_ns = self._data["imu_t_ns"]
-        if t_ns.ndim != 1 or t_ns.dtype.kind not in "iu":
-            raise SourceError(f"'imu_t_ns' is {t_ns.dtype} {t_ns.shape}, expected integers (N,)", where=self.path)
+        if t_ns.ndim != 1 or t_ns.dtype.kind not in "iu" or (t_ns > _MAX_STAMP_S * 1e9).any():
+            raise SourceError(f"'imu_t_ns' is {t_ns.dtype} {t_ns.shape}, expected nanoseconds (N,)", where=self.path)
         k = len(t_ns)
         absent = [a for a in ("imu_gyro_radps", "imu_acc_mps2") if a not in self._data]
         if absent:
@@ -152,44 +162,67 @@ class TracksSource:
         if not keep.any():
             raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="leave it out: no truth")
         poses = [check_pose(T[k], f"'T_world_cam' row {k}", self.path) for k in np.flatnonzero(keep)]
-        stated = [self._data.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
-        if noise is None and all(s is not None and s.shape == () for s in stated):
-            noise = TruthNoise(*(float(s) for s in stated if s is not None))
+        stated = ("sigma_translation_m", "sigma_rotation_rad")
+        if noise is None and all(k in self._data for k in stated):
+            noise = TruthNoise(*(abs(float(_shaped(self._data, k, (), self.path, most=1e3))) for k in stated))
         noise = noise or GPS_INS
         return TruthLog(self._t_ns[keep], np.stack(poses), noise.translation_m, noise.rotation_rad)
 
 
-def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Numeric arrays of an ``.npz``, with its sizes checked before anything is unpacked and nothing unpickled.
+def load_arrays(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
+    """Those arrays of an ``.npz`` that are asked for, sizes checked before anything is unpacked, nothing unpickled.
 
     Raises
     ------
     SourceError
-        Where the file is damaged, too large, or lacks an array.
+        Where the file is damaged, too large, or lacks a required array.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _MAX_UNPACKED_BYTES:
-                raise SourceError("unpacks to more than 4 GB", where=path)
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: np.asarray(file[name]) for name in file.files}
+            named = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            wanted = {name: named[name] for name in (*required, *optional) if name in named}
+            n_bytes = sum(entry.file_size for entry in wanted.values())
+            packed = sum(entry.compress_size for entry in wanted.values())
+            if n_bytes > _MAX_UNPACKED_BYTES or n_bytes > _PLAIN_BYTES + _MAX_RATIO * packed:
+                raise SourceError(f"unpacks to more than tracks do: {packed} bytes to {n_bytes}", where=path)
+            data = {name: _read_array(archive, entry) for name, entry in wanted.items()}
+    except SourceError:
+        raise
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror or error}", where=path) from None
-    # zipfile knows not every compression (NotImplementedError), and no password (RuntimeError).
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
-        raise SourceError(
-            f"not readable as .npz: {str(error).splitlines()[0] if str(error) else error!r}", where=path
-        ) from None
+    # Each layer has its own errors: zip, deflate, unknown compressions, passwords, and NumPy's headers.
+    except (ArithmeticError, EOFError, LookupError, MemoryError, RuntimeError, SyntaxError, TypeError, ValueError,
+            tokenize.TokenError, zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
+        reason = (str(error).splitlines() or [repr(error)])[0][:160]
+        raise SourceError(f"not readable as .npz: {reason}", where=path) from None
     absent = [k for k in required if k not in data]
     if absent:
         raise SourceError(f"lacks {', '.join(absent)}", where=path, cure=f"tracks need {', '.join(required)}")
     return data
 
 
+def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array, whose shape is held against the bytes there are before it is made."""
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(file)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise ValueError(f"'{entry.filename}' of {dtype} {shape} does not fit its {entry.file_size} bytes")
+    with archive.open(entry) as file:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
 def _shaped(
-    data: dict[str, NDArray[Any]], key: str, shape: tuple[int | None, ...], path: Path, *, finite: bool = True
+    data: dict[str, NDArray[Any]],
+    key: str,
+    shape: tuple[int | None, ...],
+    path: Path,
+    *,
+    finite: bool = True,
+    most: float = 1e12,
 ) -> Array:
-    """``data[key]`` as float64 of the given shape; None matches any length."""
+    """``data[key]`` as float64 of the given shape, no value beyond ``most``; None matches any length."""
     array = data[key]
     fits = array.ndim == len(shape) and all(s is None or s == n for s, n in zip(shape, array.shape))
     if not fits:
@@ -201,6 +234,8 @@ def _shaped(
     if finite and not np.isfinite(out).all():
         first = int(np.argwhere(~np.isfinite(np.atleast_1d(out)))[0][0])
         raise SourceError(f"'{key}' is NaN or infinite at row {first}", where=path, cure="drop that row")
+    if (np.abs(out) > most).any():
+        raise SourceError(f"'{key}' holds {np.nanmax(np.abs(out)):.3g}, and {most:.3g} is the most", where=path)
     return out
 
 

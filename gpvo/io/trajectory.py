@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +11,14 @@ from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import Array
+from gpvo.io.atomic import replacing
+from gpvo.io.lines import text_lines
 from gpvo.io.stamps import integer_ns, ns_to_seconds_text, seconds_text_to_ns
+from gpvo.types import Array
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
-_MAX_BYTES = 2_000_000_000
+_FARTHEST_M = 1e9
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,20 @@ def read_tum(path: str | Path) -> Trajectory:
     p = Path(path)
     rows = _rows(p, None, exactly=8, stamp=seconds_text_to_ns, what="t tx ty tz qx qy qz qw")
     return _from_rows(p, rows, q_columns=(3, 4, 5, 6))
+
+
+def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
+    """TUM lines with ``more`` words behind the pose: the trajectory, and those words line by line.
+
+    Raises
+    ------
+    SourceError
+        As :func:`read_tum`.
+    """
+    behind: list[list[str]] = []
+    what = f"t tx ty tz qx qy qz qw and {more} more"
+    rows = _rows(path, None, exactly=8 + more, stamp=seconds_text_to_ns, what=what, behind=behind)
+    return _from_rows(path, rows, q_columns=(3, 4, 5, 6)), behind
 
 
 def read_euroc_csv(path: str | Path) -> Trajectory:
@@ -132,24 +147,15 @@ def write_euroc_csv(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Arr
 
 
 def _write(path: Path, lines: Iterator[str]) -> None:
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", encoding="ascii", newline="\n") as file:
+    with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(line + "\n" for line in lines)
-    os.replace(temporary, path)
 
 
 def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and fields of the lines that hold something; comments and one header line are skipped."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise SourceError("is larger than 2 GB: not a trajectory", where=path)
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for number, line in enumerate(file, 1):
-                text = line.strip().removeprefix("\ufeff")
-                if text and not text.startswith("#"):
-                    yield number, [f.strip() for f in text.split(separator)]
-    except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+    for number, text in text_lines(path):
+        if not text.startswith("#"):
+            yield number, [f.strip() for f in text.split(separator)]
 
 
 def _floats(path: Path, number: int, fields: list[str]) -> Array:
@@ -157,6 +163,8 @@ def _floats(path: Path, number: int, fields: list[str]) -> Array:
         values = np.array([float(f) for f in fields])
     except ValueError:
         raise SourceError(f"line {number} holds something that is not a number", where=path) from None
+    if (np.abs(values) > _FARTHEST_M).any() and np.isfinite(values).all():
+        raise SourceError(f"line {number} holds {np.abs(values).max():.3g}: no position on Earth", where=path)
     if not np.isfinite(values).all():
         raise SourceError(
             f"line {number} holds NaN or infinity", where=path, cure="remove the line: a gap is better than a lie"
@@ -172,8 +180,9 @@ def _rows(
     what: str,
     exactly: int | None = None,
     at_least: int = 0,
+    behind: list[list[str]] | None = None,
 ) -> Iterator[tuple[int, int, Array]]:
-    """(line number, stamp, the seven numbers of the pose) of each line."""
+    """(line number, stamp, the seven numbers of the pose) of each line; what follows them goes to ``behind``."""
     for number, fields in _fields(path, separator):
         if len(fields) < at_least or (exactly is not None and len(fields) != exactly):
             wanted = f"{exactly}" if exactly is not None else f"at least {at_least}"
@@ -182,6 +191,8 @@ def _rows(
             t_ns = stamp(fields[0])
         except ValueError as error:
             raise SourceError(f"line {number}: {error}", where=path) from None
+        if behind is not None:
+            behind.append(fields[8:])
         yield number, t_ns, _floats(path, number, fields[1:8])
 
 

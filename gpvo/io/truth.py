@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.geometry.se3 import Array
 from gpvo.io.trajectory import Trajectory
-from gpvo.types import TruthLog
+from gpvo.types import Array, TruthLog
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,17 @@ from gpvo.learning.calibrate import (
     fit_scale,
 )
 from gpvo.learning.geometryweight import choose_geometry_weight, divided
-from gpvo.learning.meanfit import no_mean
-from gpvo.learning.noise import HeteroscedasticFit
+from gpvo.learning.logvariance import basis_of, log_ratio
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
 from gpvo.learning.patterns import LASTING_S, Patterns, learn_patterns
 from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
 from gpvo.learning.rows import Rows
-from gpvo.learning.scores import beyond_chance
+from gpvo.learning.selection import significant_gain
 from gpvo.learning.spans import at_most
 from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
-from gpvo.online.basis import SharedBasis
+from gpvo.online.basis import ProjectedGP
 from gpvo.online.division import divide, ln_faster, of_calibration
 from gpvo.online.estimate import NO_CALIBRATION, ErrorModelArrays
 from gpvo.online.guard import Domain
@@ -41,35 +40,31 @@ def assemble(
     base: BaseVariance,
     columns: tuple[str, ...],
     inputs: Sequence[str],
-    fitted: HeteroscedasticFit | None,
-    error: Array,
+    gp: ProjectedGP | None,
     variance: Array,
-    *,
-    mean_in_sigma: bool = True,
 ) -> tuple[ErrorModelArrays, dict[str, Any]]:
-    """Parts, correlation and calibration from the out-of-fold residuals; then everything in one place.
+    """Parts, correlation and calibration by the out-of-fold ``variance`` (n, 6); then everything in one place.
+
+    ``base``, and ``gp`` of ``inputs`` where there is one: what states the variance of another sequence.
 
     Errors of the camera's calibration have a part of their own where the poses of flights ask for it.
     """
+    error = rows.error
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     of = _Residuals(rows, error, variance * scale.factor, rows.select(columns), rows.geometry(base.method))
     z = error / np.sqrt(of.variance)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
-    # Out of the domain no mean is taken off, so what is left of one says nothing of how wrong VO is there.
-    plain = np.ones(6, dtype=bool)
-    if fitted is None:
-        inputs, basis = (columns[0],), SharedBasis(no_mean(1, 6), None, np.zeros(6))
-        high = np.zeros(6)
-    else:
-        basis, plain = fitted.basis, ~fitted.use_mean if not fitted.use_mean.all() else plain
-        high = np.quantile(fitted.oof_log_noise_var, 0.95, axis=0)
-    outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z[:, plain] ** 2).mean(axis=1), rows.group)
+    outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z**2).mean(axis=1), rows.group)
+    domain, high = Domain.learn(of.X), np.zeros(6)
+    places = np.array([columns.index(n) for n in inputs or columns[:1]], dtype=np.int64)
+    if gp is not None:
+        high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
     sums = _sums_of(of)
     model = ErrorModelArrays(
         columns=columns,
-        inputs=np.array([columns.index(n) for n in inputs], dtype=np.int64),
-        basis=basis,
-        domain=Domain.learn(of.X),
+        inputs=places,
+        basis=basis_of(gp),
+        domain=domain,
         base=base,
         factor=scale.factor,
         outside_power=np.array([outside_power]),
@@ -77,7 +72,7 @@ def assemble(
         typical_ln_det=np.zeros(1),
         usual_rate_var=usual_rate_var(rows),
         rate_change_var=rate_changes(rows),
-        mean_in_sigma=np.array([mean_in_sigma]),
+        mean_in_sigma=np.array([True]),
         steady_mean=np.zeros(6),
         dt_s=rows.step_s,
         **sums.arrays,
@@ -213,7 +208,7 @@ def _with_calibration(bare: ErrorModelArrays, of: _Residuals, plain: _Found) -> 
     of = replace(of, patterns=patterns)
     sums = _sums_of(of)
     found = _consistent(replace(bare, **sums.arrays), of)
-    return (sums, found) if beyond_chance(plain[1].losses - found.losses) else plain
+    return (sums, found) if significant_gain(plain[1].losses - found.losses) else plain
 
 
 def _sums_of(of: _Residuals) -> _Sums:

@@ -6,19 +6,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from gpvo.online.base import BaseVariance, parts
+from gpvo.stats.student_t import NU
 from gpvo.types import Array
-
-NU = 5.0
-"""Degrees of freedom of the Student-t that judges the fit: a few gross errors must not set the scale of all."""
 
 _SMALLEST = np.log(1e-6)
 _LARGEST = np.log(1e3)
-
-
-def t_negative_log_likelihood(square: Array, variance: Array, nu: float = NU) -> Array:
-    """Of a Student-t with second moment ``variance`` at the squared error, without its constant [nats]."""
-    scale = variance * (nu - 2.0) / nu
-    return 0.5 * np.log(scale) + 0.5 * (nu + 1.0) * np.log1p(square / (nu * scale))
 
 
 def fit_base(

@@ -9,51 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from gpvo.geometry.covariance import correlation
-from gpvo.learning.basefit import t_negative_log_likelihood
 from gpvo.online.guard import growth
+from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
 LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95)
-_NU_RANGE = (2.5, 200.0)
 # Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
 _OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
 _POWERS = (1.0, 1.25, 1.5, 2.0)
-
-
-def robust_second_moment(square: Array) -> float:
-    """Second moment of one axis' normalised residuals (n,), given their squares, by the best Student-t.
-
-    The t's second moment is its squared scale times nu / (nu - 2); a few gross errors hardly move it.
-    """
-    square = np.maximum(square, 1e-300)
-    level = float(np.median(square)) / 0.4549  # Median of a squared standard normal.
-
-    def best_scale(nu: float) -> float:
-        v = max(level, 1e-300)
-        for _ in range(30):  # Fixed point of the likelihood equation (EM for the t).
-            w = (nu + 1.0) / (nu + square / v)
-            v_new = float((w * square).mean())
-            if abs(v_new - v) <= 1e-6 * v:
-                break
-            v = v_new
-        return v
-
-    def score(log_nu: float) -> float:
-        nu = float(np.exp(log_nu))
-        v = best_scale(nu)
-        from math import lgamma
-
-        constant = lgamma((nu + 1) / 2) - lgamma(nu / 2) - 0.5 * np.log(nu)
-        return float(t_negative_log_likelihood(square, np.asarray(v * nu / (nu - 2.0)), nu).mean() - constant)
-
-    found = minimize_scalar(score, bounds=np.log(_NU_RANGE).tolist(), method="bounded", options={"xatol": 1e-2})
-    nu = float(np.exp(found.x))
-    return best_scale(nu) * nu / (nu - 2.0)
 
 
 @dataclass(frozen=True)
@@ -75,7 +42,7 @@ def fit_scale(z: Array, group: NDArray, blocks: tuple[slice, ...] = (slice(0, 3)
     known from G groups, is ``exp(m + s^2 (1 + 1/G) / 2)``. The spread is pooled over the axes of each block.
     """
     labels = np.unique(group)
-    by_group = np.array([[robust_second_moment(z[group == g, j] ** 2) for j in range(z.shape[1])] for g in labels])
+    by_group = np.array([[student_t.second_moment(z[group == g, j] ** 2) for j in range(z.shape[1])] for g in labels])
     logs = np.log(by_group)
     G = len(labels)
     spread = np.zeros(z.shape[1])

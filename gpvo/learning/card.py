@@ -25,10 +25,8 @@ def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -
 
 def _intro(h: Mapping[str, Any], name: str) -> str:
     choices = h["choices"]
-    axes = ", ".join(a for a, used in zip(AXES, choices["use_mean"]) if used)
-    mean = f"{axes} (given: {choices['mean_inputs']})" if axes else "no axis; none helped left-out sequences for sure"
-    inputs = (
-        ", ".join(f"`{i}`" for i in h["inputs"]) or "none: the base variance alone predicts left-out sequences best"
+    inputs = ", ".join(f"`{i}`" for i in h["inputs"]) or (
+        "none: no set of them predicts left-out sequences better than the base variance does, beyond chance"
     )
     return "\n".join(
         [
@@ -38,8 +36,7 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             "",
             f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
             f"* base variance: {choices['base']}",
-            f"* inputs of the Gaussian process (chosen set: {choices['inputs']}, trust {choices['trust']:g}): {inputs}",
-            f"* mean corrected on: {mean}",
+            f"* inputs of the Gaussian process (chosen set: {choices['inputs']}): {inputs}",
             f"* mean that a filter takes off: {_steady(choices)}",
         ]
     )
@@ -56,7 +53,19 @@ def _position(h: Mapping[str, Any], name: str) -> str:
 
 
 def _data(h: Mapping[str, Any]) -> str:
-    return _sequences(h) + f"\n\nDigest of the rows: `{h['training_digest']}`"
+    return _sequences(h) + _simulated(h) + f"\n\nDigest of the rows: `{h['training_digest']}`"
+
+
+def _simulated(h: Mapping[str, Any]) -> str:
+    """Says so where truth was simulated, as the twins' is."""
+    told = []
+    for s in h.get("simulated_truth") or ():
+        rig = ", ".join(f"{k} {v:g}" for k, v in s["tolerance"].items())
+        told.append(f"* {s['twins']} twins of `{s['of']}`; tolerance of the rig `{s['tolerance_name']}` ({rig})")
+    if not told:
+        return ""
+    head = "Truth was simulated: these sequences are twins, made of the tracks of a run. Twins of one run left out"
+    return "\n".join(["\n", f"{head} in turn show how far the fit goes, not how far another flight is.", "", *told])
 
 
 def _sequences(h: Mapping[str, Any]) -> str:
@@ -105,8 +114,21 @@ def _scores(table: Mapping[str, Any]) -> str:
         "",
         f"Best row by NLL: `{c['best_row']}`. `learned` minus `{c['rival']}`: "
         f"{d['mean']:+.3f} nats per axis [{d['low']:+.3f}, {d['high']:+.3f}].",
+        _gain_of_gp(c["learned_less_base"]),
     ]
     return "\n".join(lines)
+
+
+def _gain_of_gp(d: Mapping[str, float]) -> str:
+    """What the Gaussian process adds to its own mean function, in plain words."""
+    interval = f"{d['mean']:+.3f} nats per axis [{d['low']:+.3f}, {d['high']:+.3f}]"
+    if d["mean"] == d["low"] == d["high"] == 0.0:
+        verdict = "the Gaussian process is not at work"
+    elif d["high"] < 0:
+        verdict = "the Gaussian process gains"
+    else:
+        verdict = "the Gaussian process loses" if d["low"] > 0 else "what the Gaussian process changes may be chance"
+    return f"`learned` minus `base` (the Gaussian process held at its mean): {interval}: {verdict}."
 
 
 def _calibration(h: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,12 @@ import numpy as np
 from gpvo.dataset.build import observe
 from gpvo.io.run_read import Run
 from gpvo.online.predictor import Predictor
+from gpvo.types import StereoCamera
 
 _RATE = 0.2
 _CAMERA = 0.25
-_ENOUGH_INSIDE = 0.9
+ENOUGH_INSIDE = 0.9
+"""A model fits a run where at least this share of its frames lies in the training domain."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ class Check:
 
 def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
-    problems = [*_camera_problems(predictor, run), *_rate_problems(predictor, run)]
+    steps = [r.dt_s for r in run.log if r.usable]
+    problems = [*camera_problems(predictor.camera, run.log.camera), *rate_problems(predictor, steps)]
     records, X = observe(run.log, predictor.features, predictor.target)
     usable = np.array([r.usable for r in records], dtype=bool)
     missing = [
@@ -48,13 +52,13 @@ def check(predictor: Predictor, run: Run) -> Check:
     beyond = predictor.model.domain.outside(X[usable]).mean(axis=0) if usable.any() else np.zeros(X.shape[1])
     order = np.argsort(-beyond, kind="stable")[:3]
     farthest = tuple((predictor.features[i], float(beyond[i])) for i in order if beyond[i] > 0)
-    if inside < _ENOUGH_INSIDE:
+    if inside < ENOUGH_INSIDE:
         problems.append(f"only {100 * inside:.0f} % of the frames lie inside the training domain")
     return Check(len(run.log), int(usable.sum()), inside, farthest, tuple(problems))
 
 
-def _camera_problems(predictor: Predictor, run: Run) -> list[str]:
-    trained, here = predictor.camera, run.log.camera
+def camera_problems(trained: StereoCamera | None, here: StereoCamera | None) -> list[str]:
+    """Where a camera differs from the one that a model was trained with, a line each."""
     if trained is None or here is None:
         return []
     out = []
@@ -67,11 +71,11 @@ def _camera_problems(predictor: Predictor, run: Run) -> list[str]:
     return out
 
 
-def _rate_problems(predictor: Predictor, run: Run) -> list[str]:
-    steps = [r.dt_s for r in run.log if r.usable]
-    if not steps or predictor.target != "frame":
+def rate_problems(predictor: Predictor, steps_s: Collection[float]) -> list[str]:
+    """Whether motions of durations ``steps_s`` [s] come at the rate that a model was trained at; a line if not."""
+    if not steps_s or predictor.target != "frame":
         return []
-    here, trained = 1.0 / float(np.median(steps)), 1.0 / predictor.model.dt_s
+    here, trained = 1.0 / float(np.median(list(steps_s))), 1.0 / predictor.model.dt_s
     return (
         []
         if abs(here / trained - 1.0) <= _RATE

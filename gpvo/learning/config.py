@@ -8,38 +8,36 @@ from dataclasses import dataclass
 from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
-from gpvo.online.base import RESIDUAL_COLUMN
+from gpvo.online.base import ACCELERATION_COLUMNS, RESIDUAL_COLUMN, TWIST_COLUMNS
 from gpvo.online.features import AXES, GEOMETRIC_METHODS, resolve
 from gpvo.types import IMPORTED
 
+AGILITY = ("ln_speed", "ln_turn_rate", "ln_jerk", "ln_angular_jerk", "ln_jerk_lately", "ln_angular_jerk_lately")
+TRACKING = ("n_inliers", "inlier_ratio", "ln_disparity_p50", "spread_u", "spread_v", "ln_reproj_rms")
+IMAGE = ("sharpness", "noise_level", "brightness", "contrast")
+
 FAMILIES: dict[str, tuple[str, ...]] = {
-    "motion": ("velocity", "rotation"),
-    "compact": (
-        "velocity",
-        "rotation",
-        "n_inliers",
-        "inlier_ratio",
-        "ln_disparity_p50",
-        "spread_u",
-        "spread_v",
-        "ln_reproj_rms",
-        "acceleration_mps2",
-        "angular_acceleration_radps2",
-        "sharpness",
-        "noise_level",
-    ),
-    "full": tuple(resolve("full")),
+    "speed": AGILITY[:2],
+    "agility": AGILITY,
+    "tracking": TRACKING,
+    "image": IMAGE,
+    "all": (*AGILITY, *TRACKING, *IMAGE),
 }
-"""What ``features="auto"`` chooses among, beside no inputs at all: the base variance alone."""
+"""What ``features="auto"`` chooses among, the simplest first, beside no inputs at all: the base variance alone."""
+
+GUARDED = (*TWIST_COLUMNS, *TRACKING, *ACCELERATION_COLUMNS, *IMAGE[:2])
+"""Columns by which a model tells whether it knows a place, also where no GP needs them: other surroundings show in
+them first."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """``features``: ``auto`` (chosen by cross-validation over the training sequences), ``thesis``, ``full`` or a list.
 
-    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of the mean. ``align``:
+    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of
+    positions and of the thesis' model. ``align``:
     ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
-    which the truth moves. ``inducing``, ``noise_inducing``: points of the GPs. ``max_rows``: held in memory, of larger
+    which the truth moves. ``inducing``: points of its GP. ``max_rows``: held in memory, of larger
     files the rest streams. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
     """
 
@@ -50,7 +48,6 @@ class TrainConfig:
     align: str = "none"
     waits: str = "drop"
     inducing: int = 256
-    noise_inducing: int = 64
     max_rows: int = 100_000
     jobs: int = 1
     backend: str = "local"
@@ -87,9 +84,8 @@ def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tu
 
 
 def guarded(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[str, ...]:
-    """Columns by which a model tells whether it knows a place, also where no GP needs them: other surroundings show in
-    them first. None beside those that were asked for by name."""
-    return supported_columns(sets, resolve(FAMILIES["compact"])) if config.features == "auto" else ()
+    """Those of :data:`GUARDED` that the logs know; none beside those that were asked for by name."""
+    return supported_columns(sets, GUARDED) if config.features == "auto" else ()
 
 
 def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:

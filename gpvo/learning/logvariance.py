@@ -1,124 +1,137 @@
-"""A GP of the log noise variance: started on the log squared residual, finished by Fisher scoring on the likelihood
-itself.
+"""The log-variance GP: how much noisier than its base variance a motion is, in the conditions that its inputs tell.
 
-The log of a squared Gaussian residual is the log-variance plus log chi^2_1, of mean -1.2704 and variance pi^2 / 2;
-taking it for Gaussian noise wastes 60 % of the information. Scoring to the maximum a posteriori under the residual's
-own density (Gaussian or Student-t) wins it back: P. Green, B. Silverman, "Nonparametric Regression and Generalized
-Linear Models" (1994), section 5.3.
+The squared error over the base is a Student-t's; the log of its scale is a GP, found by Fisher scoring on that density
+(P. Green, B. Silverman, "Nonparametric Regression and Generalized Linear Models" (1994), section 5.3).
+
+The kernel is a prior and is not learnt: the marginal likelihood of few sequences, whose rows go together, takes what
+differs between sequences for structure and ends at length scales of a tenth of the data's width. A level of its own
+for each sequence (a random effect) is taken out for the same reason: only what changes within sequences teaches.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.learning.regressors.base import FittedGP
-from gpvo.learning.regressors.collapsed import Eigenbasis, Sums, accumulate, chunks
-from gpvo.learning.tails import log_fisher, log_scale_score
-from gpvo.online.basis import ProjectedGP
+from gpvo.learning.regressors.inducing import greedy_points
+from gpvo.online.basis import ProjectedGP, SharedBasis
+from gpvo.stats.student_t import NU, log_fisher, log_scale_score
+from gpvo.types import Array
 
-Array = NDArray[np.float64]
+POINTS = 64
+LENGTH = 1.5
+"""Length scale over the root of the number of inputs, in robust standard deviations of an input."""
 
-LOG_CHI2_MEAN = -1.2703628454614782
-"""E[log chi^2_1] = digamma(1/2) + log 2."""
+_COMMON, _BLOCKS, _OWN = 0.15, 0.05, 0.05
+"""Prior variances of the log variance: what the axes share, how translation and rotation differ, and the axes."""
 
-_STEPS = 30
+_STEPS, _ENOUGH = 30, 1e-4
+_FAR_ASTRAY = 20.0
+_LEAST_EIGENVALUE = 1e-9
+
+_CONTRASTS = np.array(
+    [
+        [1, 1, 1, 1, 1, 1],
+        [1, 1, 1, -1, -1, -1],
+        [1, -1, 0, 0, 0, 0],
+        [1, 1, -2, 0, 0, 0],
+        [0, 0, 0, 1, -1, 0],
+        [0, 0, 0, 1, 1, -2],
+    ]
+)
+_ROTATION = _CONTRASTS / np.linalg.norm(_CONTRASTS, axis=1, keepdims=True)
+"""(6, 6) orthonormal: the axes as their sum, translation against rotation, and differences within the blocks."""
+_PRIOR_VAR = np.array([6.0 * _COMMON, 6.0 * _BLOCKS, _OWN, _OWN, _OWN, _OWN])
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """``square`` (n, D): squared out-of-fold residuals. ``base`` (n, D): log of a variance known per row (zeros
-    without).
+def fit_log_variance(inputs: Array, ratio: Array, weight: Array, group: NDArray[np.int64]) -> ProjectedGP:
+    """Posterior of the log variance ratio of six axes, of mean zero over the rows of each group.
 
-    ``mean_var`` (n, D): variance of the mean they are about. ``count`` (n,): how often a row counts.
+    ``inputs`` (n, d) in standard deviations; ``ratio`` (n, 6) squared errors over their base variances; ``weight`` (n,)
+    how much a row counts; ``group`` (n,) the sequence of each row.
     """
-
-    square: Array
-    base: Array
-    mean_var: Array
-    count: Array
-
-    def subset(self, rows: NDArray[np.int64]) -> Residuals:
-        """Some of the rows."""
-        return Residuals(self.square[rows], self.base[rows], self.mean_var[rows], self.count[rows])
-
-    def log_ratio(self) -> Array:
-        """(n, D) log of the squared residual over the base, unbiased; squares floored at 1e-6 of their median."""
-        floor = 1e-6 * np.maximum(np.median(self.square, axis=0), 1e-300)
-        return np.log(self.square + floor) - self.base - LOG_CHI2_MEAN
-
-
-def score_log_variance(
-    start: FittedGP, X: Array, residuals: Residuals, nu: Array, fold: NDArray[np.int64]
-) -> tuple[ProjectedGP, dict[int, ProjectedGP]]:
-    """Posterior mode of the log squared scale under Student-t residuals of ``nu`` (D,), given all rows and without
-    each fold.
-
-    ``start``: GP of :meth:`Residuals.log_ratio`, whose kernel, points and signal variances are kept.
-    """
-    U = (X - start.gp.centre) / start.gp.lengthscale
-    unit = np.ones(U.shape[1])
-    fisher = log_fisher(nu)
-    kernel = replace(start.gp, centre=0.0 * unit, lengthscale=unit).kernel(U)
-    g0, _ = start.predict(X)
-    blank, ones = np.zeros_like(residuals.square), np.ones(len(U))
-
-    def sums_of(rows: NDArray[np.bool_]) -> Sums:
-        return accumulate(chunks(U[rows], blank[rows], ones[rows], residuals.count[rows]), start.gp.points, unit)
-
-    parts = {int(f): sums_of(fold == f) for f in np.unique(fold)}
-    total = Sums.zero(len(start.gp.points), g0.shape[1])
-    for part in parts.values():
-        total = total.combined(part, 1.0)
-    whole = _mode(start, total, kernel, g0, residuals, residuals.count, fisher, nu)
-    if len(parts) == 1:
-        return whole, dict.fromkeys(parts, whole)
-    without = {
-        f: _mode(start, total.combined(part, -1.0), kernel, g0, residuals, residuals.count * (fold != f), fisher, nu)
-        for f, part in parts.items()
-    }
-    return whole, without
+    length = np.full(inputs.shape[1], LENGTH * np.sqrt(inputs.shape[1]))
+    points = greedy_points(inputs / length, POINTS)
+    whitening = _whitening(points)
+    zeros = np.zeros((6, len(whitening)))
+    prior = ProjectedGP(
+        centre=np.zeros(len(length)),
+        lengthscale=length,
+        points=points,
+        projection=whitening,
+        weights=zeros,
+        reduction=zeros,
+        signal_var=_PRIOR_VAR @ _ROTATION**2,
+        offset=np.zeros(6),
+    )
+    return _mode(prior, prior.kernel(inputs) @ prior.projection.T, ratio, weight, group)
 
 
-def _mode(
-    start: FittedGP, sums: Sums, kernel: Array, g: Array, residuals: Residuals, count: Array, fisher: Array, nu: Array
-) -> ProjectedGP:
-    """Fisher scoring from ``g`` (n, D); rows of zero ``count`` do not take part.
+def _whitening(points: Array) -> Array:
+    """(r, m) that gives the kernel's values directions of unit prior variance."""
+    square = (points**2).sum(axis=1)
+    values, vectors = np.linalg.eigh(np.exp(np.minimum(points @ points.T - 0.5 * (square[:, None] + square), 0.0)))
+    kept = values > _LEAST_EIGENVALUE * values[-1]
+    return np.asarray(vectors[:, kept].T / np.sqrt(values[kept])[:, None])
+
+
+def _mode(prior: ProjectedGP, Z: Array, ratio: Array, weight: Array, group: NDArray[np.int64]) -> ProjectedGP:
+    """The posterior's mode, and the variance about it, by the directions Z (n, r) of unit prior variance.
 
     The working response ``g + score / fisher`` of noise variance ``1 / fisher`` has the mode as its fixed point.
-    Where the mean's own variance explains part of a residual the true information is smaller, so steps are cautious,
-    never wild.
     """
-    gp = start.gp
-    basis = Eigenbasis.of(sums, gp.points)
-    P, used = basis.P.numpy(), count / count.sum()
-    ratio = (gp.signal_var * fisher)[:, None]
-    gain = ratio / (1.0 + ratio * basis.eigenvalues[None])
-    offset, weights = used @ g, np.zeros((len(gp.signal_var), len(P)))
+    fisher = float(log_fisher(NU))
+    labels, place = np.unique(group, return_inverse=True)
+    total = np.bincount(place, weight, len(labels))
+
+    def of_group(values: Array) -> Array:
+        """(n, ...) weighted means over the groups, at each row."""
+        means = [np.bincount(place, weight * column, len(labels)) / total for column in values.T]
+        return np.stack(means, axis=1)[place]
+
+    centred = Z - of_group(Z)
+    information, V = np.linalg.eigh((centred * (weight * fisher)[:, None]).T @ centred)
+    information = np.maximum(information, 0.0)
+    Z, centred = Z @ V, centred @ V
+    precision = information[:, None] + 1.0 / _PRIOR_VAR
+    A, g = np.zeros((Z.shape[1], 6)), np.zeros_like(ratio)
+    # A Student-t's scale is smaller than its second moment, of which the ratio is.
+    scale_ratio = ratio * NU / (NU - 2.0)
     for _ in range(_STEPS):
-        response = g + _score(g, residuals, nu) / fisher
-        offset = offset + used @ (response - g)
-        z_y = P @ (kernel.T @ (count[:, None] * (response - offset)))
-        weights = gain * z_y.T
-        new = offset + kernel @ (P.T @ weights.T)
-        moved = float(np.abs((new - g)[count > 0]).max())
-        g = new
-        if moved < 1e-5:
+        score = log_scale_score(scale_ratio * np.exp(-np.clip(g, -_FAR_ASTRAY, _FAR_ASTRAY)), NU)
+        response = g + score / fisher
+        level = of_group(response - Z @ A)
+        A = (centred.T @ (response * (weight * fisher)[:, None]) @ _ROTATION.T / precision) @ _ROTATION
+        moved, g = g, Z @ A + level
+        if np.abs(g - moved).max() < _ENOUGH:
             break
-    return replace(
-        gp,
-        projection=P.copy(),
-        weights=weights,
-        reduction=gain * basis.eigenvalues[None] * gp.signal_var[:, None],
-        offset=offset,
+    explained = _PRIOR_VAR - 1.0 / precision
+    return ProjectedGP(
+        centre=prior.centre,
+        lengthscale=prior.lengthscale,
+        points=prior.points,
+        projection=V.T @ prior.projection,
+        weights=A.T.copy(),
+        reduction=(explained @ _ROTATION**2).T.copy(),
+        signal_var=prior.signal_var,
+        offset=np.zeros(6),
     )
 
 
-def _score(g: Array, residuals: Residuals, nu: Array) -> Array:
-    """Derivative of the log density of the residuals by g (n, D), the variance of the mean counted in."""
-    # A step of the search may lie far off; it is drawn in again by the next.
-    noise = np.exp(np.clip(g + residuals.base, -600.0, 600.0))
-    total = noise + residuals.mean_var
-    return log_scale_score(residuals.square / total, nu) * (noise / total)
+def log_ratio(gp: ProjectedGP, inputs: Array) -> Array:
+    """(n, 6) log of the expected variance ratio: half the posterior's variance is the mean of a log-normal's share."""
+    mean, variance = gp.evaluate(inputs)
+    return mean + 0.5 * variance
+
+
+def basis_of(gp: ProjectedGP | None) -> SharedBasis:
+    """What the predictor evaluates: no mean of the error, and the log ratio on the same kernel; nothing without it."""
+    none = np.zeros((6, 1))
+    if gp is None:
+        one = np.zeros((1, 1))
+        return SharedBasis(
+            ProjectedGP(one[0], np.ones(1), one, one, none, none, none[:, 0], none[:, 0]), None, none[:, 0]
+        )
+    blank = np.zeros_like(gp.weights)
+    still = ProjectedGP(gp.centre, gp.lengthscale, gp.points, gp.projection, blank, blank, none[:, 0], none[:, 0])
+    return SharedBasis(still, gp, none[:, 0])

@@ -27,6 +27,7 @@ METHODS = (
     *(f"{m}_scaled" for m in STATED),
     *(f"{m}_vt" for m in GEOMETRIC),
     "gp_thesis",
+    "base",
     "learned",
 )
 _THESIS_ROWS = 1500
@@ -75,7 +76,7 @@ def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:
 
 
 def simple_statements(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Statement]:
-    """All rows but ``gp_thesis`` and ``learned``, from a model file's arrays."""
+    """All rows but ``gp_thesis``, ``base`` and ``learned``, from a model file's arrays."""
     out: dict[str, Statement] = {"constant": _constant(arrays["method.constant"])}
     for method in STATED:
         out[method] = _stated(method, None)

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from gpvo.geometry import se3
+from gpvo.accumulation import adjoints_to_end, persistent_sum
 from gpvo.geometry.covariance import scaled_root
-from gpvo.learning.scores import beyond_chance
-from gpvo.learning.spans import SPANS, cut, lagged
+from gpvo.learning.selection import significant_gain
+from gpvo.learning.spans import SPANS, cut
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
@@ -58,7 +58,7 @@ def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
     bounds = (np.log(_LEAST_FACTOR), np.log(most))
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x
     factor = float(np.exp(found))
-    return factor if beyond_chance(_losses(spans, 1.0) - _losses(spans, factor)) else 1.0
+    return factor if significant_gain(_losses(spans, 1.0) - _losses(spans, factor)) else 1.0
 
 
 def pose_losses(chains: Sequence[Motions], phi: Array) -> Array:
@@ -121,15 +121,13 @@ class _Poses:
 
 def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array]:
     """Error, jitter, added and at_ends of :class:`_Poses`, of the windows of one chain: as
-    :class:`gpvo.evaluation.accumulate.PoseError` adds up, for all at once and with one time step."""
+    :class:`gpvo.accumulation.PoseError` adds up, for all at once and with one time step."""
     T, error, parts, calibration = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts, c.calibration))
-    to_end = _adjoints_to_end(T)
+    to_end = adjoints_to_end(T)
     jitter, white, bias = np.moveaxis(to_end[:, :, None] @ parts @ np.swapaxes(to_end, -1, -2)[:, :, None], 2, 0)
-    added = (white + bias).sum(axis=1) + lagged(to_end @ _roots(parts[:, :, 2]), phi[0])
-    lasting = np.zeros_like(added)
-    if calibration.any():
-        root = to_end @ calibration
-        lasting = (root @ np.swapaxes(root, -1, -2)).sum(axis=1) + lagged(root, phi[1])
+    bias_phi, calibration_phi = (np.broadcast_to(x, to_end.shape[:3]) for x in phi)
+    added = white.sum(axis=1) + persistent_sum(to_end @ _roots(parts[:, :, 2]), bias_phi)
+    lasting = persistent_sum(to_end @ calibration, calibration_phi) if calibration.any() else np.zeros_like(added)
     ends = [0, -1]
     return (
         np.einsum("wkij,wkj->wi", to_end, error),
@@ -137,15 +135,6 @@ def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array
         added,
         0.5 * (white + bias)[:, ends].sum(axis=1),
     )
-
-
-def _adjoints_to_end(T: Array) -> Array:
-    """(w, m, 6, 6) that carry an error from after each motion to after the last; ``T`` (w, m, 4, 4)."""
-    since = np.empty_like(T)
-    since[:, -1] = np.eye(4)
-    for k in range(T.shape[1] - 2, -1, -1):
-        since[:, k] = T[:, k + 1] @ since[:, k + 1]
-    return se3.adjoint(se3.inverse(since))
 
 
 def _roots(C: Array) -> Array:

@@ -12,12 +12,6 @@ from gpvo.types import Array
 _BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
 
 
-def beyond_chance(gain: Array) -> bool:
-    """Whether the mean of gains (G,), one per sequence, is more than its standard error, so that a choice is worth
-    leaving the simpler one (L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3)."""
-    return len(gain) > 1 and bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
-
-
 def score(error: Array, mean: Array, covariance: Array) -> dict[str, Any]:
     """Of errors (n, 6), predicted means (n, 6) and covariances (n, 6, 6) about them.
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import ModelError
+from gpvo.io.atomic import write_text
 from gpvo.learning.card import model_card
 from gpvo.learning.train import TrainedModel, TrainingSet, training_digest
 from gpvo.online import modelfile
@@ -29,9 +29,7 @@ def save_model(trained: TrainedModel, path: str | Path) -> None:
         raise ModelError("cannot be written: not a file in an existing folder", where=path)
     write_sets(rows_path(path), trained.sets)
     text = model_card(trained.header, trained.table, path.name)
-    temporary = card_path(path).with_name(f".{card_path(path).name}.part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, card_path(path))
+    write_text(card_path(path), text)
     modelfile.save(path, trained.arrays, trained.header)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
@@ -23,12 +23,12 @@ from gpvo.learning.parallel import map_jobs
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score
-from gpvo.online.estimate import Estimate
+from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.features import units
 from gpvo.online.predictor import Predictor
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 from gpvo.stats.consistency import nees
-from gpvo.types import Array
+from gpvo.types import Array, Prediction
 
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
 """A translation error longer than so many medians of its sequence counts as a slip in the report; if nobody called it
@@ -65,13 +65,11 @@ def train_sets(
     config: TrainConfig,
     *,
     judge: bool = True,
-    refine: Callable[[Learned], Learned] | None = None,
 ) -> TrainedModel:
-    """The same from training sets. ``judge`` False leaves the table out; ``refine``: a last step of the final fit."""
+    """The same from training sets. ``judge`` False leaves the table out."""
     sets = _checked(sets, config.target)
     table = train_table(sets, config) if judge else {}
     learned = fit_model(sets, config)
-    learned = learned if refine is None else refine(learned)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays()}
     arrays |= fit_thesis(sets, seed=config.seed).to_arrays()
@@ -125,8 +123,9 @@ def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainC
     statements = {**simple_statements(arrays), "gp_thesis": thesis_gp(train_on, seed=config.seed)}
     said = {name: state(held_out) for name, state in statements.items()}
     learned = fit_model(train_on, config)
-    estimate = estimate_set(learned, held_out)
+    estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     said["learned"] = (estimate.mean, estimate.covariance)
+    said["base"] = (of_base.mean, of_base.covariance)
     methods = {name: empty() if (s := said[name]) is None else score(held_out.Y, *s) for name in METHODS}
     return {
         "held_out": held_out.name,
@@ -134,19 +133,18 @@ def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainC
         "lost": held_out.counts["lost"],
         "truth_moves_at_rest": held_out.counts.get("truth_moves_at_rest", 0),
         "methods": methods,
-        "in_domain": float((estimate.in_domain > 0.5).mean()),
+        "in_domain": float(np.mean(estimate.in_domain > 0.5)),
         "slips": _slips(held_out, estimate, learned, arrays["method.constant"]),
         "choices": learned.choices,
     }
 
 
-def estimate_set(learned: Learned, s: TrainingSet) -> Estimate:
+def estimate_set(model: ErrorModelArrays, s: TrainingSet) -> Prediction:
     """The online predictor's own arithmetic over the rows of a sequence."""
-    model = learned.model
     return model.estimate(s.select(model.columns), s.covariances.get(model.base.method or ""), s.dt_s)
 
 
-def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array) -> dict[str, Any]:
+def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Array) -> dict[str, Any]:
     """Gross errors caught, and missed though nobody expected them; good motions flagged; and NEES/dof with the caught
     ones counted in."""
     length, lost_length = (np.linalg.norm(xi[:, :3], axis=1) for xi in (s.Y, s.lost_xi))
@@ -169,15 +167,17 @@ def _slips(s: TrainingSet, estimate: Estimate, learned: Learned, constant: Array
 
 
 def _compare(folds: Sequence[dict[str, Any]], mean: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Mean NLL of ``learned`` minus the best other row's, with a paired bootstrap interval over the sequences."""
-    rivals = {m: mean[m]["nll_per_dim"] for m in METHODS if m != "learned" and mean[m]["nll_per_dim"] is not None}
+    """Mean NLL of ``learned`` minus that of the best other row and of ``base``, with paired bootstrap intervals over
+    the sequences."""
+    scored = {m: mean[m]["nll_per_dim"] for m in METHODS if mean[m]["nll_per_dim"] is not None}
+    rivals = {m: v for m, v in scored.items() if m not in ("base", "learned")}
     scaled = {m: v for m, v in rivals.items() if m.endswith("_scaled")} or rivals
     best = min(scaled, key=scaled.__getitem__)
-    difference = paired_nll(folds, "learned", best)
     return {
         "rival": best,
-        "best_row": min({**rivals, "learned": mean["learned"]["nll_per_dim"]}.items(), key=lambda item: item[1])[0],
-        "nll_per_dim_difference": asdict(difference),
+        "best_row": min(scored, key=scored.__getitem__),
+        "nll_per_dim_difference": asdict(paired_nll(folds, "learned", best)),
+        "learned_less_base": asdict(paired_nll(folds, "learned", "base")),
     }
 
 

@@ -20,8 +20,6 @@ from gpvo.types import Array
 
 TWIST_COLUMNS = ("v_x_mps", "v_y_mps", "v_z_mps", "w_x_radps", "w_y_radps", "w_z_radps")
 ACCELERATION_COLUMNS = ("acceleration_mps2", "angular_acceleration_radps2")
-OWN_MOTION = (*TWIST_COLUMNS, *ACCELERATION_COLUMNS)
-"""Features that are VO's own motion."""
 RESIDUAL_COLUMN = "ln_residual_px"
 N_PARTS = 5
 

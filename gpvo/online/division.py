@@ -23,7 +23,7 @@ def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
     out[:, 0] = share[0]
     out[:, 1] = share[1] * np.exp(by_speed)
     # The exponent is bounded where the bias is all there is, or nothing.
-    out[:, 2] = share[2] * np.exp(by_speed + np.clip(growth[1] * above, -60.0, 60.0))
+    out[:, 2] = share[2] * np.exp(by_speed + np.minimum(np.maximum(growth[1] * above, -60.0), 60.0))
     return out / out.sum(axis=1, keepdims=True)
 
 
@@ -50,4 +50,4 @@ def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
     """
     speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
     ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical
-    return np.where(np.isfinite(ratio), np.clip(ratio, 0.0, LN_FASTEST), 0.0)
+    return np.where(np.isfinite(ratio), np.minimum(np.maximum(ratio, 0.0), LN_FASTEST), 0.0)

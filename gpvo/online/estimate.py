@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import correlation as correlation_of
-from gpvo.geometry.covariance import turn_first_root
-from gpvo.online.base import N_PARTS, RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
+from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise, turn_first_root
+from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
-from gpvo.online.division import PARTS, divide, ln_faster, of_calibration
+from gpvo.online.division import divide, ln_faster, of_calibration
 from gpvo.online.guard import Domain, Whereabouts, growth
-from gpvo.types import Array
+from gpvo.online.validation import LARGEST, check_arrays, check_related
+from gpvo.types import Array, MotionError, Prediction
 
 _EYE = np.eye(6)
+_RIDGE = 1e-6 * _EYE
 NO_CALIBRATION: Mapping[str, Array] = {
     "calibration_patterns": np.zeros((6, 6, 6)),
     "calibration_tau_s": np.ones(6),
@@ -28,71 +30,39 @@ NO_CALIBRATION: Mapping[str, Array] = {
 COASTED = (1, 2, 5, 10, 20, 50)
 """Over so many usual motions training tells how much a velocity changes."""
 LN_LARGEST = 60.0
-"""Geometric log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
+"""Log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
+LEAST_VAR = 1e-24
+"""No motion is known better [m^2, rad^2]."""
+DURATIONS_S = (1e-6, 1e4)
+"""A motion whose stated duration lies outside has the usual one."""
 
-_SHAPES = {
-    "factor": (6,),
-    "outside_power": (1,),
-    "high": (6,),
-    "correlation": (3, 6, 6),
-    "geometry_weight": (1,),
-    "share": (3, 6),
-    "growth": (2, 6),
-    "level": (6,),
-    "ln_speed": (1,),
-    "bias_tau_s": (6,),
-    "typical_ln_det": (1,),
-    "usual_rate_var": (6,),
-    "rate_change_var": (len(COASTED), 6),
-    "mean_in_sigma": (1,),
-    "steady_mean": (6,),
-    "calibration_patterns": (6, 6, 6),
-    "calibration_tau_s": (6,),
-}
-_OWN = ("inputs", *_SHAPES)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """The error's distribution for n rows; see ``gpvo.types.Prediction`` for the words.
-
-    ``mean`` (n, 6); ``covariance`` (n, 6, 6); ``parts``: name to (n, 6, 6); ``calibration_root`` (n, 6, 6);
-    ``epistemic`` (n, 6); ``in_domain``, ``confidence``, ``distance`` (n,). For a single row all without the first axis.
-    """
-
-    mean: Array
-    covariance: Array
-    parts: dict[str, Array]
-    calibration_root: Array
-    epistemic: Array
-    in_domain: Array
-    confidence: Array
-    distance: Array
-
-    @property
-    def sigma(self) -> Array:
-        """(n, 6) standard deviations."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
-
-    def row(self, k: int) -> Estimate:
-        """One of the rows."""
-        parts = {name: C[k] for name, C in self.parts.items()}
-        return Estimate(
-            self.mean[k],
-            self.covariance[k],
-            parts,
-            self.calibration_root[k],
-            self.epistemic[k],
-            self.in_domain[k],
-            self.confidence[k],
-            self.distance[k],
-        )
+_OWN = (
+    "inputs",
+    "factor",
+    "outside_power",
+    "high",
+    "correlation",
+    "geometry_weight",
+    "share",
+    "growth",
+    "level",
+    "ln_speed",
+    "bias_tau_s",
+    "typical_ln_det",
+    "usual_rate_var",
+    "rate_change_var",
+    "mean_in_sigma",
+    "steady_mean",
+    "calibration_patterns",
+    "calibration_tau_s",
+)
 
 
 @dataclass(frozen=True)
 class Variances:
     """Of n rows, before calibration: ``place``, where they lie; (n, 6) each: ``unit`` of the mean, ``known`` aleatoric
-    variance, ``total`` with ignorance of it, ``mean`` and its ``mean_var``; ``limit``, as wrong as a motion can be."""
+    variance, ``total`` with ignorance of it, ``mean`` and its ``mean_var``; ``limit``, as wrong as a motion can be.
+    ``dt_s`` (n,): durations that were used."""
 
     place: Whereabouts
     unit: Array
@@ -101,6 +71,7 @@ class Variances:
     mean: Array
     mean_var: Array
     limit: Array
+    dt_s: Array
 
 
 @dataclass(frozen=True)
@@ -161,7 +132,9 @@ class ErrorModelArrays:
     def from_arrays(
         cls, arrays: Mapping[str, NDArray[Any]], columns: tuple[str, ...], method: str | None, dt_s: float
     ) -> ErrorModelArrays:
-        """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or of the wrong shape."""
+        """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or is not what the schema of
+        :mod:`gpvo.online.validation` says."""
+        check_arrays(arrays, len(columns))
         try:
             # Velocities that have nothing to do with each other, where an older file does not say.
             unrelated = np.tile(2.0 * arrays["usual_rate_var"], (len(COASTED), 1))
@@ -170,41 +143,42 @@ class ErrorModelArrays:
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
-        wrong = [n for n, s in _SHAPES.items() if own[n].shape != s]
+        check_related(arrays, len(columns))
+        if unknown := set(base.columns) - set(columns):
+            raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
-        if (
-            wrong
-            or {base.theta.shape, base.plain.shape} != {(6, N_PARTS)}
-            or len(domain.centre) != len(columns)
-            or basis.n_inputs != len(own["inputs"])
-        ):
-            raise ModelError(f"the model file's arrays do not fit its features ({', '.join(wrong) or 'sizes differ'})")
+        if basis.n_inputs != len(own["inputs"]) or basis.n_outputs != 6:
+            raise ModelError("the model file's GPs do not fit its inputs and the six axes")
         return cls(columns=columns, basis=basis, domain=domain, base=base, dt_s=dt_s, **own)
 
-    def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Estimate:
-        """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown."""
+    def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Prediction:
+        """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown.
+
+        Whatever the numbers, the covariance is finite and positive definite: what is not finite, or beyond all measure,
+        counts as missing.
+        """
+        X = np.where(np.abs(X) < LARGEST, X, np.nan)
         v = self.variances(X, dt_s)
         place = v.place
         unlimited = v.total + v.mean_var
         variance = within(unlimited * self.factor, v.limit)
-        each, root = self.split(variance, X, geometry)
-        parts = {name: each[:, i] for i, name in enumerate(PARTS)}
-        covariance = each.sum(axis=1)
-        _, ln_det = np.linalg.slogdet(covariance)
+        stated = self.split(variance, X, geometry)
+        _, ln_det = np.linalg.slogdet(stated.covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
         mean = v.mean
         if self._has_steady_mean:
-            mean = mean + self.steady(covariance, place.inside) * place.in_domain[:, None]
-        return Estimate(
-            mean,
-            covariance,
-            parts,
-            root,
-            variance * (1.0 - v.known / unlimited),
-            place.in_domain,
-            place.in_domain * precision,
-            place.distance,
+            mean = mean + self.steady(stated.covariance, place.inside) * place.in_domain[:, None]
+        return Prediction(
+            mean=mean,
+            jitter=stated.jitter,
+            white=stated.white,
+            persistent_root=stated.persistent_root,
+            persistent_tau_s=stated.persistent_tau_s,
+            dt_s=v.dt_s,
+            epistemic=variance * (1.0 - v.known / unlimited),
+            confidence=place.in_domain * precision,
+            in_domain=place.in_domain,
         )
 
     def steady(self, covariance: Array, inside: Array) -> Array:
@@ -241,21 +215,25 @@ class ErrorModelArrays:
         return motion_noise(self.columns)
 
     def _duration(self, X: Array, dt_s: Array | None) -> Array:
-        return np.full(len(X), self.dt_s) if dt_s is None else dt_s
+        if dt_s is None:
+            return np.full(len(X), self.dt_s)
+        shortest, longest = DURATIONS_S
+        return np.where((dt_s >= shortest) & (dt_s <= longest), dt_s, self.dt_s)
 
     def variances(self, X: Array, dt_s: Array | None) -> Variances:
         """Variances of rows X (n, d), before calibration."""
         duration, columns = self._duration(X, dt_s), self._base_columns(X)
-        base, plain = self.base.both(columns, duration)
+        base, plain = (np.maximum(v, LEAST_VAR) for v in self.base.both(columns, duration))
         place = self._locate(X, base, duration)
         said = self.basis.predict(place.inside[:, self.inputs])
         outside = (1.0 - place.in_domain)[:, None]
         # A bias of noise goes with the noise; what VO is wrong by on average of its motion, with the motion's duration.
         unit = np.sqrt(base) if self.mean_in_sigma[0] else np.repeat((duration / self.dt_s)[:, None], 6, axis=1)
         usual = said.mean * unit
-        known = said.log_noise_var - 0.5 * said.log_noise_spread
+        log_noise = np.maximum(np.minimum(said.log_noise_var, LN_LARGEST), -LN_LARGEST)
+        known = log_noise - 0.5 * said.log_noise_spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
-        cautious = said.log_noise_var + outside * np.maximum(self.high - said.log_noise_var, 0.0)
+        cautious = log_noise + outside * np.maximum(self.high - log_noise, 0.0)
         grown = growth(place.distance, self.outside_power)[:, None]
         mean = usual * place.in_domain[:, None]
         mean_var = (said.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
@@ -263,7 +241,7 @@ class ErrorModelArrays:
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
         # VO's motion less the true one is no longer than both together, whatever is said of its variance.
         moved = (columns[:, :6] ** 2 + self.usual_rate_var) * duration[:, None] ** 2
-        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, _block_sums(moved))
+        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, _block_sums(moved), duration)
 
     def lost_variance(self, dt_s: float, age_s: float, rate: Array, rate_var: Array, jump: Array) -> Array:
         """(6,) variance of a lost motion of duration ``dt_s``, of which nothing was measured.
@@ -281,11 +259,12 @@ class ErrorModelArrays:
         return np.asarray((changed + rate_var) * dt_s**2 + _block_sums(jump**2))
 
     def _base_columns(self, X: Array) -> Array:
-        """The base's columns, missing ones typical, geometric log variances never below the training's smallest."""
-        at, centre, smallest = self._base_place
+        """The base's columns, missing ones by :attr:`absent`, geometric log variances never below the training's
+        smallest."""
+        at, _, smallest = self._base_place
         C = X[:, at]
-        C = np.where(np.isfinite(C), C, centre)
-        C[:, 6:] = np.clip(C[:, 6:], smallest, LN_LARGEST)
+        C = np.where(np.isfinite(C), C, self.absent)
+        C[:, 6:] = np.minimum(np.maximum(C[:, 6:], smallest), LN_LARGEST)
         return C
 
     @cached_property
@@ -295,41 +274,87 @@ class ErrorModelArrays:
         d = self.domain
         return at, d.centre[at], (d.centre + d.scale * d.low)[at][6:]
 
+    @cached_property
+    def absent(self) -> Array:
+        """What stands for the base's columns where they are missing: the worst of the training, the fastest motion and
+        the largest geometric variance; where training missed them too, their typical value."""
+        at, d = self._base_place[0], self.domain
+        low, high = (side[at] for side in d.reach)
+        worst = np.where(np.abs(low) > np.abs(high), low, high)
+        worst[6:] = high[6:]
+        return np.where(d.may_miss[at], d.centre[at], worst)
+
     def faster(self, X: Array) -> Array:
         """(n, 1) log of the speed over the typical one (see :func:`ln_faster`)."""
         at = self._base_place[0][:3]
         return ln_faster(X[:, at], self.ln_speed)
 
-    def split(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
-        """(n, 3, 6, 6) covariances of jitter, white and bias of rows X, from variances (n, 6); and the root (n, 6, 6)
-        of what a wrong calibration has of the bias.
+    def split(self, variance: Array, X: Array, geometry: Array | None) -> MotionError:
+        """The errors of rows X by their parts, without a mean, from variances (n, 6).
 
         Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own pattern.
         """
-        each, root = self.divided(variance, X, geometry)
+        sigma, correlation, of_wrong = self._divided(variance, X, geometry)
+        noise = correlation * sigma[:, :2, :, None] * sigma[:, :2, None, :]
+        return MotionError(
+            mean=np.zeros((len(X), 6)),
+            jitter=noise[:, 0],
+            white=noise[:, 1],
+            persistent_root=np.concatenate([sigma[:, 2, :, None] * self._bias_root, of_wrong], axis=-1),
+            persistent_tau_s=self.persistent_tau_s,
+        )
+
+    def divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
+        """Covariances (n, 3, 6, 6) of jitter, white and bias, the bias without that of calibration, and the root
+        (n, 6, 6) of the latter."""
+        e = self.split(variance, X, geometry)
+        bias = e.persistent_root[..., :6]
+        return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
+
+    def _divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array, Array]:
+        """Deviations (n, 3, 6) of jitter, white and bias, correlations (n, 2, 6, 6) of the first two, and the root
+        (n, 6, 6) of what a wrong calibration has of the variance."""
+        out = np.repeat(self.correlation[None, :2], len(variance), axis=0)
+        w = float(self.geometry_weight[0])
+        if geometry is not None and w > 0:
+            R = _correlations(geometry)
+            known = np.isfinite(R).all(axis=(1, 2))
+            out[known] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
+        root, rest = np.zeros((len(variance), 6, 6)), variance
         if self._calibrated:
-            each[:, 2] += root @ np.swapaxes(root, -1, -2)
-        return each, root
+            root, rest = of_calibration(variance, self.calibration_patterns, X[:, self._base_place[0][:6]])
+        share = divide(self.share, self.growth, np.log(rest) - self.level, self.faster(X))
+        return np.sqrt(share * rest[:, None, :]), _regular(out), root
 
     @cached_property
     def _calibrated(self) -> bool:
         return bool(self.calibration_patterns.any())
 
-    def divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
-        """As :meth:`split`, but the bias without that of calibration."""
-        out = np.repeat(self.correlation[None], len(variance), axis=0)
-        w = float(self.geometry_weight[0])
-        if geometry is not None and w > 0:
-            R = correlation_of(geometry)
-            known = np.isfinite(R).all(axis=(1, 2))
-            out[known, :2] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
-        root, rest = np.zeros((len(variance), 6, 6)), variance
-        if self._calibrated:
-            root, rest = of_calibration(variance, self.calibration_patterns, X[:, self._base_place[0][:6]])
-        # One part in a million of the identity keeps a nearly singular geometry positive definite after rounding.
-        share = divide(self.share, self.growth, np.log(rest) - self.level, self.faster(X))
-        sigma = np.sqrt(share * rest[:, None, :])
-        return (out * (1.0 - 1e-6) + 1e-6 * _EYE) * sigma[..., :, None] * sigma[..., None, :], root
+    @cached_property
+    def _bias_root(self) -> Array:
+        return scaled_root(_regular(self.correlation[2]))
+
+    @cached_property
+    def persistent_tau_s(self) -> Array:
+        """(12,) time constants of the bias and of errors of calibration."""
+        return np.concatenate([self.bias_tau_s, self.calibration_tau_s])
+
+
+def _regular(correlation: Array) -> Array:
+    """One part in a million of the identity keeps a nearly singular geometry positive definite after rounding."""
+    return correlation * (1.0 - 1e-6) + _RIDGE
+
+
+def _correlations(geometry: Array) -> Array:
+    """(n, 6, 6) correlations of covariances; NaN throughout where one is not positive semidefinite."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        R = symmetrise(correlation_of(geometry))
+    ridge = R + _RIDGE
+    try:
+        np.linalg.cholesky(ridge)
+    except np.linalg.LinAlgError:
+        R[[not is_positive_definite(C) for C in ridge]] = np.nan
+    return R
 
 
 def _block_sums(values: Array) -> Array:

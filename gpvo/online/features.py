@@ -23,6 +23,10 @@ GEOMETRIC_METHODS = ("pointing_matching", "triangulation")
 TREND_S = 1.0
 """Time constant of the running means that the trends are measured against [s]."""
 
+AGILITY_S = 0.5
+"""Time constant of the running mean of the squared jerk [s]."""
+_STILL = 1e-3
+
 Step = Callable[[VoRecord], Sequence[float] | Array]
 
 
@@ -135,7 +139,8 @@ class _Trend:
         level = np.array([_ln(r.n_inliers), _ln(r.reproj_rms_px), r.brightness])
         change, acceleration = np.full(3, np.nan), np.full(2, np.nan)
         if self._twist is not None and self._mean is not None:
-            step_s = (r.t_ns - self._t_ns) * 1e-9
+            # A clock may be set back: a trend then begins anew.
+            step_s = max((r.t_ns - self._t_ns) * 1e-9, 1e-6)
             delta = (now - self._twist) / step_s
             acceleration = np.array([np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])])
             change = level - self._mean
@@ -143,6 +148,38 @@ class _Trend:
             level = np.where(np.isnan(change), level, self._mean + gain * change)
         self._twist, self._t_ns, self._mean = now, r.t_ns, level
         return (*acceleration, *change)
+
+
+class _Agility:
+    """Logs of how fast the vehicle moves and turns, and of how its velocity jerks: now, and lately on average.
+
+    A vehicle moves smoothly from frame to frame, so that most of a jerk is VO's own noise.
+    """
+
+    def __init__(self, _: StereoCamera | None) -> None:
+        self._before: list[Array] = []
+        self._square = np.full(2, np.nan)
+
+    def __call__(self, r: VoRecord) -> Sequence[float]:
+        if not r.usable or r.dt_s <= 0:
+            self._before = []
+            return (math.nan,) * 6
+        now = twist(r)
+        velocity, jerk = _lengths(now), np.full(2, np.nan)
+        if len(self._before) == 2:
+            jerk = _lengths(now - 2.0 * self._before[1] + self._before[0]) / r.dt_s**2
+            gain = -math.expm1(-r.dt_s / AGILITY_S)
+            last = np.where(np.isnan(self._square), jerk**2, self._square)
+            self._square = last + gain * (jerk**2 - last)
+        self._before = [*self._before[-1:], now]
+        values = np.concatenate([velocity, jerk, np.sqrt(self._square)])
+        out: list[float] = np.log(values + _STILL).tolist()
+        return out
+
+
+def _lengths(rate: Array) -> Array:
+    """(2,) of the translation's and the rotation's half of a twist or its derivative."""
+    return np.sqrt(np.array([rate[:3] @ rate[:3], rate[3:] @ rate[3:]]))
 
 
 def _columns(*pairs: str) -> tuple[Feature, ...]:
@@ -202,6 +239,18 @@ BUILT_IN = (
             "brightness_change [0..1]",
         ),
         _Trend,
+    ),
+    FeatureGroup(
+        "agility",
+        _columns(
+            "ln_speed [ln m/s]",
+            "ln_turn_rate [ln rad/s]",
+            "ln_jerk [ln m/s^3]",
+            "ln_angular_jerk [ln rad/s^3]",
+            "ln_jerk_lately [ln m/s^3]",
+            "ln_angular_jerk_lately [ln rad/s^3]",
+        ),
+        _Agility,
     ),
     FeatureGroup(IMPORTED, _columns(*_variance_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
     # In pixels, as the geometric covariance at one pixel is scaled by it.

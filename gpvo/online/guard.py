@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ __all__ = ["Domain", "SlipDetector", "Whereabouts", "flag_slips"]
 
 _RARE = 0.0002
 
+_MISSING = 2.0  # Standard deviations outside, where training never missed the value.
 DEGRADED_BELOW = 0.5
 """``in_domain`` under which a prediction is called ``degraded``."""
 
@@ -86,12 +88,19 @@ class Domain:
         U = (X - self.centre) / self.scale
         missing = ~np.isfinite(U)
         U = np.where(missing, 0.0, U)
-        inside = np.clip(U, self.low, self.high)
-        away = (U - np.clip(U, self.least, self.most)) ** 2 / (1.0 + noise / self.scale**2)
-        beyond = away.sum(1) + (missing & ~self.may_miss).sum(1)
-        joint = np.maximum(np.linalg.norm(inside @ self.whitening, axis=1) - self.radius[0], 0.0)
+        # np.clip takes five times as long for a row.
+        inside = np.minimum(np.maximum(U, self.low), self.high)
+        away = (U - np.minimum(np.maximum(U, self.least), self.most)) ** 2 / (1.0 + noise / self.scale**2)
+        beyond = away.sum(1) + self.charge_of_missing @ missing.T
+        length = np.sqrt(((inside @ self.whitening) ** 2).sum(axis=1))
+        joint = np.maximum(length - self.radius[0], 0.0)
         distance = np.sqrt(beyond + joint**2)
         return Whereabouts(inside, distance, np.exp(-0.5 * distance**2))
+
+    @cached_property
+    def charge_of_missing(self) -> Array:
+        """(d,) what a missing value adds to the squared distance from the domain."""
+        return np.where(self.may_miss, 0.0, _MISSING**2)
 
     def outside(self, X: Array) -> Array:
         """How far each value of rows (n, d), or of one (d,), lies beyond all of the training, in training standard

@@ -16,6 +16,7 @@ files lack what is marked optional:
 * ``steady_mean`` (6,), ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,)
   (all optional): the same class;
 * ``for_filter.*`` (optional): those of these arrays in which the model for filters differs;
+* ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
 * ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.online.sample.TrainingSample`.
@@ -31,7 +32,7 @@ import struct
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as _load_tensors
 from safetensors.numpy import save as _save_tensors
 
-from gpvo.errors import ModelError
+from gpvo.errors import ModelError, printable
+from gpvo.online.validation import check_header
 
 SCHEMA = 1
 KIND = "gpvo-error-model"
@@ -86,17 +88,16 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
         arrays = _load_tensors(blob)
     except (OSError, SafetensorError, KeyError, ValueError) as problem:
         raise ModelError(f"cannot be read as a model file: {problem}", where=path) from None
-    header = document["header"]
-    if _digest(arrays, header) != document["digest"]:
+    if _digest(arrays, document["header"]) != document["digest"]:
         raise ModelError("the content does not match its digest", where=path, cure="copy or train the model again")
-    return arrays, header
+    return arrays, document["printable"]
 
 
 def read_header(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The header alone, without reading the arrays (their digest is therefore not checked)."""
     document, _ = _read_document(Path(path))
     _check_document(document, Path(path))
-    return dict(document["header"])
+    return dict(document["printable"])
 
 
 def _read_document(path: Path) -> tuple[dict[str, Any], int]:
@@ -116,16 +117,21 @@ def _read_document(path: Path) -> tuple[dict[str, Any], int]:
         tensors = json.loads(raw)
         metadata = tensors.pop("__metadata__")
         _check_sizes(tensors, size - 8 - n_header, path)
-        document = json.loads(metadata["gpvo"], parse_constant=_refuse)
+        document = json.loads(metadata["gpvo"], parse_constant=_refuse, parse_float=_finite)
     except ModelError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise ModelError("is not a gpvo model file, or its header is damaged", where=path) from None
     return document, size
 
 
-def _refuse(constant: str) -> None:
+def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no JSON")
+
+
+def _finite(number: str) -> float:
+    value = float(number)
+    return value if math.isfinite(value) else _refuse(number)
 
 
 def _check_sizes(tensors: dict[str, Any], n_bytes: int, path: Path) -> None:
@@ -153,6 +159,20 @@ def _check_document(document: Any, path: Path) -> None:
         raise ModelError(what, where=path, cure="update gpvo")
     if not isinstance(document.get("header"), dict) or not isinstance(document.get("digest"), str):
         raise ModelError("has a damaged header", where=path)
+    document["printable"] = _printable(document["header"])
+    try:
+        check_header(document["header"])
+    except ModelError as problem:
+        raise ModelError(problem.what, where=path) from None
+
+
+def _printable(value: Any) -> Any:
+    """The same document, none of whose texts a terminal would obey."""
+    if isinstance(value, dict):
+        return {printable(k): _printable(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_printable(v) for v in value]
+    return printable(value) if isinstance(value, str) else value
 
 
 def _storable(name: str, array: NDArray[Any]) -> NDArray[Any]:

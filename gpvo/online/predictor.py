@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpvo.errors import ModelError
+from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
-from gpvo.online.division import PARTS
-from gpvo.online.estimate import ErrorModelArrays, Estimate
+from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.features import known_columns
-from gpvo.online.for_filter import arrays_for_filter
+from gpvo.online.for_filter import arrays_for_filter, arrays_of_base
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.observer import Observer
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord
@@ -92,11 +91,11 @@ class Predictor:
             self.features = tuple(header["features"])
             method, target = header["base_method"], header["target"]
             dt_s, camera = float(header["dt_s"]), header["camera"]
+            self.camera = None if camera is None else StereoCamera(**camera)
         except (KeyError, TypeError, ValueError) as problem:
             raise ModelError(f"the model's header is incomplete: {problem}") from None
         _check_known(self.features)
         self.model = ErrorModelArrays.from_arrays(arrays, self.features, method, dt_s)
-        self.camera = None if camera is None else StereoCamera(**camera)
         self.target = str(target)
         self.reset()
 
@@ -109,8 +108,12 @@ class Predictor:
         try:
             digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
             return cls(arrays, header, digest, for_filter=for_filter)
-        except ModelError as problem:
+        except GpvoError as problem:
             raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
+
+    def base(self) -> Predictor:
+        """The same model with its Gaussian process held at its mean function, the base variance."""
+        return Predictor(arrays_of_base(self.arrays), self.header)
 
     def reset(self, camera: StereoCamera | None = None) -> None:
         """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with."""
@@ -136,8 +139,8 @@ class Predictor:
 
     def predict(
         self, features: ArrayLike, geometry: ArrayLike | None = None, dt_s: ArrayLike | None = None
-    ) -> Estimate:
-        """The error's distribution for one row of features (d,) or many (n, d), in the units of the header.
+    ) -> Prediction:
+        """The error's distribution for one row of features (d,) or for many (n, d), in the units of the header.
 
         ``geometry`` (6, 6) or (n, 6, 6): covariance by the model's geometric method, for the correlations; without it
         the training's typical ones. ``dt_s``: duration of the motion(s), by default the training's.
@@ -224,59 +227,75 @@ class Predictor:
             for i in order
         ]
 
-    def _publish(self, record: VoRecord, estimate: Estimate) -> Prediction:
-        status, confidence, mean = record.status, float(estimate.confidence), estimate.mean
-        scale = self._adaptive.scale
-        parts = {name: C * np.outer(scale, scale) for name, C in estimate.parts.items()}
-        root = estimate.calibration_root * scale[:, None]
-        if estimate.in_domain < DEGRADED_BELOW and status is Status.OK:
+    def _publish(self, record: VoRecord, said: Prediction) -> Prediction:
+        """The prediction for a record in flight: the adapted scale, the record's status, and what is lost."""
+        t_ns, status, confidence, scale = record.t_ns, record.status, float(said.confidence), self._adaptive.scale
+        if status is Status.LOST:
+            return self._publish_lost(record, said)
+        if said.in_domain < DEGRADED_BELOW and status is Status.OK:
             status = Status.DEGRADED
         if status is Status.DEGRADED:
             confidence *= 0.5
-        if status is Status.LOST:
-            # What was learnt of measured motions does not apply to one that was not.
-            parts = dict.fromkeys(PARTS, np.zeros((6, 6))) | {"white": np.diag(self._lost_variance(record))}
-            confidence, mean, root = 0.0, np.zeros(6), np.zeros((6, 6))
-        covariance = parts["jitter"] + parts["white"] + parts["bias"]
-        sigma = np.sqrt(np.diagonal(covariance))
-        if status is not Status.LOST and record.dt_s > 0:
-            self._rate_var = np.diagonal(covariance) / record.dt_s**2
-        # What is stated of a lost motion was not learnt: truth of it says nothing of the scale of what was.
-        self._stated[record.t_ns] = None if status is Status.LOST else (mean, sigma)
+        squared = scale[:, None] * scale
+        variance = np.diagonal(said.covariance) * scale**2
+        if record.dt_s > 0:
+            self._rate_var = variance / record.dt_s**2
+        self._remember(t_ns, (said.mean, np.sqrt(variance)))
+        return Prediction(
+            mean=said.mean,
+            jitter=said.jitter * squared,
+            white=said.white * squared,
+            persistent_root=said.persistent_root * scale[:, None],
+            persistent_tau_s=said.persistent_tau_s,
+            dt_s=record.dt_s,
+            status=status,
+            t_ns=t_ns,
+            epistemic=np.minimum(said.epistemic * scale**2, variance),
+            confidence=confidence,
+            in_domain=float(said.in_domain),
+        )
+
+    def _publish_lost(self, record: VoRecord, said: Prediction) -> Prediction:
+        """What was learnt of measured motions does not apply to one that was not."""
+        variance = self._lost_variance(record)
+        # Truth of it says nothing of the scale of what was.
+        self._remember(record.t_ns, None)
+        p = self._unmeasured(record, np.diag(variance), 0.0, float(said.in_domain))
+        return replace(p, epistemic=np.minimum(said.epistemic * self._adaptive.scale**2, variance))
+
+    def _remember(self, t_ns: int, stated: tuple[Array, Array] | None) -> None:
+        self._stated[t_ns] = stated
         if len(self._stated) > _REMEMBERED:
             del self._stated[next(iter(self._stated))]
-        return Prediction(
-            record.t_ns,
-            record.dt_s,
-            mean,
-            covariance,
-            parts,
-            self.model.bias_tau_s,
-            np.minimum(estimate.epistemic * scale**2, np.diagonal(covariance)),
-            confidence,
-            float(estimate.in_domain),
-            status,
-            root,
-            self.model.calibration_tau_s,
-        )
 
     def _lost_variance(self, record: VoRecord) -> Array:
         """(6,) variance of a lost motion: what VO gives is the motion expected of the vehicle, or a jump away from it,
         and the vehicle has not kept its velocity."""
         xi, slip = se3.log(record.T_prev_cur), self._observer.slip
+        # A record that is lost for its stamps has no duration to go by.
+        dt_s = record.dt_s if record.dt_s > 0 else self.model.dt_s
         if slip.expected is None:
-            rate = xi / max(record.dt_s, 1e-6)
-            return self.model.lost_variance(record.dt_s, np.inf, rate, np.zeros(6), np.zeros(6))
-        jump = xi - slip.expected * record.dt_s
-        return self.model.lost_variance(record.dt_s, slip.age_s, slip.expected, self._rate_var, jump)
+            variance = self.model.lost_variance(dt_s, np.inf, xi / dt_s, np.zeros(6), np.zeros(6))
+        else:
+            jump = xi - slip.expected * dt_s
+            variance = self.model.lost_variance(dt_s, slip.age_s, slip.expected, self._rate_var, jump)
+        return np.maximum(variance, _NO_MOTION_VAR)
 
     def _at_rest(self, record: VoRecord) -> Prediction:
         """The first frame has no motion and hence no error to speak of."""
-        white = np.eye(6) * _NO_MOTION_VAR
-        parts = {name: white if name == "white" else np.zeros((6, 6)) for name in PARTS}
-        zero = np.zeros(6)
-        m, no_root = self.model, np.zeros((6, 6))
+        return self._unmeasured(record, np.eye(6) * _NO_MOTION_VAR, 1.0, 1.0)
+
+    def _unmeasured(self, record: VoRecord, white: Array, confidence: float, in_domain: float) -> Prediction:
         return Prediction(
-            record.t_ns, 0.0, zero, white, parts, m.bias_tau_s, zero, 1.0, 1.0, record.status, no_root,
-            m.calibration_tau_s,
-        )  # fmt: skip
+            mean=np.zeros(6),
+            jitter=np.zeros((6, 6)),
+            white=white,
+            persistent_root=np.zeros((6, len(self.model.persistent_tau_s))),
+            persistent_tau_s=self.model.persistent_tau_s,
+            dt_s=record.dt_s,
+            status=record.status,
+            t_ns=record.t_ns,
+            epistemic=np.zeros(6),
+            confidence=confidence,
+            in_domain=in_domain,
+        )

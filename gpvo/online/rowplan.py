@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from gpvo.online.basis import ProjectedGP, SharedBasis
-
-Array = NDArray[np.float64]
+from gpvo.online.projected import ProjectedGP
+from gpvo.types import Array
 
 
 @dataclass(frozen=True)
@@ -31,16 +29,16 @@ class StackedBasis:
     offset: Array
 
 
-def stack(basis: SharedBasis) -> StackedBasis:
-    """The matrices of a shared basis."""
-    mean, noise, D = basis.mean, basis.noise, basis.n_outputs
-    own = noise is not None and not basis.shares_kernel
+def stack(mean: ProjectedGP, noise: ProjectedGP | None, log_noise_offset: Array) -> StackedBasis:
+    """The matrices of a shared basis: GPs of the mean and the log noise variance, and what is added to the latter."""
+    D = mean.n_outputs
+    own = noise is not None and noise.points is not mean.points
     kernels = (mean, noise) if own and noise is not None else (mean,)
     M, R = sum(len(gp.points) for gp in kernels), sum(len(gp.flat_projection) for gp in kernels)
     B, H, offset = np.zeros((2, D, M)), np.zeros((3, D, R)), np.zeros((4, D))
     B[0, :, : len(mean.points)] = _kernel_weights(mean)
     _place(H[0], mean, -mean.reduction, 0)
-    offset[0], offset[1], offset[2] = mean.offset, mean.signal_var, basis.log_noise_offset
+    offset[0], offset[1], offset[2] = mean.offset, mean.signal_var, log_noise_offset
     if noise is not None:
         k_start, z_start = (len(mean.points), len(mean.flat_projection)) if own else (0, 0)
         B[1, :, k_start : k_start + len(noise.points)] = _kernel_weights(noise)

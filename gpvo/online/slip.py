@@ -1,9 +1,10 @@
 """Is this motion possible at all? Slips are caught from what is known at the time, before any truth is seen.
 
-The implied acceleration is compared with the motion so far: its far quantile is extrapolated from the history's upper
-tail (B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after I.
-Weissman, 1978). Nothing has a unit that would favour a car or a drone, except that an acceleration of one g is
-always believed.
+The implied acceleration is compared with what any vehicle can have. Odometry's own noise, which counts by the square of
+the frame rate, raises the bound to eight times the median of what was seen, and no further than to four times the
+vehicle's. Disagreement with a gyro is compared with its far quantile, extrapolated from the history's
+upper tail (B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after
+I. Weissman, 1978).
 """
 
 from __future__ import annotations
@@ -15,13 +16,19 @@ from dataclasses import replace
 import numpy as np
 
 from gpvo.online.features import twist
-from gpvo.types import Array, Status, VoLog, VoRecord
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, Status, VoLog, VoRecord
 
-GRAVITY_MPS2 = 9.81
 FALSE_FLAG_RATE = 1e-6
 """Wanted share of good motions that are called impossible."""
 
-_ARM_M = 0.5  # One g at this arm bounds the angular accelerations that are always believed.
+MAX_ACCELERATION_MPS2 = 40.0
+"""No vehicle has more: a car about one g, a rover that drops off a stone two; a multirotor has two to four times its
+weight in thrust, and an arm moves a camera at up to four g."""
+MAX_TURN_RADPS2 = 200.0
+"""The same of angular acceleration: a racing multirotor turns over within a tenth of a second, a wrist flicks."""
+
+_NOISE_MEDIANS = 8.0
+_MOST_NOISE = 4.0  # times the vehicle's bound
 _GYRO_TRUST_RADPS = 0.05  # Disagreement with a gyro of ordinary bias and scale error that is always believed.
 _HISTORY = 1000
 _ENOUGH = 50  # Fewer motions do not show a tail: then tail index _PRIOR_TAIL and the median stand in.
@@ -29,6 +36,13 @@ _PRIOR_TAIL = 3.0
 _TAIL_SHARE = 0.1
 _PATIENCE_S = 1.0
 REASON = "implausible motion"
+
+
+def _bound(history: deque[float], vehicle: float) -> float:
+    """What a vehicle can have, or what odometry's noise makes of it, which is unknown at first; a history of failures
+    raises it fourfold at most."""
+    noise = _NOISE_MEDIANS * float(np.median(history)) if len(history) >= _ENOUGH else math.inf
+    return min(max(vehicle, noise), _MOST_NOISE * vehicle)
 
 
 def tail_quantile(history: Array, rate: float = FALSE_FLAG_RATE) -> float:
@@ -48,7 +62,8 @@ def tail_quantile(history: Array, rate: float = FALSE_FLAG_RATE) -> float:
 class SlipDetector:
     """Calls motions ``lost`` that the vehicle cannot have made.
 
-    A flagged velocity that the next motion confirms is believed: a true manoeuvre costs one frame.
+    Each motion is compared with the last believed one, however often another velocity repeats itself; where that one is
+    more than a second away, or the clock was set, it starts afresh.
     """
 
     def __init__(self) -> None:
@@ -56,7 +71,6 @@ class SlipDetector:
         self._angular: deque[float] = deque(maxlen=_HISTORY)
         self._gyro: deque[float] = deque(maxlen=_HISTORY)
         self._anchor: tuple[float, Array] | None = None
-        self._suspect: tuple[float, Array] | None = None
         self.expected: Array | None = None
         """(6,) velocity expected of the latest motion, the last one believed; None before there is one."""
         self.age_s = 0.0
@@ -73,43 +87,31 @@ class SlipDetector:
         if not record.usable or record.dt_s <= 0:
             return record
         now = twist(record)
-        if self._anchor is None or middle_s - self._anchor[0] > _PATIENCE_S:
-            self._believe(middle_s, now)
+        if self._anchor is None or abs(middle_s - self._anchor[0]) > _PATIENCE_S:
+            self._anchor = (middle_s, now)
             return record
         change = _rates(middle_s, now, self._anchor)
         disagreement = self._gyro_disagreement(record, now)
         problem = self._problem(record, change, disagreement)
-        if problem and self._suspect is not None and self._confirmed(record, middle_s, now):
-            problem = ""
         if problem:
-            self._suspect = (middle_s, now)
             return record.with_status(Status.LOST, f"{REASON}: {problem}")
         self._linear.append(change[0])
         self._angular.append(change[1])
         if disagreement is not None:
             self._gyro.append(disagreement)
-        self._believe(middle_s, now)
+        self._anchor = (middle_s, now)
         return record
-
-    def _believe(self, middle_s: float, now: Array) -> None:
-        self._anchor, self._suspect = (middle_s, now), None
-
-    def _confirmed(self, record: VoRecord, middle_s: float, now: Array) -> bool:
-        """Whether the motion before, flagged too, had this very velocity (a gyro's word is not outvoted)."""
-        assert self._suspect is not None
-        change = _rates(middle_s, now, self._suspect)
-        return not self._problem(record, change, self._gyro_disagreement(record, now))
 
     def _problem(self, record: VoRecord, change: tuple[float, float], disagreement: float | None) -> str:
         acc = record.imu_acc_mean_mps2
         # Whatever the attitude, a camera accelerates by no more than specific force plus gravity.
-        believed = GRAVITY_MPS2 + (0.0 if acc is None else float(np.linalg.norm(acc)))
-        if change[0] > believed and change[0] > tail_quantile(np.array(self._linear)):
+        felt = 0.0 if acc is None or not np.isfinite(acc).all() else STANDARD_GRAVITY_MPS2 + float(np.linalg.norm(acc))
+        if change[0] > max(_bound(self._linear, MAX_ACCELERATION_MPS2), felt):
             return f"acceleration of {change[0]:.3g} m/s^2"
         if disagreement is not None:
             if disagreement > _GYRO_TRUST_RADPS and disagreement > tail_quantile(np.array(self._gyro)):
                 return f"{disagreement:.3g} rad/s from the gyro"
-        elif change[1] > GRAVITY_MPS2 / _ARM_M and change[1] > tail_quantile(np.array(self._angular)):
+        elif change[1] > _bound(self._angular, MAX_TURN_RADPS2):
             return f"angular acceleration of {change[1]:.3g} rad/s^2"
         return ""
 

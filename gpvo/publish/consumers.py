@@ -3,7 +3,8 @@
 PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
 libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026) and
 libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the clamps).
-robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2.
+robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: the stated diagonal drives its
+chi-square gate, and a zero falls back to a constant.
 """
 
 from __future__ import annotations
@@ -12,14 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.publish.odometry import Odometry
+from gpvo.types import Array
 
-Array = NDArray[np.float64]
-
-CONSUMERS = ("px4", "ardupilot", "robot_localization")
+CONSUMERS = ("px4", "ardupilot", "robot_localization", "fusioncore")
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,16 @@ def ardupilot_errors(
     return float(np.clip(position, p.VISO_POS_M_NSE, 100.0)), float(np.clip(angle, p.VISO_YAW_M_NSE, 1.5))
 
 
+FUSIONCORE_FALLBACK = (0.1, 0.02)
+"""Standard deviations [m, rad] that FusionCore takes where a variance is zero."""
+
+
+def fusioncore_sigmas(covariance: Array) -> Array:
+    """(6,) standard deviations that FusionCore's gate and update use: of the diagonal alone, zeros replaced."""
+    variances = np.diagonal(covariance)
+    return np.where(variances > 0, np.sqrt(np.maximum(variances, 0.0)), np.repeat(FUSIONCORE_FALLBACK, 3))
+
+
 def robot_localization_covariance(covariance: Array) -> Array:
     """(6, 6) as its update uses it: negative variances by their absolute value, variances under 1e-9 set to 1e-9."""
     out = np.array(covariance, dtype=np.float64)
@@ -127,6 +136,8 @@ def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
             _verdict("twist", "variance floor", 1e-9, np.sqrt(twist).min(axis=1), "m/s, rad/s", floor=1e-9**0.5),
             _verdict("pose", "variance floor", 1e-9, np.sqrt(pose).min(axis=1), "m, rad", floor=1e-9**0.5),
         ]
+    if consumer == "fusioncore":
+        return _check_fusioncore(good)
     raise GpvoError(f"unknown consumer '{consumer}'", cure=f"choose {', '.join(CONSUMERS)}")
 
 
@@ -141,6 +152,24 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
         value = getattr(p, name)
         typical = 0.05 if quantity == "velocity" else 0.5
         out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=p.minimum(name), typical=typical))
+    return out
+
+
+def _check_fusioncore(good: Sequence[Odometry]) -> list[Verdict]:
+    """No floor hides anything; what is lost are the correlations, which make some combinations of axes more certain.
+
+    ``hidden_percent``: frames whose most certain combination of axes, in units of their sigmas, is taken for more than
+    twice as uncertain as it is.
+    """
+    out = []
+    for quantity, unit in (("twist", "m/s, rad/s"), ("pose", "m, rad")):
+        C = np.array([o.pose_covariance if quantity == "pose" else o.twist_covariance for o in good], dtype=np.float64)
+        sigma = np.array([fusioncore_sigmas(c) for c in C])
+        correlated = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
+        low, middle, high = (float(q) for q in np.quantile(sigma.min(axis=1), [0.05, 0.5, 0.95]))
+        advice = "It reads the diagonal alone, and its chi-square gate is as good as these sigmas; send no zeros"
+        hidden = 100.0 * float(correlated.mean())
+        out.append(Verdict(quantity, "diagonal only", 0.0, hidden, (low, middle, high), unit, advice))
     return out
 
 

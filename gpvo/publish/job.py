@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.io.atomic import write_text
 from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.publish import consumers, mavlink, ros
@@ -160,10 +161,8 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
         count = ros.write_ros2(out, odometry, settings.topic, mcap=kind == "mcap")
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
     parameters = out.with_name(f"{out.stem}_robot_localization.yaml")
-    temporary = parameters.with_name(f".{parameters.name}.part")
     text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=ros1)
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(parameters)
+    write_text(parameters, text)
     return str(out), count
 
 

@@ -17,14 +17,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, MissingExtraError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FRD_FLU, rotate_covariance
 from gpvo.publish.odometry import Odometry
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LOCAL_FRD, _BODY_FRD, _ESTIMATOR_VISION = 20, 12, 2

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpvo.accumulation import PoseError, frame_jitter
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite, persistent_root, symmetrise
+from gpvo.geometry.covariance import is_positive_definite, symmetrise
 from gpvo.geometry.frames import R_FLU_OPTICAL, rotate_covariance
-from gpvo.types import Prediction, Status, VoRecord
-
-Array = NDArray[np.float64]
-
-
-_NO_BIAS = (np.zeros((6, 12)), np.full(12, np.inf))
-"""Root of a bias, and its time constants [s], where there is none."""
+from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 
 @dataclass(frozen=True)
@@ -65,14 +59,17 @@ def lift(covariance: Array, first: float, second: float) -> Array:
     return out + np.diag(missing)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Chain:
-    """Accumulated error of the pose at one frame, in camera axes: what walks and persists, and what is shared."""
+    """The pose at one frame and its error, in camera axes."""
 
     T_first_cam: Array
-    walked: Array  # (6, 6) white and bias, of the pose
-    cross: Array  # (6, 6) between the pose's error and the normalised bias
+    error: PoseError
     t_ns: int
+
+    def extended(self, record: VoRecord, error: MotionError) -> _Chain:
+        """The chain one motion further."""
+        return _Chain(self.T_first_cam @ record.T_prev_cur, self.error.after(record.T_prev_cur, error), record.t_ns)
 
 
 @dataclass
@@ -101,7 +98,6 @@ class OdometryBuilder:
         self._last: tuple[int, Array, Array] | None = None  # stamp, T_first_cam, noise of the last good frame
         self._speed = np.zeros(6)
         self._resets = 0
-        self._first_jitter: Array | None = None
 
     def step(self, record: VoRecord, prediction: Prediction | None = None) -> Odometry:
         """The message of one frame.
@@ -114,63 +110,56 @@ class OdometryBuilder:
         base = self._chain.get(record.t_prev_ns)
         if base is None:
             self._resets += bool(self._chain)
-            base = self._latest() or _Chain(np.eye(4), np.zeros((6, 6)), np.zeros((6, 12)), record.t_prev_ns)
+            base = self._latest() or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
             self._last = None
         if not record.usable or _status(record, prediction) is Status.LOST:
             return self._lost(record, prediction, base)
-        white, jitter, root, tau_s = self._parts(record, prediction)
-        chain = _extend(base, record, white, root, tau_s)
-        own = 0.5 * jitter
-        if self._first_jitter is None:
-            self._first_jitter = own
-        twist, twist_covariance = self._twist(record, prediction, chain, own, white + root @ root.T)
+        error = self._error(record, prediction)
+        chain = base.extended(record, error)
+        twist, twist_covariance = self._twist(record, error, prediction, chain)
         self._remember(record, chain)
-        self._last = (record.t_ns, chain.T_first_cam, own + white)
-        A = se3.adjoint(se3.inverse(chain.T_first_cam))
-        total = chain.walked + own + A @ self._first_jitter @ A.T
-        return self._message(record, prediction, chain, total, twist, twist_covariance)
+        self._last = (record.t_ns, chain.T_first_cam, frame_jitter(error.jitter) + error.white)
+        return self._message(record, prediction, chain, twist, twist_covariance)
 
-    def _parts(self, record: VoRecord, prediction: Prediction | None) -> tuple[Array, Array, Array, Array]:
-        """White and jitter covariance, root (6, 12) of the bias' covariance and its time constants (12,)."""
-        zero = np.zeros((6, 6))
+    def _error(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
+        """What is stated of a measured motion."""
         if prediction is not None:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
-            jitter, bias = prediction.parts.get("jitter", zero), prediction.parts.get("bias", zero)
-            white = prediction.covariance - jitter - bias
-            if not self.correct_twist:  # what is not taken off remains part of the error
-                white = white + np.outer(prediction.mean, prediction.mean)
-            tau_s = np.concatenate([prediction.bias_tau_s, prediction.calibration_tau_s])
-            return white, jitter, persistent_root(bias, prediction.calibration_root), tau_s
+            if self.correct_twist:
+                return prediction
+            # What is not taken off remains part of the error.
+            return replace(prediction, white=prediction.white + np.outer(prediction.mean, prediction.mean))
         covariance = record.covariances.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
             raise GpvoError(
                 f"the frame at t_ns {record.t_ns} has neither a prediction nor a '{self.method}' covariance",
                 cure=f"give --model, or --method with one of {', '.join(record.covariances) or 'what the run holds'}",
             )
-        return np.asarray(covariance, dtype=np.float64), zero, *_NO_BIAS
+        return MotionError.independent(covariance, dt_s=record.dt_s)
 
     def _twist(
-        self, record: VoRecord, prediction: Prediction | None, chain: _Chain, own: Array, independent: Array
+        self, record: VoRecord, error: MotionError, prediction: Prediction | None, chain: _Chain
     ) -> tuple[Array, Array]:
         """Body twist since the last good frame, and its covariance.
 
         Usually that frame is the reference. Where it is not (the vehicle stood still, or a keyframe is kept), the
         motion is the difference of two motions from one reference, whose noise cancels; both frames' noise remains.
         """
+        own = frame_jitter(error.jitter)
         t_last, T_last, noise_last = self._last or (record.t_prev_ns, se3.inverse(record.T_prev_cur), own)
         dt = (record.t_ns - t_last) * 1e-9
         if dt <= 0:
             raise GpvoError(f"the frame at t_ns {record.t_ns} does not follow the one at {t_last}")
         if t_last == record.t_prev_ns:
-            xi, covariance = se3.log(record.T_prev_cur), independent + 2.0 * own
+            xi, covariance = se3.log(record.T_prev_cur), error.covariance
             if self.correct_twist and prediction is not None:
                 xi = se3.log(record.T_prev_cur @ se3.exp(-prediction.mean))
         else:
             # Both motions have the mean of their reference in them: nothing is left of it to take off.
             T_rel = se3.inverse(T_last) @ chain.T_first_cam
             A = se3.adjoint(se3.inverse(T_rel))
-            xi, covariance = se3.log(T_rel), independent + own + A @ noise_last @ A.T
+            xi, covariance = se3.log(T_rel), error.covariance - own + A @ noise_last @ A.T
         self._speed = xi / dt
         twist = self._Ad @ xi / dt
         moved = self._Ad @ covariance @ self._Ad.T / dt**2
@@ -182,28 +171,26 @@ class OdometryBuilder:
         if stated is None or not is_positive_definite(stated):
             dt = (record.t_ns - base.t_ns) * 1e-9
             stated = np.diag((np.abs(self._speed) * dt) ** 2)
-        chain = _extend(base, record, stated, *_NO_BIAS)
+        chain = base.extended(record, MotionError.independent(stated, dt_s=record.dt_s, status=Status.LOST))
         self._remember(record, chain)
         if record.is_reference and _status(record, prediction) is Status.LOST:
             # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone,
             # and its twist must not begin before it.
             self._resets += 1
             self._last = None
-        first = np.zeros((6, 6)) if self._first_jitter is None else self._first_jitter
-        return self._message(record, prediction, chain, chain.walked + first, None, None)
+        return self._message(record, prediction, chain, None, None)
 
     def _message(
         self,
         record: VoRecord,
         prediction: Prediction | None,
         chain: _Chain,
-        total: Array,
         twist: Array | None,
         twist_covariance: Array | None,
     ) -> Odometry:
         T = self.T_odom_body @ self._T_body_cam @ chain.T_first_cam @ se3.inverse(self._T_body_cam)
         status = _status(record, prediction)
-        in_odom = rotate_covariance(T[:3, :3], self._Ad @ total @ self._Ad.T)
+        in_odom = rotate_covariance(T[:3, :3], self._Ad @ chain.error.covariance @ self._Ad.T)
         return Odometry(
             t_ns=record.t_ns,
             T_odom_body=T,
@@ -212,8 +199,8 @@ class OdometryBuilder:
             twist_covariance=twist_covariance,
             status=status,
             tracked=status is not Status.LOST,
-            confidence=None if prediction is None else prediction.confidence,
-            in_domain=None if prediction is None else prediction.in_domain,
+            confidence=None if prediction is None else float(prediction.confidence),
+            in_domain=None if prediction is None else float(prediction.in_domain),
             reset_counter=self._resets % 256,
         )
 
@@ -224,16 +211,6 @@ class OdometryBuilder:
         """Keep the reference and the newest frame; nothing else is ever started from."""
         if record.is_reference or not self._chain:
             self._chain = {record.t_ns: chain}
-
-
-def _extend(base: _Chain, record: VoRecord, white: Array, root: Array, tau_s: Array) -> _Chain:
-    """The chain one motion further: the pose's error moves with the adjoint, the bias forgets and adds."""
-    phi = np.diag(np.exp(-record.dt_s / np.maximum(tau_s, 1e-9)))
-    A = se3.adjoint(se3.inverse(record.T_prev_cur))
-    cross = A @ base.cross @ phi
-    persistent = cross @ root.T
-    walked = A @ base.walked @ A.T + white + root @ root.T + persistent + persistent.T
-    return _Chain(base.T_first_cam @ record.T_prev_cur, symmetrise(walked), cross + root, record.t_ns)
 
 
 def _status(record: VoRecord, prediction: Prediction | None) -> Status:

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.accumulation import along
 from gpvo.dataset.align import interpolate_truth
-from gpvo.evaluation.accumulate import Step, along
 from gpvo.geometry import se3
 from gpvo.io.run import Run
-from gpvo.types import Array, VoLog
+from gpvo.types import Array, MotionError, VoLog
 
 _FIELDS = ("t_s", "path_m", "error_m", "mean_m", "covariance_m2")
 
@@ -78,10 +78,10 @@ def summed_v_t(log: VoLog, method: str) -> Array:
     return out
 
 
-def compounded(log: VoLog, steps: Sequence[Step]) -> Array:
-    """(N, 3, 3) covariance of every position from the covariance of every motion."""
+def compounded(log: VoLog, errors: Sequence[MotionError]) -> Array:
+    """(N, 3, 3) covariance of every position from the errors stated of every motion."""
     R = log.trajectory()[:, :3, :3]
-    return R @ along(steps, log.parent)[:, :3, :3] @ np.swapaxes(R, 1, 2)
+    return R @ along(log.T_prev_cur, errors, log.parent)[1][:, :3, :3] @ np.swapaxes(R, 1, 2)
 
 
 def mean_shift(log: VoLog, mean: Array) -> Array:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from gpvo.io.atomic import replacing
 from gpvo.reproduce.bounds import Bounds
-from gpvo.reproduce.store import replacing
 
 _AXES = ("x: right", "y: down", "z: forward")
 _GREEN = "#2ca02c"
@@ -72,5 +72,6 @@ def curve_figure(curves: Mapping[str, tuple[list[int], list[float], list[float],
 
 def save(figure: Figure, path: Path) -> None:
     """As PNG, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=100, metadata={"Software": None})
+        figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})

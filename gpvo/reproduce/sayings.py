@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 
 from gpvo.dataset.build import TrainingSet, build_run, observe
-from gpvo.evaluation.accumulate import Step
 from gpvo.evaluation.evaluate import predictions_by_stamp
 from gpvo.evaluation.statements import statements
 from gpvo.io.run import Run, read_run
@@ -21,7 +20,7 @@ from gpvo.reproduce.bounds import Bounds, as_arrays, bounds_of, compounded, mean
 from gpvo.reproduce.experiments import Experiment, Way, printed
 from gpvo.reproduce.learn import ModelJob, sets_of
 from gpvo.reproduce.store import Store, digest_of, write_arrays
-from gpvo.types import Array, Status, VoLog
+from gpvo.types import Array, MotionError, Status, VoLog
 from gpvo.vo.config import pair_method
 
 Kind = Literal["v_t", "joint", "position", "motion", "learned"]
@@ -109,9 +108,9 @@ def _joint(run: Run, method: str) -> Bounds:
     log = VoLog(
         [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in run.log]
     )
-    steps = next(s.steps for s in statements(log) if s.method == method)
-    assert steps is not None
-    return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, steps))
+    errors = next(s.errors for s in statements(log) if s.method == method)
+    assert errors is not None
+    return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, errors))
 
 
 def _position(run: Run, predictor: PositionPredictor) -> Bounds:
@@ -126,19 +125,19 @@ def _motion(run: Run, state: Statement) -> Bounds:
     said = state(s)
     assert said is not None
     at = {int(t): k for k, t in enumerate(s.t_ns)}
-    mean, steps, last = np.zeros((len(run.log), 6)), [], 1e-12 * np.eye(6)
+    mean, errors, last = np.zeros((len(run.log), 6)), [], 1e-12 * np.eye(6)
     for k, record in enumerate(run.log):
         row = at.get(record.t_ns)
         if row is not None:
             mean[k], last = said[0][row], said[1][row]
-        steps.append(Step.independent(record.T_prev_cur, last))
-    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, steps))
+        errors.append(MotionError.independent(last))
+    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, errors))
 
 
 def _learned(run: Run, predictor: Predictor) -> Bounds:
     predictions = predictions_by_stamp(run, predictor)
     bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
     said = next(s for s in statements(bare, predictions) if s.method == "learned")
-    assert said.steps is not None
+    assert said.errors is not None
     mean: Array = np.where([[r.status is Status.LOST] for r in run.log], 0.0, said.mean)
-    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, said.steps))
+    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, said.errors))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,13 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, SourceError
+from gpvo.io import atomic
+from gpvo.io.folder_lock import FolderLock
 from gpvo.io.jsonfile import plain
-
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 _LENGTH = 12
 
@@ -62,40 +57,25 @@ def only_user(root: Path) -> Iterator[None]:
     GpvoError
         Where another process has it.
     """
-    lock = Store(root).folder(".") / "lock"
-    with lock.open("w") as handle:
-        if fcntl is not None:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise GpvoError("another reproduction is at work here", where=root, cure="give another --out") from None
-        yield
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path`` to write to; it takes the place of ``path`` at the end, or goes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    folder = Store(root).folder(".")
     try:
-        yield temporary
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+        lock = FolderLock(folder)
+    except SourceError:
+        raise GpvoError("another reproduction is at work here", where=root, cure="give another --out") from None
+    try:
+        yield
     finally:
-        temporary.unlink(missing_ok=True)
+        lock.release()
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(path, text)
 
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Write an ``.npz`` whole or not at all."""
-    with replacing(path) as temporary, temporary.open("wb") as stream:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic.replacing(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types import Array, ImuLog, ImuNoise
-
-GRAVITY_MPS2 = 9.80665
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, ImuNoise
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Motion:
         return Motion(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-def exact_imu(motion: Motion, gravity_mps2: float = GRAVITY_MPS2) -> tuple[Array, Array]:
+def exact_imu(motion: Motion, gravity_mps2: float = STANDARD_GRAVITY_MPS2) -> tuple[Array, Array]:
     """Turn rate [rad/s] and specific force [m/s^2] in body axes, (N, 3) each, without any noise."""
     up = np.array([0.0, 0.0, gravity_mps2])
     force = np.einsum("nji,nj->ni", motion.R_world_body, motion.acceleration_mps2 + up)
@@ -72,7 +70,11 @@ def exact_imu(motion: Motion, gravity_mps2: float = GRAVITY_MPS2) -> tuple[Array
 
 
 def measured_imu(
-    motion: Motion, model: ImuModel, rng: np.random.Generator, t_start_ns: int = 0, gravity_mps2: float = GRAVITY_MPS2
+    motion: Motion,
+    model: ImuModel,
+    rng: np.random.Generator,
+    t_start_ns: int = 0,
+    gravity_mps2: float = STANDARD_GRAVITY_MPS2,
 ) -> tuple[ImuLog, Array, Array]:
     """The log that a sensor of this kind would give, and its true biases: gyroscope and accelerometer, (N, 3) each."""
     n, dt = len(motion.t_s), float(motion.t_s[1] - motion.t_s[0])

@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.sim.imu import GRAVITY_MPS2, Motion
-from gpvo.types import Array
+from gpvo.sim.imu import Motion
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array
 
 _KNOTS_PER_S = 25.0
 
@@ -178,7 +178,7 @@ def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float 
     pull = place.derivative(2)
 
     def attitude(u: Array) -> Array:
-        z = lean * pull(u) + np.array([0, 0, GRAVITY_MPS2])
+        z = lean * pull(u) + np.array([0, 0, STANDARD_GRAVITY_MPS2])
         z = z / np.linalg.norm(z, axis=1, keepdims=True)
         psi = turn(u)
         x = np.stack([np.cos(psi), np.sin(psi), np.zeros_like(psi)], 1)

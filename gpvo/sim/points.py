@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.cameras.tolerance import RIG_ERRORS, Tolerance, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
@@ -22,16 +23,6 @@ from gpvo.sim import clouds, imu
 from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3
 from gpvo.types import Array, ImuLog, StereoCamera
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """Standard deviations of how the true rig differs from the written one: what a data sheet allows, drawn once per
-    flight."""
-
-    baseline: float = 0.0  # fraction
-    focal: float = 0.0  # fraction
-    rotation_rad: float = 0.0  # between the cameras, per axis
 
 
 @dataclass(frozen=True)
@@ -210,7 +201,7 @@ def observe(
     streams: list[np.random.Generator],
 ) -> list[Seen]:  # fmt: skip
     """Tracks of each frame: identities (n,), left and right pixels (n, 2)."""
-    rig = _TrueRig.draw(scenario, streams[3])
+    rig = TrueRig.of(scenario.camera, scenario.tolerance, streams[3].standard_normal(RIG_ERRORS), scenario.offset)
     life, noise = streams[4], streams[5]
     quality = np.exp(scenario.spread * noise.standard_normal())
     active = np.zeros(len(cloud), bool)
@@ -226,7 +217,7 @@ def observe(
             out.append((np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2))))
             continue
         bad = next((e for e in episodes if e.begin_s <= t < e.end_s), None)
-        left, right, visible = rig.project(T_world_cam[k], cloud)
+        left, right, visible = _visible(rig, T_world_cam[k], cloud)
         wanted = int(scenario.tracks * (bad.count_factor if bad else 1.0))
         _renew(active, generation, visible, wanted, min(1.0, scenario.drop * (3.0 if bad else 1.0)), life)
         i = np.flatnonzero(active)
@@ -263,38 +254,18 @@ def _renew(
         active[rng.choice(candidates, room, replace=False)] = True
 
 
-@dataclass(frozen=True)
-class _TrueRig:
-    """The rig that draws the pixels; the scenario's camera is what the calibration says."""
-
-    camera: StereoCamera
-    R_right_left: Array
-
-    @classmethod
-    def draw(cls, scenario: PointsScenario, rng: np.random.Generator) -> _TrueRig:
-        tolerance, offset, c = scenario.tolerance, scenario.offset, scenario.camera
-        e = rng.standard_normal(5)
-        focal = 1 + offset.focal + tolerance.focal * e[1]
-        baseline_m = c.baseline_m * (1 + offset.baseline + tolerance.baseline * e[0])
-        camera = replace(c, baseline_m=baseline_m, fx_px=c.fx_px * focal, fy_px=c.fy_px * focal)
-        return cls(camera, se3.so3_exp(tolerance.rotation_rad * e[2:] + [0.0, offset.rotation_rad, 0.0]))
-
-    def project(self, T_world_cam: Array, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Left and right pixels (n, 2) of world points, and which are in both images between 0.4 and 40 m."""
-        c = self.camera
-        depth = (points - T_world_cam[:3, 3]) @ T_world_cam[:3, 2]
-        near = np.flatnonzero((depth > 0.4) & (depth < 40.0))
-        P = se3.transform(se3.inverse(T_world_cam), points[near])
-        Q = (P - [c.baseline_m, 0, 0]) @ self.R_right_left.T
-        focal, centre = np.array([c.fx_px, c.fy_px]), np.array([c.cx_px, c.cy_px])
-        seen, pixels = np.ones(len(near), bool), []
-        for X in (P, Q):
-            uv = focal * X[:, :2] / X[:, 2:] + centre
-            u, v = uv[:, 0], uv[:, 1]
-            seen &= (u > 2) & (v > 2) & (u < c.width - 3) & (v < c.height - 3)
-            whole = np.full((len(points), 2), np.nan)
-            whole[near] = uv
-            pixels.append(whole)
-        visible = np.zeros(len(points), bool)
-        visible[near] = seen
-        return pixels[0], pixels[1], visible
+def _visible(rig: TrueRig, T_world_cam: Array, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Left and right pixels (n, 2) of world points, and which are in both images between 0.4 and 40 m."""
+    c = rig.camera
+    depth = (points - T_world_cam[:3, 3]) @ T_world_cam[:3, 2]
+    near = np.flatnonzero((depth > 0.4) & (depth < 40.0))
+    seen, pixels = np.ones(len(near), bool), []
+    for uv in rig.pixels(se3.transform(se3.inverse(T_world_cam), points[near])):
+        u, v = uv[:, 0], uv[:, 1]
+        seen &= (u > 2) & (v > 2) & (u < c.width - 3) & (v < c.height - 3)
+        whole = np.full((len(points), 2), np.nan)
+        whole[near] = uv
+        pixels.append(whole)
+    visible = np.zeros(len(points), bool)
+    visible[near] = seen
+    return pixels[0], pixels[1], visible

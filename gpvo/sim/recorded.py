@@ -26,11 +26,6 @@ class Recording:
     turned_xyzw: Array
 
     @property
-    def length_s(self) -> float:
-        """How long it lasts [s]."""
-        return (len(self.position_m) - 1) * _STEP_S
-
-    @property
     def main_direction_rad(self) -> float:
         """Heading of the longest horizontal extent [rad]."""
         xy = self.position_m[:, :2] - self.position_m[:, :2].mean(0)

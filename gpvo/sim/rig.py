@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
+from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -53,16 +55,18 @@ CAMERAS = tuple(_PRESETS)
 
 
 def camera_rig(name: str) -> StereoRig:
-    """The nominal rig of a preset: ``pinhole``, ``euroc`` or ``t265``.
+    """The nominal rig of a preset (``pinhole``, ``euroc`` or ``t265``) or of a Kalibr or OpenCV calibration file.
 
     Raises
     ------
     GpvoError
-        For any other name.
+        For any other name, or a file that is no calibration.
     """
-    if name not in _PRESETS:
-        raise GpvoError(f"unknown camera '{name}'", cure=f"choose from {', '.join(CAMERAS)}")
-    return _PRESETS[name]()
+    if name in _PRESETS:
+        return _PRESETS[name]()
+    if not Path(name).is_file():
+        raise GpvoError(f"unknown camera '{name}'", cure=f"choose from {', '.join(CAMERAS)}, or a calibration file")
+    return replace(read_stereo_yaml(Path(name)), T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)
 
 
 def mounted(rig: StereoRig, vehicle: str, pitch_deg: float) -> StereoRig:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gpvo.errors import GpvoError
 from gpvo.sim.points import SCENARIOS, PointsScenario, Tolerance
-from gpvo.sim.rig import RigTolerance
+from gpvo.sim.rig import CAMERAS, RigTolerance, camera_rig
 
 try:
     import tomllib
@@ -59,7 +59,7 @@ class Scenario(BaseModel):
     sway_m: float = Field(0.3, ge=0.0, le=2.0)
     agility: float = Field(1.0, ge=0.1, le=5.0)
     rest_s: float = Field(3.0, ge=0.0, le=60.0)
-    camera: Literal["pinhole", "euroc", "t265"] = "pinhole"
+    camera: str = "pinhole"
     camera_pitch_deg: float = Field(0.0, ge=-60.0, le=60.0)
     right_light: float = Field(1.0, ge=0.1, le=10.0)
     exposure_s: float = Field(0.0, ge=0.0, le=0.1)
@@ -133,7 +133,6 @@ def stated_seed(name: str) -> int:
 def points_scenario(scenario: Scenario) -> PointsScenario:
     """The same flight without images."""
     from gpvo.cameras.rectify import Rectifier
-    from gpvo.sim.rig import camera_rig
 
     base = SCENARIOS.get(scenario.name, PointsScenario())
     camera = base.camera if scenario.camera in ("pinhole", "t265") else Rectifier(camera_rig(scenario.camera)).camera
@@ -192,6 +191,12 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
     known = {f.name for f in fields(PointsScenario)}
     if unknown := sorted(set(scenario.points) - known):
         raise GpvoError(f"unknown parameter 'points.{unknown[0]}'", where=where, cure=_nearest(unknown[0], known))
+    if scenario.camera not in CAMERAS and not Path(scenario.camera).is_file():
+        raise GpvoError(
+            f"camera is '{scenario.camera}'",
+            where=where,
+            cure=f"choose from {', '.join(CAMERAS)}, or give a calibration file (Kalibr or OpenCV)",
+        )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")
     if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:

@@ -10,12 +10,12 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.sim import rover, vehicles
 from gpvo.sim.episodes import Episode, draw_episodes
-from gpvo.sim.imu import GRAVITY_MPS2, Motion
+from gpvo.sim.imu import Motion
 from gpvo.sim.paths import Path3
 from gpvo.sim.routes import place, refuse_outside
 from gpvo.sim.scenario import Scenario
 from gpvo.sim.worlds import World
-from gpvo.types import Array
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array
 
 _CHECK_HZ = 50
 _BARE, _RAMP_S = 0.92, 0.5  # share of the fine texture that a bare wall lacks; time it takes to come into view
@@ -39,7 +39,7 @@ class FramePlan:
 def gravity_mps2(scenario: Scenario) -> float:
     """Gravity of the scenario's world. A vehicle that flies needs air, so only the rover feels the moon's."""
     lunar = scenario.world == "lunar" and scenario.vehicle == "rover"
-    return vehicles.LUNAR_GRAVITY_MPS2 if lunar else GRAVITY_MPS2
+    return vehicles.LUNAR_GRAVITY_MPS2 if lunar else STANDARD_GRAVITY_MPS2
 
 
 def move(scenario: Scenario, path: Path3, world: World) -> Motion:

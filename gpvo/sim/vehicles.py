@@ -14,9 +14,9 @@ import numpy as np
 
 from gpvo.errors import GpvoError, MissingExtraError
 from gpvo.geometry import se3
-from gpvo.sim.imu import GRAVITY_MPS2, Motion
+from gpvo.sim.imu import Motion
 from gpvo.sim.paths import Path3
-from gpvo.types import Array
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array
 
 RATE_HZ = 1000.0
 LUNAR_GRAVITY_MPS2 = 1.62
@@ -57,7 +57,8 @@ class Quadrotor:
             for i in range(4)
         )
         return (
-            f'<mujoco><option timestep="{1 / RATE_HZ}" integrator="implicitfast" gravity="0 0 -{GRAVITY_MPS2}"/>'
+            f'<mujoco><option timestep="{1 / RATE_HZ}" integrator="implicitfast"'
+            f' gravity="0 0 -{STANDARD_GRAVITY_MPS2}"/>'
             f'<worldbody><body name="body"><freejoint/><inertial pos="0 0 0" mass="{self.mass}"'
             f' diaginertia="{" ".join(map(str, self.inertia))}"/>{sites}</body></worldbody>'
             f"<actuator>{rotors}</actuator></mujoco>"
@@ -87,7 +88,7 @@ def fly(path: Path3, vehicle: Quadrotor | None = None) -> Motion:
     reference = _Reference.of(path, t_control)
     data.qpos[:3] = reference.position[0]
     data.qpos[3:7] = np.roll(se3.rotation_to_quaternion_xyzw(reference.attitude[:1])[0], 1)
-    data.act[:] = quad.mass * GRAVITY_MPS2 / 4
+    data.act[:] = quad.mass * STANDARD_GRAVITY_MPS2 / 4
     mujoco.mj_forward(model, data)
     controller = _Controller(quad, reference)
     states = np.empty((steps, 7))
@@ -140,7 +141,7 @@ class _Controller:
         if off @ off > 4.0:
             raise GpvoError(f"the quadrotor loses its path after {data.time:.1f} s", cure="a slower or smoother path")
         pull = quad.position_gain * off + quad.velocity_gain * (ref.velocity[k] - data.qvel[:3])
-        force = quad.mass * (pull + ref.acceleration[k] + [0, 0, GRAVITY_MPS2]) + quad.drag * ref.velocity[k]
+        force = quad.mass * (pull + ref.acceleration[k] + [0, 0, STANDARD_GRAVITY_MPS2]) + quad.drag * ref.velocity[k]
         R = se3.from_quaternion(np.zeros((1, 3)), np.roll(data.qpos[3:7], -1)[None])[0, :3, :3]
         z = force / np.linalg.norm(force)
         y = np.cross(z, ref.attitude[k][:, 0])

@@ -1,7 +1,8 @@
 """Is a stated covariance honest? NEES, coverage, NLL and CRPS of Gaussian statements.
 
 NEES: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
-section 5.4.2. CRPS of a Gaussian: T. Gneiting, A. Raftery, "Strictly Proper Scoring Rules" (2007), section 4.2.
+section 5.4.2. CRPS of a Gaussian and energy score: T. Gneiting, A. Raftery, "Strictly Proper Scoring Rules,
+Prediction, and Estimation" (2007), sections 4.2 and 4.3.
 """
 
 from __future__ import annotations
@@ -9,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 _SQRT2 = math.sqrt(2.0)
 _erf = np.vectorize(math.erf, otypes=[np.float64])
@@ -60,3 +60,43 @@ def crps_gaussian(error: Array, sigma: Array) -> Array:
     pdf = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
     cdf = 0.5 * (1.0 + _erf(z / _SQRT2))
     return sigma * (z * (2 * cdf - 1) + 2 * pdf - 1 / math.sqrt(math.pi))
+
+
+def energy_score(error: Array, covariance: Array, *, draws: int = 256, seed: int = 0) -> Array:
+    """``E|X - e| - E|X - X'| / 2`` for X, X' ~ N(0, C): the CRPS of vectors, in the error's unit. (..., d) -> (...).
+
+    By antithetic draws, the same for all rows. A statement of C = 0 scores the length of the error.
+    """
+    error, covariance = _checked(error, covariance)
+    half = np.random.default_rng(seed).standard_normal((draws // 2, error.shape[-1]))
+    z = np.concatenate([half, -half])
+    x = np.swapaxes(np.linalg.cholesky(covariance) @ z.T, -1, -2)  # (..., draws, d)
+    to_error = np.linalg.norm(x - error[..., None, :], axis=-1).mean(axis=-1)
+    # Differences of independent draws are draws of twice the covariance.
+    return np.asarray(to_error - np.linalg.norm(x, axis=-1).mean(axis=-1) / _SQRT2)
+
+
+def correlation_gain(error: Array, covariance: Array) -> Array:
+    """Nats per dimension by which the stated correlations make the errors likelier than the variances alone. (...).
+
+    Negative where the correlations are wrong: to know some axes then misleads about the others.
+    """
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    return nll_per_dim(error, variances[..., None] * np.eye(variances.shape[-1])) - nll_per_dim(error, covariance)
+
+
+def by_difficulty(error: Array, covariance: Array, groups: int = 4) -> tuple[Array, Array]:
+    """NEES/dof and coverage at one sigma in groups of rising stated uncertainty, each of equal size. (groups,) each.
+
+    A covariance that is right on average but blind to what makes a motion hard is too wide in the first group and too
+    narrow in the last. Difficulty is the determinant of the covariance. NaN with fewer rows than groups.
+    """
+    if len(error) < groups:
+        return np.full(groups, np.nan), np.full(groups, np.nan)
+    rows = np.array_split(np.argsort(np.linalg.slogdet(covariance)[1], kind="stable"), groups)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    d = error.shape[-1]
+    return (
+        np.array([nees(error[r], covariance[r]).mean() / d for r in rows]),
+        np.array([coverage(error[r], sigma[r], (1.0,))[0] for r in rows]),
+    )

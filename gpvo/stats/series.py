@@ -6,9 +6,8 @@ D. W. Allan, "Statistics of atomic frequency standards" (1966); overlapping esti
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 
 def autocorrelation(values: Array, max_lag: int) -> Array:

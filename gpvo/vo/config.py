@@ -32,6 +32,7 @@ class VoConfig:
     sigma_p_px: float | None = 0.1  # pointing; None: estimated from the residuals so far
     sigma_m_px: float | None = 0.5  # matching; None: likewise
     sigma_pairs_px: tuple[tuple[float, float], ...] = ()  # further pairs, each stated as a method of its own
+    self_calibration: bool = True  # estimate what the calibration has wrong between the cameras
     seed: int = 0
 
     @property
@@ -48,7 +49,7 @@ def pair_method(sigma_p_px: float, sigma_m_px: float) -> str:
 PRESETS: dict[str, VoConfig] = {
     "fast": VoConfig(),
     # What the thesis describes, to the letter: every frame is matched afresh to the one before.
-    "thesis": VoConfig(preset="thesis", keyframe_parallax_px=0.0, max_features=500),
+    "thesis": VoConfig(preset="thesis", keyframe_parallax_px=0.0, max_features=500, self_calibration=False),
 }
 
 

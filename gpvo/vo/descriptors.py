@@ -13,21 +13,27 @@ from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import EMPTY, Matches, Observation
 from gpvo.vo.image import image_stats
+from gpvo.vo.rig_error import RigError
 
 
 @dataclass(frozen=True)
 class _Features:
-    """Stereo-matched corners of one frame: ``uvd`` (N, 3), ``bits`` (N, 61) of the left descriptors."""
+    """Stereo-matched corners of one frame: ``uvd`` (N, 3), ``row_error`` (N,), ``bits`` (N, 61) of the left
+    descriptors."""
 
     uvd: Array
+    row_error: Array
     bits: NDArray[np.uint8]
 
 
 class DescriptorFrontend:
     """Every frame is detected, described and matched afresh (D. Ross, thesis, chapter 2)."""
 
-    def __init__(self, camera: StereoCamera, config: VoConfig, mask: NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self, camera: StereoCamera, rig_error: RigError, config: VoConfig, mask: NDArray[np.bool_] | None = None
+    ) -> None:
         self._camera = camera
+        self._rig_error = rig_error
         self._config = config
         self._mask = None if mask is None else np.ascontiguousarray(mask.astype(np.uint8) * 255)
         self._reference: _Features | None = None
@@ -46,21 +52,24 @@ class DescriptorFrontend:
         pairs = opencv.match_mutual(bits_left, bits_right)
         left, bits = uv_left[pairs[:, 0]].astype(np.float64), bits_left[pairs[:, 0]]
         matched = uv_right[pairs[:, 1]].astype(np.float64)
-        d, row_error = left[:, 0] - matched[:, 0], np.abs(left[:, 1] - matched[:, 1])
-        limit = self._config.max_disparity_share * self._camera.width
-        good = (d >= self._config.min_disparity_px) & (d <= limit) & (row_error <= 2 * self._config.max_row_error_px)
-        uvd = np.column_stack([left[:, 0], 0.5 * (left[:, 1] + matched[:, 1]), d])
-        self._current = _Features(uvd[good], bits[good])
+        row_error = matched[:, 1] - left[:, 1]
+        uvd = np.column_stack([left[:, 0], 0.5 * (left[:, 1] + matched[:, 1]), left[:, 0] - matched[:, 0]])
+        config = self._config
+        limit = config.max_disparity_share * self._camera.width
+        good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, 2 * config.max_row_error_px)
+        self._current = _Features(uvd[good], row_error[good], bits[good])
         self._detected = len(uv_left)
-        repeated = before is not None and all(np.array_equal(a, b) for a, b in zip(before, self._images, strict=True))
-        return Observation(image_stats(frame.left, opencv.halve(frame.left)), repeated)
+        left_same, right_same = (before is not None and np.array_equal(before[k], self._images[k]) for k in range(2))
+        stats = image_stats(frame.left, opencv.halve(frame.left))
+        return Observation(stats, left_same and right_same, right_same and not left_same)
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
         """Match descriptors to the frame before; the guess is not used."""
         if self._reference is None or self._current is None:
             return EMPTY
         pairs = opencv.match_mutual(self._reference.bits, self._current.bits)
-        return Matches(self._reference.uvd[pairs[:, 0]], self._current.uvd[pairs[:, 1]], len(pairs))
+        i, j = pairs.T
+        return Matches(self._reference.uvd[i], self._current.uvd[j], self._current.row_error[j], len(pairs))
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """See :class:`gpvo.vo.frontend.Frontend`."""

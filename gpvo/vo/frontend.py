@@ -8,33 +8,68 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
+from gpvo.types import Array, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.image import ImageStats
+from gpvo.vo.rig_error import RigError
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What is known of a frame before any motion: its statistics, and whether it repeats the frame before bit by
-    bit."""
+    """What is known of a frame before any motion.
+
+    ``repeated``, ``right_repeated``: the pair, or its right picture alone, is that of the frame before bit by bit.
+    ``right_light``: how many times brighter or fuller of contrast the right picture is; 1 where they are alike.
+    """
 
     stats: ImageStats | None
     repeated: bool
+    right_repeated: bool = False
+    right_light: float = 1.0
+
+
+@dataclass(frozen=True)
+class RightSearch:
+    """How points of the left picture fared in the right one, while both could still be compared.
+
+    Of ``sought`` points ``found`` gave a measurement, ``behind`` lie behind the cameras and ``off_row`` in another row.
+    ``row_error_px`` (n,): right row less left row, of points followed from the frame before; ``row_motion_px`` (n,): by
+    how much these moved down the left picture.
+    """
+
+    sought: int
+    found: int
+    behind: int
+    off_row: int
+    row_error_px: Array
+    row_motion_px: Array
 
 
 @dataclass(frozen=True)
 class Matches:
     """The same points in the reference and the current frame: (u, v, d) [px], each (N, 3).
 
-    ``n_tracked``: points found again in the left image, with or without a right one.
+    ``row_error`` (N,): row in the right image less that in the left one, in the current frame [px]. ``n_tracked``:
+    points found again in the left image, with or without a right one. ``spare`` (N,) marks weaker points where the
+    strong ones leave the picture empty: they do not decide the motion, but may speak against it; None for none.
+    ``right``: how the search in the right image went. ``sought_uvd`` (M, 3): all points of the reference.
     """
 
     uvd_prev: Array
     uvd_cur: Array
+    row_error: Array
     n_tracked: int
+    spare: NDArray[np.bool_] | None = None
+    right: RightSearch | None = None
+    sought_uvd: Array | None = None
+
+    @property
+    def strong(self) -> NDArray[np.bool_]:
+        """(N,) the points that decide the motion."""
+        return np.ones(len(self.uvd_cur), bool) if self.spare is None else ~self.spare
 
 
-EMPTY = Matches(np.empty((0, 3)), np.empty((0, 3)), 0)
+EMPTY = Matches(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), 0)
 
 
 class Frontend(Protocol):
@@ -60,24 +95,26 @@ class Frontend(Protocol):
 class TrackFrontend:
     """For stereo tracks: points are matched by their identity."""
 
-    def __init__(self, camera: StereoCamera, config: VoConfig) -> None:
+    def __init__(self, rig_error: RigError, config: VoConfig) -> None:
+        self._rig_error = rig_error
         self._min_disparity_px = config.min_disparity_px
         self._max_row_error_px = config.max_row_error_px
         self._previous: tuple[NDArray[np.int64], Array] | None = None
         self._current: tuple[NDArray[np.int64], Array] | None = None
+        self._row_error: Array = np.empty(0)
         self._detected = 0
 
     def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
         """Take in a :class:`TrackFrame`; a non-finite pixel or an impossible disparity drops its point."""
         assert isinstance(frame, TrackFrame)
         left, right = np.asarray(frame.uv_left, np.float64), np.asarray(frame.uv_right, np.float64)
-        d, row_error = left[:, 0] - right[:, 0], np.abs(left[:, 1] - right[:, 1])
-        with np.errstate(invalid="ignore"):
-            good = (d >= self._min_disparity_px) & (row_error <= max(self._max_row_error_px, 3.0))
-        uvd = np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), d], 1)
+        uvd = np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), left[:, 0] - right[:, 0]], 1)
+        row_error = right[:, 1] - left[:, 1]
+        good = self._rig_error.allows(uvd, row_error, self._min_disparity_px, np.inf, max(self._max_row_error_px, 3.0))
         self._detected = len(left)
         track, first = np.unique(frame.track[good], return_index=True)
         before, self._current = self._current, (track, uvd[good][first])
+        self._row_error = row_error[good][first]
         repeated = before is not None and len(track) > 0 and np.array_equal(before[1], self._current[1])
         return Observation(None, repeated)
 
@@ -86,7 +123,7 @@ class TrackFrontend:
         if self._previous is None or self._current is None:
             return EMPTY
         _, i, j = np.intersect1d(self._previous[0], self._current[0], assume_unique=True, return_indices=True)
-        return Matches(self._previous[1][i], self._current[1][j], len(i))
+        return Matches(self._previous[1][i], self._current[1][j], self._row_error[j], len(i))
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """See :class:`Frontend`."""

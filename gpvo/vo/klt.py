@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
-from gpvo.vo.frontend import EMPTY, Matches, Observation
-from gpvo.vo.image import image_stats
+from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
+from gpvo.vo.image import Light, image_stats, in_light_of
 from gpvo.vo.motion import transfer
 from gpvo.vo.opencv import Image, Points
+from gpvo.vo.rig_error import RigError
+from gpvo.vo.rivals import cells
 
 
 @dataclass
@@ -30,29 +32,49 @@ class _View:
     right: Image
     half_left: Image
     half_right: Image
+    light_left: Light
+    right_as_left: Image  # the right picture in the left's light
     survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) of the half image, disparity of a quarter one
     uvd: Array  # (N, 3) points usable as reference
     left_uv: Points  # (N, 2) their positions in the left image, the templates' centres
+    strong: int = 0  # the points from here on are spare ones
 
 
 @dataclass(frozen=True)
 class _New:
-    """New corners of the current frame: how many were found, and those (N, 2) with their measurement (N, 3)."""
+    """New corners of the current frame: how many were found, and those (N, 2) with their measurement (N, 3).
+
+    ``strong``: how many of them are the image's best; after them come spare ones.
+    """
 
     detected: int
     left_uv: Points
     uvd: Array
+    strong: int = 0
+
+    @classmethod
+    def of(cls, detected: int, uv: Points, uvd: Array, good: NDArray[np.bool_]) -> _New:
+        """From corners (M, 2), the first ``detected`` of them strong, and which have a measurement."""
+        return cls(detected, uv[good], uvd[good], int(good[:detected].sum()))
 
 
 _NO_POINTS: Points = np.empty((0, 2), np.float32)
 _NONE_NEW = _New(0, _NO_POINTS, np.empty((0, 3)))
 
 
+def _equal(half_a: Image, half_b: Image, a: Image, b: Image) -> bool:
+    """Whether two images are equal; comparing the small ones first leaves the costly comparison to repetitions."""
+    return np.array_equal(half_a, half_b) and np.array_equal(a, b)
+
+
 class KltFrontend:
     """See the module's text. One instance per run; not for use from several threads at once."""
 
-    def __init__(self, camera: StereoCamera, config: VoConfig, mask: NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self, camera: StereoCamera, rig_error: RigError, config: VoConfig, mask: NDArray[np.bool_] | None = None
+    ) -> None:
         self._camera = camera
+        self._rig_error = rig_error
         self._config = config
         half = None if mask is None else mask[: camera.height // 2 * 2 : 2, : camera.width // 2 * 2 : 2]
         self._half_mask = None if half is None else np.ascontiguousarray(half.astype(np.uint8) * 255)
@@ -68,17 +90,21 @@ class KltFrontend:
         assert isinstance(frame, StereoFrame)
         before = self._current
         half_left, half_right = opencv.halve(frame.left), opencv.halve(frame.right)
+        light_left, light_right = Light.of(half_left), Light.of(half_right)
+        right = in_light_of(frame.right, light_right, light_left)
         # New corners and rough depth are wanted only after the motion; they are found beside it.
         survey = self._pool.submit(self._survey, half_left, half_right)
-        self._current = _View(frame.left, frame.right, half_left, half_right, survey, np.empty((0, 3)), _NO_POINTS)
-        # Comparing the small images first leaves the costly comparison to true repetitions.
-        repeated = (
-            before is not None
-            and np.array_equal(before.half_left, half_left)
-            and np.array_equal(before.left, frame.left)
-            and np.array_equal(before.right, frame.right)
+        self._current = _View(
+            frame.left, frame.right, half_left, half_right, light_left, right, survey, np.empty((0, 3)), _NO_POINTS
         )
-        return Observation(image_stats(frame.left, half_left), bool(repeated))
+        same_left = before is not None and _equal(before.half_left, half_left, before.left, frame.left)
+        same_right = before is not None and _equal(before.half_right, half_right, before.right, frame.right)
+        return Observation(
+            image_stats(frame.left, half_left),
+            same_right and same_left,
+            same_right and not same_left,
+            light_left.ratio(light_right),
+        )
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
         """Follow the reference's points into the left image, then find each in the right one."""
@@ -87,23 +113,28 @@ class KltFrontend:
             return EMPTY
         config = self._config
         uvd, left_uv, guess = reference.uvd, reference.left_uv, self._predict(T_prev_cur_guess)
+        index = np.arange(len(uvd))
         if from_scratch:
-            chosen, uv = self._match_descriptors(reference, current)
-            uvd, left_uv = uvd[chosen], left_uv[chosen]
+            index, uv = self._match_descriptors(reference, current)
+            uvd, left_uv = uvd[index], left_uv[index]
             guess = np.column_stack([uv, uvd[:, 2]])
+        left = in_light_of(current.left, current.light_left, reference.light_left)
         cur_left, found = opencv.track(
-            reference.left, current.left, left_uv, guess[:, :2], config.klt_window_px, config.klt_levels
+            reference.left, left, left_uv, guess[:, :2], config.klt_window_px, config.klt_levels
         )
-        uvd, cur_left, disparity = uvd[found], cur_left[found], guess[found, 2]
+        uvd, from_left, cur_left, disparity = uvd[found], left_uv[found], cur_left[found], guess[found, 2]
+        spare = index[found] >= reference.strong
         # One search in the right image serves both the followed points and the new corners between them.
-        new_uv, new_disparity = self._new_corners(current, cur_left)
+        new_uv, new_disparity, detected = self._new_corners(current, cur_left)
         both_uv = np.concatenate([cur_left, new_uv])
-        both_uvd, both_good = self._find_right(current, both_uv, np.concatenate([disparity, new_disparity]))
+        both_uvd, both_good, row_error = self._find_right(current, both_uv, np.concatenate([disparity, new_disparity]))
         n = len(cur_left)
-        self._new = _New(len(new_uv), new_uv[both_good[n:]], both_uvd[n:][both_good[n:]])
+        self._new = _New.of(detected, new_uv, both_uvd[n:], both_good[n:])
         uvd_cur, good = both_uvd[:n], both_good[:n]
         self._matched_left, self._matched_uvd = cur_left[good], uvd_cur[good]
-        return Matches(uvd[good], uvd_cur[good], int(found.sum()))
+        right = self._right_search(both_uvd, both_good, row_error, cur_left[:, 1] - from_left[:, 1])
+        row_error = row_error[:n][good]
+        return Matches(uvd[good], uvd_cur[good], row_error, int((~spare).sum()), spare[good], right, reference.uvd)
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """Carry on the inliers, and add new corners where there are none."""
@@ -111,17 +142,18 @@ class KltFrontend:
         assert current is not None
         if inliers is None:
             self._matched_left, self._matched_uvd = _NO_POINTS, np.empty((0, 3))
-            new_uv, disparity = self._new_corners(current, _NO_POINTS)
-            new_uvd, good = self._find_right(current, new_uv, disparity)
-            self._new = _New(len(new_uv), new_uv[good], new_uvd[good])
+            new_uv, disparity, detected = self._new_corners(current, _NO_POINTS)
+            new_uvd, good, _ = self._find_right(current, new_uv, disparity)
+            self._new = _New.of(detected, new_uv, new_uvd, good)
             inliers = np.zeros(0, bool)
         uv, new = self._matched_left[inliers], self._new
         current.left_uv = np.concatenate([uv, new.left_uv])
         current.uvd = np.concatenate([self._matched_uvd[inliers], new.uvd])
-        if len(current.uvd) >= at_least:
+        current.strong = len(uv) + new.strong
+        if current.strong >= at_least:
             self._reference = current
         self._matched_left, self._matched_uvd, self._new = _NO_POINTS, np.empty((0, 3)), _NONE_NEW
-        return len(uv) + new.detected, len(current.uvd)
+        return len(uv) + new.detected, current.strong
 
     def _predict(self, T_prev_cur: Array) -> Array:
         """(N, 3) where the guess puts the reference's points; the old place for those it puts out of sight."""
@@ -138,37 +170,70 @@ class KltFrontend:
         config = self._config
         limit = int(config.max_disparity_share * self._camera.width / 4)
         found = opencv.corners(
-            half_left, config.max_features, config.corner_quality, config.min_distance_px / 2, self._half_mask
+            half_left, 2 * config.max_features, config.corner_quality, config.min_distance_px / 2, self._half_mask
         )
         return found, opencv.coarse_disparity(opencv.halve(half_left), opencv.halve(half_right), limit)
 
-    def _new_corners(self, view: _View, taken_uv: Points) -> tuple[Points, Array]:
-        """Corners (N, 2) away from those taken, on even pixels of the full image, and their rough disparity (N,)."""
+    def _new_corners(self, view: _View, taken_uv: Points) -> tuple[Points, Array, int]:
+        """Corners (N, 2) away from those taken, on even pixels of the full image, and their rough disparity (N,).
+
+        The first of them, whose number comes last, are the image's best; the others stand alone in their parts of it.
+        """
         corners, coarse = view.survey.result()
-        uv = corners * 2.0
+        uv, limit = corners * 2.0, self._config.max_features
+        free = np.ones(len(uv), bool)
         if len(taken_uv) and len(uv):
             # Axis by axis in float32: a tenth of the time of a sum over the last axis.
             (x, y), (taken_x, taken_y) = uv.T, taken_uv.astype(np.float32).T
             distance2 = (x[:, None] - taken_x) ** 2 + (y[:, None] - taken_y) ** 2
-            uv = uv[distance2.min(1) > self._config.min_distance_px**2]
-        uv = uv[: self._config.max_features - len(taken_uv)]
+            free = distance2.min(1) > self._config.min_distance_px**2
+        best = uv[:limit][free[:limit]][: max(limit - len(taken_uv), 0)]
+        uv = np.concatenate([best, self._alone(uv[limit:][free[limit:]], np.concatenate([best, taken_uv]))])
         column, row = (uv / 4).astype(int).T
         near = coarse[np.clip(row, 0, coarse.shape[0] - 1), np.clip(column, 0, coarse.shape[1] - 1)]
         known = near >= 0
         # Where the block matcher saw nothing, the median of what it saw is the fairest start.
         default = np.median(near[known]) if known.any() else 2.0
-        return uv, 4.0 * np.where(known, near, default)
+        return uv, 4.0 * np.where(known, near, default), len(best)
 
-    def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, 3) measurements of left points, from a guessed disparity; and which of them can be believed."""
+    def _alone(self, uv: Points, taken_uv: Points) -> Points:
+        """The strongest of the corners (N, 2) in each cell of the image that holds none of those taken."""
+        cell, taken = (cells(a, self._camera) for a in (uv, taken_uv))
+        chosen, first = np.unique(cell, return_index=True)
+        return uv[first[~np.isin(chosen, taken)]]
+
+    def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_], Array]:
+        """(N, 3) measurements of left points, from a guessed disparity; which of them can be believed; and by how much
+        the right row lies below the left one, NaN where nothing was found."""
         config = self._config
         guess = np.column_stack([uv_left[:, 0] - disparity, uv_left[:, 1]])
-        uv_right, found = opencv.track(view.left, view.right, uv_left, guess, config.klt_window_px, 2)
+        uv_right, found = opencv.track(view.left, view.right_as_left, uv_left, guess, config.klt_window_px, 2)
         d = uv_left[:, 0].astype(np.float64) - uv_right[:, 0]
         row_error = uv_right[:, 1].astype(np.float64) - uv_left[:, 1]
         uvd = np.column_stack([uv_left[:, 0], uv_left[:, 1] + 0.5 * row_error, d])
-        good = found & (d >= config.min_disparity_px) & (d <= config.max_disparity_share * self._camera.width)
-        return uvd, good & (np.abs(row_error) <= config.max_row_error_px)
+        limit = config.max_disparity_share * self._camera.width
+        good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, config.max_row_error_px)
+        return uvd, found & good, np.where(found, row_error, np.nan)
+
+    def _right_search(self, uvd: Array, good: NDArray[np.bool_], row_error: Array, row_motion: Array) -> RightSearch:
+        """What the search in the right image came to; the first points were followed and have moved down so far."""
+        d_expected, row_expected = self._rig_error.errors(uvd)
+        disparity, row_error = uvd[:, 2] - d_expected, row_error - row_expected
+        # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
+        usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
+        n, off_row = len(row_motion), np.abs(row_error - usual) > self._config.max_row_error_px
+        behind = np.isfinite(row_error) & ~off_row & (disparity < -self._config.min_disparity_px)
+        # Points at infinity have no measurable depth, which is nobody's fault.
+        far = np.isfinite(row_error) & (np.abs(disparity) < self._config.min_disparity_px)
+        seen = np.abs(row_error[:n]) < self._config.klt_window_px
+        return RightSearch(
+            len(uvd) - int(far.sum()),
+            int((good & ~off_row).sum()),
+            int(behind.sum()),
+            int(off_row.sum()),
+            row_error[:n][seen],
+            row_motion[seen],
+        )
 
     def _match_descriptors(self, reference: _View, current: _View) -> tuple[NDArray[np.int64], Points]:
         """Reference points (indices) and their places in the current left image, without any guess."""

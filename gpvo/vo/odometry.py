@@ -12,18 +12,21 @@ from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFr
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
-from gpvo.vo.frontend import EMPTY, Frontend, Matches
+from gpvo.vo.frontend import EMPTY, Frontend, Matches, Observation
 from gpvo.vo.imu_moments import ImuMoments
 from gpvo.vo.motion import Motion, refine
+from gpvo.vo.pairwatch import PairWatch
 from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
+from gpvo.vo.rig_error import RigError, RigState
+from gpvo.vo.rivals import areas, unexplained
 from gpvo.vo.sigmas import SigmaEstimator
 
 
 @dataclass(frozen=True)
 class Followed:
-    """The matches of one motion, and which of them (N,) agree with it."""
+    """The matches of one motion as measured, and which of them (N,) agree with it."""
 
     matches: Matches
     inliers: NDArray[np.bool_]
@@ -37,21 +40,33 @@ class StereoOdometry:
     camera : the rectified pair.
     config : settings; default the preset ``fast``.
     mask : (H, W) bool, where the left image may be used.
+    known : what is known of the calibration's errors; default nothing, or with ``self_calibration`` off that there are
+        none.
 
     Frames must be rectified and of the camera's size, in time order. ``last``: the points behind the last motion, for
-    drawing.
+    drawing. ``pair``: what is wrong with the pairs of pictures; ``rig_error``: with the calibration.
     """
 
     def __init__(
-        self, camera: StereoCamera, config: VoConfig | None = None, mask: NDArray[np.bool_] | None = None
+        self,
+        camera: StereoCamera,
+        config: VoConfig | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        known: RigState | None = None,
     ) -> None:
         self.camera = camera
         self.config = config or VoConfig()
         self._mask = mask
+        if self.config.self_calibration:
+            self.rig_error = RigError(camera, known)
+        else:
+            self.rig_error = RigError(camera, known or RigState.exact(), learn=False)
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
         self._state: _State | None = None
         self._imu = ImuMoments.of(None)  # since the reference
+        self.pair = PairWatch(camera)
+        self._raw = EMPTY  # the last matches as measured
         self.last: Followed = Followed(EMPTY, np.zeros(0, bool))
 
     def step(self, frame: StereoFrame | TrackFrame, imu: ImuLog | None = None) -> VoRecord:
@@ -67,7 +82,9 @@ class StereoOdometry:
         """
         clock = Stopwatch()
         check_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
-        frontend = self._frontend = self._frontend or make_frontend(frame, self.camera, self.config, self._mask)
+        frontend = self._frontend = self._frontend or make_frontend(
+            frame, self.camera, self.rig_error, self.config, self._mask
+        )
         seen = frontend.observe(frame)
         clock.lap("observe")
         if self._state is None:
@@ -77,8 +94,20 @@ class StereoOdometry:
             return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **ImuMoments.of(imu).fields())
         guess = self._state.guess(frame.t_ns)
         matches, motion = self._solve(guess, clock)
-        self.last = Followed(matches, np.zeros(len(matches.uvd_cur), bool) if motion is None else motion.inliers)
-        verdict = judge(matches, motion, seen.repeated and self._state.parallax_px > 0.3, self.camera, self.config)
+        doubts = self.pair.step(seen, matches.right)
+        motion = self._choose(matches, motion, guess, doubts)
+        clock.lap("motion")
+        raw = self._raw
+        self.last = Followed(raw, np.zeros(len(raw.uvd_cur), bool) if motion is None else motion.inliers)
+        verdict = judge(
+            matches,
+            motion,
+            self.camera,
+            self.config,
+            frozen=self._state.frozen(seen),
+            usual_inliers=self._state.usual_inliers,
+            doubts=doubts,
+        )
         record = self._record(frame.t_ns, guess, matches, motion, verdict)
         clock.lap("covariance")
         is_reference, counts = self._advance(record, matches, motion)
@@ -99,26 +128,56 @@ class StereoOdometry:
         """Match near the guess; if too little agrees, match without it and keep the better."""
         assert self._frontend is not None
         config = self.config
-        matches = self._frontend.match(guess)
+        matches = self._match(guess)
         clock.lap("match")
         motion = self._estimate(matches)
         clock.lap("motion")
         agreeing = 0 if motion is None else int(motion.inliers.sum())
         if config.preset != "fast" or agreeing >= max(config.weak_inliers, 0.5 * matches.n_tracked):
             return matches, motion
-        again = self._frontend.match(guess, from_scratch=True)
+        again = self._match(guess, from_scratch=True)
         second = self._estimate(again)
         if second is not None and second.inliers.sum() > agreeing:
             matches, motion = again, second
         elif motion is not None:
-            matches = self._frontend.match(guess)  # the first result stands: the front end must hold its points again
+            matches = self._match(guess)  # the first result stands: the front end must hold its points again
         clock.lap("rematch")
         return matches, motion
 
-    def _estimate(self, matches: Matches) -> Motion | None:
-        """P3P in RANSAC on the left image, then the weighted refinement over both."""
+    def _match(self, guess: Array, *, from_scratch: bool = False) -> Matches:
+        """Matches of the front end, freed from what is known of the rig's errors."""
+        assert self._frontend is not None
+        raw = self._raw = self._frontend.match(guess, from_scratch=from_scratch)
+        return replace(raw, uvd_prev=self.rig_error.correct(raw.uvd_prev), uvd_cur=self.rig_error.correct(raw.uvd_cur))
+
+    def _choose(self, matches: Matches, motion: Motion | None, guess: Array, doubts: list[str]) -> Motion | None:
+        """The motion, or its rival among the points that disagree: a second one is added to the doubts.
+
+        Between two the one nearer to the expected motion is taken; without an expectation, the one seen over more.
+        """
+        assert self._state is not None
+        self._state.rival = None
+        free = None if motion is None else unexplained(motion, matches, self.camera, self.config)
+        second = None if free is None else self._estimate(matches, free)
+        covered = (
+            (0, 0) if motion is None or second is None else areas(motion, second, matches, self.camera, self.config)
+        )
+        self._state.rivalry = 0.85 * self._state.rivalry + float(covered[1] > 0)
+        if motion is None or second is None or covered[1] == 0:
+            if self._state.rivalry > 1.5:
+                doubts.append("two motions in the frames before")
+            return motion
+        self._state.rival = motion.inliers | second.inliers
+        doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the picture")
+        off_m = [float(np.linalg.norm((se3.inverse(guess) @ m.T_prev_cur)[:3, 3])) for m in (motion, second)]
+        rival_is_better = off_m[1] < off_m[0] if self._state.twist.any() else covered[1] > covered[0]
+        return second if rival_is_better else motion
+
+    def _estimate(self, matches: Matches, among: NDArray[np.bool_] | None = None) -> Motion | None:
+        """P3P in RANSAC on the left image, then the weighted refinement over both; of the points ``among``, (N,)."""
         camera, config = self.camera, self.config
-        near = matches.uvd_prev[:, 2] > 2 * config.min_disparity_px
+        among = matches.strong if among is None else among
+        near = among & (matches.uvd_prev[:, 2] > 2 * config.min_disparity_px)
         if near.sum() < config.min_inliers:
             return None
         found = opencv.pose_from_points(
@@ -132,7 +191,7 @@ class StereoOdometry:
         if found is None:
             return None
         T_prev_cur = se3.inverse(found[0])
-        close = agrees(T_prev_cur, matches, camera, 2 * config.ransac_threshold_px)
+        close = among & agrees(T_prev_cur, matches, camera, 2 * config.ransac_threshold_px)
         if close.sum() < config.min_inliers:
             return None
         motion = refine(T_prev_cur, matches.uvd_prev[close], matches.uvd_cur[close], camera)
@@ -170,10 +229,13 @@ class StereoOdometry:
             sigma_m_px=sigma_m_px,
             sigma_pairs_px=config.sigma_pairs_px,
         )
+        unknown = np.zeros((6, 6))
+        if config.self_calibration:
+            unknown = self.rig_error.update(motion, matches.row_error[motion.inliers], config.min_disparity_px)
         return replace(
             record,
             T_prev_cur=motion.T_prev_cur,
-            covariances={m: c.full for m, c in by_method.items()},
+            covariances={m: c.full + unknown for m, c in by_method.items()},
             v_t={m: c.v_t for m, c in by_method.items()},
         )
 
@@ -193,11 +255,13 @@ class StereoOdometry:
             state.restart(record.t_ns, counts[1])
             return True, counts
         inliers = motion.inliers
-        state.believe(record.t_ns, record.T_prev_cur, median_parallax_px(matches, inliers))
+        state.believe(record.t_ns, record.T_prev_cur, median_parallax_px(matches, inliers), int(inliers.sum()))
         at_rest = state.parallax_from_reference_px < config.keyframe_parallax_px
-        if at_rest and inliers.sum() > 0.6 * state.reference_points:
+        # Beside a rival the reference stays fresh: what moves otherwise is seen in two frames or never.
+        if at_rest and state.rivalry < 0.2 and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)
-        counts = self._frontend.promote(inliers, at_least=config.min_inliers)
+        kept = inliers if state.rival is None else state.rival
+        counts = self._frontend.promote(kept, at_least=config.min_inliers)
         if counts[1] < config.min_inliers:
             return False, counts
         state.restart(record.t_ns, counts[1])
@@ -216,14 +280,24 @@ class _State:
     parallax_px: float  # median image motion between the last two believed frames
     reference_points: int
     parallax_from_reference_px: float = 0.0
+    usual_inliers: float = 0.0
+    rival: NDArray[np.bool_] | None = None  # the points of the last motion and of its rival, if there was one
+    rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
+
+    def frozen(self, seen: Observation) -> str:
+        """What repeats itself although the camera was moving; empty for nothing."""
+        if seen.right_repeated:
+            return "frozen right picture"
+        return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
 
     def guess(self, t_ns: int) -> Array:
         """Motion from the reference to time ``t_ns`` at constant velocity, for at most half a second."""
         dt_s = min((t_ns - self.t_believed_ns) * 1e-9, 0.5)
         return self.T_ref_believed @ se3.exp(self.twist * dt_s)
 
-    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float) -> None:
+    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int) -> None:
         """Take over a measured motion from the reference."""
+        self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
         step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
         self.twist = step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
         self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)

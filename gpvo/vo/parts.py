@@ -15,6 +15,7 @@ from gpvo.vo.frontend import Frontend, Matches, TrackFrontend
 from gpvo.vo.image import ImageStats
 from gpvo.vo.motion import Motion, transfer
 from gpvo.vo.quality import log10_condition
+from gpvo.vo.rig_error import RigError
 from gpvo.vo.sigmas import residual_sigmas
 
 
@@ -50,19 +51,23 @@ def check_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns
 
 
 def make_frontend(
-    frame: StereoFrame | TrackFrame, camera: StereoCamera, config: VoConfig, mask: NDArray[np.bool_] | None
+    frame: StereoFrame | TrackFrame,
+    camera: StereoCamera,
+    rig_error: RigError,
+    config: VoConfig,
+    mask: NDArray[np.bool_] | None,
 ) -> Frontend:
     """The front end for this kind of frame and preset."""
     # Imported here: tracks need no image code.
     if isinstance(frame, TrackFrame):
-        return TrackFrontend(camera, config)
+        return TrackFrontend(rig_error, config)
     if config.preset == "thesis":
         from gpvo.vo.descriptors import DescriptorFrontend
 
-        return DescriptorFrontend(camera, config, mask)
+        return DescriptorFrontend(camera, rig_error, config, mask)
     from gpvo.vo.klt import KltFrontend
 
-    return KltFrontend(camera, config, mask)
+    return KltFrontend(camera, rig_error, config, mask)
 
 
 def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera) -> dict[str, Any]:

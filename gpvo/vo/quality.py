@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,14 +29,24 @@ def agrees(T_prev_cur: Array, matches: Matches, camera: StereoCamera, threshold_
     return moved.in_front & (np.hypot(off[:, 0], off[:, 1]) < threshold_px) & (np.abs(off[:, 2]) < 1.5 * threshold_px)
 
 
-def judge(matches: Matches, motion: Motion | None, frozen: bool, camera: StereoCamera, config: VoConfig) -> Verdict:
+def judge(
+    matches: Matches,
+    motion: Motion | None,
+    camera: StereoCamera,
+    config: VoConfig,
+    *,
+    frozen: str = "",
+    usual_inliers: float = 0.0,
+    doubts: Sequence[str] = (),
+) -> Verdict:
     """Status of a solved motion.
 
-    ``frozen``: the image repeats the one before bit by bit although the camera was moving. The rig's baseline is the
-    ruler for translation: a motion that is uncertain by half of it is ``degraded``, by five of it ``lost``.
+    ``frozen``: what repeats itself bit by bit although the camera was moving. ``usual_inliers``: of the motions so far.
+    ``doubts``: what others hold against it. The rig's baseline is the ruler for translation: a motion that is uncertain
+    by half of it is ``degraded``, by five of it ``lost``.
     """
     if frozen:
-        return Verdict(Status.LOST, "frozen image")
+        return Verdict(Status.LOST, frozen)
     if motion is None:
         return Verdict(Status.LOST, f"no motion fits the {matches.n_tracked} points found again")
     inliers, tracked = int(motion.inliers.sum()), max(matches.n_tracked, 1)
@@ -44,7 +55,9 @@ def judge(matches: Matches, motion: Motion | None, frozen: bool, camera: StereoC
     sigma_m = worst_translation_sigma_m(motion)
     if not sigma_m < 5 * camera.baseline_m:
         return Verdict(Status.LOST, "the points do not determine the translation")
-    doubts = []
+    doubts = list(doubts)
+    if inliers < usual_inliers / 3:
+        doubts.append(f"only {inliers} points agree where {usual_inliers:.0f} usually do")
     if sigma_m > 0.5 * camera.baseline_m:
         doubts.append(f"translation uncertain by {sigma_m:.2g} m")
     if inliers < config.weak_inliers or inliers < 0.35 * tracked:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpvo.types import Array, VoLog
+from gpvo.types import Array
 
 _START_PX = (0.1, 0.5)
 _MEMORY = 0.97  # of the running mean: about thirty frames
@@ -47,11 +47,3 @@ class SigmaEstimator:
         running = np.array(_START_PX) if self._running is None else np.sqrt(self._running)
         p, m = (float(r) if f is None else f for f, r in zip(self._fixed, running, strict=True))
         return p, m
-
-
-def estimate_sigmas(log: VoLog) -> tuple[float, float]:
-    """(sigma_p, sigma_m) [px] of a whole run: medians over its usable motions; NaN where it holds none."""
-    with np.errstate(all="ignore"):
-        p = [r.residual_sigma_p_px for r in log if r.usable and np.isfinite(r.residual_sigma_p_px)]
-        m = [r.residual_sigma_m_px for r in log if r.usable and np.isfinite(r.residual_sigma_m_px)]
-    return (float(np.median(p)), float(np.median(m))) if p and m else (float("nan"), float("nan"))

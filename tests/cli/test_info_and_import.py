@@ -282,7 +282,9 @@ def test_run_says_what_the_source_remarks(gpvo, tmp_path):
     assert code == 0
     assert json.loads(out)["frames"] == 12
     assert err.count("poses on '/vicon/head/head' not used as truth") == 1
-    code, _, err = gpvo("run", path, "-o", tmp_path / "run", "--preset", "thesis", "--truth-topic", "none")
+    code, _, err = gpvo(
+        "run", path, "-o", tmp_path / "run", "--overwrite", "--preset", "thesis", "--truth-topic", "none"
+    )
     assert (code, err) == (0, "")
 
 

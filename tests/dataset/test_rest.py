@@ -140,7 +140,7 @@ def test_waits_with_a_wandering_truth_spoil_a_model_that_learns_from_them(tmp_pa
     def nll(waits):
         moved = [(log, wandering(truth, 0.1, 0.3, AT_REST_S)) for log, truth in flights[:6]]
         learned = fit_model([build(*f, name=str(i), waits=waits) for i, f in enumerate(moved)], TrainConfig())
-        said = [estimate_set(learned, s) for s in tests]
+        said = [estimate_set(learned.model, s) for s in tests]
         return np.mean([nll_per_dim(s.Y - e.mean, e.covariance).mean() for s, e in zip(tests, said, strict=True)])
 
     assert nll("drop") < nll("keep") - 0.05

@@ -26,17 +26,17 @@ from gpvo.types import Mounting, Prediction, Status, TruthLog, VoLog
 from small_model import small_model
 from synthetic_runs import make_run as synthetic_run
 
+from motion_errors import prediction
+
 RUN_KEYS = {"run", "source", "frames", "lost", "path_length_m", "ate_rmse_m", "rmse_origin_m", "final_error_m"}
 METHOD_KEYS = {"nees_dof", "nees_dof_median", "coverage", "nll_per_dim", "crps", "predicted_final_error_m", "horizons"}
 
 
 def predictions_of(log: VoLog) -> list[Prediction]:
     C = stated_covariance()
-    parts = {"jitter": 0.3 * C, "white": 0.5 * C, "bias": 0.2 * C}
+    parts = [share * C for share in (0.3, 0.5, 0.2)]
     made = (r for r in log if r.status is not Status.START)
-    return [
-        Prediction(r.t_ns, r.dt_s, np.zeros(6), C, parts, np.ones(6), np.zeros(6), 0.9, 1.0, r.status) for r in made
-    ]
+    return [replace(prediction(r.t_ns, *parts, dt_s=r.dt_s, confidence=0.9), status=r.status) for r in made]
 
 
 @pytest.fixture(scope="module")

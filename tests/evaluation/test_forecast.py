@@ -174,7 +174,7 @@ def test_forecast_along_unseen_simulated_flights(tmp_path):
     from gpvo.learning.train import train_sets
 
     campaign = Campaign("tunnel-clean", tmp_path, 10.0)
-    config = TrainConfig(features="velocity,rotation,n_inliers", noise_inducing=32)
+    config = TrainConfig(features="velocity,rotation,n_inliers")
     predictor = train_sets(
         [build_run(r) for r in flights(campaign, range(1000, 1010))], config, judge=False
     ).predictor()

@@ -9,13 +9,13 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from gpvo.accumulation import along
 from gpvo.errors import GpvoError
-from gpvo.evaluation.accumulate import Step, along
 from gpvo.io import open_source
 from gpvo.io.run import read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
-from gpvo.types import Status, StereoCamera
+from gpvo.types import MotionError, Status, StereoCamera
 
 
 def test_without_rerun_one_line_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,6 +60,6 @@ def test_the_path_goes_on_over_a_break(tmp_path: Path, monkeypatch: pytest.Monke
     assert any(r.status is Status.LOST and r.is_reference for r in log)
     assert len(view._path) == 1 + log.usable.sum()
     np.testing.assert_allclose(view._path[-1], log.trajectory()[-1, :3, 3], atol=1e-9)
-    steps = [Step.independent(r.T_prev_cur, C) for r, C in zip(log, log.covariance(log.methods[0]), strict=True)]
-    sigma = np.sqrt(np.linalg.eigvalsh(along(steps, log.parent)[-1, :3, :3]))
+    errors = [MotionError.independent(C) for C in log.covariance(log.methods[0])]
+    sigma = np.sqrt(np.linalg.eigvalsh(along(log.T_prev_cur, errors, log.parent)[1][-1, :3, :3]))
     np.testing.assert_allclose(viewer.Ellipsoids3D.call_args.kwargs["half_sizes"], [3 * sigma], rtol=1e-6)

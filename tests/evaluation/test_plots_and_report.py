@@ -117,7 +117,7 @@ def test_the_table_shows_the_numbers_of_json(evaluation, page):
     expected += [m["nees_dof_median"]["joint"], m["nees_dof_truth_noise"]["joint"]]
     expected += [m["one_second"][name] for name in ("nees_dof", "nees_dof_truth_noise")]
     expected += [100 * m["coverage"][k] for k in "123"]
-    expected += [m["nll_per_dim"], 1000 * m["crps"]["translation_m"], m["predicted_final_error_m"]]
+    expected += [m["nll_per_dim"], 1000 * m["energy"]["translation_m"], m["predicted_final_error_m"]]
     assert rows["triangulation"][1:] == [shown(v) for v in expected]
     assert rows["triangulation_vt"][1] == "–"
     reached = [s for s in run["segments"] if s["count"]]
@@ -131,7 +131,10 @@ def test_the_table_shows_the_numbers_of_json(evaluation, page):
 def test_the_scene_is_centred_and_has_ellipsoids(evaluation):
     s = scene(evaluation)
     assert len(s["est"]) == len(s["true"]) == 301
-    assert np.abs(s["true"]).max() == pytest.approx(s["size"], abs=1e-4)
+    ends = [
+        np.array(o["at"]) + sign * np.array(axis) for o in s["ellipsoids"] for axis in o["axes"] for sign in (1, -1)
+    ]
+    assert max(np.abs(s["true"]).max(), np.abs(ends).max()) <= s["size"] + 1e-4 <= 3 * np.abs(s["true"]).max()
     assert len(s["ellipsoids"]) == 9
     axes = np.array(s["ellipsoids"][-1]["axes"])
     half = np.linalg.norm(axes, axis=1)
@@ -217,6 +220,25 @@ def test_a_browser_shows_the_page_without_errors(page, tmp_path, width):
     document.body.dataset.wide = document.documentElement.scrollWidth - window.innerWidth;
     document.body.dataset.drawn = document.querySelectorAll("figure.panel svg path").length;
     document.body.dataset.fetched = performance.getEntriesByType("resource").length;
+    const drawn = () => document.querySelectorAll("figure.panel svg path").length, before = drawn();
+    document.querySelector("figure.panel figcaption button").click();
+    document.body.dataset.hidden = before - drawn();
+    document.querySelector("figure.panel figcaption button").click();
+    document.body.dataset.back = before - drawn();
+    const svg = document.querySelector("svg.timed"), box = svg.getBoundingClientRect();
+    const move = (type, share) => svg.dispatchEvent(new PointerEvent(type,
+      { clientX: box.left + share * box.width, pointerType: "mouse", bubbles: true }));
+    move("pointermove", 0.5);
+    document.body.dataset.values = svg.parentElement.querySelector(".values").textContent.split("\\n").length;
+    const timed = () => [...document.querySelectorAll("svg.timed")];
+    const ticks = () => timed().map(s => s.querySelector("text").textContent).join();
+    const whole = ticks();
+    move("pointerdown", 0.4);
+    move("pointerup", 0.6);
+    document.body.dataset.zoomed = ticks() !== whole;
+    document.querySelector("svg.timed").dispatchEvent(new MouseEvent("dblclick"));
+    document.body.dataset.unzoomed = ticks() === whole;
+    document.body.dataset.verdict = document.querySelector(".verdict strong").textContent;
     document.body.dataset.letters = getComputedStyle(document.querySelector("figure text")).fontSize;
     </script></body>"""
     (tmp_path / "report.html").write_text(page.replace("</body>", probe), encoding="utf-8")
@@ -226,11 +248,22 @@ def test_a_browser_shows_the_page_without_errors(page, tmp_path, width):
         "--dump-dom", (tmp_path / "report.html").as_uri(),
     ]  # fmt: skip
     shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    found = dict(re.findall(r'data-(wide|drawn|fetched|letters)="([^"]*)"', shown.stdout))
+    found = dict(
+        re.findall(
+            r'data-(wide|drawn|fetched|letters|hidden|back|values|zoomed|unzoomed|verdict)="([^"]*)"', shown.stdout
+        )
+    )
     assert int(found["wide"]) <= 0
     assert int(found["drawn"]) >= 13
     assert found["fetched"] == "0"
     assert found["letters"] == "12px"
+    # A click on a name hides its curve wherever it is drawn, and another brings it back.
+    assert int(found["hidden"]) >= 1
+    assert found["back"] == "0"
+    # The pointer shows the time and what each curve has there; dragging zooms all times together.
+    assert int(found["values"]) >= 2
+    assert (found["zoomed"], found["unzoomed"]) == ("true", "true")
+    assert found["verdict"] == "The triangulation covariance is true here, per motion and over distance."
     # Drawing sets the size of the canvas.
     assert re.search(r'<canvas[^>]* width="\d+"', shown.stdout)
     # The page forbids itself to fetch anything: an attempt would be an error here, as any other would.

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.filters import metrics
-from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy, split_noise
+from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy
 from gpvo.filters.run import FuseOptions, fuse_flight
 from gpvo.filters.side_by_side import fuse_side_by_side
 from gpvo.filters.study import Constants, Study, fit_scalars, has_noise, make_policies, study, table
 from gpvo.filters.synthetic import ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
-from gpvo.types import Prediction, Status, VoRecord
+from gpvo.types import Status, VoRecord
 
 
 def test_ate_agrees_with_evo() -> None:
@@ -55,23 +55,6 @@ def test_divergence() -> None:
     assert metrics.diverged(np.array([0.0, np.nan]), 10.0)
     assert metrics.diverged(np.array([0.0, 3.0]), 10.0)
     assert not metrics.diverged(np.array([0.0, 3.0]), 100.0)
-
-
-def test_parts_sum_to_the_total_and_a_bias_without_time_constant_is_white() -> None:
-    rng = np.random.default_rng(2)
-    J, W, B = (A @ A.T for A in rng.standard_normal((3, 6, 6)))
-    L, zero = rng.standard_normal((6, 6)), np.zeros(6)
-    B = B + L @ L.T
-    parts = {"jitter": J, "white": W, "bias": B}
-    stated = Prediction(0, 0.1, zero, J + W + B, parts, np.full(6, 3.0), zero, 1.0, 1.0, Status.OK, L, np.full(6, 9.0))
-    noise = split_noise(np.zeros((1, 6)), J + W + B, stated)
-    assert noise.jitter is not None
-    np.testing.assert_array_equal(noise.bias_tau_s, [3.0] * 6 + [9.0] * 6)
-    np.testing.assert_array_equal(noise.bias_root[0, :, 6:], L)
-    np.testing.assert_allclose(noise.white + noise.jitter + noise.bias_covariance, (J + W + B)[None], atol=1e-9)
-    noise = split_noise(np.zeros((1, 6)), J + W + B, replace(stated, bias_tau_s=np.full(6, np.nan)))
-    assert noise.bias_root is None
-    np.testing.assert_allclose(noise.white, (W + B)[None], atol=1e-9)
 
 
 def test_constant_widens_over_lost_frames_and_scales_by_block() -> None:

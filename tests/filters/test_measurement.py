@@ -14,6 +14,7 @@ from gpvo.filters.run import FuseOptions, begin, make_filter
 from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
+from gpvo.types import MotionError
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-5, 5e-3, 0.5, 1.5])
@@ -42,14 +43,14 @@ def test_jacobian_of_the_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     camera = me.CameraOnImu.of(FORWARD_CAMERA @ se3.exp(rng.standard_normal(6) * 0.3))
     R0, p0, R1, p1 = _random_poses(rng)
-    bias_root = rng.standard_normal((1, 6, 12)) * 0.01
+    error = replace(MotionError.independent(np.eye(6)[None]), persistent_root=rng.standard_normal((1, 6, 12)) * 0.01)
 
     def motion(dx: np.ndarray) -> np.ndarray:
         """``Exp(-n_ref) T Exp(n_cur + b)`` of the perturbed state, as the measurement's law has it."""
         ref = camera.pose(p0 + dx[me.CLONE_P], R0 @ se3.so3_exp(dx[None, me.CLONE_TH]))
         cur = camera.pose(p1 + dx[P], R1 @ se3.so3_exp(dx[None, TH]))
         R, t = me.relative_motion(*ref, *cur)
-        late = se3.exp(dx[me.JITTER_CUR] + bias_root[0] @ dx[me.BIAS])
+        late = se3.exp(dx[me.JITTER_CUR] + error.persistent_root[0] @ dx[me.BIAS])
         return se3.exp(-dx[me.JITTER_REF]) @ se3.from_rt(R[0], t[0]) @ late
 
     T = motion(np.zeros(me.JOINT))
@@ -65,7 +66,7 @@ def test_jacobian_of_the_motion(seed: int) -> None:
     R_ref, p_ref = camera.pose(p0, R0)
     R_cur, p_cur = camera.pose(p1, R1)
     R, t = me.relative_motion(R_ref, p_ref, R_cur, p_cur)
-    me.jacobian(H, camera, R_ref, R_cur, R, t, bias_root)
+    me.jacobian(H, camera, R_ref, R_cur, R, t, error)
     np.testing.assert_allclose(H[0], numeric, atol=1e-8)
 
     xi = rng.standard_normal(6) * 0.1

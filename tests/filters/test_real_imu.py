@@ -14,7 +14,9 @@ from gpvo.filters.run import Flight, fuse_flight, vertical_in_world
 from gpvo.filters.sanity import check_flight
 from gpvo.geometry import se3
 from gpvo.io import open_source
-from gpvo.types import Prediction, Status, VoRecord
+from gpvo.types import Status, VoRecord
+
+from motion_errors import prediction
 
 SIGMA = np.array([5e-3] * 3 + [3e-3] * 3)
 
@@ -35,10 +37,7 @@ def flight() -> Flight:
         t = int(t_ns[k])
         T_est = se3.inverse(T[k - 1]) @ T[k] @ se3.exp(SIGMA * rng.standard_normal(6))
         records.append(VoRecord(t, int(t_ns[k - 1]), Status.OK, T_est))
-        parts = {"jitter": zero, "white": C, "bias": zero}
-        predictions[t] = Prediction(
-            t, 0.05, np.zeros(6), C, parts, np.full(6, np.inf), np.zeros(6), 1.0, 1.0, Status.OK
-        )
+        predictions[t] = prediction(t, zero, C, zero, np.inf, dt_s=0.05)
     return Flight("room1", records, source.imu, source.mounting.T_imu_cam, T, valid, predictions)
 
 

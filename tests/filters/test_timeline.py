@@ -19,6 +19,8 @@ from gpvo.types import ImuLog, Status, VoRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from motion_errors import prediction
+
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
@@ -278,13 +280,12 @@ def test_standing_still_against_one_reference_does_not_grow(flight: Flight) -> N
     gyro = 2e-4 * np.sqrt(200) * rng.standard_normal((n + 1, 3))
     acc = np.array([0, 0, 9.80665]) + 2e-3 * np.sqrt(200) * rng.standard_normal((n + 1, 3))
     predictions, records = {}, [VoRecord(0, 0, Status.START, np.eye(4))]
-    template = next(iter(flight.predictions.values()))
+    template, zero = next(iter(flight.predictions.values())), np.zeros((6, 6))
     for k in range(10, n + 1, 10):
         t = int(t_ns[k])
         error = rng.standard_normal(6) * np.sqrt(np.diagonal(template.covariance))
         records.append(VoRecord(t, 0, Status.OK, se3.exp(error), is_reference=False))
-        parts = {"jitter": np.zeros((6, 6)), "white": template.covariance, "bias": np.zeros((6, 6))}
-        predictions[t] = replace(template, t_ns=t, parts=parts)
+        predictions[t] = prediction(t, zero, template.covariance, zero)
     poses = np.tile(FORWARD_CAMERA, (len(records), 1, 1))
     still = Flight("still", records, ImuLog(t_ns, gyro, acc, MEMS), FORWARD_CAMERA, poses, None, predictions)
     run = fuse_flight(still, LearnedPolicy())[0]

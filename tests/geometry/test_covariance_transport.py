@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.accumulation import along
 from gpvo.geometry import covariance as cov
 from gpvo.geometry import se3
+from gpvo.types import MotionError
 
 TRIALS = 20_000
 # An entry of a sample covariance scatters by sqrt(2 / trials) = 1 % of its variances; 5 of that.
@@ -62,13 +64,14 @@ def test_position_in_world_is_that_of_samples():
 def test_accumulate_is_repeated_compounding_and_follows_parents():
     T = se3.exp(0.3 * np.random.default_rng(10).normal(size=(5, 6)))
     C = np.array([_spd(k) for k in range(5)])
-    chain = cov.accumulate(T, C)
-    expected = C[0]
+    errors = [MotionError.independent(S) for S in C]
+    _, chain = along(T, errors, np.arange(5) - 1)
+    expected = np.zeros((6, 6))
     for k in range(1, 5):
         expected = cov.compound(T[k], expected, C[k])
     np.testing.assert_allclose(chain[-1], expected, atol=1e-18)
     # Frame 3 is left out: frame 4 starts from frame 2.
-    branched = cov.accumulate(T, C, np.array([-1, 0, 1, 2, 2]))
+    _, branched = along(T, errors, [-1, 0, 1, 2, 2])
     np.testing.assert_allclose(branched[4], cov.compound(T[4], chain[2], C[4]), atol=1e-18)
 
 

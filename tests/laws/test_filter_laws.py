@@ -9,7 +9,6 @@ import pytest
 from gpvo.filters import measurement as me
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate
-from gpvo.filters.measurement import MotionNoise
 from gpvo.filters.policies import ConstantPolicy
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V, imu_step
 from gpvo.filters.run import Flight, FuseOptions, fuse_flight
@@ -17,7 +16,7 @@ from gpvo.filters.start import StartSigmas
 from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, smooth_path
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
-from gpvo.types import ImuLog, Status, VoRecord
+from gpvo.types import ImuLog, MotionError, Status, VoRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,14 +35,18 @@ def _filter(covariance: np.ndarray) -> ErrorStateFilter:
     return ErrorStateFilter(_nominal(), covariance, imu_noise=MEMS, T_imu_cam=FORWARD_CAMERA)
 
 
-def _noise(rng: np.random.Generator, scale: float = 1e-3, parts: bool = True) -> MotionNoise:
+def _noise(rng: np.random.Generator, scale: float = 1e-3, parts: bool = True) -> MotionError:
     def spd(size: float) -> np.ndarray:
         A = rng.standard_normal((6, 6)) * size
         return (A @ A.T + size**2 * np.eye(6))[None]
 
     if not parts:
-        return MotionNoise(np.zeros((1, 6)), spd(scale))
-    return MotionNoise(np.zeros((1, 6)), spd(scale), spd(scale), scale * np.eye(6, 12)[None], np.full(12, 5.0))
+        return MotionError.independent(spd(scale))
+    root, tau_s = scale * np.eye(6, 12)[None], np.full(12, 5.0)
+    white = spd(scale)
+    return MotionError(
+        mean=np.zeros((1, 6)), jitter=spd(scale), white=white, persistent_root=root, persistent_tau_s=tau_s
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -235,9 +238,9 @@ def _linear_regime(batch: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
             phi = np.exp(-every / rate / 5.0)
             beta = phi * beta + np.sqrt(1 - phi**2) * rng.standard_normal((batch, 12))
             n_cur = rng.standard_normal((batch, 6)) @ jitter.T
-            error = rng.standard_normal((batch, 6)) @ white.T + beta @ noise.bias_root[0].T
+            error = rng.standard_normal((batch, 6)) @ white.T + beta @ noise.persistent_root[0].T
             T = se3.exp(-n_ref) @ (se3.inverse(T_ref) @ T_cam) @ se3.exp(n_cur) @ se3.exp(error)
-            filter.decay_bias(every / rate, noise.bias_tau_s)
+            filter.decay_bias(every / rate, noise.persistent_tau_s)
             nis.append(filter.update_motion(T, noise, ACCEPT).nis.mean())
             filter.clone(measured=True)
             n_ref, T_ref = n_cur, T_cam

@@ -17,5 +17,5 @@ def training_sets(seeds, **options) -> list[TrainingSet]:
 @cache
 def small_model() -> TrainedModel:
     """Trained once per test process on four short flights with geometric covariances."""
-    config = TrainConfig(features="velocity,rotation,n_inliers", noise_inducing=32)
+    config = TrainConfig(features="velocity,rotation,n_inliers")
     return train_sets(training_sets(range(4), n=300), config, judge=False)

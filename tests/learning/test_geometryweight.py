@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.evaluation.accumulate import PoseError, Step
+from gpvo.accumulation import PoseError
 from gpvo.geometry.covariance import correlation
 from gpvo.learning.geometryweight import Divided, _Sums, choose_geometry_weight
+
+from motion_errors import motion_error
 
 PHI = 0.9
 OWN = np.eye(6)
@@ -64,7 +66,7 @@ def test_what_is_stated_of_a_sum_is_what_adds_up_along_a_path():
     error = PoseError()
     for j, w, b in zip(jitter, white, bias):
         parts = [C * np.outer(s, s) for C, s in zip(R, (j, w, b))]
-        error.add(Step(np.eye(4), *parts, np.full(6, tau_s), dt_s))
+        error = error.after(np.eye(4), motion_error(*parts, tau_s, dt_s=dt_s))
     for stated in (sums.own, sums.by_geometry):  # where the geometry is unknown, its place is taken
         np.testing.assert_allclose((stated + sums.bias)[0], error.covariance, rtol=1e-9, atol=1e-9)
 

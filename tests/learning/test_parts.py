@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from gpvo.evaluation.accumulate import PoseError, Step
+from gpvo.accumulation import PoseError
 from gpvo.learning.partcorrelation import curves, part_correlations
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.spans import SpanVariances, chains, span_variances
 from scipy.signal import lfilter
+
+from motion_errors import motion_error
 
 
 def _times(parents: list[int], step_ns: int = 50_000_000) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +152,7 @@ def test_what_is_stated_along_a_path_is_what_was_fitted():
     jitter, white, bias = R[:3] * of_parts[:, :, None] * of_parts[:, None, :]
     error = PoseError()
     for _ in range(200):
-        error.add(Step(np.eye(4), jitter, white, bias, parts.tau_s, 0.05))
+        error = error.after(np.eye(4), motion_error(jitter, white, bias, parts.tau_s))
     fitted = [curves(np.array([200]), tau / 0.05)[0] @ s for tau, s in zip(parts.tau_s, parts.share.T)]
     np.testing.assert_allclose(np.diagonal(error.covariance), sigma**2 * fitted, rtol=1e-6)
 

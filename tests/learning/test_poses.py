@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gpvo.evaluation.accumulate import PoseError, Step
+from gpvo.accumulation import PoseError
 from gpvo.geometry import se3
 from gpvo.learning.poses import Motions, _windows, added_factor, with_added
+
+from motion_errors import motion_error
 
 PHI, LASTING = 0.9, 0.99
 BOTH = np.repeat([[PHI], [LASTING]], 6, axis=1)
@@ -31,7 +33,7 @@ def test_what_is_stated_of_a_pose_is_what_adds_up_along_a_path():
     pose = PoseError()
     tau_s, lasting_s = -1.0 / np.log(BOTH)
     for T_prev_cur, (jit, white, bias), L in zip(T, parts, root):
-        pose.add(Step(T_prev_cur, jit, white, bias + L @ L.T, tau_s, 1.0, L, lasting_s))
+        pose = pose.after(T_prev_cur, motion_error(jit, white, bias, tau_s, L, lasting_s, dt_s=1.0))
     np.testing.assert_allclose((jitter + added)[0], pose.covariance, rtol=1e-9)
 
 

@@ -16,7 +16,8 @@ from gpvo.learning.regressors.inducing import greedy_points
 from gpvo.learning.regressors.likelihood import ExactEvidence
 from gpvo.learning.regressors.numerics import pack
 from gpvo.learning.regressors.rows import ArrayRows, ParquetRows, draw
-from gpvo.learning.regressors.sparse import SparseRegressor, streamed_scaling
+from gpvo.learning.regressors.sparse import SparseRegressor
+from gpvo.learning.regressors.streamed import streamed_scaling
 from gpvo.learning.regressors.svgp import SvgpRegressor
 from synthetic_errors import gaussian_nll, make_problem
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from gpvo.geometry.covariance import turn_first_root
-from gpvo.online.for_filter import FOR_FILTER, arrays_for_filter
+from gpvo.online.for_filter import BASE, FOR_FILTER, arrays_for_filter
 from gpvo.online.predictor import Predictor
 from small_model import small_model
 from synthetic_runs import make_run
@@ -57,6 +57,6 @@ def test_a_steady_mean_is_the_root_of_the_covariance_times_the_noise() -> None:
 
 def test_files_without_a_model_for_filters_are_read() -> None:
     trained = small_model()
-    arrays = {n: a for n, a in trained.arrays.items() if not n.startswith(FOR_FILTER) and n != "steady_mean"}
+    arrays = {n: a for n, a in trained.arrays.items() if not n.startswith((FOR_FILTER, BASE)) and n != "steady_mean"}
     assert arrays_for_filter(arrays).keys() == arrays.keys()
     assert not Predictor(arrays, trained.header, for_filter=True).model.steady_mean.any()

@@ -31,15 +31,25 @@ def test_good_motions_pass_and_jumps_are_caught_at_any_speed(speed, rate_hz):
     assert "implausible" in found.records[300].reason
 
 
-def test_a_manoeuvre_that_lasts_costs_one_frame():
+def test_a_second_bad_motion_is_not_believed_because_the_first_was():
     log, _ = make_run(1, n=200, speed=20.0, rate_hz=10.0)
     faster = [
-        replace(r, T_prev_cur=r.T_prev_cur @ se3.exp(np.array([0, 0, 500.0, 0, 0, 0]))) if k >= 120 else r
+        replace(r, T_prev_cur=r.T_prev_cur @ se3.exp(np.array([0, 0, 500.0, 0, 0, 0]))) if 120 <= k < 125 else r
         for k, r in enumerate(log)
     ]
     flagged = flag_slips(VoLog(faster))
-    assert _lost(flagged) == [120]
+    assert _lost(flagged) == [120, 121, 122, 123, 124]
     assert [r.status for r in flag_slips(flagged)] == [r.status for r in flagged]
+
+
+def test_what_was_accepted_cannot_raise_the_bound_without_limit():
+    """A jerky log, and then a jump of 220 m/s^2."""
+    log, _ = make_run(4, n=600, speed=20.0, rate_hz=10.0)
+    rng = np.random.default_rng(0)
+    jerky = VoLog(
+        [replace(r, T_prev_cur=r.T_prev_cur @ se3.exp(0.1 * rng.standard_normal(6) * [1, 1, 1, 0, 0, 0])) for r in log]
+    )
+    assert 500 in _lost(flag_slips(_with_jump(jerky, 500, metres=2.2)))
 
 
 def test_the_gyro_catches_a_turn_that_never_was():

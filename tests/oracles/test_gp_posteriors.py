@@ -7,7 +7,7 @@ import pytest
 from gpvo.learning.regressors import Hyperparameters, get_regressor
 from gpvo.learning.regressors.numerics import Scaling
 from gpvo.learning.regressors.rows import ArrayRows
-from gpvo.learning.regressors.sparse import close
+from gpvo.learning.regressors.streamed import close
 
 HYPER = Hyperparameters(np.array([1.5, 0.8, 4.0]), signal_var=np.array([2.0, 0.5]), noise_var=np.array([0.1, 0.4]))
 

@@ -96,3 +96,22 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
     with pytest.raises(GpvoError, match="unknown consumer"):
         consumers.check(odometry, "betaflight")
+
+
+def test_fusioncore_reads_the_diagonal_and_replaces_zeros(odometry: list[Odometry]) -> None:
+    C = np.array(odometry[0].pose_covariance)
+    C[2, :] = C[:, 2] = C[4, :] = C[:, 4] = 0.0
+    want = np.sqrt(np.diagonal(C))
+    want[2], want[4] = 0.1, 0.02
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), want)
+
+
+def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:
+    R = np.eye(6)
+    R[0, 4] = R[4, 0] = 0.9
+    flat, slanted = (
+        [replace(o, twist_covariance=C, pose_covariance=np.eye(6)) for o in odometry] for C in (np.eye(6), R)
+    )
+    assert [v.hidden_percent for v in consumers.check(flat, "fusioncore")] == [0.0, 0.0]
+    assert [v.hidden_percent for v in consumers.check(slanted, "fusioncore")] == [100.0, 0.0]
+    assert "send no zeros" in str(consumers.check(slanted, "fusioncore")[0])

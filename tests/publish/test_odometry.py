@@ -13,14 +13,14 @@ from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.publish.odometry import Floors, OdometryBuilder, lift, messages
 from gpvo.types import Prediction, Status, VoRecord
 
+from motion_errors import prediction
+
 MOUNT = se3.from_rt(R_FLU_OPTICAL @ se3.so3_exp(np.array([0.1, 0.2, 0.05])), np.array([0.4, 0.1, -0.2]))
 TINY = Floors(0.0, 0.0, 0.0, 0.0)
 
 
 def _prediction(t_ns: int, jitter: np.ndarray, white: np.ndarray, bias: np.ndarray, tau: float = 5.0) -> Prediction:
-    parts = {"jitter": jitter, "white": white, "bias": bias}
-    total, zero = jitter + white + bias, np.zeros(6)
-    return Prediction(t_ns, 0.1, zero, total, parts, np.full(6, tau), zero, 0.8, 1.0, Status.OK)
+    return prediction(t_ns, jitter, white, bias, tau)
 
 
 def _spd(rng: np.random.Generator, scale: float) -> np.ndarray:
@@ -55,7 +55,8 @@ def test_accumulated_pose_covariance_against_monte_carlo(parts: tuple[float, flo
         values, vectors = np.linalg.eigh(C)
         return rng.standard_normal((n, 6)) @ (vectors * np.sqrt(np.maximum(values, 0))).T
 
-    n_first = n_ref = draw(J / 2)
+    # The motion's other half, as if the first frame's pose were off.
+    n_ref = draw(J / 2) @ se3.adjoint(motions[0]).T
     b = draw(B)
     estimate = np.tile(np.eye(4), (n, 1, 1))
     for k, T in enumerate(motions, start=1):
@@ -66,10 +67,8 @@ def test_accumulated_pose_covariance_against_monte_carlo(parts: tuple[float, flo
         estimate = estimate @ se3.exp(-n_ref) @ T @ se3.exp(n_cur) @ se3.exp(b + draw(W))
         n_ref, truth = n_cur, truth @ T
         t = round(k * dt * 1e9)
-        total = J + W + B + 1e-14 * np.eye(6)
-        prediction = replace(_prediction(t, J, W, B, tau), covariance=total)
-        out = builder.step(VoRecord(t, round((k - 1) * dt * 1e9), Status.OK, T), prediction)
-    assert n_first is not None
+        stated = _prediction(t, J, W + 1e-14 * np.eye(6), B, tau)
+        out = builder.step(VoRecord(t, round((k - 1) * dt * 1e9), Status.OK, T), stated)
     body = MOUNT @ estimate @ se3.inverse(MOUNT)
     T_true = MOUNT @ truth @ se3.inverse(MOUNT)
     R = T_true[:3, :3]
@@ -164,7 +163,7 @@ def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
 def test_no_covariance_is_one_clear_line() -> None:
     with pytest.raises(GpvoError, match="neither a prediction nor a 'triangulation'"):
         OdometryBuilder(method="triangulation").step(VoRecord(10**8, 0, Status.OK, np.eye(4)))
-    bad = replace(_prediction(10**8, *(np.eye(6),) * 3), covariance=-np.eye(6))
+    bad = _prediction(10**8, np.eye(6), -3.0 * np.eye(6), np.eye(6))
     with pytest.raises(GpvoError, match="not symmetric positive definite"):
         OdometryBuilder().step(VoRecord(10**8, 0, Status.OK, np.eye(4)), bad)
 
@@ -182,11 +181,7 @@ def test_the_pose_of_a_wrong_calibration_is_right_again_at_home() -> None:
     L, C, zero = rng.standard_normal((6, 6)) * 1e-2, _spd(rng, 1e-3), np.zeros((6, 6))
     builder = OdometryBuilder(np.eye(4), floors=TINY)
     for k in range(1, 9):
-        stated = replace(
-            _prediction(k * 10**8, zero, C, L @ L.T),
-            calibration_root=L if k % 2 else -L,
-            calibration_tau_s=np.full(6, np.inf),
-        )
+        stated = prediction(k * 10**8, zero, C, zero, 5.0, L if k % 2 else -L, np.inf)
         out = builder.step(VoRecord(k * 10**8, (k - 1) * 10**8, Status.OK, np.eye(4)), stated)
     np.testing.assert_allclose(out.pose_covariance, 8 * C, atol=1e-9)
     np.testing.assert_allclose(out.twist_covariance, (C + L @ L.T) / 0.01, atol=1e-9)

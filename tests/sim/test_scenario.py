@@ -60,3 +60,20 @@ def test_own_file(tmp_path):
         sc.load_scenario(str(file))
     with pytest.raises(GpvoError, match="cannot be read"):
         sc.load_scenario(str(tmp_path / "none.toml"))
+
+
+def test_a_calibration_file_is_a_camera(tmp_path):
+    bent = "distortion_model: radtan, distortion_coeffs: [-0.1, 0.01, 0, 0]"
+    lens = f"{{camera_model: pinhole, {bent}, resolution: [640, 400]"
+    (tmp_path / "rig.yaml").write_text(
+        f"cam0: {lens}, intrinsics: [420, 421, 318, 201]}}\n"
+        f"cam1: {lens}, intrinsics: [419, 420, 322, 199],\n"
+        "  T_cn_cnm1: [[1, 0, 0, -0.075], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}\n"
+    )
+    scenario = sc.load_scenario("tunnel", {"camera": str(tmp_path / "rig.yaml")})
+    camera = sc.points_scenario(scenario).camera
+    assert camera.baseline_m == pytest.approx(0.075)
+    assert camera.fx_px == pytest.approx(420, rel=0.1)
+    (tmp_path / "rig.yaml").write_text("cam0: 3\n")
+    with pytest.raises(GpvoError, match=r"rig\.yaml"):
+        sc.points_scenario(scenario)

@@ -14,9 +14,9 @@ from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.sim import sequence, sequence_plan
 from gpvo.sim.eye import without_texture
-from gpvo.sim.imu import GRAVITY_MPS2
 from gpvo.sim.rig import RigError, RigTolerance, camera_rig, true_rig
 from gpvo.sim.scenario import load_scenario, stated_seed
+from gpvo.types import STANDARD_GRAVITY_MPS2
 
 
 def digest(folder):
@@ -129,7 +129,7 @@ def test_perfect_imu_in_the_file_integrates_to_the_truth(quick, tmp_path):
     truth = np.loadtxt(mav / "state_groundtruth_estimate0" / "data.csv", delimiter=",")[3500:13501]
     q_xyzw = np.roll(truth[:, 4:8], -1, axis=1)
     R, v, p = se3.from_quaternion(truth[:, 1:4], q_xyzw)[0, :3, :3], truth[0, 8:11], truth[0, 1:4]
-    down, h = np.array([0.0, 0.0, -GRAVITY_MPS2]), 1e-3
+    down, h = np.array([0.0, 0.0, -STANDARD_GRAVITY_MPS2]), 1e-3
     for now, then in pairwise(readings):
         R_then = R @ se3.so3_exp(0.5 * h * (now[1:4] + then[1:4]))
         a = 0.5 * (R @ now[4:] + R_then @ then[4:]) + down

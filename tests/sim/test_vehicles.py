@@ -5,7 +5,8 @@ import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.sim import paths, vehicles
-from gpvo.sim.imu import GRAVITY_MPS2, Motion, exact_imu
+from gpvo.sim.imu import Motion, exact_imu
+from gpvo.types import STANDARD_GRAVITY_MPS2
 
 LOW, HIGH = np.array([-4.0, -4.0, 0.8]), np.array([4.0, 4.0, 3.2])
 
@@ -14,7 +15,7 @@ def integrate(motion: Motion, begin: int, end: int) -> tuple[float, float]:
     """Errors of position [m] and attitude [degrees] after integrating exact readings by the trapezoid."""
     h = float(motion.t_s[1] - motion.t_s[0])
     gyro, force = exact_imu(motion)
-    down = np.array([0.0, 0.0, -GRAVITY_MPS2])
+    down = np.array([0.0, 0.0, -STANDARD_GRAVITY_MPS2])
     R, v, p = motion.R_world_body[begin], motion.velocity_mps[begin], motion.position_m[begin]
     for k in range(begin, end):
         R_next = R @ se3.so3_exp(0.5 * h * (gyro[k] + gyro[k + 1]))

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.stats.consistency import coverage, crps_gaussian, nees, nll_per_dim, whiten
+from gpvo.stats.consistency import (
+    by_difficulty,
+    correlation_gain,
+    coverage,
+    crps_gaussian,
+    energy_score,
+    nees,
+    nll_per_dim,
+    whiten,
+)
 from scipy import stats
 from scipy.integrate import quad
 
@@ -70,3 +79,42 @@ def test_crps_is_its_integral(error, sigma):
 def test_shapes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="last axes"):
         nees(np.zeros((5, 6)), np.zeros((5, 3, 3)))
+
+
+def test_the_energy_score_of_one_axis_is_its_crps():
+    e, C = _drawn(1, seed=3)
+    found = energy_score(e[:500], C[:500], draws=20_000)
+    np.testing.assert_allclose(found, crps_gaussian(e[:500], np.sqrt(C[:500, 0]))[:, 0], rtol=0.02, atol=2e-3)
+
+
+def test_the_energy_score_is_proper_and_of_no_width_the_length():
+    e, C = _drawn(3, seed=4)
+    right, bold, timid = (energy_score(e[:5000], f * C[:5000]).mean() for f in (1.0, 0.25, 4.0))
+    assert right < min(bold, timid)
+    sure = energy_score(e[:100], 1e-18 * C[:100])
+    np.testing.assert_allclose(sure, np.linalg.norm(e[:100], axis=1), rtol=1e-6)
+
+
+def test_right_correlations_gain_and_wrong_ones_lose():
+    rng = np.random.default_rng(5)
+    R = np.full((4, 4), 0.8) + 0.2 * np.eye(4)
+    e = rng.standard_normal((N, 4)) @ np.linalg.cholesky(R).T
+    S = np.diag([1.0, -1.0, 1.0, -1.0])
+    # Of a Gaussian the gain is minus half the log determinant of the correlation, per dimension.
+    expected = -0.5 * np.linalg.slogdet(R)[1] / 4
+    assert correlation_gain(e, np.broadcast_to(R, (N, 4, 4))).mean() == pytest.approx(expected, abs=0.02)
+    assert correlation_gain(e, np.broadcast_to(S @ R @ S, (N, 4, 4))).mean() < -0.5
+    np.testing.assert_allclose(correlation_gain(e, np.broadcast_to(np.eye(4), (N, 4, 4))), 0.0, atol=1e-12)
+
+
+def test_a_constant_in_changing_conditions_fails_by_difficulty():
+    rng = np.random.default_rng(6)
+    sigma = np.exp(rng.normal(0, 0.7, N))
+    e = sigma[:, None] * rng.standard_normal((N, 2))
+    told = (sigma**2)[:, None, None] * np.eye(2)
+    nees_dof, covered = by_difficulty(e, told)
+    np.testing.assert_allclose(nees_dof, 1.0, atol=0.06)
+    np.testing.assert_allclose(covered, 0.6827, atol=0.02)
+    blunted = (sigma**1.0)[:, None, None] * np.eye(2)  # half of what is to be known of each motion's difficulty
+    nees_dof, _ = by_difficulty(e, blunted)
+    assert nees_dof[0] < 0.7 < 1.6 < nees_dof[3]

@@ -10,7 +10,7 @@
     return parent.appendChild(node);
   };
   const extent = (panel, key, log) => {
-    const all = panel.lines.filter(l => !l.aside).flatMap(l => l[key]).filter(v => finite(v) && (!log || v > 0));
+    const all = panel.lines.filter(l => !l.aside && !hidden.has(l.name)).flatMap(l => l[key]).filter(v => finite(v) && (!log || v > 0));
     if (key === "y" && finite(panel.level) && (!log || panel.level > 0)) all.push(panel.level);
     let low = all.reduce((a, b) => Math.min(a, b), Infinity), high = all.reduce((a, b) => Math.max(a, b), -Infinity);
     if (!(low <= high)) [low, high] = log ? [0.1, 10] : [0, 1];
@@ -34,11 +34,18 @@
   const label = v => v === 0 ? "0" : Math.abs(v) >= 1e4 || Math.abs(v) < 1e-3 ? v.toExponential(0).replace("e+", "e")
     : String(Number(v.toPrecision(4)));
 
+  // Black lines are drawn in the page's ink, so that they show on a dark page too.
+  const ink = colour => colour === "#1b1b1b" ? "var(--ink)" : colour;
+  const timed = panel => panel.x.startsWith("time");
+  const hidden = new Set();
+  let span = null;
+
   function draw(figure, panel, index, fixed) {
     const width = fixed || Math.max(260, figure.clientWidth), square = panel.equal;
     const left = 58, right = 10, top = 8, bottom = 40;
     const [logX, logY] = [(panel.log || "").includes("x"), (panel.log || "").includes("y")];
     let [x0, x1] = extent(panel, "x", logX), [y0, y1] = panel.limit || extent(panel, "y", logY);
+    if (span && timed(panel)) [x0, x1] = span;
     const inner = width - left - right;
     let height = Math.round(Math.min(280, Math.max(170, width * 0.42)));
     if (square) {
@@ -54,7 +61,8 @@
       : v => a + (b - a) * (v - low) / (high - low);
     const X = scale(x0, x1, logX, left, width - right), Y = scale(y0, y1, logY, height - bottom, top);
     figure.replaceChildren();
-    const svg = make(figure, "svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${panel.y} over ${panel.x}` });
+    const svg = make(figure, "svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${panel.y} over ${panel.x}`,
+      ...(timed(panel) ? { class: "timed" } : {}) });
     const clip = `clip-${index}`;
     make(make(svg, "clipPath", { id: clip }), "rect", { x: left, y: top, width: inner, height: height - top - bottom });
     for (const v of ticks(x0, x1, logX, Math.max(4, inner / 70))) {
@@ -81,28 +89,81 @@
     if (finite(panel.level)) {
       make(inside, "line", { x1: left, x2: width - right, y1: Y(panel.level), y2: Y(panel.level), class: "level" });
     }
-    for (const l of panel.lines) {
+    for (const l of panel.lines.filter(l => !hidden.has(l.name))) {
       let path = "", pen = false;
       l.x.forEach((x, i) => {
         const seen = finite(x) && finite(l.y[i]) && Number.isFinite(X(x)) && Number.isFinite(Y(l.y[i]));
         if (seen) path += `${pen ? "L" : "M"}${X(x).toFixed(1)} ${Y(l.y[i]).toFixed(1)}`;
         pen = seen;
       });
-      make(inside, "path", { d: path, fill: "none", stroke: l.colour, "stroke-width": l.width,
+      make(inside, "path", { d: path, fill: "none", stroke: ink(l.colour), "stroke-width": l.width,
         "stroke-linejoin": "round", ...(l.dash ? { "stroke-dasharray": "5 4" } : {}) });
     }
     make(svg, "rect", { x: left, y: top, width: inner, height: height - top - bottom, class: "frame" });
     make(svg, "text", { x: left + inner / 2, y: height - 6, "text-anchor": "middle" }, panel.x);
     const middle = top + (height - top - bottom) / 2;
     make(svg, "text", { x: 12, y: middle, "text-anchor": "middle", transform: `rotate(-90 12 ${middle})` }, panel.y);
+    const back = u => logX ? x0 * (x1 / x0) ** ((u - left) / inner) : x0 + (x1 - x0) * (u - left) / inner;
+    listen(figure, svg, { X, back, left, right: width - right, top, bottom: height - bottom, width }, panel);
     const named = panel.lines.filter(l => l.name);
     if (named.length === 0) return;
     const key = figure.appendChild(document.createElement("figcaption"));
     for (const l of named) {
-      const entry = key.appendChild(document.createElement("span"));
+      const entry = key.appendChild(document.createElement("button"));
       entry.textContent = l.name;
-      entry.style.setProperty("--tint", l.colour);
+      entry.style.setProperty("--tint", ink(l.colour));
+      entry.setAttribute("aria-pressed", String(!hidden.has(l.name)));
+      entry.addEventListener("click", () => {
+        if (!hidden.delete(l.name)) hidden.add(l.name);
+        drawAll();
+      });
     }
+  }
+
+  // What the curves say at the pointer, and a stretch of time chosen by dragging.
+  function listen(figure, svg, frame, panel) {
+    const { X, back, left, right, top, bottom, width } = frame;
+    const at = event => {
+      const box = svg.getBoundingClientRect();
+      return (event.clientX - box.left) * width / box.width;
+    };
+    const label = figure.appendChild(document.createElement("div"));
+    label.className = "values";
+    label.hidden = true;
+    const pointer = make(svg, "line", { y1: top, y2: bottom, class: "pointer", visibility: "hidden" });
+    const choice = make(svg, "rect", { y: top, height: bottom - top, width: 0, class: "zoom" });
+    let from = null;
+    svg.addEventListener("pointermove", event => {
+      const u = Math.min(Math.max(at(event), left), right), x = back(u);
+      if (from !== null) {
+        choice.setAttribute("x", Math.min(u, from));
+        choice.setAttribute("width", Math.abs(u - from));
+      }
+      const rows = panel.lines.filter(l => !l.aside && !l.dash && !hidden.has(l.name) && l.x.length).map(l => {
+        const k = l.x.reduce((best, v, i) => finite(v) && Math.abs(v - x) < Math.abs(l.x[best] - x) ? i : best, 0);
+        return finite(l.y[k]) ? `${l.name || panel.y.replace(/ \[.*/, "")} ${Number(l.y[k].toPrecision(3))}` : null;
+      }).filter(Boolean);
+      label.textContent = [`${panel.x.replace(/ \[.*/, "")} ${Number(x.toPrecision(4))}`, ...rows].join("\n");
+      label.hidden = panel.equal || rows.length === 0;
+      pointer.setAttribute("x1", X(x));
+      pointer.setAttribute("x2", X(x));
+      pointer.setAttribute("visibility", label.hidden ? "hidden" : "visible");
+    });
+    svg.addEventListener("pointerleave", () => {
+      label.hidden = true;
+      pointer.setAttribute("visibility", "hidden");
+    });
+    if (!timed(panel)) return;
+    svg.addEventListener("pointerdown", event => { if (event.pointerType === "mouse") from = at(event); });
+    svg.addEventListener("pointerup", event => {
+      const [a, b] = [from, at(event)].sort((p, q) => p - q);
+      if (from !== null && b - a > 8) {
+        span = [back(Math.max(a, left)), back(Math.min(b, right))];
+        drawAll();
+      }
+      from = null;
+    });
+    svg.addEventListener("dblclick", () => { span = null; drawAll(); });
   }
 
   const figures = [...document.querySelectorAll("figure.panel")];

@@ -15,7 +15,8 @@ document.querySelectorAll("div.scene").forEach(box => {
     const ratio = window.devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
     canvas.width = w * ratio;
     canvas.height = h * ratio;
-    const g = canvas.getContext("2d");
+    const g = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
+    const [ink, grid] = ["--ink", "--grid"].map(name => style.getPropertyValue(name).trim());
     g.scale(ratio, ratio);
     const s = zoom * 0.42 * Math.min(w, h * 1.6) / data.size;
     const place = ([x, y, z]) => {
@@ -31,14 +32,14 @@ document.querySelectorAll("div.scene").forEach(box => {
     };
     const r = data.size, low = Math.min(...data.true.map(p => p[2]));
     for (let k = -2; k <= 2; k += 1) {
-      line([[k * r / 2, -r, low], [k * r / 2, r, low]], "#e6e6e6", 1);
-      line([[-r, k * r / 2, low], [r, k * r / 2, low]], "#e6e6e6", 1);
+      line([[k * r / 2, -r, low], [k * r / 2, r, low]], grid, 1);
+      line([[-r, k * r / 2, low], [r, k * r / 2, low]], grid, 1);
     }
     rings.forEach(ring => line(ring, "rgba(44, 160, 44, 0.55)", 0.8));
-    line(data.true, "#1b1b1b", 1.8);
+    line(data.true, ink, 1.8);
     line(data.est, "#d62728", 1.4);
     const [a, b] = place(data.true[0]);
-    g.fillStyle = "#1b1b1b";
+    g.fillStyle = ink;
     g.beginPath();
     g.arc(a, b, 4, 0, 2 * Math.PI);
     g.fill();
@@ -77,5 +78,6 @@ document.querySelectorAll("div.scene").forEach(box => {
     draw();
   }));
   window.addEventListener("resize", draw);
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   draw();
 });

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from importlib.resources import files
 from pathlib import Path
 
@@ -10,13 +11,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import GpvoError
+from gpvo.io.atomic import write_text
 from gpvo.online.base import motion_noise, positions
-from gpvo.online.estimate import LN_LARGEST, ErrorModelArrays
-from gpvo.online.rowplan import StackedBasis, stack
+from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModelArrays
+from gpvo.online.rowplan import StackedBasis
+from gpvo.online.validation import LARGEST
 
 PREFIX = "gpvo"
 """Of every symbol, unless another is asked for."""
 _PER_LINE = 8
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+# Of C23 and C++, so that a header compiles in either.
+_KEYWORDS = (
+    " alignas alignof and asm auto bitand bitor bool break case catch char class compl const constexpr continue default"
+    " delete do double else enum explicit export extern false float for friend goto if inline int long mutable"
+    " namespace new noexcept not nullptr operator or private protected public register restrict return short signed"
+    " sizeof static struct switch template this throw true try typedef typeid typename typeof union unsigned using"
+    " virtual void volatile wchar_t while xor main "
+)
+# What a comment may hold of a model file's text: nothing that could end it.
+_NOT_IN_COMMENTS = re.compile(r"[^A-Za-z0-9_./^,;:=() -]")
 
 
 def to_c(
@@ -33,25 +47,23 @@ def to_c(
     ``ErrorModelArrays.estimate`` to about 1e-6: projections are kept in single precision. GpvoError where ``name``
     is no C identifier.
     """
-    if not name.isidentifier() or not name.isascii():
-        raise GpvoError(f"the prefix '{name}' is no C identifier", cure="letters, digits and _, no digit first")
+    if not _NAME.fullmatch(name) or f" {name} " in _KEYWORDS:
+        raise GpvoError(f"the prefix {name!r} is no C identifier", cure="a letter first, then letters, digits, _")
     template = files("gpvo.learning.export").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
     code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(code, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(Path(path), code)
 
 
 def _preamble(model: ErrorModelArrays, units: tuple[str, ...], note: str) -> list[str]:
     units = units or ("",) * len(model.columns)
     features = [
-        f" *  {i:3d}  {c} {f'[{u}]' if u else ''}".rstrip() for i, (c, u) in enumerate(zip(model.columns, units))
+        f" *  {i:3d}  {_comment(c)} {f'[{_comment(u)}]' if u else ''}".rstrip()
+        for i, (c, u) in enumerate(zip(model.columns, units))
     ]
     return [
         "/* Error model of stereo visual odometry, written by gpvo. No dependency but math.h; no heap; no state.",
-        *([f" * {note.replace('*/', '')}"] if note else []),
+        *([f" * {_comment(note)}"] if note else []),
         " *",
         " * Features, in order:",
         *features,
@@ -64,8 +76,13 @@ def _preamble(model: ErrorModelArrays, units: tuple[str, ...], note: str) -> lis
     ]
 
 
+def _comment(text: object) -> str:
+    """The text without what could leave a comment, or fool a reader of it."""
+    return _NOT_IN_COMMENTS.sub("?", str(text).replace("..", " to "))[:200]
+
+
 def _constants(model: ErrorModelArrays) -> list[str]:
-    stacked, domain, d = stack(model.basis), model.domain, len(model.columns)
+    stacked, domain, d = model.basis.stacked(), model.domain, len(model.columns)
     columns = positions(model.columns, model.base.columns)
     by_velocity, by_acceleration = motion_noise(model.columns)
     sizes = {
@@ -84,6 +101,10 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         "OUTSIDE_POWER": _number(model.outside_power[0]),
         "LN_SPEED": _number(model.ln_speed[0]),
         "LN_LARGEST": _number(LN_LARGEST),
+        "LARGEST": _number(LARGEST),
+        "LEAST_VAR": _number(LEAST_VAR),
+        "SHORTEST_S": _number(DURATIONS_S[0]),
+        "LONGEST_S": _number(DURATIONS_S[1]),
         "MEAN_IN_SIGMA": int(model.mean_in_sigma[0]),
     }
     return [
@@ -96,7 +117,8 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("least", domain.least),
         *_array("most", domain.most),
         *_array("whitening", domain.whitening),
-        *_array("may_miss", domain.may_miss, "int"),
+        *_array("missing", domain.charge_of_missing),
+        *_array("absent", model.absent),
         *_array("input", model.inputs, "int"),
         *_array("base_column", columns, "int"),
         *_array("by_velocity", by_velocity),

@@ -11,14 +11,16 @@ from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
 from gpvo.geometry.covariance import TURN_FIRST
+from gpvo.io.atomic import replacing
 from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
 from gpvo.online.division import LN_FASTEST, PARTS
-from gpvo.online.estimate import LN_LARGEST, ErrorModelArrays
-from gpvo.online.rowplan import stack
+from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModelArrays
+from gpvo.online.validation import LARGEST
 from gpvo.types import Array
 
 OPSET = 17
 _INT64 = 7  # TensorProto.INT64
+_USUAL_DURATIONS = tuple(zip(("GreaterOrEqual", "LessOrEqual"), DURATIONS_S, strict=True))
 
 
 def to_onnx(model: ErrorModelArrays, path: str | os.PathLike[str], *, metadata: dict[str, str] | None = None) -> None:
@@ -41,10 +43,8 @@ def to_onnx(model: ErrorModelArrays, path: str | os.PathLike[str], *, metadata: 
     outputs: dict[str, list[Any]] = {"mean": ["N", 6], **square, "epistemic": ["N", 6], **scalar}
     names = {"features": ",".join(model.columns), **(metadata or {})}
     blob = graph.serialise(shapes, outputs, names)
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_bytes(blob)
-    os.replace(temporary, path)
+    with replacing(Path(path)) as temporary:
+        temporary.write_bytes(blob)
 
 
 class _Graph:
@@ -54,6 +54,7 @@ class _Graph:
         self._onnx = onnx
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
+        self.dt = "dt_s"
 
     def constant(self, value: ArrayLike, dtype: type = np.float64) -> str:
         name = f"c{len(self._constants)}"
@@ -82,9 +83,9 @@ class _Graph:
     def expand(self, value: str, axis: int) -> str:
         return self("Unsqueeze", value, self.constant([axis], np.int64))
 
-    def finite(self, value: str) -> str:
-        """Where x - x is zero, x is neither NaN nor infinite."""
-        return self("Equal", self("Sub", value, value), 0.0)
+    def known(self, value: str) -> str:
+        """Where a feature is there: not NaN, not infinite, not beyond all measure."""
+        return self("Less", self("Abs", value), LARGEST)
 
     def outer(self, value: str) -> str:
         return self("Mul", self.expand(value, 2), self.expand(value, 1))
@@ -107,10 +108,12 @@ class _Graph:
 
 def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     """The whole graph; line by line ``ErrorModelArrays.estimate``."""
-    base, plain = (_base(g, model, theta) for theta in (model.base.theta, model.base.plain))
+    g.dt = g("Where", g("And", *(g(op, "dt_s", s) for op, s in _USUAL_DURATIONS)), "dt_s", model.dt_s)
+    base, plain = (g("Max", _base(g, model, theta), LEAST_VAR) for theta in (model.base.theta, model.base.plain))
     inside, distance, in_domain = _locate(g, model, base)
     ratio, ratio_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
-    unit = g("Sqrt", base) if model.mean_in_sigma[0] else g.expand(g("Div", "dt_s", model.dt_s), 1)
+    log_noise = g("Max", g("Min", log_noise, LN_LARGEST), -LN_LARGEST)
+    unit = g("Sqrt", base) if model.mean_in_sigma[0] else g.expand(g("Div", g.dt, model.dt_s), 1)
     mean, mean_var = g("Mul", ratio, unit), g("Mul", ratio_var, g("Mul", unit, unit))
     near = g.expand(in_domain, 1)
     growth = g.expand(g("Pow", g("Add", distance, 1.0), float(model.outside_power[0])), 1)
@@ -131,7 +134,8 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     jitter, white, bias = (g("Mul", g.outer(sigma), R, out=None if name == "bias" else name) for name, sigma, R in each)
     parts = [jitter, white, g("Add", bias, g("MatMul", root, g("Transpose", root, perm=[0, 2, 1])), out="bias")]
     covariance = g.add(*parts, out="covariance")
-    ln_det, steady = _turn_first(g, covariance, model.steady_mean)
+    pivots, steady = _turn_first(g, covariance, model.steady_mean)
+    ln_det = g.add(*(g("Log", pivot) for pivot in pivots))
     noise = g("Mul", _residual_px(g, model, inside), near)
     g("Add", trusted, g("Mul", steady, noise), out="mean")
     precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), ln_det), 12.0))
@@ -141,15 +145,15 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
 def _locate(g: _Graph, model: ErrorModelArrays, base: str) -> tuple[str, str, str]:
     domain = model.domain
     by_velocity, by_acceleration = (g.constant(m / domain.scale**2) for m in motion_noise(model.columns))
-    squared_dt = g.expand(g("Mul", "dt_s", "dt_s"), 1)
+    squared_dt = g.expand(g("Mul", g.dt, g.dt), 1)
     noise = g.add(g("MatMul", base, by_velocity), g("Div", g("MatMul", base, by_acceleration), squared_dt))
     known = g.add(g("Div", noise, squared_dt), 1.0)
     u = g("Div", g("Sub", "features", g.constant(domain.centre)), g.constant(domain.scale))
-    present = g.finite(u)
+    present = g.known("features")
     u = g("Where", present, u, 0.0)
     inside = g("Min", g("Max", u, g.constant(domain.low)), g.constant(domain.high))
     away = g("Sub", u, g("Min", g("Max", u, g.constant(domain.least)), g.constant(domain.most)))
-    charged = g("Where", present, 0.0, g.constant((~domain.may_miss).astype(np.float64)))
+    charged = g("Where", present, 0.0, g.constant(domain.charge_of_missing))
     beyond = g.sum(g("Add", g("Div", g("Mul", away, away), known), charged), 1)
     white = g("MatMul", inside, g.constant(domain.whitening))
     joint = g("Max", g("Sub", g("Sqrt", g.sum(g("Mul", white, white), 1)), float(domain.radius[0])), 0.0)
@@ -159,7 +163,7 @@ def _locate(g: _Graph, model: ErrorModelArrays, base: str) -> tuple[str, str, st
 
 
 def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, str, str]:
-    stacked = stack(model.basis)
+    stacked = model.basis.stacked()
     kernels, squares = [], []
     for gp in stacked.kernels:
         u = g("Div", g("Sub", inputs, g.constant(gp.centre)), g.constant(gp.lengthscale))
@@ -186,8 +190,8 @@ def _limit(g: _Graph, model: ErrorModelArrays) -> str:
     """(N, 6): no motion is more wrong than VO's and the usual one are long."""
     at = positions(model.columns, model.base.columns)[:6]
     rate = g.take("features", at, axis=1)
-    rate = g("Where", g.finite(rate), rate, g.constant(model.domain.centre[at]))
-    dt = g.expand("dt_s", 1)
+    rate = g("Where", g.known(rate), rate, g.constant(model.absent[:6]))
+    dt = g.expand(g.dt, 1)
     moved = g("Mul", g("Add", g("Mul", rate, rate), g.constant(model.usual_rate_var)), g("Mul", dt, dt))
     return g("MatMul", moved, g.constant(np.kron(np.eye(2), np.ones((3, 3)))))
 
@@ -201,8 +205,8 @@ def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:
     domain = model.domain
     at = positions(model.columns, model.base.columns)
     columns = g.take("features", at, axis=1)
-    columns = g("Where", g.finite(columns), columns, g.constant(domain.centre[at]))
-    dt = g.expand("dt_s", 1)
+    columns = g("Where", g.known(columns), columns, g.constant(model.absent))
+    dt = g.expand(g.dt, 1)
     moved = [g("Mul", g.take(columns, part, axis=1), dt) for part in ([0, 1, 2], [3, 4, 5])]
     squared = [g.expand(g.sum(g("Mul", part, part), 1), 1) for part in moved]
     terms = [g("Mul", squared[i], g.constant(theta[:, 2 + i])) for i in range(2)]
@@ -222,10 +226,13 @@ def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
     """Of each part (N, 6, 6)."""
     weight = float(model.geometry_weight[0])
     flat = g("Reshape", "geometry", g.constant([-1, 36], np.int64))
-    own = g("Div", "geometry", g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
-    finite = g.finite(own)
-    known = g("Equal", g("ReduceMin", g("Cast", finite, to=_INT64), axes=[1, 2]), g.constant(1, np.int64))
-    own = g("Mul", g("Where", finite, own, 0.0), weight)
+    both = g("Mul", g("Add", "geometry", g("Transpose", "geometry", perm=[0, 2, 1])), 0.5)
+    own = g("Div", both, g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
+    pivots, _ = _turn_first(g, g("Add", own, g.constant(1e-6 * np.eye(6))), np.zeros(6))
+    definite = g("Cast", g("Greater", g("Concat", *(g.expand(p, 1) for p in pivots), axis=1), 0.0), to=_INT64)
+    definite = g("Equal", g("ReduceMin", definite, axes=[1], keepdims=0), g.constant(1, np.int64))
+    known = g.expand(g.expand(definite, 1), 1)
+    own = g("Mul", g("Where", known, own, 0.0), weight)
     out = []
     for i, R in enumerate(model.correlation):
         typical = g.constant(R)
@@ -239,7 +246,7 @@ def _of_calibration(g: _Graph, model: ErrorModelArrays, variance: str) -> tuple[
     """Its root (N, 6, 6) and what is left of the variance (N, 6); ``gpvo.online.division.of_calibration``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:6], axis=1)
     patterns = np.transpose(model.calibration_patterns, (2, 1, 0)).reshape(6, 36)
-    flat = g("MatMul", g("Where", g.finite(v), v, 0.0), g.constant(patterns))
+    flat = g("MatMul", g("Where", g.known(v), v, 0.0), g.constant(patterns))
     root = g("Reshape", flat, g.constant([-1, 6, 6], np.int64))
     left = g("Div", variance, g("Add", variance, g.sum(g("Mul", root, root), 2)))
     return g("Mul", root, g.expand(g("Sqrt", left), 2), out="calibration_root"), g("Mul", variance, left)
@@ -248,8 +255,9 @@ def _of_calibration(g: _Graph, model: ErrorModelArrays, variance: str) -> tuple[
 def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:
     """Of jitter, white and bias (N, 6); line by line ``gpvo.online.division.divide`` and ``ln_faster``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:3], axis=1)
-    known = g.finite(g.expand(g.sum(v, 1), 1))
-    v = g("Where", g.finite(v), v, 0.0)
+    there = g.known(v)
+    known = g("Equal", g("ReduceMin", g("Cast", there, to=_INT64), axes=[1]), g.constant(1, np.int64))
+    v = g("Where", there, v, 0.0)
     speed = g("Sqrt", g.expand(g.sum(g("Mul", v, v), 1), 1))
     ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), g.constant(model.ln_speed))
     faster = g("Where", known, g("Max", g("Min", ratio, LN_FASTEST), 0.0), 0.0)
@@ -271,18 +279,19 @@ def _residual_px(g: _Graph, model: ErrorModelArrays, inside: str) -> str:
     return g("Exp", g("Add", g("Mul", g.take(inside, k, axis=1), model.domain.scale[k[0]]), model.domain.centre[k[0]]))
 
 
-def _turn_first(g: _Graph, covariance: str, steady_mean: Array) -> tuple[str, str]:
-    """Of (N, 6, 6) positive definite matrices the log-determinants (N,), and their root times ``steady_mean`` (N, 6).
+def _turn_first(g: _Graph, covariance: str, steady_mean: Array) -> tuple[list[str], str]:
+    """Of (N, 6, 6) matrices the six pivots (N,), positive where a matrix is positive definite and its determinant's
+    factors, and their root times ``steady_mean`` (N, 6).
 
     ``gpvo.geometry.covariance.turn_first_root``: the columns of its Cholesky factor are those of successive Schur
     complements over the roots of the pivots.
     """
     rest = g.take(g.take(covariance, TURN_FIRST, axis=1), TURN_FIRST, axis=2)
-    logs, lean = [], []
+    pivots, lean = [], []
     for size in range(6, 0, -1):
         column = g.take(rest, [0], axis=2)
         pivot = g.take(column, [0], axis=1)
-        logs.append(g("Log", g("Reshape", pivot, g.constant([-1], np.int64))))
+        pivots.append(g("Reshape", pivot, g.constant([-1], np.int64)))
         # Each axis still there back to its place among the six.
         back = steady_mean[TURN_FIRST[-size]] * np.eye(6)[TURN_FIRST[-size:]]
         unit = g("Div", column, g("Sqrt", pivot))
@@ -293,4 +302,4 @@ def _turn_first(g: _Graph, covariance: str, steady_mean: Array) -> tuple[str, st
             right = g.take(g.take(rest, [0], axis=1), others, axis=2)
             block = g.take(g.take(rest, others, axis=1), others, axis=2)
             rest = g("Sub", block, g("Div", g("MatMul", below, right), pivot))
-    return g.add(*logs), g.add(*lean)
+    return pivots, g.add(*lean)

@@ -13,6 +13,9 @@ typedef struct {
     double distance;     /* from the training domain, in training standard deviations */
 } gpvo_estimate;
 
+/* Whether a feature is there: not NaN, not infinite, not beyond all measure. */
+static int gpvo_known(double v) { return fabs(v) < GPVO_LARGEST; }
+
 static double gpvo_clip(double v, double low, double high) { return v < low ? low : v > high ? high : v; }
 
 /* Draws the standardised features into the training domain; returns how far outside they were, given the variance of
@@ -23,14 +26,14 @@ static double gpvo_locate(const double *features, const double *base, double dt_
     for (i = 0; i < GPVO_N_FEATURES; ++i) {
         double u = (features[i] - gpvo_centre[i]) / gpvo_scale[i];
         double noise = 0.0, dt2 = dt_s * dt_s, away;
-        int missing = !isfinite(u);
+        int missing = !gpvo_known(features[i]);
         for (j = 0; j < 6; ++j) {
             int at = j * GPVO_N_FEATURES + i;
             noise += base[j] * (gpvo_by_velocity[at] + gpvo_by_acceleration[at] / dt2) / dt2;
         }
         if (missing) {
             u = 0.0;
-            beyond += gpvo_may_miss[i] ? 0.0 : 1.0;
+            beyond += gpvo_missing[i];
         }
         inside[i] = gpvo_clip(u, gpvo_low[i], gpvo_high_edge[i]);
         away = u - gpvo_clip(u, gpvo_least[i], gpvo_most[i]);
@@ -92,7 +95,7 @@ static void gpvo_base(const double *features, double dt_s, double base[6], doubl
     for (i = 0; i < GPVO_N_BASE; ++i) {
         int at = gpvo_base_column[i];
         double least = gpvo_centre[at] + gpvo_scale[at] * gpvo_low[at];
-        column[i] = isfinite(features[at]) ? features[at] : gpvo_centre[at];
+        column[i] = gpvo_known(features[at]) ? features[at] : gpvo_absent[i];
         if (i >= 6) column[i] = gpvo_clip(column[i], least, GPVO_LN_LARGEST);
     }
     for (i = 0; i < 3; ++i) {
@@ -105,6 +108,8 @@ static void gpvo_base(const double *features, double dt_s, double base[6], doubl
         double noise = GPVO_N_BASE > 12 ? exp(2.0 * column[12 % GPVO_N_BASE]) : 0.0;
         base[j] = (theta[0] + theta[4] * noise) * geometry + theta[1] + theta[2] * translation + theta[3] * rotation;
         plain[j] = (without[0] + without[4] * noise) * geometry + without[1] + without[2] * translation + without[3] * rotation;
+        if (base[j] < GPVO_LEAST_VAR) base[j] = GPVO_LEAST_VAR;
+        if (plain[j] < GPVO_LEAST_VAR) plain[j] = GPVO_LEAST_VAR;
     }
 }
 
@@ -114,7 +119,7 @@ static void gpvo_limits(const double *features, double dt_s, double limit[2]) {
     limit[0] = limit[1] = 0.0;
     for (i = 0; i < 6; ++i) {
         int at = gpvo_base_column[i];
-        double rate = isfinite(features[at]) ? features[at] : gpvo_centre[at];
+        double rate = gpvo_known(features[at]) ? features[at] : gpvo_absent[i];
         limit[i / 3] += (rate * rate + gpvo_usual_rate_var[i]) * dt_s * dt_s;
     }
 }
@@ -125,15 +130,32 @@ static double gpvo_within(double variance, double limit) {
     return limit * ratio / sqrt(1.0 + ratio * ratio);
 }
 
+/* Lower Cholesky factor of a symmetric 6x6 matrix, the turn before the translation: row and column i are of axis
+ * (i + 3) % 6. Returns the log-determinant, NaN where the matrix is not positive definite. */
+static double gpvo_turn_first_root(const double C[36], double L[36]) {
+    double sum = 0.0;
+    int i, j, k;
+    for (i = 0; i < 6; ++i)
+        for (j = 0; j <= i; ++j) {
+            double v = C[(i + 3) % 6 * 6 + (j + 3) % 6];
+            for (k = 0; k < j; ++k) v -= L[i * 6 + k] * L[j * 6 + k];
+            L[i * 6 + j] = i == j ? sqrt(v) : v / L[j * 7];
+            if (i == j) sum += 2.0 * log(L[i * 7]);
+        }
+    return sum;
+}
+
 /* Correlations of jitter, white and bias; the first two mixed with those of the geometric covariance where there is one. */
 static void gpvo_correlations(const double *geometry, double R[3][36]) {
     int i, j, p, known = geometry != 0 && GPVO_GEOMETRY_WEIGHT > 0.0;
-    double own[36];
+    double own[36], ridge[36], L[36];
     for (i = 0; i < 6 && known; ++i)
         for (j = 0; j < 6; ++j) {
-            own[i * 6 + j] = geometry[i * 6 + j] / (sqrt(geometry[i * 7]) * sqrt(geometry[j * 7]));
-            if (!isfinite(own[i * 6 + j])) known = 0;
+            double both = 0.5 * (geometry[i * 6 + j] + geometry[j * 6 + i]);
+            own[i * 6 + j] = both / (sqrt(geometry[i * 7]) * sqrt(geometry[j * 7]));
+            ridge[i * 6 + j] = own[i * 6 + j] + (i == j ? 1e-6 : 0.0);
         }
+    if (known) known = isfinite(gpvo_turn_first_root(ridge, L));
     for (p = 0; p < 3; ++p)
         for (i = 0; i < 36; ++i) {
             R[p][i] = gpvo_correlation[36 * p + i];
@@ -146,7 +168,10 @@ static void gpvo_correlations(const double *geometry, double R[3][36]) {
 static double gpvo_faster(const double *features) {
     double v2 = 0.0, ratio;
     int i;
-    for (i = 0; i < 3; ++i) v2 += features[gpvo_base_column[i]] * features[gpvo_base_column[i]];
+    for (i = 0; i < 3; ++i) {
+        double v = features[gpvo_base_column[i]];
+        v2 += gpvo_known(v) ? v * v : NAN;
+    }
     ratio = log(sqrt(v2) > 1e-9 ? sqrt(v2) : 1e-9) - GPVO_LN_SPEED;
     return isfinite(v2) ? gpvo_clip(ratio, 0.0, log(20.0)) : 0.0;
 }
@@ -159,7 +184,7 @@ static double gpvo_of_calibration(const double *features, int j, double variance
         root[p] = 0.0;
         for (i = 0; i < 6; ++i) {
             double v = features[gpvo_base_column[i]];
-            if (isfinite(v)) root[p] += gpvo_calibration_patterns[(p * 6 + j) * 6 + i] * v;
+            if (gpvo_known(v)) root[p] += gpvo_calibration_patterns[(p * 6 + j) * 6 + i] * v;
         }
         sum += root[p] * root[p];
     }
@@ -180,21 +205,6 @@ static void gpvo_divide(int j, double variance, double faster, double part[3][6]
     part[2][j] = sqrt(variance * bias / whole);
 }
 
-/* Lower Cholesky factor of a symmetric positive definite 6x6 matrix, the turn before the translation: row and column i are
- * of axis (i + 3) % 6. Returns the log-determinant. */
-static double gpvo_turn_first_root(const double C[36], double L[36]) {
-    double sum = 0.0;
-    int i, j, k;
-    for (i = 0; i < 6; ++i)
-        for (j = 0; j <= i; ++j) {
-            double v = C[(i + 3) % 6 * 6 + (j + 3) % 6];
-            for (k = 0; k < j; ++k) v -= L[i * 6 + k] * L[j * 6 + k];
-            L[i * 6 + j] = i == j ? sqrt(v) : v / L[j * 7];
-            if (i == j) sum += 2.0 * log(L[i * 7]);
-        }
-    return sum;
-}
-
 /* Noise [px] that the residuals show; 1 where the base does not look at it. */
 static double gpvo_residual_px(const double *inside) {
 #if GPVO_N_BASE > 12
@@ -207,11 +217,11 @@ static double gpvo_residual_px(const double *inside) {
 }
 
 /* The error of one motion. features: GPVO_N_FEATURES values in the order above, NAN where missing. geometry: 6x6
- * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; 0 or less means the
- * training's. Never fails; uses no heap and no state. */
+ * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; what is none, such as
+ * 0, means the training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
     double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], limit[2], distance, outside, growth, ln_det, noise;
-    double duration = dt_s > 0.0 ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
+    double duration = dt_s >= GPVO_SHORTEST_S && dt_s <= GPVO_LONGEST_S ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     gpvo_base(features, duration, base, plain);
     distance = gpvo_locate(features, base, duration, inside);
@@ -224,7 +234,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     outside = 1.0 - out->in_domain;
     growth = pow(1.0 + distance, GPVO_OUTSIDE_POWER);
     for (j = 0; j < 6; ++j) {
-        double log_noise = said[2][j], known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance;
+        double log_noise = gpvo_clip(said[2][j], -GPVO_LN_LARGEST, GPVO_LN_LARGEST), known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
         double unit = GPVO_MEAN_IN_SIGMA ? sqrt(base[j]) : duration / GPVO_DT_S, usual = said[0][j] * unit;
         out->mean[j] = usual * out->in_domain;

@@ -5,12 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gpvo.online.basis import ProjectedGP
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 
 @dataclass(frozen=True)

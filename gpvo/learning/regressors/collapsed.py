@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -30,8 +29,7 @@ from gpvo.learning.regressors.numerics import (
     unpack,
 )
 from gpvo.online.basis import ProjectedGP
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 CHUNK_ROWS = 8192
 FEW_POINTS = 128
@@ -68,11 +66,6 @@ class Sums:
         """Of no rows."""
         kk, ky, k, y = (torch.zeros(*shape, dtype=torch.float64) for shape in ((m, m), (m, D), (m,), (D,)))
         return cls(kk, ky, k, y, y, 0.0, 0.0, 0.0)
-
-    def combined(self, other: Sums, sign: float) -> Sums:
-        """These sums plus (sign 1) or minus (sign -1) those of other rows."""
-        mine, theirs = vars(self), vars(other)
-        return Sums(**{name: mine[name] + sign * theirs[name] for name in mine})
 
     def centred(self, shift: Array) -> Sums:
         """The sums had ``shift`` (D,) been subtracted from the outputs."""

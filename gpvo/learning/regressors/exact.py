@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from gpvo.learning.regressors.base import FittedGP, Hyperparameters
@@ -24,8 +23,7 @@ from gpvo.learning.regressors.numerics import (
     unit_kernel,
 )
 from gpvo.online.basis import ProjectedGP
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 BOUND_POINTS = 512
 
@@ -41,7 +39,7 @@ class ExactRegressor:
     """For up to a few thousand rows: O(n^2) memory, O(n^3) time.
 
     ``isotropic``: one length scale for all inputs. ``hyper``: fixed hyperparameters, in the units of the data;
-    nothing is learnt then. ``guess``: where to start learning instead. ``centre_outputs``: subtract the outputs'
+    nothing is learnt then. ``centre_outputs``: subtract the outputs'
     weighted mean first (a constant mean function). Beyond a few hundred rows the length scales climb the collapsed
     bound of all rows where it is tight, and the exact likelihood elsewhere; signal and noise variances are always
     those of the exact likelihood.
@@ -49,7 +47,6 @@ class ExactRegressor:
 
     isotropic: bool = False
     hyper: Hyperparameters | None = None
-    guess: Hyperparameters | None = None
     centre_outputs: bool = True
     max_iterations: int = 25
     device: str = "auto"
@@ -79,18 +76,17 @@ class ExactRegressor:
                 hyper = scaling.scaled(self.hyper)
                 spectrum = Spectrum.of(Xs, Ys, w, hyper, device)
             else:
-                guess = None if self.guess is None else scaling.scaled(self.guess)
-                hyper, spectrum = self._learn(Xs, Ys, w, guess, device, seed)
+                hyper, spectrum = self._learn(Xs, Ys, w, device, seed)
             gp = spectrum.posterior(Xs, hyper, scaling)
         evidence = spectrum.log_evidence(hyper) - len(X) * np.log(scaling.y_scale).sum()
         return FittedGP(gp, scaling.unscaled(hyper), float(evidence), self.name, len(X))
 
     def _learn(
-        self, Xs: Array, Ys: Array, w: Array, guess: Hyperparameters | None, device: torch.device, seed: int
+        self, Xs: Array, Ys: Array, w: Array, device: torch.device, seed: int
     ) -> tuple[Hyperparameters, Spectrum]:
         """Hyperparameters of standardised data, and the spectrum at them."""
         n, D = Ys.shape
-        hyper = guess or start(Xs, Ys, w, isotropic=self.isotropic, seed=seed)
+        hyper = start(Xs, Ys, w, isotropic=self.isotropic, seed=seed)
         loose = n <= START_ROWS
         if not loose:
             bound, slack = tight_bound((Xs, Ys, w, np.ones(n)), hyper, BOUND_POINTS, seed=seed)

@@ -7,9 +7,8 @@ Regression" (2020), section 7.2.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 _CANDIDATES = 8000
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from gpvo.learning.regressors.base import Hyperparameters
 from gpvo.learning.regressors.numerics import bounds, first_guess, length_gradient, pack, unit_kernel, unpack
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 START_ROWS = 400
 START_ITERATIONS = 15

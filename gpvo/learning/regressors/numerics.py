@@ -8,13 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gpvo.learning.regressors.base import Hyperparameters
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 LOG_LENGTH_BOUNDS = (np.log(0.05), np.log(50.0))
 LOG_SIGNAL_BOUNDS = (np.log(1e-6), np.log(1e3))

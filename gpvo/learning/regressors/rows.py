@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 RawChunk = tuple[Array, Array, Array, Array]
 """Inputs (b, d), outputs (b, D), noise weights (b,), sample weights (b,), in the units of the data."""

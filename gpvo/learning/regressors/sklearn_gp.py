@@ -8,13 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gpvo.learning.regressors.base import FittedGP, Hyperparameters
 from gpvo.learning.regressors.exact import Spectrum
 from gpvo.learning.regressors.numerics import Scaling, checked, fixed_threads
-
-Array = NDArray[np.float64]
+from gpvo.types import Array
 
 
 @dataclass(frozen=True)

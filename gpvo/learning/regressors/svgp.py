@@ -22,9 +22,8 @@ from gpvo.learning.regressors.inducing import greedy_points
 from gpvo.learning.regressors.likelihood import start
 from gpvo.learning.regressors.numerics import checked, fixed_threads, pick_device
 from gpvo.learning.regressors.rows import ArrayRows, Rows, draw
-from gpvo.learning.regressors.sparse import close, exact_instead, standardised, streamed_scaling
-
-Array = NDArray[np.float64]
+from gpvo.learning.regressors.streamed import close, exact_instead, standardised, streamed_scaling
+from gpvo.types import Array
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,209 @@
+"""How the errors of single motions add up along a path: the one recursion that filters, messages and learning share.
+
+The error of a pose is ``e_k = Ad(T_k)^-1 e_(k-1) + xi_k``, right perturbation, in the axes of the last camera, and that
+of a motion ``xi_k = n_k - Ad(T_k)^-1 n_(k-1) + w_k + L_k u_k``. Two-frame VO shares the pixel noise n of each frame
+between two motions, with opposite sign, as if that frame's pose were off by n; w is white; what persists (errors of
+calibration, bias of depth) is ``L u`` with u first-order Gauss-Markov of unit variance (A. Gelb, "Applied Optimal
+Estimation" (1974), section 3.8). So jitter never adds up: a pose holds the last frame's and, from
+afar, the first one's.
+
+A ``lost`` motion was not made of any frame's pixels: it adds its covariance and shares nothing, and the next motion
+brings the noise of the frame where it starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import symmetrise
+from gpvo.types import Array, MotionError
+
+_E, _N = slice(0, 6), slice(6, 12)
+_U = 12
+
+
+def carry(T_prev_cur: Array) -> Array:
+    """(..., 6, 6) ``Ad(T)^-1``: takes an error of the pose before a motion to the pose after it."""
+    return se3.adjoint(se3.inverse(T_prev_cur))
+
+
+def frame_jitter(jitter: Array) -> Array:
+    """Covariance (..., 6, 6) of the noise of the frame where a motion of this jitter ends, in that frame's axes."""
+    return 0.5 * jitter
+
+
+def first_jitter(T_prev_cur: Array, jitter: Array) -> Array:
+    """The same of the frame where a motion starts, if no motion before it has ended there: the motion's other half."""
+    back = se3.adjoint(T_prev_cur)
+    return np.asarray(back @ frame_jitter(jitter) @ np.swapaxes(back, -1, -2))
+
+
+def from_start(error: MotionError, carried: Array) -> Array | float:
+    """d(error of a motion) / d(noise of the frame where it starts), with its ``Ad(T)^-1`` (..., 6, 6)."""
+    return 0.0 if error.lost else -carried
+
+
+def from_end(error: MotionError) -> Array | float:
+    """Covariance (..., 6, 6) of the noise that a motion shares with those that start where it ends."""
+    return 0.0 if error.lost else frame_jitter(error.jitter)
+
+
+def independent_part(error: MotionError) -> Array:
+    """Covariance (..., 6, 6) of what a motion shares with no other."""
+    return error.white + error.jitter if error.lost else error.white
+
+
+def persistence(dt_s: ArrayLike, tau_s: Array) -> Array:
+    """(..., P) correlation ``exp(-dt / tau)`` of the persistent vector over ``dt_s`` (...)."""
+    return np.asarray(np.exp(-np.maximum(dt_s, 0.0)[..., None] / np.maximum(tau_s, 1e-9)))
+
+
+class PoseError:
+    """Mean and covariance of the error of a pose, motion by motion.
+
+    The joint state is (e, n, u): error of the pose, noise of its frame, and the persistent vector, so that a part
+    whose size or sign changes stays correlated with what it was.
+    """
+
+    def __init__(self) -> None:
+        self._mean = np.zeros(6)
+        self._P = np.zeros((_U, _U))
+        self._jitter_known = False
+        self._unaged_s = 0.0
+
+    @property
+    def mean(self) -> Array:
+        """(6,) of the pose."""
+        return self._mean
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of the pose."""
+        return symmetrise(self._P[_E, _E])
+
+    def after(self, T_prev_cur: Array, error: MotionError) -> PoseError:
+        """The error of the pose at the end of a motion ``T_prev_cur`` (4, 4) of this error; several may start here.
+
+        Raises ValueError where the persistent vector has another length than before.
+        """
+        if not (self._jitter_known or error.lost):
+            # The first motion that starts here says how noisy this frame is.
+            self._P[_N, _N] = first_jitter(T_prev_cur, error.jitter)
+            self._jitter_known = True
+        further = PoseError()
+        further._P, further._unaged_s = self._P, self._unaged_s
+        root, phi = further._aged(error)
+        own, P, moved = from_end(error), further._P, carry(T_prev_cur)
+        A = np.zeros_like(P)
+        A[_E, _E] = moved
+        A[_E, _N] = from_start(error, moved)
+        A[_E, _U:] = root * phi
+        A[_U:, _U:] = np.diag(phi)
+        P = A @ P @ A.T
+        # What is new: the frame's noise enters the error and its own place, and so does the innovation of u.
+        innovation = 1.0 - phi**2
+        P[_E, _E] += independent_part(error) + own + (root * innovation) @ root.T
+        for block in ((_E, _N), (_N, _E), (_N, _N)):
+            P[block] += own
+        P[_E, _U:] += root * innovation
+        P[_U:, _E] += (root * innovation).T
+        P[_U:, _U:] += np.diag(innovation)
+        further._P, further._jitter_known = P, not error.lost
+        further._mean = moved @ self._mean + error.mean
+        return further
+
+    def _aged(self, error: MotionError) -> tuple[Array, Array]:
+        """Root (6, P) and correlation (P,) since the vector last aged; an error without one lets time pass."""
+        known, P = len(self._P) - _U, len(error.persistent_tau_s)
+        elapsed_s = self._unaged_s + float(error.dt_s)
+        if P == 0:
+            self._unaged_s = elapsed_s
+            return np.zeros((6, known)), np.ones(known)
+        if known == 0:
+            # It starts in its steady state.
+            joint = np.eye(_U + P)
+            joint[:_U, :_U] = self._P
+            self._P = joint
+        elif known != P:
+            raise ValueError(f"the persistent vector has {P} elements, and had {known}")
+        self._unaged_s = 0.0
+        return error.persistent_root, persistence(elapsed_s, error.persistent_tau_s)
+
+
+def along(T_prev_cur: Array, errors: Sequence[MotionError], parent: Iterable[int]) -> tuple[Array, Array]:
+    """Mean (N, 6) and covariance (N, 6, 6) of the error of every pose of a log.
+
+    ``T_prev_cur`` (N, 4, 4) motions with their ``errors``; ``parent``: the pose that each starts from, -1 for the
+    origin, which is known.
+    """
+    states: dict[int, PoseError] = {}
+    mean, covariance = np.zeros((len(errors), 6)), np.zeros((len(errors), 6, 6))
+    for k, (T, error, p) in enumerate(zip(T_prev_cur, errors, parent, strict=True)):
+        states[k] = PoseError() if p < 0 else states[p].after(T, error)
+        mean[k], covariance[k] = states[k].mean, states[k].covariance
+        # No motion starts before the reference of this one.
+        for old in [j for j in states if j < p]:
+            del states[old]
+    return mean, covariance
+
+
+@dataclass(frozen=True)
+class WindowError:
+    """Covariances (w, 6, 6) of the error of the last pose of w windows, by the part of the motions' errors."""
+
+    jitter: Array
+    white: Array
+    persistent: Array
+
+    @property
+    def covariance(self) -> Array:
+        """(w, 6, 6) of all parts together."""
+        return self.jitter + self.white + self.persistent
+
+
+def window_error(T_prev_cur: Array, error: MotionError) -> WindowError:
+    """What :class:`PoseError` gives after m motions, for w windows at once, none of them with a lost motion.
+
+    ``T_prev_cur`` (w, m, 4, 4); ``error``: arrays with leading axes (w, m). Time and memory go with w m.
+    """
+    to_end = adjoints_to_end(T_prev_cur)
+    ends = to_end[:, [0, -1]]
+    phi = persistence(np.broadcast_to(error.dt_s, to_end.shape[:2]), error.persistent_tau_s)
+    return WindowError(
+        # The noise of a frame between two motions cancels.
+        _sum(ends @ frame_jitter(error.jitter[:, [0, -1]]), ends),
+        _sum(to_end @ error.white, to_end),
+        persistent_sum(to_end @ error.persistent_root, phi),
+    )
+
+
+def adjoints_to_end(T_prev_cur: Array) -> Array:
+    """(w, m, 6, 6) that carry an error from after each motion to after the last; motions (w, m, 4, 4)."""
+    since = np.empty_like(T_prev_cur)
+    since[:, -1] = np.eye(4)
+    for k in range(T_prev_cur.shape[1] - 2, -1, -1):
+        since[:, k] = T_prev_cur[:, k + 1] @ since[:, k + 1]
+    return carry(since)
+
+
+def persistent_sum(root: Array, phi: Array) -> Array:
+    """(w, n, n) covariance of ``sum_k L_k u_k`` over windows of m motions.
+
+    ``root`` (w, m, n, P): L, all in the same axes; ``phi`` (w, m, P): correlation of u from the motion before to each.
+    """
+    before = np.zeros_like(root)
+    for k in range(1, root.shape[1]):
+        before[:, k] = (before[:, k - 1] + root[:, k - 1]) * phi[:, k, None, :]
+    return symmetrise(_sum(root + 2.0 * before, root))
+
+
+def _sum(A: Array, B: Array) -> Array:
+    """(w, n, n) ``sum_k A_k B_k^T`` of (w, m, n, p) each, as one product a window."""
+    w, m, n, p = A.shape
+    flat_A, flat_B = (X.swapaxes(1, 2).reshape(w, n, m * p) for X in (A, B))
+    return np.asarray(flat_A @ flat_B.swapaxes(1, 2))

@@ -1,0 +1,113 @@
+"""The size that an image file claims, read from its header: what would fill the memory is never decoded."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+
+MAX_PIXELS = 1 << 25
+"""33 megapixels: more than any stereo camera has."""
+MAX_SIDE_PX = 16384
+
+Size = tuple[int, int]
+
+
+def image_size(raw: bytes | memoryview) -> Size | None:
+    """(width, height) in pixels of encoded bytes (PNG, JPEG, BMP, TIFF, PNM, WebP); None where they are none of these
+    or damaged before the size."""
+    head = bytes(raw[:16])
+    reader = next((read for magic, read in _READERS if re.match(magic, head, re.DOTALL)), None)
+    try:
+        size = None if reader is None else reader(raw)
+    except (struct.error, ValueError, IndexError, KeyError):
+        return None
+    return size if size is not None and min(size) > 0 else None
+
+
+def is_plausible(size: Size | None) -> bool:
+    """Whether an image of this size may be decoded."""
+    return size is not None and max(size) <= MAX_SIDE_PX and size[0] * size[1] <= MAX_PIXELS
+
+
+def is_decodable(raw: bytes | memoryview) -> bool:
+    """Whether encoded bytes are an image, of a size and of chunks that a decoder may be given."""
+    return is_plausible(image_size(raw)) and is_whole(raw)
+
+
+def is_whole(raw: bytes | memoryview) -> bool:
+    """Whether the chunks of a PNG lie within the file: decoders make room for what a chunk claims. True for others."""
+    if bytes(raw[:4]) != b"\x89PNG":
+        return True
+    at = 8
+    while at + 12 <= len(raw):
+        (length,) = struct.unpack(">I", raw[at : at + 4])
+        if bytes(raw[at + 4 : at + 8]) == b"IEND":
+            return True
+        at += 12 + length
+    return False
+
+
+def _png(raw: bytes | memoryview) -> Size:
+    return struct.unpack(">II", raw[16:24])
+
+
+def _jpeg(raw: bytes | memoryview) -> Size | None:
+    at = 2
+    while True:
+        while raw[at] == 0xFF and raw[at + 1] == 0xFF:  # fill bytes
+            at += 1
+        marker, (length,) = raw[at + 1], struct.unpack(">H", raw[at + 2 : at + 4])
+        if raw[at] != 0xFF or length < 2:
+            return None
+        # Start of frame, of any coding; C4, C8 and CC are something else.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", raw[at + 5 : at + 9])
+            return width, height
+        at += 2 + length
+
+
+def _bmp(raw: bytes | memoryview) -> Size:
+    (header,) = struct.unpack("<I", raw[14:18])
+    width, height = struct.unpack("<HH", raw[18:22]) if header == 12 else struct.unpack("<ii", raw[18:26])
+    return width, abs(height)  # a negative height: top row first
+
+
+def _tiff(raw: bytes | memoryview) -> Size:
+    order = "<" if raw[0] == 0x49 else ">"
+    (at,) = struct.unpack(order + "I", raw[4:8])
+    (count,) = struct.unpack(order + "H", raw[at : at + 2])
+    found: dict[int, int] = {}
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind = struct.unpack(order + "HH", raw[entry : entry + 4])
+        if tag in (256, 257):
+            code, end = ("H", 10) if kind == 3 else ("I", 12)
+            (found[tag],) = struct.unpack(order + code, raw[entry + 8 : entry + end])
+    return found[256], found[257]
+
+
+def _pnm(raw: bytes | memoryview) -> Size:
+    text = re.sub(rb"#[^\n]*\n", b" ", bytes(raw[2:4096]))
+    width, height = text.split(None, 2)[:2]
+    return int(width), int(height)
+
+
+def _webp(raw: bytes | memoryview) -> Size | None:
+    kind = bytes(raw[12:16])
+    if kind == b"VP8X":
+        return 1 + int.from_bytes(raw[24:27], "little"), 1 + int.from_bytes(raw[27:30], "little")
+    if kind == b"VP8L":
+        bits = int.from_bytes(raw[21:25], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    width, height = struct.unpack("<HH", raw[26:30])
+    return width & 0x3FFF, height & 0x3FFF
+
+
+_READERS: tuple[tuple[bytes, Callable[[bytes | memoryview], Size | None]], ...] = (
+    (rb"\x89PNG\r\n\x1a\n", _png),
+    (rb"\xff\xd8\xff", _jpeg),
+    (rb"BM", _bmp),
+    (rb"II\*\x00|MM\x00\*", _tiff),
+    (rb"P[1-6]\s", _pnm),
+    (rb"RIFF....WEBP", _webp),
+)

@@ -1,0 +1,139 @@
+"""``gpvo live``: pictures or anyone's odometry in, covariance out; ``gpvo doctor``: a linter of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gpvo.cli.output import one_of
+from gpvo.errors import GpvoError
+
+
+def live(
+    model: Annotated[Path, typer.Option(help="Error model of this camera, or of this odometry.")],
+    stereo: Annotated[
+        tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the pictures.")
+    ] = None,
+    imu: Annotated[str | None, typer.Option(help="Topic of the IMU, with --stereo.")] = None,
+    odometry: Annotated[
+        str | None, typer.Option(help="Topic of another odometry, to be published again with its covariance.")
+    ] = None,
+    odometry_type: Annotated[
+        str, typer.Option(help="Type of that topic: odometry, or pose (PoseWithCovarianceStamped).")
+    ] = ("odometry"),
+    replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False,
+    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 by rclpy, where it is installed.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 by rospy, where it is installed.")] = False,
+    address: Annotated[
+        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
+    ] = None,
+    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0,
+    mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write a bag: .bag, .mcap or a ROS 2 folder.")] = None,
+    topic: Annotated[str, typer.Option(help="Topic of the odometry that is published.")] = "/gpvo/odometry",
+    pose_topic: Annotated[str | None, typer.Option(help="Publish PoseWithCovarianceStamped here too.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the pictures.")] = (
+        None
+    ),
+    pose_covariance: Annotated[str, typer.Option(help="accumulated since the start, or of the last increment.")] = (
+        "accumulated"
+    ),
+    correct_twist: Annotated[
+        bool, typer.Option("--correct-twist", help="Subtract the predicted mean error from the twist.")
+    ] = False,
+    state: Annotated[
+        Path | None, typer.Option(help="File that keeps the state, and from which a restart continues.")
+    ] = None,
+    depth: Annotated[int, typer.Option(help="Longest queue of a topic; older messages are dropped.", min=2)] = 10,
+    json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
+) -> None:
+    """Publish odometry with an honest covariance, live.
+
+    Example: gpvo live --odometry /vins_estimator/odometry --model vins.gpvo --zenoh
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.live.engine import EngineSettings
+    from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings, run_live
+
+    one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
+    one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
+    result = run_live(
+        LiveSettings(
+            model=model,
+            stereo=stereo,
+            imu=imu,
+            odometry=odometry,
+            pose_type=POSE_TYPE_NAMES[odometry_type],
+            calibration=calibration,
+            replay=replay,
+            fast=fast,
+            wire=_one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1),
+            address=address,
+            domain=domain,
+            mavlink=mavlink,
+            out=out,
+            topic=topic,
+            pose_topic=pose_topic,
+            depth=depth,
+            engine=EngineSettings(correct_twist, pose_covariance == "increment", state),
+        )
+    )
+    if json_:
+        print_json({"schema": 1, **result})
+    else:
+        print(", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing came")
+
+
+def doctor(
+    source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
+    topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Listen over Zenoh.")] = False,
+    dds: Annotated[bool, typer.Option("--dds", help="Listen over DDS.")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Listen by rclpy.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="Listen by rospy.")] = False,
+    odometry_type: Annotated[str, typer.Option(help="Type of a topic: odometry, pose, or pose_stamped.")] = "odometry",
+    address: Annotated[str | None, typer.Option(help="Zenoh router.")] = None,
+    domain: Annotated[int, typer.Option(help="ROS domain id.", min=0, max=232)] = 0,
+    seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
+    json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Find what is wrong with anyone's covariance, and say what each filter makes of it.
+
+    Example: gpvo doctor flight.mcap
+    """
+    from gpvo.cli.output import print_json
+    from gpvo.live.examination import examine_bag, examine_topic
+    from gpvo.live.job import POSE_TYPE_NAMES
+
+    wire = _one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1)
+    if wire is None:
+        found = examine_bag(Path(source), topic)
+    else:
+        kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
+        found = {source: examine_topic(wire, source, kind, seconds, address, domain)}
+    if json_:
+        rows = [{"topic": t, "findings": [f.__dict__ for f in findings]} for t, findings in found.items()]
+        print_json({"schema": 1, "source": source, "topics": rows})
+        return
+    for name, findings in found.items():
+        print(f"{name}: {len(findings) or 'nothing'} found")
+        for finding in findings:
+            print(f"  {finding}")
+
+
+def _one_wire(**given: bool) -> str | None:
+    chosen = [name for name, on in given.items() if on]
+    if len(chosen) > 1:
+        raise GpvoError(f"--{' and --'.join(chosen)} exclude each other", cure="choose one")
+    return chosen[0] if chosen else None
+
+
+def register(app: typer.Typer) -> None:
+    """Add this file's commands to the application."""
+    app.command()(live)
+    app.command()(doctor)

@@ -1,0 +1,160 @@
+"""``gpvo selftest``: does everything work on this machine? From simulated tracks to a filter, in fifteen seconds."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import typer
+
+from gpvo.errors import EXTRA_OF, GpvoError
+
+_FLIGHTS = 3
+_SECONDS, _RATE_HZ = 15.0, 10.0
+
+
+@dataclass
+class _Bench:
+    """Where the parts leave what the next ones need."""
+
+    folder: Path
+    runs: list[Path] = field(default_factory=list)
+
+    @property
+    def model(self) -> Path:
+        return self.folder / "model.gpvo"
+
+
+class _Wrong(Exception):
+    """A part ran, and its result is not what it must be."""
+
+
+def selftest() -> None:
+    """Test this installation, in about fifteen seconds.
+
+    Simulates, runs odometry, evaluates, trains, predicts and fuses: [PASS], [FAIL] or [SKIP] for each.
+
+    Example: gpvo selftest
+    """
+    parts = (
+        ("simulate", _simulate), ("odometry", _odometry), ("evaluate", _evaluate), ("train", _train),
+        ("predict", _predict), ("filter", _filter), ("messages", _messages),
+    )  # fmt: skip
+    failed, missing = [], ""
+    with tempfile.TemporaryDirectory(prefix="gpvo-selftest-") as folder:
+        bench = _Bench(Path(folder))
+        for name, part in parts:
+            began = time.monotonic()
+            if missing:
+                print(f"[SKIP] {name}: needs {missing}")
+                continue
+            verdict, said = _try(part, bench)
+            print(f"[{verdict}] {name}: {said} ({time.monotonic() - began:.1f} s)", flush=True)
+            if verdict != "PASS":
+                missing = name
+            if verdict == "FAIL":
+                failed.append(name)
+    if failed:
+        raise GpvoError(f"{', '.join(failed)} failed", cure="reinstall gpvo; if that does not help, report these lines")
+
+
+def _try(part: Callable[[_Bench], str], bench: _Bench) -> tuple[str, str]:
+    try:
+        return "PASS", part(bench)
+    except ImportError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRA_OF:
+            return "FAIL", str(error)
+        return "SKIP", f"package '{package}' is not installed (pip install 'gpvo[{EXTRA_OF[package]}]')"
+    except Exception as error:  # whatever breaks is this command's finding
+        return "FAIL", f"{type(error).__name__}: {error}"
+
+
+def _require(holds: bool, what: str) -> None:
+    if not holds:
+        raise _Wrong(what)
+
+
+def _simulate(bench: _Bench) -> str:
+    from gpvo.sim.points import simulate_points
+
+    for seed in range(_FLIGHTS):
+        flight = simulate_points("tunnel-bursts", seed, duration_s=_SECONDS, rate_hz=_RATE_HZ)
+        flight.save(bench.folder / f"flight{seed}.npz")
+    return f"{_FLIGHTS} flights of {_SECONDS:g} s"
+
+
+def _odometry(bench: _Bench) -> str:
+    from gpvo import runner
+    from gpvo.io import open_source
+
+    said = []
+    for seed in range(_FLIGHTS):
+        bench.runs.append(bench.folder / f"run{seed}")
+        summary = runner.run(open_source(bench.folder / f"flight{seed}.npz"), bench.runs[-1])
+        moved = summary.status.get("ok", 0) + summary.status.get("degraded", 0)
+        _require(moved >= 0.8 * summary.frames, f"only {moved} of {summary.frames} frames have a motion")
+        said.append(summary.frames_per_s)
+    return f"{sum(said) / len(said):.0f} frames/s"
+
+
+def _evaluate(bench: _Bench) -> str:
+    from gpvo.evaluation.evaluate import evaluate_run
+    from gpvo.io.run_read import read_run
+
+    t = evaluate_run(read_run(bench.runs[-1])).trajectory
+    _require(t.ate_rmse_m < 0.05 * t.path_length_m, f"ATE of {t.ate_rmse_m:.2g} m over {t.path_length_m:.3g} m")
+    return f"ATE {t.ate_rmse_m:.3f} m over {t.path_length_m:.0f} m"
+
+
+def _train(bench: _Bench) -> str:
+    from gpvo.io.run_read import read_run
+    from gpvo.learning.config import TrainConfig
+    from gpvo.learning.store import save_model
+    from gpvo.learning.train import train_sets
+
+    config = TrainConfig()
+    sets = [config.rows_of(read_run(path)) for path in bench.runs[:-1]]
+    save_model(train_sets(sets, config, judge=False), bench.model)
+    return f"a model of {sum(map(len, sets))} motions, {bench.model.stat().st_size / 1e3:.0f} kB"
+
+
+def _predict(bench: _Bench) -> str:
+    from gpvo.evaluation.evaluate import evaluate_run
+    from gpvo.io.run_read import read_run
+    from gpvo.online.predictor import Predictor
+
+    learned = evaluate_run(read_run(bench.runs[-1]), Predictor.load(bench.model)).consistency["learned"]
+    nees = learned.nees_dof["joint"]
+    _require(nees is not None and 0.2 < nees.mean < 5.0, f"NEES/dof {nees} on a flight left out")
+    return f"NEES/dof {nees} on a flight left out (1 is right)"
+
+
+def _filter(bench: _Bench) -> str:
+    from gpvo.evaluation.fusion import FusionSettings, fuse_runs
+
+    report = fuse_runs([bench.runs[-1]], FusionSettings(model=bench.model, policies=("learned",)))
+    score = report.study.scores["learned"][0]
+    _require(score is not None and not score.diverged, "the filter diverged")
+    assert score is not None
+    return f"ATE {score.ate_rmse_m:.3f} m with an IMU"
+
+
+def _messages(bench: _Bench) -> str:
+    from gpvo.io.run_read import read_run
+    from gpvo.online.predictor import Predictor
+    from gpvo.publish.odometry import OdometryBuilder
+
+    run = read_run(bench.runs[-1])
+    predictor, builder = Predictor.load(bench.model, for_filter=True), OdometryBuilder(run.mounting.T_body_cam)
+    predictor.reset(run.log.camera)
+    messages = [builder.step(record, predictor.step(record)) for record in run.log]
+    return f"{len(messages)} odometry messages"
+
+
+def register(app: typer.Typer) -> None:
+    """Add this file's commands to the application."""
+    app.command()(selftest)

@@ -1,0 +1,107 @@
+"""What an evaluation comes to, in words: which stated covariance is true, over which distances, and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from gpvo.evaluation.consistency import Consistency, Horizon
+from gpvo.learning.check import ENOUGH_INSIDE
+
+if TYPE_CHECKING:
+    from gpvo.evaluation.evaluate import Evaluation
+
+TRUE = (0.5, 2.0)
+"""NEES per degree of freedom that counts as true: sigma right within a factor of 1.4."""
+_FEW_WINDOWS = 5
+
+Colour = Literal["green", "amber", "red"]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``colour`` and ``headline`` of the best stated covariance, and what stands behind it line by line."""
+
+    colour: Colour
+    headline: str
+    lines: tuple[str, ...]
+
+
+def verdict(e: Evaluation) -> Verdict:
+    """The verdict on one evaluated run."""
+    judged = {m: c for m, c in e.consistency.items() if c.nll_per_dim is not None}
+    if not judged and e.poses is not None:
+        joint = e.poses.nees_dof["joint"].mean
+        colour: Colour = "green" if _word(joint) == "true" else "red" if joint > TRUE[1] else "amber"
+        line = f"NEES/dof {joint:.3g} over {e.poses.count} poses, median {e.poses.nees_dof_median['joint']:.3g}."
+        return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
+    if not judged:
+        return Verdict("red", "No covariance was stated, so nothing can be judged.", tuple(_conditions(e)))
+    best = min(judged, key=lambda m: judged[m].nll_per_dim or 0.0)
+    # What a vehicle would be told is judged first; others only where it is wrong.
+    told = "learned" if "learned" in judged else best
+    wrong = _wrong(judged[told])
+    outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
+    lines = [*_conditions(e), *(_line(m, c) for m, c in judged.items() if m in (told, best) or m in _ALWAYS)]
+    if not wrong and not outside:
+        return Verdict("green", f"The {told} covariance is true here, per motion and over distance.", tuple(lines))
+    if told != best and not _wrong(judged[best]):
+        lines.append(f"Use {best} here: it is true, and its likelihood is the best of all.")
+    elif outside:
+        lines.append("Train on runs of this camera and these conditions, with truth or with twins.")
+    per_motion = _word(_nees(judged[told]))
+    headline = f"The {told} covariance is {per_motion} per motion"
+    if wrong and per_motion == "true":
+        headline += f", but not over {' and '.join(wrong)}"
+    if outside:
+        headline += "; the model does not know these conditions"
+    return Verdict("red" if outside or per_motion == "overconfident" else "amber", headline + ".", tuple(lines))
+
+
+_ALWAYS = ("triangulation", "pointing_matching", "imported")
+
+
+def _nees(c: Consistency) -> float:
+    """Per motion; with the truth's own noise counted in, which nobody's odometry can know."""
+    return c.nees_dof_truth_noise["joint"] or float("nan")
+
+
+def _word(nees: float, chance: float = 0.0) -> str:
+    """``chance``: relative standard deviation that the mean of so few windows has even where the statement is true."""
+    if nees > TRUE[1] * (1 + 2 * chance):
+        return "overconfident"
+    return "too cautious" if nees < TRUE[0] * (1 - 2 * chance) else "true"
+
+
+def _spans(c: Consistency) -> Iterator[tuple[str, Horizon]]:
+    """Names and scores of the windows of which there are enough."""
+    for name, h in (("1 s", c.one_second), *((f"{h.span:g} m", h) for h in c.horizons)):
+        if h is not None and h.count >= _FEW_WINDOWS:
+            yield name, h
+
+
+def _wrong(c: Consistency) -> list[str]:
+    """Over what the statement is wrong, beyond chance."""
+    out = [] if _word(_nees(c)) == "true" else ["one motion"]
+    # Windows overlap by half, so half of them are independent: the mean of n chi-squared of 6 dof.
+    chances = ((name, h, math.sqrt(2 / (6 * h.count / 2))) for name, h in _spans(c))
+    return out + [name for name, h, chance in chances if _word(h.nees_dof_truth_noise, chance) != "true"]
+
+
+def _line(method: str, c: Consistency) -> str:
+    nees = _nees(c)
+    off = max(nees, 1.0 / nees) ** 0.5 if nees > 0 else float("inf")
+    by = "" if _word(nees) == "true" else f" by a factor of {off:.1f} in sigma"
+    over = ", ".join(f"{h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
+    return f"{method}: {_word(nees)}{by}; NEES/dof {nees:.2f} per motion" + (f", {over}" if over else "") + "."
+
+
+def _conditions(e: Evaluation) -> Iterator[str]:
+    """What was seen of the run and of the model's domain."""
+    if e.in_domain is not None:
+        yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
+    lost = sum(r.status.value == "lost" for r in e.run.log)
+    if lost:
+        yield f"{lost} of {len(e.run.log)} frames have no motion."

@@ -1,0 +1,342 @@
+"""A linter of anyone's covariance: what is wrong with the numbers, and what the filters that read them will do.
+
+robot_localization: src/ros_filter.cpp, src/ekf.cpp (variances below 1e-9 become 1e-9, negative ones positive, NaN is
+not looked for). PX4: src/modules/ekf2/EKF/aid_sources/external_vision and params_external_vision.yaml (floors).
+ArduPilot: libraries/GCS_MAVLink/GCS_Common.cpp, AP_VisualOdom_MAV.cpp (clamps). FusionCore: what is stated drives its
+chi-square gate, zeros fall back to 0.1 m and 0.02 rad, off-diagonal elements are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import is_positive_definite
+from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.types import Array
+
+_ENOUGH = 10
+_LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds up over as many frames as it lasts
+_SWAPPED = "every consumer reads metres where radians stand, and the other way round"
+_HUGE, _TINY = 1e3, 1e-8
+_ZERO_FALLBACK = "FusionCore takes 0.1 m and 0.02 rad in its place"
+_RL_FLOOR = "robot_localization takes 1e-9, a sigma of 0.03 mm, and lets go of everything else"
+_PX4_FLOOR = "PX4 takes EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) in its place"
+_AP_FLOOR = "ArduPilot takes VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong: ``code`` for scripts, what was seen, and what each consumer makes of it."""
+
+    code: str
+    what: str
+    consequence: str
+    share: float = 1.0
+
+    def __str__(self) -> str:
+        part = "" if self.share >= 1.0 else f" ({100 * self.share:.0f} % of the messages)"
+        return f"{self.code}: {self.what}{part}\n    {self.consequence}"
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A recording of one topic. ``T`` (N, 4, 4); ``pose``, ``twist`` (N, 6, 6) or None where the type has none; ``v``
+    (N, 6) the twist, None likewise; ``quaternion_norm`` (N,); ``frames``: the pairs of frame names that occur.
+    """
+
+    t_ns: np.ndarray
+    T: Array
+    quaternion_norm: Array
+    frames: tuple[tuple[str, str], ...]
+    pose: Array | None
+    twist: Array | None
+    v: Array | None
+
+    @classmethod
+    def of(cls, messages: Iterable[Any]) -> Stated:
+        """From messages in the order of their arrival. GpvoError where there are fewer than ten."""
+        kept = list(messages)
+        if len(kept) < _ENOUGH:
+            raise GpvoError(f"{len(kept)} messages are too few to judge", cure=f"record at least {_ENOUGH}")
+        rows = np.array([pose_of(m) for m in kept])
+        norm = np.linalg.norm(rows[:, 3:], axis=1)
+        good = np.isfinite(rows).all(axis=1) & (norm > 1e-6)
+        T = np.tile(np.full((4, 4), np.nan), (len(rows), 1, 1))
+        T[good] = se3.from_quaternion(rows[good, :3], rows[good, 3:] / norm[good, None])
+        frames = dict.fromkeys((str(m.header.frame_id), str(getattr(m, "child_frame_id", "-"))) for m in kept)
+        v = [_twist(m) for m in kept] if hasattr(kept[0], "twist") else None
+        pose, twist = (_covariances(kept, name) for name in ("pose", "twist"))
+        t_ns = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
+        return cls(t_ns, T, norm, tuple(frames), pose, twist, None if v is None else np.array(v))
+
+
+def _twist(message: Any) -> list[float]:
+    a, b = message.twist.twist.linear, message.twist.twist.angular
+    return [a.x, a.y, a.z, b.x, b.y, b.z]
+
+
+def _covariances(messages: Sequence[Any], name: str) -> Array | None:
+    if not hasattr(getattr(messages[0], name, None), "covariance"):
+        return None
+    return np.array([getattr(m, name).covariance for m in messages], dtype=np.float64).reshape(-1, 6, 6)
+
+
+def examine(stated: Stated) -> list[Finding]:
+    """Everything that is wrong with a recording, the gravest first; empty for a good one."""
+    found = [*_stamps(stated), *_frames(stated), *_poses(stated)]
+    if stated.pose is None and stated.twist is None:
+        found.append(Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR))
+    for name, C in (("pose", stated.pose), ("twist", stated.twist)):
+        if C is not None:
+            found += _matrices(name, C)
+    found += _pose_against_twist(stated)
+    return found
+
+
+def _matrices(name: str, C: Array) -> list[Finding]:
+    """Of each matrix by itself."""
+    if not np.isfinite(C).all():
+        share = float(1 - np.isfinite(C).all(axis=(1, 2)).mean())
+        text = "robot_localization does not look and its state becomes NaN; ArduPilot reads NaN in element 0 alone"
+        return [Finding(f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text, share)]
+    D = np.diagonal(C, axis1=1, axis2=2)
+    zero = (C == 0).all(axis=(1, 2))
+    if zero.all():
+        text = f"{_RL_FLOOR}; {_PX4_FLOOR}; {_AP_FLOOR}; {_ZERO_FALLBACK}"
+        return [Finding(f"{name}-zero", f"the {name}'s covariance is zero throughout: unknown, said as certain", text)]
+    found = []
+    if zero.any() or (D == 0).any():
+        share = float((D == 0).any(axis=1).mean())
+        what = f"variances of the {name} are exactly zero"
+        found.append(Finding(f"{name}-some-zero", what, f"{_RL_FLOOR}; {_ZERO_FALLBACK}", share))
+    checks: list[tuple[str, str, Any, str]] = [
+        ("negative", "variances of the {} are negative", (D < 0).any(axis=1),
+         "robot_localization takes the absolute value; PX4 and ArduPilot take their floors; Cholesky fails elsewhere"),
+        ("tiny", "variances of the {} are below 1e-8: a placeholder, no measurement",
+         ((D > 0) & (D < _TINY)).any(axis=1), f"{_RL_FLOOR}; {_PX4_FLOOR}; FusionCore's gate rejects good data"),
+        ("huge", "variances of the {} are above 1e3 (9999, 1e6: 'unknown' or 'lost')", (D > _HUGE).any(axis=1),
+         "no filter knows the flag: robot_localization fuses it at almost no weight and its correlations blow up; "
+         "ArduPilot clamps at 100 m and 1.5 rad and goes on fusing"),
+        ("asymmetric", "the {}'s covariance is not symmetric", ~_symmetric(C),
+         "filters read different halves: PX4 and ArduPilot the diagonal, robot_localization all of it"),
+    ]  # fmt: skip
+    for code, what, bad, text in checks:
+        if bad.any():
+            found.append(Finding(f"{name}-{code}", what.format(name), text, float(bad.mean())))
+    known = [f.code.rpartition("-")[2] for f in found]
+    if not {"zero", "negative", "asymmetric"} & set(known):
+        bad = np.array([not is_positive_definite(c) for c in C])
+        if bad.any():
+            text = "its correlations are impossible: robot_localization's gain goes wrong, a Cholesky factor fails"
+            what = f"the {name}'s covariance is not positive definite"
+            found.append(Finding(f"{name}-not-positive", what, text, float(bad.mean())))
+    if np.ptp(C, axis=0).max() == 0.0:
+        text = "every frame weighs the same, in the dark and in good light: a gate passes bad frames and drops good"
+        found.append(Finding(f"{name}-constant", f"the {name}'s covariance never changes", text))
+    elif len(np.unique(D.round(12), axis=0)) <= 4 < len(D) // 4:
+        text = "steps of a few levels (as of a tracker's confidence): most of what the source knows is lost"
+        found.append(Finding(f"{name}-levels", f"the {name}'s covariance takes four values or fewer", text))
+    return found
+
+
+def _symmetric(C: Array) -> np.ndarray:
+    scale = np.abs(C).max(axis=(1, 2))[:, None, None]
+    return np.asarray((np.abs(C - np.swapaxes(C, 1, 2)) <= 1e-6 * scale).all(axis=(1, 2)))
+
+
+def _stamps(s: Stated) -> list[Finding]:
+    out, steps = [], np.diff(s.t_ns)
+    if (s.t_ns == 0).any():
+        out.append(
+            Finding("stamp-zero", "stamps are zero", "every consumer dates the measurement to the epoch and drops it")
+        )
+    elif (steps < 0).any():
+        text = "robot_localization drops or replays them; PX4 and ArduPilot take them as they come"
+        out.append(Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean())))
+    if (steps == 0).any() and not (s.t_ns == 0).any():
+        text = "the same measurement is fused twice: the filter grows too sure of it"
+        out.append(Finding("stamp-repeated", "stamps repeat", text, float((steps == 0).mean())))
+    good = steps[steps > 0]
+    if len(good) and good.max() > 10 * np.median(good):
+        what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"
+        out.append(
+            Finding("stamp-gap", what, "what covers a gap is no measurement: the first message after it must say so")
+        )
+    return out
+
+
+def _frames(s: Stated) -> list[Finding]:
+    out, text = [], "robot_localization cannot transform it and drops every message"
+    if len(s.frames) > 1:
+        out.append(Finding("frame-changes", f"frames change: {s.frames}", text))
+    frame, child = s.frames[0]
+    if not frame or not child:
+        out.append(Finding("frame-empty", f"frame_id '{frame}', child_frame_id '{child}'", text))
+    elif frame == child:
+        out.append(
+            Finding(
+                "frame-same", f"frame_id and child_frame_id are both '{frame}'", "pose and twist lose their meaning"
+            )
+        )
+    elif "optical" in child:
+        text = "twist and rotations are of axes z forward: robot_localization needs TF to base_link"
+        out.append(Finding("frame-optical", f"child_frame_id is '{child}', an optical frame", text))
+    return out
+
+
+def _poses(s: Stated) -> list[Finding]:
+    out = []
+    bad = ~np.isfinite(s.T).all(axis=(1, 2))
+    if bad.any():
+        out.append(Finding("pose-not-finite", "poses hold NaN", "robot_localization drops them", float(bad.mean())))
+    off = np.abs(s.quaternion_norm - 1.0) > 1e-2
+    if (off & ~bad).any():
+        text = "robot_localization normalises with a warning, PX4 refuses the attitude"
+        out.append(Finding("quaternion-norm", "quaternions are not of unit length", text, float(off.mean())))
+    motion = _motions(s)
+    if motion is None:
+        return out
+    steps, dt = motion
+    speed = np.linalg.norm(steps[:, :3], axis=1) / dt
+    usual = float(np.median(speed))
+    jumps = speed > max(20 * usual, 20.0)
+    if jumps.any():
+        size = float(np.linalg.norm(steps[jumps][:, :3], axis=1).max())
+        what = f"{int(jumps.sum())} jumps of the pose, up to {size:.2g} m"
+        out.append(
+            Finding(
+                "pose-jump",
+                what,
+                "an odometry must be continuous (REP 105): a differential pose fuses the jump as speed",
+            )
+        )
+    return out
+
+
+def _motions(s: Stated) -> tuple[Array, Array] | None:
+    """(M, 6) motions in the axes of the moving frame, and their durations; the stamps must grow."""
+    dt = np.diff(s.t_ns) * 1e-9
+    good = (dt > 0) & np.isfinite(s.T[1:]).all(axis=(1, 2)) & np.isfinite(s.T[:-1]).all(axis=(1, 2))
+    if good.sum() < _ENOUGH:
+        return None
+    return se3.log((se3.inverse(s.T[:-1]) @ s.T[1:])[good]), dt[good]
+
+
+def _pose_against_twist(s: Stated) -> list[Finding]:
+    """What shows only when one part of the message is held against another."""
+    out: list[Finding] = []
+    motion = _motions(s)
+    if motion is None:
+        return out
+    steps, dt = motion
+    if s.v is not None and np.isfinite(s.v).all():
+        out += _twist_against_motion(s, steps, dt)
+    for name, C in (("pose", s.pose), ("twist", s.twist)):
+        if C is not None and np.isfinite(C).all():
+            out += _turned(name, C, s.T[:, :3, :3])
+            out += _blocks(name, C) if (np.diagonal(C, axis1=1, axis2=2) > 0).all() else []
+    if not any(f.code == "pose-swapped" for f in out):
+        out += _heading(s)
+    if s.pose is not None and s.twist is not None:
+        out += _growth(s)
+    return out
+
+
+def _usable(C: Array) -> bool:
+    return bool(np.isfinite(C).all() and (np.diagonal(C, axis1=1, axis2=2) > 0).all() and np.ptp(C, axis=0).max() > 0)
+
+
+def _twist_against_motion(s: Stated, steps: Array, dt: Array) -> list[Finding]:
+    assert s.v is not None
+    moved, said = steps / dt[:, None], s.v[1:][-len(steps) :]
+    if len(said) != len(moved) or np.linalg.norm(moved[:, :3], axis=1).mean() < 0.05:
+        return []
+    if not said.any():
+        return [
+            Finding(
+                "twist-empty",
+                "the twist is zero while the pose moves",
+                "a filter that fuses the twist is told to stand still",
+            )
+        ]
+    R = s.T[1:, :3, :3][-len(steps) :]
+    in_parent = np.einsum("nij,nj->ni", R, moved[:, :3])
+    own, other = (float(np.linalg.norm(said[:, :3] - m, axis=1).mean()) for m in (moved[:, :3], in_parent))
+    size = float(np.linalg.norm(moved[:, :3], axis=1).mean())
+    if other < 0.5 * own and own > 0.2 * size:
+        text = "robot_localization rotates it once more by the heading; MAVLink's receivers take it as of the body"
+        return [Finding("twist-in-parent", "the twist is in frame_id's axes, not in child_frame_id's", text)]
+    ratio = float(np.linalg.norm(said[:, :3], axis=1).mean()) / size
+    if not 0.5 < ratio < 2.0:
+        text = "the twist is per frame, of another unit, or of another clock"
+        return [Finding("twist-scale", f"the twist is {ratio:.3g} times the motion of the pose", text)]
+    return []
+
+
+def _blocks(name: str, C: Array) -> list[Finding]:
+    """Rotation before translation: radians squared stand where metres squared belong."""
+    D = np.median(np.diagonal(C, axis1=1, axis2=2), axis=0)
+    first, second = D[:3].mean(), D[3:].mean()
+    if second > 100 * first and 0.05 < second < _HUGE:
+        what = (
+            f"the {name}'s blocks look swapped: {first:.2g} m^2 before {second:.2g} rad^2 (order is translation first)"
+        )
+        return [Finding(f"{name}-swapped", what, _SWAPPED)]
+    return []
+
+
+def _heading(s: Stated) -> list[Finding]:
+    """A wrong heading carries the position away with it: its variance grows at least with the way that was gone.
+
+    Of a heading whose error walks, the position's error across the way has a third of the heading's variance times the
+    way squared; a hundredth of the sum over the axes is out of the question.
+    """
+    if s.pose is None or not _usable(s.pose) or not np.isfinite(s.T[[0, -1]]).all():
+        return []
+    D = np.diagonal(s.pose, axis1=1, axis2=2)
+    gained = D[-1] - D[0]
+    way_m = float(np.linalg.norm(s.T[-1, :3, 3] - s.T[0, :3, 3]))
+    if gained[3:].min() > 0 and way_m > 1.0 and gained[:3].sum() < 0.01 * gained[3:].sum() * way_m**2:
+        what = f"the rotation's variance grows by {gained[3:].sum():.2g} rad^2 over {way_m:.0f} m, the position's by"
+        return [Finding("pose-swapped", f"{what} {gained[:3].sum():.2g} m^2 only: blocks swapped?", _SWAPPED)]
+    return []
+
+
+def _turned(name: str, C: Array, R: Array) -> list[Finding]:
+    """Variances turned like the components of a vector, ``R d`` in place of ``R diag(d) R^T``."""
+    off = C[:, ~np.eye(6, dtype=bool)]
+    d = np.diagonal(C, axis1=1, axis2=2)[:, :3]
+    good = np.isfinite(R).all(axis=(1, 2))
+    if off.any() or good.sum() < _ENOUGH or np.ptp(np.abs(d), axis=0).max() < 1e-2 * np.abs(d).max():
+        return []
+    for turn in (R, np.swapaxes(R, 1, 2)):
+        back = np.einsum("nij,nj->ni", turn[good], d[good])
+        if np.ptp(back, axis=0).max() < 1e-6 * np.abs(back).max():
+            text = "a body that turns makes them negative or wrong for every consumer; turn them by R C R^T"
+            return [Finding(f"{name}-turned", f"the {name}'s variances are rotated as if they were a vector", text)]
+    return []
+
+
+def _growth(s: Stated) -> list[Finding]:
+    """Over the recording a pose's covariance grows by about what the twist's says."""
+    assert s.pose is not None
+    assert s.twist is not None
+    if np.array_equal(s.pose, s.twist) and s.pose.any():
+        text = "one of them is wrong: the pose's is in m^2 and rad^2, the twist's in their squares per second"
+        return [Finding("pose-equals-twist", "pose and twist state the same covariance", text)]
+    if not (_usable(s.pose) and _usable(s.twist)):
+        return []
+    pose, twist = (np.diagonal(C, axis1=1, axis2=2) for C in (s.pose, s.twist))
+    dt = np.diff(s.t_ns) * 1e-9
+    gained, walked = float((pose[-1] - pose[0])[3:].sum()), float((twist[1:, 3:] * dt[:, None] ** 2).sum())
+    if gained > 0 and not _LEAST < gained / walked < _MOST:
+        text = "fuse one of them only: the other is off by far (a covariance per frame is not per second)"
+        what = f"the rotation's variance in the pose grows {gained / walked:.1g} times what the twist's says"
+        return [Finding("pose-against-twist", what, text)]
+    return []

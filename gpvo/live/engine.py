@@ -1,0 +1,276 @@
+"""One engine for files, tests and every transport: messages in, odometry with its covariance and its health out."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.frames import rotate_covariance
+from gpvo.io.jsonfile import read_json, write_json
+from gpvo.learning.check import camera_problems, rate_problems
+from gpvo.live.intake import Arrival
+from gpvo.live.stages import Stage, Taken, lost
+from gpvo.online.predictor import Predictor
+from gpvo.publish.odometry import Odometry, OdometryBuilder
+from gpvo.types import Array, Prediction, Status, VoRecord
+from gpvo.vo.quality import lost_covariance
+
+REPEAT_S = 10.0
+"""How often a warning that still holds is repeated."""
+_HEALTH_S, _STALE_S, _SAVE_S = 1.0, 2.0, 10.0
+_RECENT = 100
+_POSITION_SIGMA_M, _ATTITUDE_SIGMA_RAD = 1.0, 0.1  # a source that starts again need not start where it stopped
+
+
+@dataclass(frozen=True)
+class Health:
+    """What the diagnostics say. ``level``: 0 ok, 1 warning, 2 error. ``values``: by name, in words and numbers."""
+
+    t_ns: int
+    level: int
+    text: str
+    values: Mapping[str, str]
+
+
+class Output(Protocol):
+    """Where results go."""
+
+    def odometry(self, odometry: Odometry) -> None:
+        """One frame; of a lost one ``twist_body`` is None."""
+
+    def health(self, health: Health) -> None:
+        """About once a second, and whenever the level changes."""
+
+    def close(self) -> None:
+        """Nothing follows."""
+
+
+@dataclass(frozen=True)
+class EngineSettings:
+    """``increment``: the pose's covariance is that of its last motion, not accumulated since the start.
+
+    ``state``: file that holds where the odometry stood; taken up at the start, written every 10 s and at the end.
+    """
+
+    correct_twist: bool = False
+    increment: bool = False
+    state: Path | None = None
+
+
+class Engine:
+    """Steps stage, predictor and message builder, and hands the results to the outputs.
+
+    The pose that is published never jumps: where the source starts again, or was away, an unknown motion stands
+    between, with the covariance of what may have happened. ``tell``: called with each warning, at once and then every
+    10 s while it holds.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        predictor: Predictor,
+        outputs: Iterable[Output],
+        settings: EngineSettings | None = None,
+        tell: Callable[[str], None] = print,
+    ) -> None:
+        self.stage, self.predictor, self.outputs = stage, predictor, list(outputs)
+        self.settings = settings or EngineSettings()
+        self.counts: Counter[str] = Counter()
+        self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
+        self.last: Odometry | None = None
+        self.tell = tell
+        self._told_s: dict[str, float] = {}
+        self._builder: OdometryBuilder | None = None
+        self._seen_ns: int | None = None  # arrival of the last message that was used
+        self._latency_ms: deque[float] = deque(maxlen=1000)
+        self._steps_s: deque[float] = deque(maxlen=_RECENT)
+        self._inside: deque[bool] = deque(maxlen=_RECENT)
+        self._reported = (-np.inf, 0)  # seconds and level of the last health
+        self._saved_s = -np.inf
+        self._resume = _load_state(self.settings.state)
+        predictor.require_motions()
+
+    def take(self, arrival: Arrival | None) -> list[Odometry]:
+        """Everything that follows from one message; None where nothing came for a while."""
+        out: list[Odometry] = []
+        now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
+        if arrival is not None:
+            start = time.perf_counter()
+            try:
+                for taken in self.stage.take(arrival):
+                    out.append(self._step(taken))
+                    self._latency_ms.append(1e3 * (time.perf_counter() - start))
+            # A message from outside must not end the process: what follows begins anew, across an unknown motion.
+            except (GpvoError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError) as error:
+                self.counts["failed"] += 1
+                self._warn(f"a message on {arrival.topic} could not be used: {error}", now_s)
+                self.stage.reset()
+        self._watch(now_s)
+        return out
+
+    def close(self) -> None:
+        """Save the state and close the outputs."""
+        self._save()
+        for output in self.outputs:
+            output.close()
+
+    def _step(self, taken: Taken) -> Odometry:
+        builder = self._builder
+        if taken.begins:
+            self.predictor.reset(self.stage.camera)
+        if builder is None:
+            builder = self._builder = self._first_builder(taken)
+        if taken.begins and self._seen_ns is not None:
+            self._bridge(builder, taken)
+        record = taken.record
+        prediction = self.predictor.step(record)
+        message = builder.step(record, prediction)
+        if self.settings.increment:
+            message = self._of_increment(message, record, prediction)
+        message = replace(message, frame_id=taken.frame_id, child_frame_id=taken.child_frame_id)
+        self._seen_ns, self.last = taken.received_ns, message
+        self.counts[f"frames_{message.status.value}"] += 1
+        if record.dt_s > 0:
+            self._steps_s.append(record.dt_s)
+            self._inside.append(message.in_domain is None or message.in_domain > 0.5)
+        for output in self.outputs:
+            output.odometry(message)
+        return message
+
+    def _first_builder(self, taken: Taken) -> OdometryBuilder:
+        """Starts where the source says, or where the saved state stopped."""
+        resume, start = self._resume, np.eye(4) if taken.T_parent_body is None else taken.T_parent_body
+        T_odom_body = start if resume is None else resume[0]
+        builder = OdometryBuilder(
+            self.stage.T_body_cam, T_odom_body, self.stage.method, correct_twist=self.settings.correct_twist
+        )
+        if resume is not None:
+            A = se3.adjoint(se3.inverse(self.stage.T_body_cam))
+            in_body = rotate_covariance(resume[0][:3, :3].T, resume[1])
+            away = _unknown(1.0, np.zeros(6))
+            builder.step(lost(taken.record, 1.0, A @ in_body @ A.T + away, self.stage.method))
+        return builder
+
+    def _bridge(self, builder: OdometryBuilder, taken: Taken) -> None:
+        """The motion that nobody saw between the last message of before and this one."""
+        assert self._seen_ns is not None
+        away_s = max((taken.received_ns - self._seen_ns) * 1e-9, 0.0)
+        self.counts["restarts"] += 1
+        builder.step(lost(taken.record, away_s, _unknown(away_s, self._velocity()), self.stage.method))
+
+    def _velocity(self) -> Array:
+        twist = None if self.last is None else self.last.twist_body
+        return np.zeros(6) if twist is None else twist
+
+    def _of_increment(self, message: Odometry, record: VoRecord, prediction: Prediction | None) -> Odometry:
+        C = record.covariances.get(self.stage.method) if prediction is None else prediction.covariance
+        if C is None:
+            return message
+        A = se3.adjoint(self.stage.T_body_cam)
+        in_odom = rotate_covariance(message.T_odom_body[:3, :3], A @ C @ A.T)
+        return replace(message, pose_covariance=in_odom + 1e-12 * np.eye(6))
+
+    def _watch(self, now_s: float) -> None:
+        """Warnings and diagnostics that are due."""
+        problems = self._problems(now_s)
+        for text in problems:
+            self._warn(text, now_s)
+        level = 2 if self._is_bad(problems) else 1 if problems or self._is_weak() else 0
+        if now_s - self._reported[0] >= _HEALTH_S or level != self._reported[1]:
+            self._reported = (now_s, level)
+            report = self._health(level, problems)
+            for output in self.outputs:
+                output.health(report)
+        if self.settings.state is not None and now_s - self._saved_s >= _SAVE_S:
+            self._saved_s = now_s
+            self._save()
+
+    def _problems(self, now_s: float) -> list[str]:
+        out = []
+        if self._seen_ns is not None and now_s - self._seen_ns * 1e-9 > _STALE_S:
+            out.append(f"no usable message for more than {_STALE_S:.0f} s")
+        if self.stage.camera is not None and self.predictor.camera is None:
+            out.append("the model was trained on another odometry's poses, not on pictures")
+        out += camera_problems(self.predictor.camera, self.stage.camera)
+        if len(self._steps_s) >= 20:
+            out += rate_problems(self.predictor, self._steps_s)
+        if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:
+            share = 100 * float(np.mean(self._inside))
+            out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain")
+        if self.stage.counts["uncalibrated"]:
+            out += [] if self.stage.camera else ["pictures come, but no calibration: no CameraInfo beside them"]
+        return out
+
+    def _is_bad(self, problems: list[str]) -> bool:
+        return (self.last is not None and self.last.status is Status.LOST) or any("no usable" in p for p in problems)
+
+    def _is_weak(self) -> bool:
+        return self.last is not None and self.last.status is Status.DEGRADED
+
+    def _warn(self, text: str, now_s: float) -> None:
+        kind = text.split(":")[0][:40]
+        if now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
+            self._told_s[kind] = now_s
+            self.tell(text)
+
+    def _health(self, level: int, problems: list[str]) -> Health:
+        last = self.last
+        status = "waiting" if last is None else last.status.value
+        values = {"status": status, "model": self.predictor.digest[:12], "driven_by": self._driven_by()}
+        if last is not None:
+            values["in_domain"] = "" if last.in_domain is None else f"{last.in_domain:.3f}"
+            values["confidence"] = "" if last.confidence is None else f"{last.confidence:.3f}"
+            values["resets"] = str(last.reset_counter)
+        if self._latency_ms:
+            p50, p99 = np.percentile(self._latency_ms, [50, 99])
+            values["latency_ms_p50_p99"] = f"{p50:.2f} {p99:.2f}"
+        counts: Counter[str] = Counter()
+        for source in self.sources:
+            counts.update(source)
+        values.update({name: str(n) for name, n in sorted(counts.items()) if n})
+        return Health(0 if last is None else last.t_ns, level, "; ".join(problems) or status, values)
+
+    def _driven_by(self) -> str:
+        try:
+            first = self.predictor.explain()
+        except GpvoError:
+            return ""
+        return str(first[0]) if first else ""
+
+    def _save(self) -> None:
+        if self.settings.state is None or self.last is None:
+            return
+        document = {
+            "schema": 1,
+            "T_odom_body": self.last.T_odom_body,
+            "pose_covariance": self.last.pose_covariance,
+        }
+        write_json(self.settings.state, document)
+
+
+def _unknown(away_s: float, twist: Array) -> Array:
+    """(6, 6) covariance of what may have happened while nothing was heard, or the source began elsewhere."""
+    start = np.diag([_POSITION_SIGMA_M**2] * 3 + [_ATTITUDE_SIGMA_RAD**2] * 3)
+    return lost_covariance(min(away_s, 1e3), twist) + start
+
+
+def _load_state(path: Path | None) -> tuple[Array, Array] | None:
+    """Pose (4, 4) and its covariance (6, 6) in ``odom`` of a state file; None where there is none yet."""
+    if path is None or not path.exists():
+        return None
+    try:
+        document = read_json(path)
+        T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
+        if T.shape != (4, 4) or C.shape != (6, 6) or not (np.isfinite(T).all() and np.isfinite(C).all()):
+            raise ValueError("it holds no pose")
+    except (GpvoError, ValueError, KeyError, TypeError) as error:
+        raise GpvoError(f"is no state of gpvo live: {error}", where=path, cure="remove it to begin anew") from None
+    return T, C

@@ -1,0 +1,142 @@
+"""What comes in: messages with their time of arrival, a mailbox that drops the oldest, and a watch over stamps."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from gpvo.io.foreign import GAP_STEPS
+
+BACK_S = 1.0
+"""A stamp further back than this is no late message but another clock, if the next ones agree."""
+AHEAD_S = 10.0
+"""The same of a stamp ahead of the last: after so long a silence nothing of before holds."""
+_CONFIRM = 3
+_WINDOW = 51
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """One message: its topic, itself (the attributes of the ROS type) and when it came, on a clock that only grows."""
+
+    topic: str
+    message: Any
+    received_ns: int
+
+
+class Sequence(Enum):
+    """How a stamp continues those before it."""
+
+    FIRST = "first"
+    NEXT = "next"
+    GAP = "gap"
+    RESTART = "restart"
+    REPEATED = "repeated"
+    LATE = "late"
+    CLOCK = "clock"
+
+    @property
+    def dropped(self) -> bool:
+        """Whether the message is not used."""
+        return self in (Sequence.REPEATED, Sequence.LATE, Sequence.CLOCK)
+
+
+class StampWatch:
+    """Judges stamps [ns] as they come.
+
+    A jump of the clock, back by more than a second or ahead by more than ten, is believed when three messages in a row
+    agree on it: one corrupt stamp costs one message, a source that starts again three.
+    """
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._suspect: tuple[int, int] | None = None  # stamp and count of those that agree on another clock
+        self._steps: deque[int] = deque(maxlen=_WINDOW)
+
+    def see(self, t_ns: int) -> Sequence:
+        """What the next stamp is."""
+        if self._last is None:
+            self._last = t_ns
+            return Sequence.FIRST
+        step = t_ns - self._last
+        if -BACK_S * 1e9 <= step <= AHEAD_S * 1e9:
+            self._suspect = None
+            if step <= 0:
+                return Sequence.LATE if step else Sequence.REPEATED
+            return self._advance(t_ns, step)
+        before, count = self._suspect or (t_ns, 0)
+        agrees = count == 0 or 0 < t_ns - before <= AHEAD_S * 1e9
+        self._suspect = (t_ns, count + 1 if agrees else 1)
+        if self._suspect[1] < _CONFIRM:
+            return Sequence.CLOCK
+        self._last, self._suspect = t_ns, None
+        self._steps.clear()
+        return Sequence.RESTART
+
+    def _advance(self, t_ns: int, step: int) -> Sequence:
+        usual = float(np.median(self._steps)) if len(self._steps) >= 3 else np.inf
+        self._last = t_ns
+        if step > GAP_STEPS * usual:
+            return Sequence.GAP
+        self._steps.append(step)
+        return Sequence.NEXT
+
+
+class Mailbox:
+    """Raw messages between a transport's threads and the engine's; of a full lane (topic) the oldest is dropped.
+
+    ``dropped``: how many, by topic. ``put`` never waits.
+    """
+
+    def __init__(self, depth: int = 10) -> None:
+        self._lanes: dict[str, deque[tuple[int, str, bytes]]] = {}
+        self._depth = depth
+        self._ready = threading.Condition()
+        self.dropped: Counter[str] = Counter()
+
+    def put(self, topic: str, data: bytes, depth: int | None = None) -> None:
+        """Add a message that has just arrived."""
+        with self._ready:
+            lane = self._lanes.setdefault(topic, deque())
+            if len(lane) >= (depth or self._depth):
+                lane.popleft()
+                self.dropped[topic] += 1
+            lane.append((time.monotonic_ns(), topic, data))
+            self._ready.notify()
+
+    def get(self, timeout_s: float) -> tuple[int, str, bytes] | None:
+        """The oldest message of all lanes: arrival [ns], topic, bytes; None where none came in time."""
+        with self._ready:
+            if not any(self._lanes.values()):
+                self._ready.wait(timeout_s)
+            lanes = [lane for lane in self._lanes.values() if lane]
+            return min(lanes, key=lambda lane: lane[0][0]).popleft() if lanes else None
+
+
+def arrivals(
+    mailbox: Mailbox,
+    decode: Callable[[str, bytes], Any],
+    stop: threading.Event,
+    counts: Counter[str],
+    timeout_s: float = 0.2,
+) -> Iterator[Arrival | None]:
+    """Decoded messages until ``stop``; None where nothing came for ``timeout_s``. What cannot be decoded is counted."""
+    while not stop.is_set():
+        raw = mailbox.get(timeout_s)
+        if raw is None:
+            yield None
+            continue
+        received_ns, topic, data = raw
+        try:
+            message = decode(topic, data)
+        except Exception:  # whatever a decoder of bytes from the network raises: index, struct, unicode, assertion
+            counts["undecodable"] += 1
+            continue
+        yield Arrival(topic, message, received_ns)

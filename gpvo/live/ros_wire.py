@@ -1,0 +1,121 @@
+"""ROS itself, where it is installed: rclpy and rospy, fed with serialised messages like every other wire."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from rosbags.typesys import Stores, get_typestore
+
+from gpvo.errors import GpvoError
+from gpvo.live.outputs import Send
+
+_DEPTH = 10
+
+
+def message_class(msgtype: str) -> Any:
+    """ROS's own class of a message type, such as ``nav_msgs/msg/Odometry``."""
+    package, _, name = msgtype.split("/")
+    return getattr(import_module(f"{package}.msg"), name)
+
+
+class Ros2Wire:
+    """A node of rclpy: ``node`` where one exists already, else one of its own, spun in a thread.
+
+    Subscribes best effort, publishes reliably, keeps the last 10.
+    """
+
+    ros1 = False
+
+    def __init__(self, node: Any = None) -> None:
+        _require("rclpy", "source ROS 2's setup file, or use --zenoh or --dds, which need no ROS")
+        import rclpy
+
+        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self._thread: threading.Thread | None = None
+        if node is None:
+            rclpy.init()
+            node = rclpy.create_node("gpvo")
+            self._thread = threading.Thread(target=rclpy.spin, args=(node,), daemon=True)
+            self._thread.start()
+        self._node = node
+
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+        """Deliver every message of a topic."""
+        from rclpy.qos import qos_profile_sensor_data
+
+        kind = message_class(msgtype)
+        self._node.create_subscription(kind, topic, lambda b: deliver(topic, b), qos_profile_sensor_data, raw=True)
+
+    def advertise(self, topic: str, msgtype: str) -> Send:
+        """Announce a topic."""
+        publisher = self._node.create_publisher(message_class(msgtype), topic, _DEPTH)
+        return lambda data: publisher.publish(data)
+
+    def close(self) -> None:
+        """End the node, if it is of our own making."""
+        if self._thread is not None:
+            import rclpy
+
+            rclpy.shutdown()
+            self._thread.join(1.0)
+
+
+class Ros1Wire:
+    """A node of rospy, at the master that ROS_MASTER_URI names."""
+
+    ros1 = True
+
+    def __init__(self) -> None:
+        _require("rospy", "source ROS 1's setup file, or install python3-rospy")
+        import rospy
+
+        self.store = get_typestore(Stores.ROS1_NOETIC)
+        rospy.init_node("gpvo", anonymous=True, disable_signals=True)
+
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+        """Deliver every message of a topic, whatever type its publisher says it has."""
+        import rospy
+
+        rospy.Subscriber(topic, rospy.AnyMsg, lambda m: deliver(topic, m._buff), queue_size=_DEPTH, buff_size=1 << 24)
+
+    def advertise(self, topic: str, msgtype: str) -> Send:
+        """Announce a topic."""
+        import rospy
+
+        kind = message_class(msgtype)
+        publisher = rospy.Publisher(topic, _raw(kind), queue_size=_DEPTH)
+
+        def send(data: bytes) -> None:
+            message = publisher.data_class()
+            message.raw = data
+            publisher.publish(message)
+
+        return send
+
+    def close(self) -> None:
+        """End the node."""
+        import rospy
+
+        rospy.signal_shutdown("gpvo live has ended")
+
+
+def _raw(kind: Any) -> Any:
+    """A message class of the same name and checksum, whose instances are bytes."""
+
+    class Raw(kind):
+        raw = b""
+
+        def serialize(self, buffer: io.BytesIO) -> None:
+            buffer.write(self.raw)
+
+    return Raw
+
+
+def _require(package: str, cure: str) -> None:
+    if find_spec(package) is None:
+        raise GpvoError(f"{package} is not installed for this Python", cure=cure)

@@ -1,0 +1,63 @@
+"""Taking records in: what cannot be is ``lost``, by name, and leaves no trace in what is remembered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gpvo.types import Array, Status, VoRecord
+
+LONGEST_STEP_S = 60.0
+"""A record that comes later than this after the one before is believed when the next one confirms its clock."""
+_FARTHEST_M = 1e5  # No motion between two frames is longer.
+_NOT_RIGID = 1e-3  # Deviation of R^T R from the identity.
+_EYE = np.eye(4)
+_EYE.setflags(write=False)
+
+
+class Intake:
+    """Judges the stamps and the motion of one record after the other, in the order of their arrival.
+
+    A record whose stamp repeats, goes back or jumps ahead is ``lost``, and the next one is judged by the record before
+    it; where that next one follows the odd one, the clock itself was set, and is believed. A motion that is not finite
+    and rigid is replaced by none.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._odd_ns: int | None = None
+
+    def step(self, record: VoRecord) -> VoRecord:
+        """The record, ``lost`` with the reason where it cannot be. Call once per record."""
+        problem = self._clock(record)
+        if not _is_motion(record.T_prev_cur):
+            record = replace(record, T_prev_cur=_EYE)
+            problem = problem or "the motion is not finite and rigid"
+        return record.with_status(Status.LOST, problem) if problem else record
+
+    def _clock(self, record: VoRecord) -> str:
+        t_ns, last_ns, odd_ns = record.t_ns, self._last_ns, self._odd_ns
+        follows = last_ns is None or _follows(t_ns, last_ns) or (odd_ns is not None and _follows(t_ns, odd_ns))
+        if not follows and record.status is not Status.START:
+            assert last_ns is not None
+            self._odd_ns = t_ns
+            step_s = (t_ns - last_ns) * 1e-9
+            return "the stamp repeats" if step_s == 0 else f"the stamp jumps by {step_s:+.3g} s"
+        self._last_ns, self._odd_ns = t_ns, None
+        if record.usable and record.t_prev_ns >= t_ns:
+            return "the motion ends no later than it begins"
+        return ""
+
+
+def _follows(t_ns: int, before_ns: int) -> bool:
+    return 0 < t_ns - before_ns <= LONGEST_STEP_S * 1e9
+
+
+def _is_motion(T: Array) -> bool:
+    """Whether T is a rigid transform (4, 4) of a credible length."""
+    # Comparisons with NaN are false.
+    if T.shape != (4, 4) or not np.abs(T).max() < _FARTHEST_M:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R.T @ R - _EYE[:3, :3]).max() < _NOT_RIGID)

@@ -1,0 +1,185 @@
+"""Twins of a run: its flight seen again with new noise by a rig that its calibration allows, and odometry over it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from gpvo.cameras.tolerance import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.io.source import SourceReport
+from gpvo.io.toml import read_toml
+from gpvo.runner import run as run_odometry
+from gpvo.twin.estimate import Original, estimate
+from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
+
+
+@dataclass(frozen=True)
+class TwinSettings:
+    """``replicates`` of each run; ``tolerance`` of the rig, drawn for each replicate, by the ``tolerance_name``."""
+
+    replicates: int = 8
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    tolerance_name: str = "none"
+    seed: int = 0
+
+
+@dataclass
+class TwinSource:
+    """A twin as a sequence of tracks: a :class:`gpvo.io.source.Source` in memory, with exact truth."""
+
+    name: str
+    path: Path
+    camera: StereoCamera
+    mounting: Mounting
+    imu: ImuLog | None
+    truth: TruthLog | None
+    frames: list[TrackFrame]
+    span_ns: tuple[int, int]
+    kind: Literal["images", "tracks"] = "tracks"
+    format: str = "twin"
+    mask: NDArray[np.bool_] | None = None
+    calibration: dict[str, Any] | None = None
+    report: SourceReport = field(default_factory=SourceReport)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[TrackFrame]:
+        self.report = SourceReport(frames=len(self.frames))
+        return iter(self.frames)
+
+
+def twin_source(original: Original, settings: TwinSettings, replicate: int) -> TwinSource:
+    """One twin. Equal settings and replicate give equal twins."""
+    run, seen = original.run, original.seen
+    rng = np.random.default_rng([settings.seed, replicate, 29])
+    rig = TrueRig.of(seen.camera, settings.tolerance, rig_errors(settings)[replicate])
+    uvd = _projected(original, rig) + _drawn_noise(original, rng)
+    t_ns = run.log.t_ns
+    starts = np.searchsorted(seen.frame, np.arange(len(t_ns) + 1))
+    frames: list[TrackFrame] = []
+    for k, t in enumerate(t_ns):
+        rows = slice(starts[k], starts[k + 1])
+        if original.repeats[k] and frames:
+            frames.append(replace(frames[-1], t_ns=int(t)))
+            continue
+        left = uvd[rows, :2]
+        right = left - np.stack([uvd[rows, 2], np.zeros(len(left))], axis=1)
+        frames.append(TrackFrame(int(t), seen.track[rows], left, right))
+    name = f"{run.name}-twin{replicate}"
+    truth = TruthLog(t_ns, original.structure.T_world_cam)
+    return TwinSource(name, run.path, seen.camera, run.mounting, run.imu, truth, frames, (int(t_ns[0]), int(t_ns[-1])))
+
+
+def rig_errors(settings: TwinSettings) -> Array:
+    """(replicates, 5) how wrong the rig of each twin is, in sigma.
+
+    Drawn at random, then made uncorrelated and of unit size over the replicates (moment matching), as a handful of
+    draws would show a covariance of five numbers wrongly by chance; of five or fewer that cannot be.
+    """
+    n = settings.replicates
+    drawn = np.random.default_rng([settings.seed, 29]).standard_normal((n, RIG_ERRORS))
+    if n <= RIG_ERRORS:
+        return drawn
+    return drawn @ np.linalg.inv(np.linalg.cholesky(drawn.T @ drawn / n)).T
+
+
+def _projected(original: Original, rig: TrueRig) -> Array:
+    """(M, 3) what the rig sees of the landmarks without noise, as (u, v, d) [px]."""
+    seen, s = original.seen, original.structure
+    T = se3.inverse(s.T_world_cam)[seen.frame]
+    P = np.einsum("mij,mj->mi", T[:, :3, :3], s.points_world[seen.track]) + T[:, :3, 3]
+    P[:, 2] = np.maximum(P[:, 2], 0.05)
+    left, right = rig.pixels(P)
+    return np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), left[:, 0] - right[:, 0]], axis=1)
+
+
+def _drawn_noise(original: Original, rng: np.random.Generator) -> Array:
+    """(M, 3) noise [px]: the residuals of each track, as a whole, with a random sign.
+
+    So it keeps its size by depth, place and time, and how it goes on along the track. An outlier is an event, not
+    noise: it happens again as it was.
+    """
+    sign = rng.choice([-1.0, 1.0], size=len(original.structure.points_world))[original.seen.track]
+    return original.noise_px * np.where(original.structure.weight > 0, sign, 1.0)[:, None]
+
+
+def make_twins(
+    path: Path, out: Path, settings: TwinSettings, *, jobs: int = 1, on_twin: Callable[[], None] | None = None
+) -> list[Path]:
+    """Twins of one run as run folders ``out/NAME-twinK``, by the odometry and the settings of the run.
+
+    Raises
+    ------
+    SourceError
+        As :func:`gpvo.twin.estimate.estimate`.
+    """
+    original = estimate(path)
+    work = (delayed(_make_twin)(original, settings, k, out) for k in range(settings.replicates))
+    made = []
+    for target in Parallel(n_jobs=jobs, return_as="generator")(work):
+        made.append(target)
+        if on_twin is not None:
+            on_twin()
+    return made
+
+
+def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path) -> Path:
+    source = twin_source(original, settings, replicate)
+    about = {**asdict(settings), "of": original.run.name, "replicate": replicate}
+    run_odometry(source, out / source.name, original.config, amend=_Conditions(original).amend, meta={"twin": about})
+    return out / source.name
+
+
+def simulated_truth(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Which of some runs, by their ``run.json``, are twins: of what, how many, with which tolerance."""
+    found: dict[str, dict[str, Any]] = {}
+    for about in (m["twin"] for m in metas if m.get("twin")):
+        key = json.dumps([about["of"], about["tolerance_name"], about["tolerance"]])
+        kept = {k: about[k] for k in ("of", "tolerance_name", "tolerance", "seed")}
+        found.setdefault(key, {**kept, "twins": 0})["twins"] += 1
+    return list(found.values())
+
+
+def read_tolerance(text: str) -> tuple[str, Tolerance]:
+    """A named tolerance, or that of a TOML file, with its name. Raises GpvoError where it is neither."""
+    if text in TOLERANCES:
+        return text, TOLERANCES[text]
+    path = Path(text)
+    known = {f.name for f in fields(Tolerance)}
+    cure = f"give one of {', '.join(TOLERANCES)}, or a TOML file with {', '.join(sorted(known))}"
+    if not path.is_file():
+        raise GpvoError(f"there is no tolerance '{text}'", cure=cure)
+    values = read_toml(path)
+    if not values or set(values) - known or not all(_is_small(v) for v in values.values()):
+        raise GpvoError("is no tolerance: numbers from 0 to 0.2", where=path, cure=cure)
+    return path.stem, Tolerance(**{k: float(v) for k, v in values.items()})
+
+
+def _is_small(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value <= 0.2
+
+
+class _Conditions:
+    """What points alone cannot show, as the run saw it: statistics of its pictures, and points without a match."""
+
+    _PICTURE = ("n_detected", "n_stereo", "brightness", "contrast", "sharpness", "noise_level")
+
+    def __init__(self, original: Original) -> None:
+        matched = np.bincount(original.seen.frame[~original.first], minlength=len(original.run.log))
+        self._by_stamp = {r.t_ns: (r, max(r.n_tracked - int(n), 0)) for r, n in zip(original.run.log, matched)}
+
+    def amend(self, record: VoRecord) -> VoRecord:
+        """The record of the twin, completed."""
+        own, unmatched = self._by_stamp[record.t_ns]
+        n_tracked = record.n_tracked + unmatched if record.n_tracked >= 0 else record.n_tracked
+        return replace(record, n_tracked=n_tracked, **{name: getattr(own, name) for name in self._PICTURE})

@@ -1,0 +1,263 @@
+"""What the calibration has wrong between the cameras, found from the residuals of odometry itself.
+
+Where the right picture is displaced by (dx, dy) in normalised coordinates, measured disparity is too small by ``fx dx``
+and the row in the right picture too large by ``fy dy``. To first order a rotation (wx, wy, wz) of the right camera, a
+relative error s of its focal length and a shift (c, e) of its centre displace a point at (x, y) by
+
+    dx = -xy wx + (1 + x^2) wy - y wz + x s + c,    dy = -(1 + y^2) wx + xy wy + x wz + y s + e
+
+(H. Longuet-Higgins, K. Prazdny, "The interpretation of a moving retinal image", 1980, eq. 2.12). Lenses add to each
+term, so the coefficients of both second-order polynomials are free, and a turn is a part of their prior covariance. A
+Kalman filter of constant state estimates them: dx from the residuals of each motion, with the motion as an unknown
+without a prior, and dy from the rows, which need no motion. What cannot be told apart from motion: the depth's scale.
+
+Two things keep it honest. Errors of neighbouring frames are alike (a feature's place is off in the same way for as
+long as it is followed): blocks of frames are compared with their expected scatter, and all information is divided by
+the ratio. And rigs are of several kinds, exact, good, usual and bad ones: the estimate is the mean over the kinds by
+their probability (J. Dickey, "The weighted likelihood ratio", 1971), so that an exact rig keeps its exact geometry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.types import Array, StereoCamera
+from gpvo.vo.motion import Motion, apply_whitener, residual_covariance, transfer, whitener
+from gpvo.vo.points import triangulation_pixel_covariance
+
+TERMS = ("1", "x", "y", "x^2", "xy", "y^2")
+N_TERMS = len(TERMS)
+ORDER = np.array([0, 1, 1, 2, 2, 2])
+_DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
+# Standard deviations of the prior. Terms beyond the constant are given at half the width of the picture.
+_DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
+_ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
+_TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
+_KINDS = (0.3, 1.0, 4.0)  # of rigs beside exact ones, equally likely: their prior of dx is so many times as wide
+_BLOCK = 20  # motions, longer than most features live
+_EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
+_NEAR = 6.0  # disparity of the points used, in standard deviations of noise: the limit of disparity selects far ones
+_S_UNIT = triangulation_pixel_covariance(1.0)
+
+
+def terms(x: Array, y: Array) -> Array:
+    """(6, N) the polynomials of :data:`TERMS` at normalised coordinates (N,) each."""
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def prior_covariance(camera: StereoCamera) -> Array:
+    """(12, 12) of the coefficients of dx, then of dy, each in the order of :data:`TERMS`."""
+    reach = (0.5 * camera.width / camera.fx_px) ** ORDER
+    vertical, optical = np.zeros((2, 2 * N_TERMS))
+    vertical[[0, 3]] = 1.0
+    optical[2], optical[N_TERMS + 1] = -1.0, 1.0
+    rows_px = np.where(ORDER == 0, *_ROW_PX)
+    disparity_px = np.where(ORDER == 0, *_DISPARITY_PX)
+    free = np.concatenate([disparity_px / camera.fx_px / reach, rows_px / camera.fy_px / reach])
+    turns = np.outer(vertical, vertical) + np.outer(optical, optical)
+    return np.diag(free**2) + _TURN_RAD**2 * turns
+
+
+@dataclass(frozen=True)
+class RigState:
+    """Coefficients of dx and dy as known: ``mean`` (12,) and ``covariance`` (12, 12), in the order of :data:`TERMS`.
+
+    ``probability``: that the disparities are off at all.
+    """
+
+    mean: Array
+    covariance: Array
+    probability: float
+
+    @classmethod
+    def prior(cls, camera: StereoCamera) -> RigState:
+        """Nothing known but the calibration."""
+        return cls(np.zeros(2 * N_TERMS), prior_covariance(camera), 0.5)
+
+    @classmethod
+    def exact(cls) -> RigState:
+        """The calibration is right beyond doubt."""
+        return cls(np.zeros(2 * N_TERMS), np.zeros((2 * N_TERMS, 2 * N_TERMS)), 0.0)
+
+
+class RigError:
+    """The running estimate, and what it does to measurements.
+
+    Parameters
+    ----------
+    camera : the rectified pair as calibrated.
+    known : where to start; by default from nothing.
+    learn : whether motions change it.
+    """
+
+    def __init__(self, camera: StereoCamera, known: RigState | None = None, *, learn: bool = True) -> None:
+        self._camera = camera
+        self._learn = learn
+        self._start = self.state = known or RigState.prior(camera)
+        # A state from a file is no calibration to return to.
+        self._may_be_exact = known is None
+        if not learn:
+            return
+        precision = np.asarray(np.linalg.inv(self._start.covariance), np.float64)
+        self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
+        kinds = _KINDS if self._may_be_exact else (1.0,)
+        self._priors = [_Prior.of(self._start, factor) for factor in kinds]
+        self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
+
+    def correct(self, uvd: Array) -> Array:
+        """Measurements (N, 3) of (u, v, d) as the right camera would have given them in its place [px]."""
+        d_error, row_error = self.errors(uvd)
+        return uvd - np.column_stack([np.zeros_like(d_error), 0.5 * row_error, d_error])
+
+    def allows(
+        self, uvd: Array, row_error: Array, min_disparity_px: float, max_disparity_px: float, max_row_error_px: float
+    ) -> NDArray[np.bool_]:
+        """(N,) whether disparity and row of a match are possible, given what is known and what is not."""
+        with np.errstate(invalid="ignore"):
+            d_expected, row_expected = self.errors(uvd)
+            phi = self._terms(uvd)
+            sigma = self._camera.fy_px * np.sqrt((phi * (self.state.covariance[_DY, _DY] @ phi)).sum(0))
+            d = uvd[:, 2] - d_expected
+            rows = np.abs(row_error - row_expected) <= max_row_error_px + 3.0 * sigma
+            return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
+
+    def update(self, motion: Motion, row_error: Array, min_disparity_px: float) -> Array:
+        """Learn from a motion over corrected measurements, whose inliers have these row errors (M,).
+
+        Returns
+        -------
+        (6, 6) covariance that the state before this motion adds to it: ``K P K^T``, K the motion's derivative by dx.
+        """
+        fx = self._camera.fx_px
+        moved = transfer(motion.T_prev_cur, motion.uvd_prev, self._camera)
+        W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT)) / max(motion.scale_px, 0.1)
+        z, A = apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H)
+        # At the points as smoothed by both frames: their noise is independent of the residual, that of the measured
+        # ones is not and would be taken for an error of the rig.
+        M = fx * moved.G[:, 2][:, None] * self._terms(motion.uvd_prev)
+        M[2] -= fx * self._terms(moved.uvd.T)
+        B = apply_whitener(W, M)
+        root = np.sqrt(np.minimum(1.0, 3.2 / np.sqrt((z**2).sum(0) + 1e-9)))
+        A = (A * root).transpose(0, 2, 1).reshape(-1, 6)
+        B = np.column_stack([(B * root).transpose(0, 2, 1).reshape(-1, N_TERMS), (z * root).reshape(-1)])
+        K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
+        added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
+        if self._learn:
+            near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * motion.scale_px, 3)
+            if near.sum() >= 3 * 8:
+                self._learn_from(A[near], B[near], self._terms(moved.uvd.T) * self._camera.fy_px, row_error)
+        return added
+
+    def _learn_from(self, A: Array, B: Array, rows: Array, row_error: Array) -> None:
+        """``A`` (n, 6) and ``B`` (n, 7): whitened derivatives by the motion, by dx, and residuals; ``rows`` (6, M): of
+        the row errors by dy."""
+        rest = B - A @ np.linalg.solve(A.T @ A, A.T @ B)
+        sums = rest.T @ rest
+        information = sums[:-1, :-1]
+        self._blocks[0].add(information, sums[:-1, -1] + information @ self.state.mean[_DX])
+        off = row_error - self.state.mean[_DY] @ rows
+        sigma = max(1.4826 * float(np.median(np.abs(off))), 0.05)
+        weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(np.abs(off), 1e-9)) / sigma**2
+        self._blocks[1].add(weighted @ rows.T, weighted @ row_error)
+        information, score = np.zeros((2 * N_TERMS, 2 * N_TERMS)), np.zeros(2 * N_TERMS)
+        for part, block in zip((_DX, _DY), self._blocks, strict=True):
+            information[part, part] = block.information / block.excess
+            score[part] = block.score / block.excess
+        self.state = self._mixed(information, score)
+        for part, block in zip((_DX, _DY), self._blocks, strict=True):
+            block.close(self.state.mean[part], self.state.covariance[part, part])
+
+    def _mixed(self, information: Array, score: Array) -> RigState:
+        """The posterior over rigs of every kind, as one Gaussian of its mean and covariance."""
+        fits, log_odds = [], []
+        for prior in self._priors:
+            covariance = np.asarray(np.linalg.inv(prior.precision + information), np.float64)
+            mean = covariance @ (prior.score + score)
+            fits.append((mean, covariance))
+            # Savage-Dickey: against a rig whose disparities are exact.
+            P, m = covariance[_DX, _DX], mean[_DX]
+            log_odds.append(0.5 * (m @ np.linalg.solve(P, m) + np.linalg.slogdet(P)[1] - prior.log_det_dx))
+        if len(fits) == 1:
+            return RigState(*fits[0], 1.0)
+        weight = np.exp(np.array([0.0, *log_odds]) - max(0.0, *log_odds))
+        weight /= weight.sum()
+        mean, best = np.zeros(2 * N_TERMS), int(np.argmax(weight[1:]))
+        covariance = np.zeros_like(fits[0][1])
+        exact = self._without_disparity(*fits[best])
+        for w, (m, P) in zip(weight, (exact, *fits), strict=True):
+            mean += w * m
+            covariance += w * (P + np.outer(m, m))
+        return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[0]))
+
+    @staticmethod
+    def _without_disparity(mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """The same fit of the rows, of a rig whose disparities are exact."""
+        mean, covariance = mean.copy(), covariance.copy()
+        mean[_DX], covariance[_DX], covariance[:, _DX] = 0.0, 0.0, 0.0
+        return mean, covariance
+
+    def _terms(self, uvd: Array) -> Array:
+        """(6, N) the terms at the place in the right picture."""
+        c = self._camera
+        return terms((uvd[:, 0] - uvd[:, 2] - c.cx_px) / c.fx_px, (uvd[:, 1] - c.cy_px) / c.fy_px)
+
+    def errors(self, uvd: Array) -> tuple[Array, Array]:
+        """(N,) errors of disparity and of the row difference [px]."""
+        phi, mean = self._terms(uvd), self.state.mean
+        return -self._camera.fx_px * (mean[_DX] @ phi), self._camera.fy_px * (mean[_DY] @ phi)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """One kind of rig: precision (12, 12) and precision times mean (12,), log determinant of the covariance of dx."""
+
+    precision: Array
+    score: Array
+    log_det_dx: float
+
+    @classmethod
+    def of(cls, start: RigState, factor: float) -> _Prior:
+        """With coefficients of dx that are ``factor`` times as large."""
+        scale = np.where(np.arange(2 * N_TERMS) < N_TERMS, factor, 1.0)
+        covariance = start.covariance * np.outer(scale, scale)
+        precision = np.asarray(np.linalg.inv(covariance), np.float64)
+        return cls(precision, precision @ start.mean, float(np.linalg.slogdet(covariance[_DX, _DX])[1]))
+
+
+class _Blocks:
+    """Information and score of one polynomial as if frames were independent, and by how much blocks of frames scatter
+    more than that."""
+
+    def __init__(self, precision: Array) -> None:
+        self.information: Array = np.zeros((N_TERMS, N_TERMS))
+        self.score: Array = np.zeros(N_TERMS)
+        self._freedom = _EXCESS[1] * N_TERMS
+        self._chi2 = _EXCESS[0] * self._freedom
+        self._floor = 1e-6 * precision
+        self._begin()
+
+    @property
+    def excess(self) -> float:
+        """Variance of a block's score over its information."""
+        return self._chi2 / self._freedom
+
+    def add(self, information: Array, score: Array) -> None:
+        """Take in one motion; the score is that of a state of zero."""
+        self.information, self.score = self.information + information, self.score + score
+        self._count += 1
+
+    def close(self, mean: Array, covariance: Array) -> None:
+        """At the end of a block, compare its score at the estimate with what is expected of it."""
+        if self._count < _BLOCK:
+            return
+        information, score = self.information - self._before[0], self.score - self._before[1]
+        left = score - information @ mean
+        self._freedom += N_TERMS - float((information * covariance).sum()) / self.excess
+        self._chi2 += float(left @ np.linalg.solve(information + self._floor, left))
+        self._begin()
+
+    def _begin(self) -> None:
+        self._count, self._before = 0, (self.information, self.score)

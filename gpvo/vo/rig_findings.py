@@ -1,0 +1,167 @@
+"""What was found wrong with a calibration: in words, as a file, and as a corrected camera chain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.cameras.kalibr import make_lens
+from gpvo.cameras.rectify import rectifying_rotations
+from gpvo.cameras.rig import StereoRig
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.geometry import se3
+from gpvo.io.jsonfile import read_json
+from gpvo.types import StereoCamera
+from gpvo.vo.rig_error import N_TERMS, ORDER, TERMS, RigState, terms
+
+STATE_FILE = "calibration_state.json"
+_WORTH_PX = 0.2  # at half the width of the picture; below, no one would calibrate anew
+_SIGMAS = 4.0
+
+
+def findings(state: RigState, camera: StereoCamera) -> list[str]:
+    """What the state says, one line each; empty for a calibration that fits."""
+    half = 0.5 * camera.width / camera.fx_px
+    sigma = np.sqrt(np.diagonal(state.covariance))
+    fx, fy = camera.fx_px, camera.fy_px
+
+    def shown(k: int, reach_px: float) -> bool:
+        return bool(abs(state.mean[k]) * reach_px > _WORTH_PX and abs(state.mean[k]) > _SIGMAS * sigma[k])
+
+    c, lines = state.mean, []
+    degrees = np.rad2deg(np.abs(c))
+    row, roll, row_focal = N_TERMS, N_TERMS + 1, N_TERMS + 2
+    if shown(row, fy):
+        side = "higher" if c[row] < 0 else "lower"
+        lines.append(
+            f"the right picture sits {abs(c[row]) * fy:.1f} px {side} than the left: consistent with a rotation of"
+            f" {degrees[row]:.2f} deg between the cameras about the horizontal axis"
+        )
+    if shown(roll, fy * half):
+        lines.append(
+            f"rows tilt: consistent with a rotation of {degrees[roll]:.2f} deg between the cameras about the optical"
+            " axis"
+        )
+    if shown(row_focal, fy * half):
+        lines.append(f"rows spread: consistent with focal lengths that differ by {100 * abs(c[row_focal]):.2f} %")
+    if state.probability > 0.95:
+        if shown(0, fx):
+            lines.append(
+                f"disparities are off by {-c[0] * fx:+.2f} px: consistent with a rotation of {degrees[0]:.2f} deg"
+                " between the cameras about the vertical axis, or a shift of the principal point"
+            )
+        reach_px = fx * half**ORDER
+        at_border = (np.abs(c[:N_TERMS]) * reach_px)[1:]
+        if any(shown(k, reach_px[k]) for k in range(1, N_TERMS)):
+            worst = TERMS[1 + int(np.argmax(at_border))]
+            lines.append(f"disparities bend over the picture by up to {max(at_border):.1f} px, most in {worst}")
+    return lines
+
+
+def document(state: RigState, camera: StereoCamera) -> dict[str, Any]:
+    """The state in plain numbers, for the file beside a run."""
+    return {
+        "schema": 1,
+        "terms": [f"{d}:{t}" for d in ("dx", "dy") for t in TERMS],
+        "mean": state.mean,
+        "covariance": state.covariance,
+        "probability": state.probability,
+        "camera_px": _camera_px(camera),
+        "findings": findings(state, camera),
+    }
+
+
+def _camera_px(camera: StereoCamera) -> list[float]:
+    return [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width, camera.height]
+
+
+def read_state(path: Path, camera: StereoCamera) -> RigState:
+    """The state of a file, or of a run folder.
+
+    Raises
+    ------
+    SourceError
+        Where the file is damaged, or of another camera.
+    """
+    path = path / STATE_FILE if path.is_dir() else path
+    read = read_json(path)
+    try:
+        mean, covariance = np.array(read["mean"], np.float64), np.array(read["covariance"], np.float64)
+        probability, of = float(read["probability"]), np.array(read["camera_px"], np.float64)
+    except (KeyError, TypeError, ValueError):
+        raise SourceError("is no state of a calibration", where=path, cure=f"give the {STATE_FILE} of a run") from None
+    n = 2 * N_TERMS
+    fits = mean.shape == (n,) and covariance.shape == (n, n) and np.isfinite(mean).all() and 0 <= probability <= 1
+    if not fits or not np.isfinite(covariance).all() or np.abs(mean).max() > 0.2:
+        raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
+    covariance = 0.5 * (covariance + covariance.T) + 1e-14 * np.eye(n)
+    if np.linalg.eigvalsh(covariance)[0] <= 0:
+        raise SourceError("its covariance is not positive definite", where=path)
+    if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):
+        raise SourceError("is of another camera, size or calibration", where=path, cure="use it with its own rig")
+    return RigState(mean, covariance, probability)
+
+
+def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRig:
+    """The rig with the right camera turned, its focal length and centre changed as fits the displacements best.
+
+    What no turn, focal length or centre explains (a lens' bend) is left over.
+    """
+    v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
+    x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
+    o, z = np.ones_like(x), np.zeros_like(x)
+    phi = terms(x, y)
+    dx, dy = state.mean[:N_TERMS] @ phi, state.mean[N_TERMS:] @ phi
+    by_x, by_y = [-x * y, 1 + x * x, -y, x, o, z], [-(1 + y * y), x * y, x, y, z, o]
+    p = np.linalg.lstsq(np.hstack([by_x, by_y]).T, np.concatenate([dx, dy]), rcond=None)[0]
+    R_rect = np.eye(3) if rig.is_rectified else rectifying_rotations(rig.T_right_left)[1]
+    T = rig.T_right_left.copy()
+    T[:3] = R_rect.T @ se3.so3_exp(p[:3]) @ R_rect @ T[:3]
+    r, scale = rig.right, 1.0 + p[3]
+    kind = "radtan" if "radtan" in r.kind else "equidistant"
+    intrinsics = [r.fx_px * scale, r.fy_px * scale, r.cx_px + p[4] * r.fx_px, r.cy_px + p[5] * r.fy_px]
+    distortion = [float(k) for k in r.distortion]
+    right = make_lens("pinhole", kind, intrinsics, distortion, (r.width, r.height), rig.where)
+    return replace(rig, right=right, T_right_left=T)
+
+
+def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRig:
+    """The rig that a run folder describes; a rectified pair where it describes none."""
+    if calibration is None:
+        K = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
+        size = [camera.width, camera.height]
+        lens = {"model": "pinhole-radtan", "intrinsics_px": K, "distortion": [], "resolution_px": size}
+        T = se3.from_rt(np.eye(3), np.array([-camera.baseline_m, 0.0, 0.0]))
+        calibration = {"left": lens, "right": lens, "T_right_left": T}
+    try:
+        lenses = []
+        for side in ("left", "right"):
+            c = calibration[side]
+            kind = "radtan" if "radtan" in c["model"] else "equidistant"
+            width, height = c["resolution_px"]
+            lenses.append(make_lens("pinhole", kind, c["intrinsics_px"], c["distortion"], (width, height), "rig.json"))
+        return StereoRig(lenses[0], lenses[1], np.array(calibration["T_right_left"], np.float64))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(f"is not what it should be: {error}", where="rig.json") from None
+
+
+def camchain(rig: StereoRig) -> str:
+    """The rig as Kalibr's ``camchain.yaml``."""
+    lines = []
+    for name, lens in (("cam0", rig.left), ("cam1", rig.right)):
+        fisheye = len(lens.distortion) == 4
+        numbers = [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px]
+        lines += [f"{name}:", "  camera_model: pinhole", f"  intrinsics: {_list(numbers)}"]
+        lines += [f"  distortion_model: {'equidistant' if fisheye else 'radtan'}"]
+        lines += [
+            f"  distortion_coeffs: {_list(lens.distortion if any(lens.distortion[4:]) else lens.distortion[:4])}",
+            f"  resolution: [{lens.width}, {lens.height}]",
+        ]
+    return "\n".join([*lines, "  T_cn_cnm1:", *(f"  - {_list(row)}" for row in rig.T_right_left)]) + "\n"
+
+
+def _list(values: Any) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in values) + "]"

@@ -1,0 +1,1 @@
+"""gpvo as a ROS 2 node."""

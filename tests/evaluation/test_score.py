@@ -1,0 +1,109 @@
+"""The scoreboard: files alone give what ``gpvo evaluate`` gives, and anybody's file is scored in one command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import make_run, stated_covariance
+from gpvo import cli
+from gpvo.errors import SourceError
+from gpvo.evaluation.evaluate import evaluate_run
+from gpvo.evaluation.score import score, score_sequence, write_statements
+from gpvo.geometry import se3
+from gpvo.io.run_read import Run
+from gpvo.io.stated import HEADER, read_stated, write_stated
+from gpvo.io.trajectory import tum_line, write_tum
+from gpvo.types import Mounting
+
+N = 300
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> tuple[Path, object]:
+    """The statements of a run of which two frames are lost, as files."""
+    log, truth = make_run(N, lost={40, 41})
+    evaluation = evaluate_run(Run(Path("hall"), "hall", log, truth, None, Mounting(), []))
+    folder = tmp_path_factory.mktemp("stated")
+    write_statements(evaluation, folder, "hall")
+    return folder, evaluation
+
+
+def test_files_alone_give_the_scores_of_evaluate(written) -> None:
+    folder, evaluation = written
+    found = score_sequence(folder / "triangulation" / "hall.txt", folder / "truth" / "hall.txt")
+    of_run = evaluation.consistency["triangulation"]
+    assert (found.motions, found.lost) == (N - 2, 2)
+    # Nine decimals of a file stand for motions of sigma 0.2 to 2e-3.
+    assert found.nees_dof == pytest.approx(of_run.nees_dof["joint"].mean, rel=1e-4)
+    assert found.nll_per_dim == pytest.approx(of_run.nll_per_dim, abs=1e-4)
+    assert found.correlation_gain_nats == pytest.approx(of_run.correlation_gain_nats, abs=1e-4)
+    assert found.nees_dof_over["1m"] == pytest.approx(of_run.horizons[0].nees_dof, rel=1e-4)
+    assert found.ate_rmse_m == pytest.approx(evaluation.trajectory.ate_rmse_m, rel=1e-4)
+
+
+def test_a_lost_motion_is_charged_with_its_length(written) -> None:
+    folder, evaluation = written
+    found = score_sequence(folder / "triangulation" / "hall.txt", folder / "truth" / "hall.txt")
+    T = evaluation.T_true
+    lost = [se3.log(se3.inverse(T[39]) @ T[k]) for k in (40, 41)]
+    of_run = evaluation.consistency["triangulation"].energy_translation_m
+    expected = (of_run * (N - 2) + sum(float(np.linalg.norm(xi[:3])) for xi in lost)) / N
+    assert found.energy_translation_m == pytest.approx(expected, rel=1e-4)
+
+
+def test_honest_beats_timid_and_bold(tmp_path: Path) -> None:
+    log, truth = make_run(N)
+    write_tum(tmp_path / "truth.txt", truth.t_ns, truth.T_world_cam)
+    energy, nll = {}, {}
+    for factor in (0.05, 1.0, 20.0):
+        C = np.full((len(log), 6, 6), np.nan)
+        C[1:] = factor * stated_covariance()
+        write_stated(tmp_path / "stated.txt", log, log.trajectory(), C)
+        s = score_sequence(tmp_path / "stated.txt", tmp_path / "truth.txt")
+        energy[factor], nll[factor] = s.energy_translation_m, s.nll_per_dim
+    assert min(energy, key=energy.__getitem__) == min(nll, key=nll.__getitem__) == 1.0
+
+
+def test_somebody_elses_file_of_29_columns(tmp_path: Path, capsys) -> None:
+    rng = np.random.default_rng(1)
+    T = se3.exp(np.cumsum(rng.normal(0, 0.01, (60, 6)), axis=0))
+    t_ns = 50_000_000 * np.arange(1, 61)
+    upper = " ".join(f"{1e-6 * (i == j)}" for i in range(6) for j in range(i, 6))
+    for name in ("a", "b"):
+        lines = [f"{tum_line(int(t), X)} {upper}" for t, X in zip(t_ns, T)]
+        (tmp_path / f"{name}.txt").write_text("\n".join([HEADER, *lines]) + "\n")
+    write_tum(tmp_path / "gt.txt", t_ns, T)
+    words = [str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), *(2 * ["--truth", str(tmp_path / "gt.txt")])]
+    cli.app(["score", *words, "--json"], standalone_mode=False)
+    found = json.loads(capsys.readouterr().out)
+    assert found["pooled"]["motions"] == 2 * 59
+    assert found["pooled"]["nees_dof"]["mean"] < 1e-3
+    cli.app(["score", *words], standalone_mode=False)
+    assert "by whole sequences" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "line,says",
+    [
+        ("0.2 0 0 0 0 0 0 1 " + " ".join(["0"] * 21), "not positive definite"),
+        ("0.2 0 0 0 0 0 0 1 " + " ".join(["x"] * 21), "holds no numbers"),
+        ("0.2 0 0 0 0 0 0 1 1 2 3", "expected 29"),
+        ("0.2 0 0 0 0 0 0 1 " + " ".join(["1"] + ["nan"] * 20), "not positive definite"),
+    ],
+)
+def test_a_malformed_file_is_refused_by_name(tmp_path: Path, line: str, says: str) -> None:
+    first = "0.1 0 0 0 0 0 0 1 " + " ".join(["nan"] * 21)
+    path = tmp_path / "stated.txt"
+    path.write_text("\n".join([HEADER, first, line]) + "\n")
+    with pytest.raises(SourceError, match=says) as refused:
+        read_stated(path)
+    assert "stated.txt" in str(refused.value)
+
+
+def test_a_file_without_the_header_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    with pytest.raises(SourceError, match="gpvo-stated"):
+        score([(tmp_path / "poses.txt", tmp_path / "poses.txt")])

@@ -1,0 +1,54 @@
+"""The verdict says in words what the numbers say: true, overconfident, too cautious, outside the domain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from evaluation_runs import make_run
+from gpvo.evaluation.evaluate import Evaluation, evaluate_run
+from gpvo.evaluation.verdict import verdict
+from gpvo.io.run_read import Run
+from gpvo.types import Mounting, VoLog
+
+
+def evaluated(factors: dict[str, float]) -> Evaluation:
+    """A run whose methods state the true covariance times a factor each."""
+    log, truth = make_run(600)
+    records = [
+        replace(r, v_t={}, covariances={m: f * r.covariances["triangulation"] for m, f in factors.items()})
+        if r.usable
+        else r
+        for r in log
+    ]
+    return evaluate_run(Run(Path("hall"), "hall", VoLog(records, log.camera), truth, None, Mounting(), []))
+
+
+@pytest.mark.parametrize(
+    "factor,colour,word", [(1.0, "green", "is true"), (0.1, "red", "overconfident"), (10.0, "amber", "too cautious")]
+)
+def test_one_method(factor: float, colour: str, word: str) -> None:
+    found = verdict(evaluated({"triangulation": factor}))
+    assert found.colour == colour
+    assert word in found.headline
+    if factor != 1.0:
+        assert "by a factor of 3." in found.lines[0]
+
+
+def test_the_method_that_is_true_is_named() -> None:
+    found = verdict(evaluated({"triangulation": 0.05, "pointing_matching": 1.0}))
+    assert found.colour == "green"
+    assert "pointing_matching" in found.headline
+    assert any(line.startswith("triangulation: overconfident") for line in found.lines)
+
+
+def test_outside_the_domain_is_never_green() -> None:
+    found = verdict(replace(evaluated({"triangulation": 1.0}), in_domain=0.1))
+    assert found.colour == "red"
+    assert "does not know these conditions" in found.headline
+    assert any(line.startswith("10 % of the frames") for line in found.lines)
+
+
+def test_nothing_stated_is_said() -> None:
+    assert "nothing can be judged" in verdict(evaluated({})).headline

@@ -1,0 +1,213 @@
+"""Small files that would fill the memory or the time: refused by their header, in one line that names them."""
+
+from __future__ import annotations
+
+import json
+import resource
+import struct
+import time
+import zipfile
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from gpvo.cameras.imagesize import image_size
+from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.errors import CalibrationError, GpvoError, SourceError
+from gpvo.io.folder import FolderSource
+from gpvo.io.foreign import read_foreign
+from gpvo.io.images import read_grey8
+from gpvo.io.jsonfile import read_json
+from gpvo.io.parquet import make_table, read_columns, write_table
+from gpvo.io.run_read import _read_imu
+from gpvo.io.tracks import TracksSource
+
+ENCODINGS = (".png", ".jpg", ".bmp", ".tif", ".pgm", ".ppm", ".webp")
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+@pytest.mark.parametrize("text", [
+    "a: &a [1,1,1,1,1,1,1,1,1,1]\n"
+    + "".join(f"{y}: &{y} [{','.join(['*' + x] * 10)}]\n" for x, y in zip("abcdefgh", "bcdefghi")),
+    "".join(f"k{i}: 1\n" for i in range(350_000)),
+    "resolution: [.inf, 480]\n", "image_width: null\nimage_height: 3\nR: 1\n", f"T: [{'9' * 400}, 0, 0]\n",
+    "x: " + "[" * 5000,
+], ids=["aliases", "many keys", "infinite", "null", "400 digits", "deep"])  # fmt: skip
+def test_yaml_bombs_are_refused_at_once(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    rest = "R: [1,0,0,0,1,0,0,0,1]\nK1: [300,0,1,0,300,1,0,0,1]\nK2: [300,0,1,0,300,1,0,0,1]\nD1: [0,0,0,0,0]\n"
+    path.write_text(text if "image_width" not in text and "T:" not in text else text + rest)
+    start = time.monotonic()
+    with pytest.raises(CalibrationError, match=r"camchain\.yaml") as refusal:
+        read_stereo_yaml(path)
+    assert "\n" not in str(refusal.value)
+    assert time.monotonic() - start < 10.0
+
+
+@pytest.mark.parametrize("suffix", ENCODINGS)
+def test_the_size_is_read_from_the_header(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"image{suffix}"
+    colour = np.random.default_rng(0).integers(0, 255, (37, 53, 3), dtype=np.uint8)
+    assert cv2.imwrite(str(path), colour if suffix != ".pgm" else colour[:, :, 0])
+    assert image_size(path.read_bytes()) == (53, 37)
+    assert read_grey8(path).shape == (37, 53)
+    for cut in range(40):
+        image_size(path.read_bytes()[:cut])  # raises nothing
+
+
+def _claiming(suffix: str, tmp_path: Path) -> Path:
+    """A file whose header claims 16384 x 16384."""
+    path = tmp_path / f"left{suffix}"
+    cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
+    raw = bytearray(path.read_bytes())
+    if suffix == ".png":
+        raw[16:24] = struct.pack(">II", 16384, 16384)
+        raw[29:33] = struct.pack(">I", zlib.crc32(raw[12:29]))
+    elif suffix == ".bmp":
+        raw[18:26] = struct.pack("<ii", 16384, 16384)
+    elif suffix == ".jpg":
+        at = raw.index(b"\xff\xc0")
+        raw[at + 5 : at + 9] = struct.pack(">HH", 16384, 16384)
+    else:
+        raw = bytearray(raw.replace(b"64 48", b"16384 16384"))
+    path.write_bytes(raw)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".pgm"])
+def test_an_image_that_claims_a_quarter_of_a_gigapixel_is_not_decoded(suffix: str, tmp_path: Path) -> None:
+    before = _peak_mb()
+    assert read_grey8(_claiming(suffix, tmp_path)) is None
+    assert _peak_mb() - before < 200
+
+
+def test_a_chunk_that_claims_gigabytes_is_not_made_room_for(tmp_path: Path) -> None:
+    path = tmp_path / "left.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8))
+    raw = bytearray(path.read_bytes())
+    at = raw.index(b"IEND") - 4
+    raw[at : at + 4] = b"\x7f\xff\xff\xff"
+    raw[at + 4 : at + 8] = b"IDAT"
+    path.write_bytes(raw)
+    before = _peak_mb()
+    assert read_grey8(path) is None
+    assert _peak_mb() - before < 200
+
+
+def test_a_sequence_of_such_images_is_refused_by_its_calibration(tmp_path: Path) -> None:
+    (tmp_path / "left").mkdir()
+    (tmp_path / "right").mkdir()
+    bomb = _claiming(".png", tmp_path)
+    for side in ("left", "right"):
+        (tmp_path / side / "1400000000000000000.png").write_bytes(bomb.read_bytes())
+    bomb.unlink()
+    block = (
+        "camera_model: pinhole\n  intrinsics: [300, 300, 320, 240]\n  distortion_model: none\n  resolution: [640, 480]"
+    )
+    pose = "  T_cn_cnm1: [[1,0,0,-0.1],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+    (tmp_path / "camchain.yaml").write_text(f"cam0:\n  {block}\ncam1:\n  {block}\n{pose}\n")
+    with pytest.raises(CalibrationError, match=r"1400000000000000000\.png.*16384x16384.*640x480"):
+        FolderSource(tmp_path)
+    huge = (
+        (tmp_path / "camchain.yaml").read_text().replace("640, 480", "16384, 16384").replace("320, 240", "8192, 8192")
+    )
+    (tmp_path / "camchain.yaml").write_text(huge)
+    with pytest.raises(CalibrationError, match="resolution 16384x16384"):
+        FolderSource(tmp_path)
+
+
+def _tracks(path: Path, **changed: object) -> Path:
+    n, m = 3, 12
+    data = {"t_s": np.arange(n) * 0.1, "frame": np.repeat(np.arange(n), 4), "track": np.arange(m),
+            "uv_left": np.full((m, 2), 100.0), "uv_right": np.full((m, 2), 90.0), "fx": 300.0, "fy": 300.0, "cx": 320.0,
+            "cy": 240.0, "baseline_m": 0.1, "width": 640, "height": 480,
+            "T_world_cam": np.tile(np.eye(4), (n, 1, 1))}  # fmt: skip
+    np.savez_compressed(path, **{**data, **changed})
+    return path
+
+
+def test_an_array_that_nobody_needs_is_not_unpacked(tmp_path: Path) -> None:
+    path = _tracks(tmp_path / "t.npz", other=np.zeros(40_000_000))
+    before = _peak_mb()
+    assert len(TracksSource(path)) == 3
+    assert _peak_mb() - before < 200
+
+
+@pytest.mark.parametrize("changed", [
+    {"uv_left": np.zeros((20_000_000, 2))}, {"width": np.array([640, 480])}, {"width": np.nan}, {"height": "480"},
+    {"sigma_translation_m": "much", "sigma_rotation_rad": 0.1}, {"t_s": np.arange(3) + 1e12}, {"t_s": np.zeros(0)},
+    {"track": np.full(12, 1e300)}, {"uv_left": np.full((12, 2), 1e200)}, {"fx": "x"}, {"baseline_m": -0.1},
+    {"imu_t_ns": np.full(3, 2**63, np.uint64), "imu_gyro_radps": np.zeros((3, 3)), "imu_acc_mps2": np.zeros((3, 3))},
+], ids=str)  # fmt: skip
+def test_tracks_that_cannot_be_are_refused(changed: dict, tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    with pytest.raises(GpvoError, match=r"t\.npz: ") as refusal:
+        list(TracksSource(_tracks(tmp_path / "t.npz", **changed)))
+    assert "\n" not in str(refusal.value)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("head", [
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }", b"{'descr': '<f8', 'fortran_order'",
+    b"(((((", b"{'descr': '|O', 'fortran_order': False, 'shape': (3,), }",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }",
+], ids=["huge", "cut", "brackets", "objects", "negative"])  # fmt: skip
+def test_damaged_array_headers_are_refused(head: bytes, tmp_path: Path) -> None:
+    path = _tracks(tmp_path / "t.npz")
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    body = head.ljust(117) + b"\n"
+    parts["t_s.npy"] = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(body)) + body + bytes(24)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data)
+    with pytest.raises(SourceError, match=r"t\.npz: not readable"):
+        TracksSource(path)
+
+
+def test_a_table_of_run_lengths_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "imu.parquet"
+    write_table(path, make_table({f"c{i}": np.zeros(3_000_000) for i in range(12)}))
+    with pytest.raises(SourceError, match=r"imu\.parquet: unpacks"):
+        read_columns(path)
+
+
+def test_text_in_the_place_of_numbers_is_refused(tmp_path: Path) -> None:
+    import pyarrow as pa
+
+    columns = {f"{k}_{a}_{u}": ["x", "y"] for k, u in (("gyro", "radps"), ("acc", "mps2")) for a in "xyz"}
+    write_table(tmp_path / "imu.parquet", pa.table({"t_ns": [1, 2], **columns}))
+    with pytest.raises(SourceError, match=r"imu\.parquet.*holds string"):
+        _read_imu(tmp_path / "imu.parquet")
+
+
+def test_a_line_without_end_is_not_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    path.write_text("1 " * 5_000_000)
+    for kind in (None, "tum", "csv"):
+        with pytest.raises(SourceError, match=r"log\.txt: line 1 is longer than a million"):
+            read_foreign(path, kind)
+
+
+@pytest.mark.parametrize("rate_hz", [1e-300, 1e300, -1.0, 0.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_refused(rate_hz: float, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    with pytest.raises(SourceError, match=r"poses\.txt: a rate of"):
+        read_foreign(tmp_path / "poses.txt", "kitti", rate_hz=rate_hz)
+
+
+def test_a_position_beyond_the_earth_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "plan.txt").write_text("0 0 0 0 0 0 0 1\n1 -1e308 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    with pytest.raises(SourceError, match=r"plan\.txt: line 2 .*1e\+308"):
+        read_foreign(tmp_path / "plan.txt", "tum")
+
+
+def test_json_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
+    for text in ('{"schema": 1e999}', '{"schema": NaN}', json.dumps({"schema": 1})[:-1]):
+        (tmp_path / "run.json").write_text(text)
+        with pytest.raises(SourceError, match=r"run\.json: is damaged"):
+            read_json(tmp_path / "run.json")

@@ -1,0 +1,102 @@
+"""A campaign of mutated inputs: 2,000 here, ``GPVO_HOSTILE_CASES`` (by default 6,000) with the longer tests."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from gpvo.cli import app
+from gpvo.io.run import write_run
+from gpvo.online.predictor import Predictor
+from gpvo.sim.points import simulate_points
+from synthetic_runs import make_run
+from typer.testing import CliRunner
+
+CAMPAIGN = Path(__file__).parent / "campaign.py"
+MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
+CAMERA = "  camera_model: pinhole\n  intrinsics: [60.0, 60.0, 32.0, 24.0]\n  distortion_model: radtan\n" \
+    "  distortion_coeffs: [0.01, 0.0, 0.0, 0.0]\n  resolution: [64, 48]\n"  # fmt: skip
+POSE = "  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]\n"
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One of each kind, as gpvo writes and reads them."""
+    root = tmp_path_factory.mktemp("hostile") / "seeds"
+    for kind in ("model", "tracks", "run", "euroc", "calibration", "log", "settings", "image", "bag"):
+        (root / kind).mkdir(parents=True)
+    shutil.copy(MODEL, root / "model" / "model.gpvo")
+    simulate_points("tunnel-bursts", 0, duration_s=2.0, rate_hz=10.0).save(root / "tracks" / "tracks.npz")
+    log, truth = make_run(50, n=12)
+    predictions = list(Predictor.load(MODEL).replay(log).values())
+    run = root / "run" / "folder"
+    write_run(run, log, predictions=predictions, truth=truth, config={"a": 1})
+    for suffix in ("bag", "mcap"):
+        done = CliRunner().invoke(app, ["publish", str(run), "--to", suffix, "-o", str(root / "bag" / f"bag.{suffix}")])
+        assert done.exit_code == 0, done.output
+    next((root / "bag").glob("*.yaml")).unlink()
+    (root / "calibration" / "camchain.yaml").write_text(f"cam0:\n{CAMERA}cam1:\n{CAMERA}{POSE}")
+    shutil.copy(run / "trajectory.tum", root / "log" / "log.tum")
+    (root / "log" / "log.csv").write_text(
+        "t_s,p_x,p_y,p_z,q_x,q_y,q_z,q_w,cov_00\n" + "0.1,1,2,3,0,0,0,1,0.1\n0.2,1,2,3,0,0,0,1,0.1\n"
+    )
+    (root / "log" / "kitti.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
+    shutil.copy(run / "config.toml", root / "settings" / "config.toml")
+    picture = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+    for suffix in ("png", "jpg", "bmp", "tif", "pgm", "webp"):
+        cv2.imwrite(str(root / "image" / f"image.{suffix}"), picture)
+    _euroc(root / "euroc" / "sequence", picture)
+    return root
+
+
+def _euroc(path: Path, picture: np.ndarray) -> None:
+    stamps = [1400000000000000000 + k * 50_000_000 for k in range(3)]
+    for k in range(2):
+        data = path / "mav0" / f"cam{k}" / "data"
+        data.mkdir(parents=True)
+        for t in stamps:
+            cv2.imwrite(str(data / f"{t}.png"), picture)
+        (data.parent / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in stamps))
+        pose = [1, 0, 0, 0.1 * k, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+        (data.parent / "sensor.yaml").write_text(
+            f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: {pose}\nresolution: [64, 48]\n"
+            "camera_model: pinhole\nintrinsics: [60.0, 60.0, 32.0, 24.0]\n"
+            "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
+        )
+
+
+def fly(seeds: Path, cases: int, workers: int = 2) -> None:
+    each = cases // workers
+    calls = [
+        subprocess.Popen([sys.executable, CAMPAIGN, seeds, str(k * each), str(each)], stdout=-1, stderr=-1, text=True)
+        for k in range(workers)
+    ]
+    for k, call in enumerate(calls):
+        out, err = call.communicate(timeout=3600)
+        last = (seeds.parent / f"work-{k * each}.case").read_text()
+        assert call.returncode == 0, f"died at case {last}: {err[-2000:]}"
+        assert not out, out[:4000]
+
+
+def test_every_seed_is_read_as_it_is(seeds: Path) -> None:
+    sys.path.insert(0, str(CAMPAIGN.parent))
+    from campaign import READERS
+
+    for kind, (read, _) in READERS.items():
+        for path in (seeds / kind).iterdir():
+            read(path)
+
+
+def test_no_mutated_input_breaks_anything(seeds: Path) -> None:
+    fly(seeds, 2_000)
+
+
+@pytest.mark.slow
+def test_no_mutated_input_of_many_breaks_anything(seeds: Path) -> None:
+    fly(seeds, int(os.environ.get("GPVO_HOSTILE_CASES", "6000")))

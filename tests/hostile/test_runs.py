@@ -1,0 +1,163 @@
+"""Run folders: what is stated in them is possible, and a finished one is not lost."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from gpvo.errors import GpvoError, SourceError
+from gpvo.io.run import RunWriter, is_finished, read_run, write_run
+from gpvo.online.predictor import Predictor
+from gpvo.types import VoLog
+from synthetic_runs import make_run
+
+MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
+ESC = "\x1b[2J\x1b]0;owned\x07"
+
+
+@pytest.fixture(scope="module")
+def log() -> VoLog:
+    return make_run(50, n=30)[0]
+
+
+@pytest.fixture
+def run(log: VoLog, tmp_path: Path) -> Path:
+    write_run(tmp_path / "run", log)
+    return tmp_path / "run"
+
+
+def gpvo(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    call = [sys.executable, "-m", "gpvo.cli", *map(str, words)]
+    return subprocess.run(call, capture_output=True, text=True, cwd=cwd, timeout=120)
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+def _change(path: Path, column: str, value: float) -> None:
+    table = pq.read_table(path)
+    values = table[column].to_pylist()
+    values[10] = value
+    at = table.column_names.index(column)
+    pq.write_table(table.set_column(at, column, pa.array(values, pa.float64())), path)
+
+
+@pytest.mark.parametrize(("column", "value"), [
+    ("cov_pointing_matching_01", 1.0), ("cov_pointing_matching_11", 0.0), ("cov_pointing_matching_11", -1.0),
+    ("cov_pointing_matching_12", np.nan), ("cov_pointing_matching_33", np.inf), ("p_x_m", np.nan), ("R_00", 2.0),
+])  # fmt: skip
+def test_a_covariance_that_is_none_is_refused(column: str, value: float, run: Path) -> None:
+    _change(run / "vo_log.parquet", column, value)
+    with pytest.raises(SourceError, match=r"vo_log\.parquet: "):
+        read_run(run)
+
+
+@pytest.mark.parametrize(("column", "value"), [("cov_white_00", -1.0), ("mean_x_m", np.inf), ("cov_jitter_01", 1.0)])
+def test_a_prediction_that_is_none_is_refused(column: str, value: float, log: VoLog, tmp_path: Path) -> None:
+    predictions = list(Predictor.load(MODEL).replay(log).values())
+    write_run(tmp_path / "run", log, predictions=predictions)
+    assert len(read_run(tmp_path / "run").predictions) == len(predictions)
+    path = tmp_path / "run" / "predictions.parquet"
+    if column in pq.read_schema(path).names:
+        _change(path, column, value)
+        with pytest.raises(SourceError, match=r"predictions\.parquet: "):
+            read_run(tmp_path / "run")
+
+
+def test_the_writer_leaves_out_what_is_no_covariance(log: VoLog, tmp_path: Path) -> None:
+    records = list(log.records)
+    bad = np.ones((6, 6)) + np.eye(6) * -0.5
+    records[5] = replace(records[5], covariances={**records[5].covariances, "pointing_matching": bad})
+    write_run(tmp_path / "run", VoLog(records, log.camera))
+    assert "pointing_matching" not in read_run(tmp_path / "run").log.records[5].covariances
+
+
+def test_a_finished_run_stays_until_the_new_one_is_whole(
+    log: VoLog, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = bytes_of(run)
+    with pytest.raises(SourceError, match="holds a finished run"):
+        RunWriter(run, overwrite=False)
+    assert bytes_of(run) == before
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("gpvo.io.parquet.pq.write_table", full)
+        with pytest.raises(SourceError, match="No space left"):
+            write_run(run, VoLog(log.records[:20], log.camera))
+    assert bytes_of(run) == before
+    assert [p.name for p in run.parent.iterdir()] == ["run"]
+    write_run(run, VoLog(log.records[:20], log.camera))
+    assert len(read_run(run).log) == 20
+    assert [p.name for p in run.parent.iterdir()] == ["run"]
+
+
+def test_what_a_broken_run_left_is_replaced_without_asking(log: VoLog, tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run", camera=log.camera, overwrite=False)
+    writer.append(log.records[0])
+    writer.close(complete=False)
+    assert not is_finished(tmp_path / "run")
+    write_run(tmp_path / "run", log, overwrite=False)
+    assert is_finished(tmp_path / "run")
+
+
+def test_a_full_disk_names_the_file_and_leaves_nothing_half_written(
+    log: VoLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(table: pa.Table, where: Path, **_: object) -> None:
+        Path(where).write_bytes(b"PAR1")
+        raise OSError("Error writing bytes to file")
+
+    monkeypatch.setattr("gpvo.io.parquet.pq.write_table", full)
+    with pytest.raises(SourceError, match=r"log_000000\.parquet: cannot be written"):
+        write_run(tmp_path / "run", log)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_two_writers_do_not_mix(log: VoLog, tmp_path: Path) -> None:
+    first = RunWriter(tmp_path / "run", camera=log.camera)
+    first.append(log.records[0])
+    with pytest.raises(SourceError, match="being written by somebody else"):
+        RunWriter(tmp_path / "run", camera=log.camera)
+    for record in log.records[1:]:
+        first.append(record)
+    first.close()
+    assert len(read_run(tmp_path / "run").log) == len(log)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_may_not_be_written_is_named(log: VoLog, tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir(mode=0o555)
+    with pytest.raises(SourceError, match="cannot be written"):
+        write_run(tmp_path / "runs" / "run", log)
+
+
+def test_the_command_replaces_a_finished_run_only_when_told(tmp_path: Path) -> None:
+    log = tmp_path / "est.txt"
+    log.write_text("".join(f"{k * 0.1:.1f} {k * 0.01} 0 0 0 0 0 1\n" for k in range(20)))
+    assert gpvo("import", log, "-o", tmp_path / "run").returncode == 0
+    again = gpvo("import", log, "-o", tmp_path / "run")
+    assert again.returncode == 2
+    assert "holds a finished run" in again.stderr
+    assert len(again.stderr.strip().splitlines()) == 1
+    assert gpvo("import", log, "-o", tmp_path / "run", "--overwrite").returncode == 0
+
+
+def test_nothing_of_a_file_reaches_the_terminal_as_a_command(log: VoLog, tmp_path: Path) -> None:
+    name = f"a{ESC}b"
+    (tmp_path / "est.csv").write_text(f"t_s,p_x,p_y,p_z,q_x,q_y,q_z,q_w,{ESC}\n0,0,0,0,0,0,0,1,0\n1,0,0,0,0,0,0,1,0\n")
+    write_run(tmp_path / "run", log, meta={"name": name, "source": name})
+    for words in (("info", "run"), ("info", "est.csv"), ("evaluate", "run"), ("info", f"no{ESC}such")):
+        done = gpvo(*words, cwd=tmp_path)
+        assert "\x1b" not in done.stdout + done.stderr, words
+    assert "\x1b" not in str(GpvoError(f"no such '{ESC}'", where=name))

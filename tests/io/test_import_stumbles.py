@@ -1,0 +1,92 @@
+"""What an import does not use is named; what people call a covariance is understood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sequences as seq
+from bag_maker import BagMaker, stereo_bag
+from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.errors import CalibrationError
+from gpvo.io import open_source
+from gpvo.io.foreign import read_foreign
+
+POSE = "0,0,0,0,0,0,1"
+
+
+def _csv(path: Path, columns: str, values: str) -> Path:
+    rows = [f"{k * 0.1:.1f},{POSE},{values}" for k in range(5)]
+    path.write_text("\n".join([f"t,x,y,z,qx,qy,qz,qw,{columns}", *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        "cov_xx,cov_yy,cov_zz,cov_rollroll,cov_pitchpitch,cov_yawyaw",
+        "var_x,var_y,var_z,var_roll,var_pitch,var_yaw",
+        "cov_x_x,cov_y_y,cov_z_z,cov_rx_rx,cov_ry_ry,cov_rz_rz",
+    ],
+)
+def test_covariance_columns_by_their_usual_names(columns: str, tmp_path: Path) -> None:
+    log = read_foreign(_csv(tmp_path / "log.csv", columns, "1,2,3,4,5,6"))
+    assert log.covariance is not None
+    np.testing.assert_array_equal(np.diagonal(log.covariance[0]), [1, 2, 3, 4, 5, 6])
+    assert log.notes == ()
+
+
+def test_columns_of_uncertainty_that_are_not_understood_are_named(tmp_path: Path) -> None:
+    log = read_foreign(_csv(tmp_path / "log.csv", "sigma_x,std_yaw,temperature", "1,2,3"))
+    assert log.covariance is None
+    [note] = log.notes
+    assert "sigma_x, std_yaw" in note
+    assert "temperature" not in note
+    assert "--map" in note
+
+
+def test_odometry_of_a_bag_that_is_not_used_is_named_with_the_option_that_takes_it(tmp_path: Path) -> None:
+    maker: BagMaker = stereo_bag(ros1=False)
+    for t, T in zip(seq.stamps(12), seq.true_poses(12), strict=True):
+        maker.odometry("/wheels/odom", t, T, np.eye(6), np.eye(6))
+    bag = maker.write(tmp_path / "bag")
+    notes = open_source(bag).report.notes
+    assert any("/wheels/odom" in n and "--topic /wheels/odom" in n and "--truth-topic" in n for n in notes)
+    log = read_foreign(bag)
+    assert log.topic == "/wheels/odom"
+    assert any("/vicon/head/head" in n and "--truth-topic" in n for n in log.notes)
+
+
+def _camera_info(path: Path, tx: float) -> None:
+    path.write_text(
+        "image_width: 640\nimage_height: 480\ncamera_name: c\ndistortion_model: plumb_bob\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [400, 0, 320, 0, 400, 240, 0, 0, 1]}\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.05, 0, 0, 0]}\n"
+        "rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\n"
+        f"projection_matrix: {{rows: 3, cols: 4, data: [380, 0, 320, {tx}, 0, 380, 240, 0, 0, 0, 1, 0]}}\n"
+    )
+
+
+def test_calibration_takes_ros_camera_info_of_both_cameras(tmp_path: Path) -> None:
+    for side, tx in (("left", 0.0), ("right", -45.6)):
+        _camera_info(tmp_path / f"{side}.yaml", tx)
+    for side in ("left", "right"):
+        rig = read_stereo_yaml(tmp_path / f"{side}.yaml")
+        assert rig.baseline_m == pytest.approx(0.12)
+        assert (rig.left.width, rig.left.fx_px) == (640, 400.0)
+    (tmp_path / "right.yaml").unlink()
+    with pytest.raises(CalibrationError, match=r"right\.yaml does not lie beside"):
+        read_stereo_yaml(tmp_path / "left.yaml")
+
+
+def test_calibration_takes_kittis_calib(tmp_path: Path) -> None:
+    folder = seq.write_folder(tmp_path / "images")
+    for found in folder.rglob("*.yaml"):
+        found.unlink()
+    row = "60 0 31.5 {} 0 60 23.5 0 0 0 1 0"
+    (tmp_path / "calib.txt").write_text(f"P0: {row.format(0)}\nP1: {row.format(-6)}\n")
+    source = open_source(folder, calibration=tmp_path / "calib.txt")
+    assert source.camera.baseline_m == pytest.approx(0.1)
+    with pytest.raises(CalibrationError, match="no size"):
+        read_stereo_yaml(tmp_path / "calib.txt")

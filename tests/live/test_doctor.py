@@ -1,0 +1,165 @@
+"""The doctor finds what is wrong with a covariance, and nothing where nothing is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_maker import BagMaker
+from gpvo.cli import app
+from gpvo.geometry import se3
+from gpvo.live.doctor import Stated, examine
+from gpvo.publish.odometry import Odometry
+from gpvo.publish.ros import odometry_message
+from shim_bags import engine, flight, flown
+from typer.testing import CliRunner
+
+TOPIC = "/vo/odometry"
+N = 150
+
+
+def good_flight(seed: int) -> list[Odometry]:
+    live, kept, _ = engine()
+    for arrival in flown(*flight(seed=seed, n=N)):
+        live.take(arrival)
+    return [o for o in kept.frames if o.twist_body is not None]
+
+
+@pytest.fixture(scope="module")
+def good() -> list[Odometry]:
+    return good_flight(11)
+
+
+def bag_of(frames: list[Odometry], path: Path) -> Path:
+    maker = BagMaker(ros1=False)
+    for k, o in enumerate(frames):
+        maker.add(TOPIC, odometry_message(o, maker.store.types), 10**18 + k * 50_000_000)
+    return maker.write(path)
+
+
+def _each(change: Callable[[Odometry, int], dict]) -> Callable[[list[Odometry]], list[Odometry]]:
+    return lambda frames: [replace(o, **change(o, k)) for k, o in enumerate(frames)]
+
+
+def _permuted(C: np.ndarray) -> np.ndarray:
+    order = [3, 4, 5, 0, 1, 2]
+    return C[np.ix_(order, order)]
+
+
+def _impossible(C: np.ndarray) -> np.ndarray:
+    out = C.copy()
+    out[0, 1] = out[1, 0] = 2 * np.sqrt(C[0, 0] * C[1, 1])
+    return out
+
+
+def _asymmetric(C: np.ndarray) -> np.ndarray:
+    out = C.copy()
+    out[0, 1] += 0.5 * C[0, 0]
+    return out
+
+
+def _with_diagonal(C: np.ndarray, index: int, value: float) -> np.ndarray:
+    out = C.copy()
+    out[index, :] = out[:, index] = 0.0
+    out[index, index] = value
+    return out
+
+
+def _turned_as_vectors(o: Odometry, k: int) -> dict:
+    d = np.array([1e-4, 4e-4, 9e-4])
+    R = o.T_odom_body[:3, :3]
+    return {"pose_covariance": np.diag([*(R @ d), 1e-5, 2e-5, 3e-5])}
+
+
+def _in_parent(o: Odometry, k: int) -> dict:
+    R = o.T_odom_body[:3, :3]
+    return {"twist_body": np.concatenate([R @ o.twist_body[:3], R @ o.twist_body[3:]])}
+
+
+def _moved(T: np.ndarray, x: float) -> np.ndarray:
+    out = T.copy()
+    out[0, 3] += x
+    return out
+
+
+FAULTS = {
+    "pose-zero": _each(lambda o, k: {"pose_covariance": np.zeros((6, 6))}),
+    "twist-zero": _each(lambda o, k: {"twist_covariance": np.zeros((6, 6))}),
+    "pose-constant": _each(lambda o, k: {"pose_covariance": np.diag([0.01] * 3 + [0.001] * 3)}),
+    "twist-constant": _each(lambda o, k: {"twist_covariance": np.diag([0.01] * 3 + [0.001] * 3)}),
+    "twist-tiny": _each(lambda o, k: {"twist_covariance": _with_diagonal(o.twist_covariance, 2, 1e-10)}),
+    "pose-huge": _each(lambda o, k: {"pose_covariance": _with_diagonal(o.pose_covariance, 5, 9999.0 + k)}),
+    "pose-some-zero": _each(lambda o, k: {"pose_covariance": _with_diagonal(o.pose_covariance, 5, 0.0)}),
+    "twist-negative": _each(lambda o, k: {"twist_covariance": _with_diagonal(o.twist_covariance, 1, -1e-3)}),
+    "twist-not-finite": _each(lambda o, k: {"twist_covariance": o.twist_covariance * (np.nan if k == 70 else 1)}),
+    "pose-asymmetric": _each(lambda o, k: {"pose_covariance": _asymmetric(o.pose_covariance)}),
+    "twist-not-positive": _each(lambda o, k: {"twist_covariance": _impossible(o.twist_covariance)}),
+    "pose-swapped": _each(lambda o, k: {"pose_covariance": _permuted(o.pose_covariance * np.outer(S, S))}),
+    "pose-turned": _each(_turned_as_vectors),
+    "pose-equals-twist": _each(lambda o, k: {"pose_covariance": o.twist_covariance}),
+    "pose-against-twist": _each(lambda o, k: {"twist_covariance": o.twist_covariance * 0.05**4}),
+    "twist-levels": _each(lambda o, k: {"twist_covariance": np.eye(6) * 10.0 ** -(2 + k // 40)}),
+    "stamp-zero": _each(lambda o, k: {"t_ns": 0}),
+    "stamp-backward": _each(lambda o, k: {"t_ns": o.t_ns - (10**8 if k % 9 == 8 else 0)}),
+    "stamp-repeated": _each(lambda o, k: {"t_ns": o.t_ns - (50_000_000 if k % 9 == 8 else 0)}),
+    "stamp-gap": lambda frames: [*frames[:60], *frames[80:]],
+    "frame-empty": _each(lambda o, k: {"child_frame_id": ""}),
+    "frame-same": _each(lambda o, k: {"child_frame_id": "odom"}),
+    "frame-optical": _each(lambda o, k: {"child_frame_id": "camera_left_optical_frame"}),
+    "frame-changes": _each(lambda o, k: {"frame_id": "odom" if k < 70 else "map"}),
+    "pose-jump": _each(lambda o, k: {"T_odom_body": _moved(o.T_odom_body, 5.0 * (k >= 70))}),
+    "twist-in-parent": _each(_in_parent),
+    "twist-empty": _each(lambda o, k: {"twist_body": np.zeros(6)}),
+    "twist-scale": _each(lambda o, k: {"twist_body": o.twist_body * 0.05}),
+}
+S = np.array([3.0] * 3 + [1.0] * 3)
+
+
+@pytest.mark.parametrize("code", FAULTS)
+def test_a_seeded_fault_is_found(code: str, good: list[Odometry], tmp_path: Path) -> None:
+    bag = bag_of(FAULTS[code](good), tmp_path / "bag")
+    result = CliRunner().invoke(app, ["doctor", str(bag), "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    [topic] = json.loads(result.stdout)["topics"]
+    assert topic["topic"] == TOPIC
+    found = {f["code"]: f for f in topic["findings"]}
+    assert code in found
+    assert found[code]["consequence"]
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13, 14, 15])
+def test_nothing_is_found_in_a_good_bag(seed: int, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["doctor", str(bag_of(good_flight(seed), tmp_path / "bag"))])
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[-1].endswith("nothing found")
+
+
+def test_wheel_odometry_of_two_robots_is_constant_and_says_the_same_twice(real_data: Path) -> None:
+    """Both recordings are real, and neither is good: their drivers publish one covariance for ever."""
+    for name in ("rl_test1.bag", "rl_test2.bag"):
+        result = CliRunner().invoke(app, ["doctor", str(real_data / "bags" / name), "--json"])
+        [topic] = json.loads(result.stdout)["topics"]
+        codes = {f["code"] for f in topic["findings"]}
+        assert {"pose-constant", "twist-constant"} <= codes
+        assert not {c for c in codes if c.startswith(("stamp", "frame", "twist-in", "twist-scale"))}
+
+
+def test_a_type_without_a_covariance_says_so(good: list[Odometry]) -> None:
+    maker = BagMaker(ros1=False)
+    for o in good:
+        header, (p, q) = maker.header(o.t_ns, "odom"), maker._pose(o.T_odom_body)
+        pose = maker.type("geometry_msgs/msg/Pose")(maker.type("geometry_msgs/msg/Point")(*p), q)
+        maker.add("/pose", maker.type("geometry_msgs/msg/PoseStamped")(header, pose), o.t_ns)
+    stated = Stated.of(m for _, _, m in maker.messages)
+    assert [f.code for f in examine(stated)] == ["no-covariance"]
+    assert np.isfinite(se3.log(stated.T)).all()
+
+
+def test_what_is_no_bag_and_no_topic_is_one_line() -> None:
+    result = CliRunner().invoke(app, ["doctor", "no/such.bag"])
+    assert result.exit_code != 0
+    assert "--zenoh" in str(result.exception)

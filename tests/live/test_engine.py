@@ -1,0 +1,143 @@
+"""The engine gives what the offline path gives, and says what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.covariance import is_positive_definite
+from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign, to_records
+from gpvo.live.engine import Engine, EngineSettings
+from gpvo.live.intake import Arrival
+from gpvo.live.job import LiveSettings, run_live
+from gpvo.live.stages import StereoStage
+from gpvo.publish.odometry import OdometryBuilder
+from gpvo.publish.odometry import messages as offline
+from gpvo.types import Status, StereoCamera, VoLog
+from shim_bags import STATED, TOPIC, engine, flight, flown, messages, save_model, shim_predictor
+
+
+@pytest.mark.parametrize("stated", [None, STATED])
+def test_the_shim_equals_the_imported_run(stated: np.ndarray | None, tmp_path: Path) -> None:
+    stamps, T = flight()
+    bag = messages(stamps, T, twist_covariance=stated).write(tmp_path / "vio")
+    log = read_foreign(bag, topic=TOPIC).seen_from(T_FLU_OPTICAL)
+    records = VoLog(to_records(log)[0])
+    predictions = shim_predictor().replay(records)
+    want = list(offline(records, predictions, OdometryBuilder(T_FLU_OPTICAL, T[0])))
+    live, kept, told = engine()
+    for arrival in flown(stamps, T, twist_covariance=stated):
+        live.take(arrival)
+    assert len(kept.frames) == len(want) == len(T)
+    for ours, theirs, pose in zip(kept.frames, want, T, strict=True):
+        np.testing.assert_allclose(ours.T_odom_body, pose, atol=1e-9)
+        np.testing.assert_allclose(ours.pose_covariance, theirs.pose_covariance, rtol=1e-9, atol=1e-15)
+        assert (ours.twist_covariance is None) == (theirs.twist_covariance is None)
+        if ours.twist_covariance is not None:
+            np.testing.assert_allclose(ours.twist_covariance, theirs.twist_covariance, rtol=1e-9)
+            np.testing.assert_allclose(ours.twist_body, theirs.twist_body, rtol=1e-9)
+    assert told == []
+    assert kept.reports[-1].level == 0
+    assert "sigma x" in kept.reports[-1].values["driven_by"]
+
+
+def test_the_twist_is_in_the_child_frame_and_the_pose_in_its_parent() -> None:
+    """A body that only drives forward, heading north: the twist is along its x, the pose moves along odom's y."""
+    north = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
+    T = np.array([north @ se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])) for k in range(60)])
+    stamps = 10**18 + np.arange(60) * 50_000_000
+    live, kept, _ = engine()
+    for arrival in flown(stamps, T):
+        live.take(arrival)
+    last = kept.frames[-1]
+    assert last.twist_body is not None
+    np.testing.assert_allclose(last.twist_body, [1.0, 0, 0, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(last.T_odom_body[:3, 3], [0, 59 * 0.05, 0], atol=1e-9)
+    # The model knows that the error along the way is twice that across it (camera z, body x, here odom's y).
+    assert last.twist_covariance is not None
+    assert last.twist_covariance[0, 0] > 1.5 * last.twist_covariance[1, 1]
+    assert last.pose_covariance[1, 1] > 1.5 * last.pose_covariance[0, 0]
+
+
+def test_the_increments_covariance_neither_grows_nor_vanishes() -> None:
+    stamps, T = flight()
+    last = {}
+    for increment in (False, True):
+        live, kept, _ = engine(EngineSettings(increment=increment))
+        for arrival in flown(stamps, T):
+            live.take(arrival)
+        last[increment] = np.array([np.trace(o.pose_covariance[:3, :3]) for o in kept.frames[1:]])
+        assert all(is_positive_definite(o.pose_covariance) for o in kept.frames)
+    assert last[False][-1] > 5 * last[False][1]
+    assert last[True][50:].mean() < 2 * last[True][1:50].mean()
+    assert last[True].min() > 1e-7
+
+
+def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
+    stamps, T = flight(n=80)
+    settings = EngineSettings(state=tmp_path / "state.json")
+    arrivals = flown(stamps, T)
+    before, kept_before, _ = engine(settings)
+    for arrival in arrivals[:40]:
+        before.take(arrival)
+    before.close()
+    after, kept_after, _ = engine(settings)
+    for arrival in arrivals[40:]:
+        after.take(arrival)
+    stopped, resumed = kept_before.frames[-1], kept_after.frames[0]
+    np.testing.assert_allclose(resumed.T_odom_body, stopped.T_odom_body, atol=1e-9)
+    assert np.linalg.eigvalsh(resumed.pose_covariance - stopped.pose_covariance).min() > 1e-3
+    (tmp_path / "state.json").write_text("[]")
+    with pytest.raises(GpvoError, match="no state of gpvo live"):
+        engine(settings)
+
+
+def test_a_model_of_another_camera_is_called_out_at_once_and_every_ten_seconds() -> None:
+    camera = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
+    stage, told = StereoStage("/left", "/right"), []
+    stage.camera = replace(camera, baseline_m=0.5)
+    predictor = shim_predictor()
+    predictor.camera = camera
+    live = Engine(stage, predictor, [], tell=told.append)
+    for second in range(26):
+        live.take(Arrival("/other", None, second * 10**9))
+    assert len(told) == 3
+    assert all("baseline is 0.5" in text for text in told)
+
+
+def test_an_odometry_at_another_rate_or_outside_the_domain_is_called_out() -> None:
+    stamps, T = flight(n=60)
+    live, kept, told = engine()
+    for arrival in flown(stamps[0] + (stamps - stamps[0]) * 4, T):
+        live.take(arrival)
+    assert any("the rate is 5 Hz" in text for text in told)
+    assert kept.reports[-1].level == 1
+
+
+def test_a_bag_replayed_by_the_command_is_the_same_in_a_bag(tmp_path: Path) -> None:
+    stamps, T = flight(n=60)
+    bag = messages(stamps, T).write(tmp_path / "vio")
+    model = save_model(tmp_path / "vio.gpvo")
+    result = run_live(LiveSettings(model, replay=bag, fast=True, out=tmp_path / "out.mcap"))
+    assert result["counts"]["frames_ok"] == 60
+    written = read_foreign(tmp_path / "out.mcap")
+    np.testing.assert_allclose(written.trajectory.T_world_body, T[1:], atol=1e-9)
+    assert written.covariance is not None
+    assert all(is_positive_definite(C) for C in written.covariance[1:])
+
+
+def test_status_lost_is_not_sent_but_reported() -> None:
+    stamps, T = flight(n=60)
+    arrivals = flown(stamps, T)
+    live, kept, _ = engine()
+    for arrival in [*arrivals[:30], *arrivals[45:]]:
+        live.take(arrival)
+    lost = [o for o in kept.frames if o.status is Status.LOST]
+    assert [o.t_ns for o in lost] == [stamps[45]]
+    assert lost[0].twist_covariance is None
+    assert max(r.level for r in kept.reports) == 2
+    assert kept.reports[-1].level == 2 or kept.frames[-1].status is Status.OK

@@ -1,0 +1,206 @@
+"""Each fault of a live source, many times: no exception, no confident message across it, and work again in a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from gpvo.geometry import se3
+from gpvo.live.engine import Engine
+from gpvo.live.intake import Arrival, Mailbox, Sequence, StampWatch
+from gpvo.publish.odometry import Odometry
+from gpvo.types import Status
+from shim_bags import Kept, engine, flight, flown, shim_predictor
+
+SECOND = 10**9
+RATE = 20
+
+
+def _moved(arrival: Arrival, seconds: float) -> Arrival:
+    """The same message with another stamp."""
+    stamp = arrival.message.header.stamp
+    total = stamp.sec * SECOND + stamp.nanosec + round(seconds * SECOND)
+    header = replace(arrival.message.header, stamp=replace(stamp, sec=total // SECOND, nanosec=total % SECOND))
+    return replace(arrival, message=replace(arrival.message, header=header))
+
+
+def _placed(arrival: Arrival, T: np.ndarray) -> Arrival:
+    pose = arrival.message.pose.pose
+    q = se3.rotation_to_quaternion_xyzw(T[:3, :3])
+    point = replace(pose.position, **dict(zip("xyz", (float(v) for v in T[:3, 3]))))
+    turn = replace(pose.orientation, **dict(zip("xyzw", (float(v) for v in q))))
+    holder = replace(arrival.message.pose, pose=replace(pose, position=point, orientation=turn))
+    return replace(arrival, message=replace(arrival.message, pose=holder))
+
+
+def _with(arrival: Arrival, **position: float) -> Arrival:
+    pose = arrival.message.pose.pose
+    changed = replace(pose, position=replace(pose.position, **position))
+    return replace(arrival, message=replace(arrival.message, pose=replace(arrival.message.pose, pose=changed)))
+
+
+def _twice(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    return [*a[: k + 1], *a[k : k + 1] * int(rng.integers(1, 5)), *a[k + 1 :]]
+
+
+def _late(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    late = int(rng.integers(1, 15))
+    return [*a[:k], *a[k + 1 : k + late + 1], a[k], *a[k + late + 1 :]]
+
+
+def _shuffled(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    return [*a[:k], *(a[k + i] for i in rng.permutation(6)), *a[k + 6 :]]
+
+
+def _missing(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    return [*a[:k], *a[k + int(rng.integers(1, 30)) :]]
+
+
+def _absurd(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    value = [np.nan, np.inf, -1e300, 1e9][int(rng.integers(4))]
+    return [*a[:k], _with(a[k], x=value), *a[k + 1 :]]
+
+
+def _glitch(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    return [*a[:k], _with(a[k], x=float(rng.uniform(30, 1e6))), *a[k + 1 :]]
+
+
+def _half_a_message(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    broken = [None, object(), replace(a[k].message, header=None), replace(a[k].message, pose=None)]
+    return [*a[:k], replace(a[k], message=broken[int(rng.integers(4))]), *a[k + 1 :]]
+
+
+def _restarted(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    """The source starts again at its own origin, with a clock of its own, after a while."""
+    away, origin = float(rng.uniform(0.5, 5)), se3.exp(rng.normal(0, 1, 6))
+    back = -float(rng.uniform(100, 1e6))
+    later = [replace(_moved(_placed(m, origin @ _pose(m)), back), received_ns=m.received_ns + round(away * SECOND))
+             for m in a[k:]]  # fmt: skip
+    return [*a[:k], *later]
+
+
+def _clock(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    jump = float(rng.choice([-1, 1]) * rng.uniform(12, 1e8))
+    return [*a[:k], *(_moved(m, jump) for m in a[k:])]
+
+
+def _one_stamp(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    return [*a[:k], _moved(a[k], float(rng.choice([-1, 1]) * rng.uniform(12, 1e8))), *a[k + 1 :]]
+
+
+def _pose(arrival: Arrival) -> np.ndarray:
+    p, q = arrival.message.pose.pose.position, arrival.message.pose.pose.orientation
+    return se3.from_quaternion(np.array([[p.x, p.y, p.z]]), np.array([[q.x, q.y, q.z, q.w]]))[0]
+
+
+FAULTS: list[Callable[[list[Arrival], int, np.random.Generator], list[Arrival]]] = [
+    _twice, _late, _shuffled, _missing, _absurd, _glitch, _half_a_message, _restarted, _clock, _one_stamp,
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording() -> list[Arrival]:
+    return flown(*flight(n=100, rate_hz=RATE))
+
+
+@pytest.fixture(scope="module")
+def healthy(recording: list[Arrival]) -> np.ndarray:
+    """Median (6,) variances of the twist without a fault."""
+    live, kept, _ = engine()
+    for arrival in recording:
+        live.take(arrival)
+    return np.median([np.diagonal(o.twist_covariance) for o in kept.frames if o.twist_covariance is not None], axis=0)
+
+
+@pytest.mark.parametrize("trials", [2, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__.strip("_"))
+def test_fault_campaign(
+    fault: Callable[..., list[Arrival]], trials: int, recording: list[Arrival], healthy: np.ndarray
+) -> None:
+    predictor = shim_predictor()
+    for trial in range(trials):
+        rng = np.random.default_rng([trial, FAULTS.index(fault)])
+        live, _kept, _ = engine(predictor=predictor)
+        predictor.reset()
+        k = int(rng.integers(30, 55))
+        out = [(a, live.take(a)) for a in fault(list(recording), k, rng)]
+        frames = [o for _, made in out for o in made]
+        assert live.counts["failed"] == (fault is _half_a_message)
+        _never_confident_across_a_jump(frames, healthy)
+        tail = frames[-10:]
+        assert len(frames) > 60
+        assert all(o.status in (Status.OK, Status.DEGRADED) and o.twist_covariance is not None for o in tail)
+        # Within a second of the last faulty message the odometry is as sure as it was.
+        late = np.median([np.diagonal(o.twist_covariance) for o in tail if o.twist_covariance is not None], axis=0)
+        assert (late < 10 * healthy).all()
+
+
+def _never_confident_across_a_jump(frames: list[Odometry], healthy: np.ndarray) -> None:
+    """Wherever the motion is not what a vehicle flies, nothing is sent; what is sent is as uncertain as ever."""
+    for o in frames:
+        if o.twist_body is None or o.twist_covariance is None:
+            continue
+        assert np.isfinite(o.twist_covariance).all()
+        assert (np.diagonal(o.twist_covariance) > 0.02 * healthy).all()
+        error = np.abs(o.twist_body[:3]).max() / np.sqrt(np.diagonal(o.twist_covariance)[:3]).max()
+        assert np.abs(o.twist_body[:3]).max() < 4.0 or error < 4.0
+
+
+def test_the_pose_never_jumps_and_its_covariance_never_shrinks_across_a_restart(recording: list[Arrival]) -> None:
+    live, kept, _ = engine()
+    for arrival in _restarted(list(recording), 50, np.random.default_rng(1)):
+        live.take(arrival)
+    steps = [np.linalg.norm(b.T_odom_body[:3, 3] - a.T_odom_body[:3, 3]) for a, b in pairwise(kept.frames)]
+    assert max(steps) < 0.5
+    assert live.counts["restarts"] == 1
+    traces = [np.trace(o.pose_covariance[:3, :3]) for o in kept.frames]
+    assert traces[60] > traces[45] + 1.0
+    assert kept.frames[-1].reset_counter > kept.frames[0].reset_counter
+
+
+def test_silence_is_an_error_in_the_diagnostics(recording: list[Arrival]) -> None:
+    live, kept, told = engine()
+    for arrival in recording[:40]:
+        live.take(arrival)
+    for tenth in range(50):
+        live.take(Arrival("/other", None, recording[39].received_ns + tenth * SECOND // 10))
+    assert kept.reports[-1].level == 2
+    assert "no usable message" in kept.reports[-1].text
+    assert sum("no usable message" in t for t in told) == 1
+
+
+def test_one_corrupt_stamp_is_one_message_and_three_that_agree_are_another_clock() -> None:
+    watch = StampWatch()
+    usual = [watch.see(k * SECOND // 20 + 10**18) for k in range(10)]
+    assert usual[0] is Sequence.FIRST
+    assert set(usual[1:]) == {Sequence.NEXT}
+    assert watch.see(5) is Sequence.CLOCK
+    assert watch.see(10 * SECOND // 20 + 10**18) is Sequence.NEXT
+    assert [watch.see(k * SECOND) for k in (1, 2, 3, 4)] == [
+        Sequence.CLOCK, Sequence.CLOCK, Sequence.RESTART, Sequence.NEXT
+    ]  # fmt: skip
+    assert watch.see(4 * SECOND) is Sequence.REPEATED
+    assert watch.see(4 * SECOND - 1) is Sequence.LATE
+
+
+def test_a_full_mailbox_drops_the_oldest_and_counts_them() -> None:
+    box = Mailbox(depth=3)
+    for k in range(10):
+        box.put("/a", bytes([k]))
+    box.put("/b", b"x")
+    assert box.dropped == {"/a": 7}
+    got = [box.get(0.0) for _ in range(5)]
+    assert [g[2] for g in got if g] == [b"\x07", b"\x08", b"\x09", b"x"]
+    assert got[-1] is None
+
+
+def test_an_engine_without_a_message_waits() -> None:
+    live, kept, told = engine()
+    assert isinstance(live, Engine)
+    assert isinstance(kept, Kept)
+    assert live.take(None) == []
+    assert kept.reports[0].values["status"] == "waiting"
+    assert told == []

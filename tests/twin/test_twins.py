@@ -1,0 +1,217 @@
+"""Twins of simulated flights: the same conditions, other noise, exact truth; and the commands around them."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from gpvo.cameras.tolerance import TOLERANCES, Tolerance, TrueRig
+from gpvo.dataset.errors import motion_errors
+from gpvo.errors import GpvoError, SourceError
+from gpvo.io import open_source
+from gpvo.io.run import read_run
+from gpvo.runner import run
+from gpvo.sim.points import simulate_points
+from gpvo.twin.against import compare
+from gpvo.twin.covariance import twin_covariance
+from gpvo.twin.estimate import estimate
+from gpvo.twin.replicate import TwinSettings, make_twins, read_tolerance, rig_errors, twin_source
+from gpvo.types import StereoCamera
+from gpvo.vo.config import VoConfig
+from typer.testing import CliRunner
+
+
+def gpvo(*arguments):
+    from gpvo.cli import app
+
+    return CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A flight of eight seconds with a dark second, its run, and three twins."""
+    folder = tmp_path_factory.mktemp("twins")
+    flight = simulate_points("tunnel-clean", seed=11, duration_s=8.0, tracks=110, dark=(3.0, 3.5))
+    run(open_source(flight.save(folder / "flight.npz")), folder / "run", keep_tracks=True)
+    made = make_twins(folder / "run", folder / "twins", TwinSettings(replicates=3))
+    return folder, read_run(folder / "run"), [read_run(p) for p in made]
+
+
+def test_twins_err_as_much_as_the_flight_did(flown):
+    _, real, twins = flown
+    own = motion_errors(real.log, real.truth).xi
+    drawn = np.concatenate([motion_errors(t.log, t.truth).xi for t in twins])
+    ratio = np.sqrt((drawn**2).mean(axis=0) / (own**2).mean(axis=0))
+    # 150 motions: a standard deviation is known to 6 %, more or less by their correlation.
+    assert ((ratio > 0.7) & (ratio < 1.4)).all()
+    assert abs(np.log(ratio).mean()) < 0.15
+
+
+def test_twins_see_what_the_flight_saw(flown):
+    _, real, twins = flown
+    for twin in twins:
+        assert (twin.log.t_ns == real.log.t_ns).all()
+        for name in ("n_inliers", "n_tracked", "reproj_rms_px", "disparity_p50_px"):
+            own, drawn = (np.nanmedian(r.log.column(name)[r.log.usable]) for r in (real, twin))
+            assert drawn == pytest.approx(own, rel=0.08)
+        assert np.mean(twin.log.usable == real.log.usable) > 0.97
+        assert (real.log.column("n_stereo") == twin.log.column("n_stereo")).all()
+
+
+def test_noise_of_a_point_seen_twice_keeps_the_difference_of_its_measurements(flown):
+    original = estimate(flown[0] / "run")
+    length = np.bincount(original.seen.track)
+    used = np.bincount(original.seen.track, original.structure.weight > 0)
+    twice = np.flatnonzero((length == 2) & (used == 2))
+    assert len(twice) > 20
+    for track in twice[:20]:
+        rows = np.flatnonzero(original.seen.track == track)
+        left = original.structure.residual_px[rows]
+        assert np.isfinite(left).all()
+        # The fit halves the difference of two like measurements between them.
+        assert np.abs(left.sum(axis=0)).max() < 0.5 * np.abs(left).sum() + 1e-3
+
+
+def test_equal_seeds_make_equal_bytes_and_other_replicates_other_noise(flown):
+    original = estimate(flown[0] / "run")
+    again = estimate(flown[0] / "run")
+    one, two, other = (twin_source(o, TwinSettings(), k) for o, k in ((original, 0), (again, 0), (original, 1)))
+    for a, b in zip(one.frames, two.frames, strict=True):
+        assert a.uv_left.tobytes() == b.uv_left.tobytes()
+        assert a.uv_right.tobytes() == b.uv_right.tobytes()
+    assert not np.array_equal(one.frames[5].uv_left, other.frames[5].uv_left)
+
+
+def test_frames_without_tracks_stay_without(flown):
+    original = estimate(flown[0] / "run")
+    dark = [k for k, r in enumerate(original.run.log) if not r.usable and k]
+    assert dark
+    assert any(len(twin_source(original, TwinSettings(), 0).frames[k].track) == 0 for k in dark)
+
+
+def test_each_twin_draws_its_own_rig(flown):
+    original = estimate(flown[0] / "run")
+    wide = TwinSettings(tolerance=Tolerance(baseline=0.05))
+    e = rig_errors(wide)
+    assert np.allclose(e.T @ e / len(e), np.eye(5))
+    assert np.ptp(e[:, 0]) > 1.0
+    disparity = [
+        np.median(np.concatenate([(f.uv_left - f.uv_right)[:, 0] for f in twin_source(original, wide, k).frames]))
+        for k in range(6)
+    ]
+    assert 0.01 < np.std(disparity) / np.mean(disparity) < 0.15
+
+
+def test_ratios_of_real_to_twin_errors(flown):
+    _, real, twins = flown
+    found = compare([real], [twins])
+    assert ((found.ratio[0, 0] > 0.7) & (found.ratio[0, 0] < 1.4)).all()
+    assert np.isnan(found.ratio[0, 2]).all()  # less than ten metres
+    mean, _ = found.pooled
+    assert mean[0] == pytest.approx(found.ratio[0, 0])
+    # A truth that is ten times as far off shows.
+    moved = real.truth.T_world_cam.copy()
+    moved[:, :3, 3] += 0.01 * np.random.default_rng(0).standard_normal((len(moved), 3))
+    worse = compare([replace(real, truth=replace(real.truth, T_world_cam=moved))], [twins])
+    assert (worse.ratio[0, 0, :3] > 5 * found.ratio[0, 0, :3]).all()
+    with pytest.raises(SourceError, match="no ground truth"):
+        compare([replace(real, truth=None)], [twins])
+
+
+def test_a_rig_without_tolerance_is_the_calibrated_one():
+    camera = StereoCamera(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 9], (50, 3))
+    left, right = TrueRig.of(camera, Tolerance(), np.ones(5)).pixels(points)
+    assert np.allclose(np.c_[left[:, 0], left[:, 1], left[:, 0] - right[:, 0]], camera.project(points))
+    assert np.allclose(left[:, 1], right[:, 1])
+
+
+def test_sample_covariance_is_that_of_the_draws():
+    """Monte Carlo: 40 twins of 60 motions whose covariance grows tenfold on the way; on average within 15 %."""
+    from gpvo.geometry import se3
+    from gpvo.io.run import Run
+    from gpvo.types import Mounting, Status, TruthLog, VoLog, VoRecord
+
+    rng = np.random.default_rng(5)
+    t_ns = np.arange(61) * 50_000_000
+    root = np.linalg.cholesky(np.diag([1e-6] * 6) + 4e-7)
+    size = np.geomspace(1.0, 10.0, 61)
+    truth = TruthLog(t_ns, np.tile(np.eye(4), (61, 1, 1)))
+
+    def drawn():
+        xi = np.sqrt(size)[:, None] * (rng.standard_normal((61, 6)) @ root.T)
+        records = [
+            VoRecord(int(t), int(t_ns[max(k - 1, 0)]), Status.OK if k else Status.START, se3.exp(xi[k] * (k > 0)))
+            for k, t in enumerate(t_ns)
+        ]
+        return Run(None, "t", VoLog(records), truth, None, Mounting(), [])
+
+    twins = [drawn() for _ in range(40)]
+    found = twin_covariance(twins[0].log, twins)
+    expected = size[1:, None, None] * (root @ root.T)
+    ratio = np.linalg.solve(expected, found[1:])
+    assert np.isnan(found[0]).all()
+    assert np.trace(ratio, axis1=1, axis2=2).mean() / 6 == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.fixture
+def blind(flown, tmp_path):
+    """The same run without its truth."""
+    from gpvo.io.run import write_run
+
+    folder, real, _ = flown
+    write_run(tmp_path / "blind", real.log, config=asdict(VoConfig()), mounting=real.mounting)
+    (tmp_path / "blind" / "tracks.parquet").write_bytes((folder / "run" / "tracks.parquet").read_bytes())
+    return tmp_path / "blind"
+
+
+def test_the_command_makes_runs_with_exact_truth(blind, tmp_path):
+    made = gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 2, "--tolerance", "kitti", "--json")
+    twins = [read_run(p) for p in json.loads(made.stdout)["twins"]]
+    assert [t.meta["twin"]["tolerance_name"] for t in twins] == ["kitti"] * 2
+    assert all(t.truth.sigma_translation_m == 0.0 for t in twins)
+
+
+def test_evaluate_by_twins_with_and_without_truth(flown, blind):
+    own = json.loads(gpvo("evaluate", flown[0] / "run", "--twins", "--replicates", 3, "--json").stdout)["runs"][0]
+    assert 0.4 < own["methods"]["twin"]["nees_dof"]["joint"] < 2.5
+    assert "simulated_truth" not in own
+    by_twins = json.loads(gpvo("evaluate", blind, "--twins", "--replicates", 2, "--json").stdout)["runs"][0]
+    assert by_twins["simulated_truth"]["twins"] == 2
+    for method in ("triangulation", "pointing_matching"):
+        real, simulated = (d["methods"][method]["nees_dof"]["joint"] for d in (own, by_twins))
+        assert simulated == pytest.approx(real, rel=0.35)
+
+
+@pytest.mark.slow
+def test_a_model_of_twins_says_so(blind, tmp_path):
+    trained = gpvo("train", blind, "--twins", "--replicates", 3, "-o", tmp_path / "m.gpvo", "--features", "thesis")
+    assert trained.exit_code == 0, trained.output
+    card = next(tmp_path.glob("m*.md")).read_text()
+    assert "Truth was simulated" in card
+    assert "3 twins of `blind`" in card
+
+
+def test_runs_without_tracks_are_refused_with_the_cure(flown, tmp_path):
+    _, real, _ = flown
+    from gpvo.io.run import write_run
+
+    write_run(tmp_path / "log", replace(real.log, camera=None))
+    with pytest.raises(SourceError, match="--keep-tracks"):
+        estimate(tmp_path / "log")
+    few = simulate_points("tunnel-clean", seed=1, duration_s=2.0, tracks=10)
+    run(open_source(few.save(tmp_path / "few.npz")), tmp_path / "few", keep_tracks=True)
+    with pytest.raises(SourceError, match="points a motion"):
+        estimate(tmp_path / "few")
+
+
+def test_tolerances_by_name_and_by_file(tmp_path):
+    assert read_tolerance("zed2") == ("zed2", TOLERANCES["zed2"])
+    (tmp_path / "mine.toml").write_text("baseline = 0.01\nrotation_rad = 1e-4\n")
+    assert read_tolerance(str(tmp_path / "mine.toml")) == ("mine", Tolerance(0.01, 0.0, 1e-4))
+    for text in ("baseline = 2", "width = 0.1", "", "baseline = [", "baseline = true"):
+        (tmp_path / "bad.toml").write_text(text)
+        with pytest.raises(GpvoError):
+            read_tolerance(str(tmp_path / "bad.toml"))
+    with pytest.raises(GpvoError, match="t265"):
+        read_tolerance("t266")

@@ -1,0 +1,220 @@
+"""Faults of a stereo camera, each a function on a sequence of pictures, and the count of frames that fail in silence.
+
+A frame fails in silence where its motion is called ``ok``, is wrong by more than a tenth and 3 cm, and lies outside the
+99.9 % ellipsoid of its triangulation covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from gpvo.geometry import se3
+from gpvo.types import Array, Status, StereoCamera, StereoFrame, VoRecord
+from gpvo.vo.config import VoConfig
+from gpvo.vo.odometry import StereoOdometry
+
+CHI2_6_999 = 22.458
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Rectified frames of one camera with their true poses ``T_world_cam`` (N, 4, 4)."""
+
+    camera: StereoCamera
+    frames: list[StereoFrame]
+    T_world_cam: Array
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one run: records, true motions by their intervals, and errors of the translation [m]."""
+
+    records: list[VoRecord]
+    error_m: Array
+    moved_m: Array
+    silent: list[int]
+
+    def count(self, status: Status) -> int:
+        """How many motions have this status."""
+        return sum(r.status is status for r in self.records)
+
+    @property
+    def reasons(self) -> set[str]:
+        """Every reason given."""
+        return {r.reason for r in self.records if r.reason}
+
+
+def run(footage: Footage, config: VoConfig | None = None) -> Outcome:
+    """The odometry over the footage, and where it fails in silence."""
+    odometry = StereoOdometry(footage.camera, config)
+    records = [odometry.step(f) for f in footage.frames]
+    index = {f.t_ns: k for k, f in enumerate(footage.frames)}
+    error_m, moved_m, silent = np.zeros(len(records)), np.zeros(len(records)), []
+    for k, r in enumerate(records):
+        T_true = se3.inverse(footage.T_world_cam[index[r.t_prev_ns]]) @ footage.T_world_cam[k]
+        xi = se3.log(se3.inverse(T_true) @ r.T_prev_cur)
+        error_m[k], moved_m[k] = np.linalg.norm(xi[:3]), np.linalg.norm(T_true[:3, 3])
+        if r.status is Status.OK and error_m[k] > max(0.1 * moved_m[k], 0.03):
+            C = r.covariances["triangulation"]
+            if xi @ np.linalg.solve(C, xi) > CHI2_6_999:
+                silent.append(k)
+    return Outcome(records, error_m, moved_m, silent)
+
+
+def _each(change: Callable[[int, StereoFrame], StereoFrame]) -> Callable[[Footage], Footage]:
+    return lambda footage: replace(footage, frames=[change(k, f) for k, f in enumerate(footage.frames)])
+
+
+def _table(image: np.ndarray, grey: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    table = np.clip(np.rint(grey(np.arange(256.0))), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(image, table), np.uint8)
+
+
+def _both(frame: StereoFrame, change: Callable[[np.ndarray], np.ndarray]) -> StereoFrame:
+    return replace(frame, left=change(frame.left), right=change(frame.right))
+
+
+def darker_right(k: int, f: StereoFrame) -> StereoFrame:
+    """The right picture at 59 % of the left's light."""
+    return replace(f, right=_table(f.right, lambda g: 0.59 * g))
+
+
+def gamma_flicker(k: int, f: StereoFrame) -> StereoFrame:
+    """A gamma of 0.5 in every second frame."""
+    return f if k % 2 else _both(f, lambda i: _table(i, lambda g: 255 * (g / 255) ** 0.5))
+
+
+def gain_drift(k: int, f: StereoFrame) -> StereoFrame:
+    """Exposure that wanders between a half and twice, up to 8 % a frame."""
+    return _both(f, lambda i: _table(i, lambda g: g * 2 ** np.sin(0.12 * k)))
+
+
+def flicker(k: int, f: StereoFrame) -> StereoFrame:
+    """Every third frame at half the light."""
+    return _both(f, lambda i: _table(i, lambda g: 0.5 * g)) if k % 3 == 0 else f
+
+
+def _in_the_middle(k: int) -> bool:
+    return k >= 4 and k % 12 in (4, 5)
+
+
+def black(k: int, f: StereoFrame) -> StereoFrame:
+    """Two black pairs of every twelve."""
+    return _both(f, np.zeros_like) if _in_the_middle(k) else f
+
+
+def right_black(k: int, f: StereoFrame) -> StereoFrame:
+    """Two black right pictures of every twelve."""
+    return replace(f, right=np.zeros_like(f.right)) if _in_the_middle(k) else f
+
+
+def swapped(k: int, f: StereoFrame) -> StereoFrame:
+    """Left for right."""
+    return replace(f, left=f.right, right=f.left)
+
+
+def jpeg_30(k: int, f: StereoFrame) -> StereoFrame:
+    """JPEG of quality 30."""
+
+    def code(image: np.ndarray) -> np.ndarray:
+        return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 30])[1], 0), np.uint8)
+
+    return _both(f, code)
+
+
+def noise(sigma: float) -> Callable[[int, StereoFrame], StereoFrame]:
+    """Gaussian noise of so many grey values."""
+
+    def add(k: int, f: StereoFrame) -> StereoFrame:
+        rng = np.random.default_rng(k)
+        return _both(f, lambda i: np.clip(np.rint(i + rng.normal(0, sigma, i.shape)), 0, 255).astype(np.uint8))
+
+    return add
+
+
+def blur(k: int, f: StereoFrame) -> StereoFrame:
+    """Out of focus: a Gaussian of 2.5 px."""
+    return _both(f, lambda i: np.asarray(cv2.GaussianBlur(i, (0, 0), 2.5), np.uint8))
+
+
+def every(stride: int) -> Callable[[Footage], Footage]:
+    """Only each n-th frame."""
+    return lambda a: Footage(a.camera, a.frames[::stride], a.T_world_cam[::stride])
+
+
+def late_right(footage: Footage) -> Footage:
+    """The right picture is that of the frame before."""
+    f = footage.frames
+    frames = [replace(now, right=before.right) for before, now in pairwise(f)]
+    return Footage(footage.camera, frames, footage.T_world_cam[1:])
+
+
+def frozen_right(footage: Footage) -> Footage:
+    """The right picture stands still for ten frames of every twenty."""
+    f = footage.frames
+    return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
+
+
+def half_size(footage: Footage) -> Footage:
+    """Pictures of half the size with the calibration of the full one."""
+    c = footage.camera
+
+    def halve(image: np.ndarray) -> np.ndarray:
+        small = cv2.resize(image, (c.width // 2, c.height // 2), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.uint8)
+
+    frames = [_both(f, halve) for f in footage.frames]
+    return Footage(replace(c, width=c.width // 2, height=c.height // 2), frames, footage.T_world_cam)
+
+
+def moving_patch(u_per_frame: float, disparity_px: float = 20.0, share: float = 0.3) -> Callable[[Footage], Footage]:
+    """A strong texture over ``share`` of the picture that moves ``u_per_frame`` px a frame: 0 moves with the camera."""
+
+    def paint(footage: Footage) -> Footage:
+        c = footage.camera
+        h, w = round(c.height * share**0.5), round(c.width * share**0.5)
+        rng = np.random.default_rng(0)
+        coarse = rng.integers(0, 256, (c.height // 6 + 8, c.width // 2 + 8)).astype(np.uint8)
+        texture = cv2.resize(coarse, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
+        top, left = c.height - h - c.height // 10, c.width // 3
+
+        def one(image: np.ndarray, shift: float) -> np.ndarray:
+            cut = cv2.warpAffine(texture, np.array([[1, 0, -w - shift], [0, 1, 0]]), (w, h), flags=cv2.INTER_LINEAR)
+            out = image.copy()
+            out[top : top + h, left : left + w] = cut
+            return out
+
+        def patch(k: int, f: StereoFrame) -> StereoFrame:
+            shift = u_per_frame * (k % 40)
+            return replace(f, left=one(f.left, shift), right=one(f.right, shift + disparity_px))
+
+        return _each(patch)(footage)
+
+    return paint
+
+
+FAULTS: dict[str, Callable[[Footage], Footage]] = {
+    "clean": lambda footage: footage,
+    "darker right": _each(darker_right),
+    "gamma flicker": _each(gamma_flicker),
+    "flicker": _each(flicker),
+    "gain drift": _each(gain_drift),
+    "every 2nd frame": every(2),
+    "every 3rd frame": every(3),
+    "black": _each(black),
+    "right black": _each(right_black),
+    "frozen right": frozen_right,
+    "late right": late_right,
+    "half size": half_size,
+    "swapped": _each(swapped),
+    "patch at rest": moving_patch(0.0),
+    "patch that moves": moving_patch(7.0),
+    "JPEG 30": _each(jpeg_30),
+    "noise 10": _each(noise(10)),
+    "noise 25": _each(noise(25)),
+    "blur": _each(blur),
+}

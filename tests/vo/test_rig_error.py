@@ -1,0 +1,118 @@
+"""What odometry finds of its calibration's errors: exact rigs stay exact, wrong ones are found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.cameras.kalibr import read_camchain
+from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.io.jsonfile import write_json
+from gpvo.types import Array, StereoCamera
+from gpvo.vo.motion import refine
+from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance
+from gpvo.vo.rig_findings import camchain, corrected, document, findings, read_state, rig_of
+
+CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
+
+
+def _fly(coefficients: Array, seed: int, frames: int = 60, sigma_px: float = 0.15) -> RigError:
+    """A rig wrong by ``coefficients`` (12,) over motions with fresh points and fresh noise."""
+    rng = np.random.default_rng(seed)
+    rig = RigError(CAMERA)
+    truth = RigError(CAMERA, RigState(coefficients, 1e-12 * np.eye(2 * N_TERMS), 1.0), learn=False)
+    for _ in range(frames):
+        T = se3.exp(np.array([*rng.normal(0, 0.05, 2), 0.15, *rng.normal(0, 0.02, 3)]))
+        Z = rng.uniform(1.0, 5.0, 200)
+        uv = rng.uniform([60, 40], [580, 440], (200, 2))
+        P = np.column_stack([(uv - [CAMERA.cx_px, CAMERA.cy_px]) / CAMERA.fx_px * Z[:, None], Z])
+        seen = []
+        for X in (P, se3.transform(se3.inverse(T), P)):
+            uvd = CAMERA.project(X)
+            d_error, row = truth.errors(uvd)
+            left, right = rng.normal(0, sigma_px, (2, len(P), 2))
+            row_error = row + right[:, 1] - left[:, 1]
+            u, v = uvd[:, 0] + left[:, 0], uvd[:, 1] + left[:, 1] + 0.5 * row_error
+            seen.append(np.column_stack([u, v, uvd[:, 2] + d_error + left[:, 0] - right[:, 0]]))
+        motion = refine(T, rig.correct(seen[0]), rig.correct(seen[1]), CAMERA)
+        assert motion is not None
+        rig.update(motion, row_error[motion.inliers], 0.5)
+    return rig
+
+
+def _turn(axis: int, rad: float) -> Array:
+    out = np.zeros(2 * N_TERMS)
+    places = {0: ([4, 6, 11], [-1, -1, -1]), 1: ([0, 3, 10], [1, 1, 1]), 2: ([2, 7], [-1, 1])}[axis]
+    out[places[0]] = rad * np.array(places[1])
+    return out
+
+
+def test_an_exact_rig_is_left_alone() -> None:
+    rig = _fly(np.zeros(12), seed=1)
+    assert rig.state.probability < 0.01
+    assert np.abs(rig.state.mean[:N_TERMS]).max() * CAMERA.fx_px < 0.01
+    assert findings(rig.state, CAMERA) == []
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_turn_is_found_and_named(axis: int) -> None:
+    truth = _turn(axis, np.deg2rad(0.2))
+    state = _fly(truth, seed=axis).state
+    assert state.probability > 0.99
+    assert np.abs(state.mean[[0, 1, 2]] - truth[[0, 1, 2]]).max() * CAMERA.fx_px < 0.1
+    word = ("horizontal", "vertical", "optical")[axis]
+    assert any(f"about the {word} axis" in " ".join(line.split()) for line in findings(state, CAMERA))
+
+
+def test_the_posterior_is_consistent() -> None:
+    """30 rigs drawn from the prior, 15 motions each: NEES of the disparity's six coefficients per degree of freedom.
+
+    Information begins divided by 16, so that short flights state too much rather than too little."""
+    rng = np.random.default_rng(7)
+    L = np.linalg.cholesky(prior_covariance(CAMERA))
+    scores = []
+    for seed in range(30):
+        truth = L @ rng.standard_normal(12)
+        state = _fly(truth, seed=100 + seed, frames=15).state
+        e = (state.mean - truth)[:N_TERMS]
+        scores.append(e @ np.linalg.solve(state.covariance[:N_TERMS, :N_TERMS], e) / N_TERMS)
+    assert 0.05 < np.mean(scores) < 1.1
+
+
+def test_known_state_is_used_and_never_learnt_away() -> None:
+    known = RigState(_turn(1, 1e-3), 1e-10 * np.eye(12), 1.0)
+    uvd = np.array([[300.0, 200.0, 10.0]])
+    fixed = RigError(CAMERA, known, learn=False)
+    assert fixed.correct(uvd)[0, 2] - 10.0 == pytest.approx(0.38, rel=0.01)
+    exact = RigError(CAMERA, RigState.exact(), learn=False)
+    assert np.array_equal(exact.correct(uvd), uvd)
+
+
+def test_state_file_round_trip_and_hostile_ones(tmp_path: Path) -> None:
+    state = _fly(_turn(2, 2e-3), seed=3, frames=10).state
+    path = tmp_path / "calibration_state.json"
+    write_json(path, document(state, CAMERA))
+    again = read_state(path, CAMERA)
+    assert np.allclose(again.mean, state.mean)
+    assert again.probability == pytest.approx(state.probability)
+    with pytest.raises(GpvoError, match="another camera"):
+        read_state(path, replace(CAMERA, width=320))
+    for change in ({"mean": [1e9] * 12}, {"covariance": [[0.0]]}, {"mean": "x"}, {"probability": None}):
+        write_json(path, {**document(state, CAMERA), **change})
+        with pytest.raises(GpvoError):
+            read_state(path, CAMERA)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
+    state = RigState(_turn(axis, 3e-3), np.eye(12), 1.0)
+    rig = corrected(rig_of(None, CAMERA), state, CAMERA)
+    path = tmp_path / "corrected.yaml"
+    path.write_text(camchain(rig))
+    read = read_camchain(path)
+    w = se3.so3_log(read.T_right_left[:3, :3])
+    assert w[axis] == pytest.approx(3e-3, rel=0.1)
+    assert np.abs(np.delete(w, axis)).max() < 3e-4

@@ -1,0 +1,128 @@
+"""Faults of a stereo camera: named, and never an ``ok`` for a motion that is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.types import Status
+from gpvo.vo.config import make_config
+from gpvo.vo.frontend import Matches, Observation, RightSearch
+from gpvo.vo.image import Light, in_light_of
+from gpvo.vo.motion import refine, transfer
+from gpvo.vo.odometry import StereoOdometry
+from gpvo.vo.opencv import halve
+from gpvo.vo.pairwatch import PairWatch
+from gpvo.vo.rivals import areas, unexplained
+from stereo_points import CAMERA, scene
+
+pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+import stress
+from gpvo.sim.clip import pinhole, render_clip, wander
+
+
+@pytest.fixture(scope="module")
+def footage() -> stress.Footage:
+    clip = render_clip(pinhole(480, 360), wander(24, seed=2))
+    return stress.Footage(clip.camera, clip.frames, clip.T_world_cam)
+
+
+@pytest.mark.parametrize("fault", ["darker right", "gamma flicker", "flicker", "gain drift"])
+def test_light_that_differs_costs_little(footage: stress.Footage, fault: str) -> None:
+    plain, changed = stress.run(footage), stress.run(stress.FAULTS[fault](footage))
+    assert changed.count(Status.OK) == len(footage.frames) - 1
+    assert np.median(changed.error_m[1:]) < 3 * np.median(plain.error_m[1:]) + 1e-3
+
+
+def test_a_table_undoes_gain_and_gamma_and_leaves_like_pictures_alone(footage: stress.Footage) -> None:
+    image = footage.frames[0].left
+    dark = np.rint(255 * (0.7 * image / 255.0) ** 1.5).astype(np.uint8)
+    found = in_light_of(dark, Light.of(halve(dark)), Light.of(halve(image)))
+    assert np.abs(found.astype(float) - image).mean() < 3.0
+    assert np.abs(dark.astype(float) - image).mean() > 20.0
+    little = np.rint(0.95 * image).astype(np.uint8)
+    assert in_light_of(little, Light.of(halve(little)), Light.of(halve(image))) is little
+    black = np.zeros_like(image)
+    assert in_light_of(black, Light.of(halve(black)), Light.of(halve(image))) is black
+
+
+FATAL = {
+    "half size": "principal point",
+    "swapped": "found in the right picture",
+    "frozen right": "frozen right picture",
+}
+
+
+@pytest.mark.parametrize("fault", [*FATAL, "black", "right black", "noise 10", "JPEG 30", "late right"])
+def test_no_fault_is_silent(footage: stress.Footage, fault: str) -> None:
+    """Sixteen frames of a small clip; the slow test has the whole list."""
+    few = stress.Footage(footage.camera, footage.frames[:16], footage.T_world_cam[:16])
+    outcome = stress.run(stress.FAULTS[fault](few))
+    assert outcome.silent == []
+    if fault in FATAL:
+        assert any(FATAL[fault] in reason for reason in outcome.reasons)
+
+
+def test_the_cause_is_named_with_its_cure(footage: stress.Footage) -> None:
+    named = {
+        "darker right": "exposure",
+        "half size": "twice as large",
+        "swapped": "right",
+        "frozen right": "repeats itself",
+    }
+    for fault, words in named.items():
+        changed = stress.FAULTS[fault](footage)
+        odometry = StereoOdometry(changed.camera)
+        for frame in changed.frames:
+            odometry.step(frame)
+        assert any(words in finding for finding in odometry.pair.findings()), fault
+    odometry = StereoOdometry(footage.camera)
+    for frame in footage.frames:
+        assert odometry.step(frame).reason == ""
+    assert odometry.pair.findings() == []
+
+
+def test_rows_that_lag_behind_are_a_delay() -> None:
+    """Rows of the right picture where the left ones were 0.8 frames ago, with noise and mismatches."""
+    rng = np.random.default_rng(0)
+    motion = rng.normal(0, 4, 200)
+    error = -0.8 * motion + rng.normal(0, 0.2, 200) + 1.0
+    watch, good = PairWatch(pinhole(480, 360)), Observation(None, False)
+    assert watch.step(good, RightSearch(200, 200, 0, 0, error, motion)) == ["the right picture is 0.8 frames late"]
+    watch = PairWatch(pinhole(480, 360))
+    assert watch.step(good, RightSearch(200, 200, 0, 0, rng.normal(0, 0.2, 200), motion)) == []
+
+
+def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
+    """Two hundred points that move as one in a third of the picture, forty of the scene all over it."""
+    rng = np.random.default_rng(0)
+    T_scene, before, after = scene(rng, 40, (5, 50))
+    T_patch, patch, patch_after = scene(rng, 200, (20, 25))
+    patch[:, :2] = rng.uniform([200, 200], [420, 400], (200, 2))
+    patch_after = transfer(T_patch, patch, CAMERA).uvd.T
+    uvd_prev, uvd_cur = np.concatenate([patch, before]), np.concatenate([patch_after, after])
+    matches = Matches(uvd_prev, uvd_cur, np.zeros(240), 200, np.arange(240) >= 200, None, uvd_prev)
+    motion, scene_motion = refine(T_patch, patch, patch_after, CAMERA), refine(T_scene, before, after, CAMERA)
+    assert motion is not None
+    assert scene_motion is not None
+    config = make_config()
+    free = unexplained(motion, matches, CAMERA, config)
+    assert free is not None
+    assert free[200:].mean() > 0.8
+    assert not free[:200].any()
+    assert areas(motion, scene_motion, matches, CAMERA, config)[1] > 15
+    alone = Matches(before, after, np.zeros(40), 40, None, None, before)
+    assert unexplained(scene_motion, alone, CAMERA, config) is None
+
+
+@pytest.mark.slow
+def test_the_stress_list() -> None:
+    """Sixty frames at 1.6 m/s; every fault but two kinds that remain, in part, unseen.
+
+    A texture that holds nearly all corners of a small picture leaves no points to speak against it; a right camera that
+    is late shows only where rows move, not in a turn about the vertical.
+    """
+    clip = render_clip(pinhole(640, 480), wander(60, speed_mps=1.6, seed=5))
+    whole = stress.Footage(clip.camera, clip.frames, clip.T_world_cam)
+    silent = {fault: stress.run(change(whole)).silent for fault, change in stress.FAULTS.items()}
+    print(silent)
+    assert sum(len(frames) for fault, frames in silent.items() if not ("patch" in fault or "late" in fault)) == 0
