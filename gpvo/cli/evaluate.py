@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
 Model = Annotated[Path | None, typer.Option(help="Error model: adds constant, scaled and learned.")]
-Truth = Annotated[
-    Path | None, typer.Option(help="Ground truth (TUM lines, left camera), taken as exact unless --truth-sigma.")
-]
+Truth = Annotated[Path | None, typer.Option(help="Ground truth (TUM lines, left camera) in place of the run's own.")]
 Segments = Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")]
-TruthSigma = Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none.")]
+TruthSigma = Annotated[
+    str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default.")
+]
 Align = Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth: rotation or none.")]
 TimeOffset = Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")]
 
@@ -81,8 +81,6 @@ def evaluate(
     else:
         for about in documents:
             _print(about)
-        if truth is not None and truth_sigma is None:
-            print(f"{truth.name} states no noise of its own and is taken as exact; --truth-sigma says otherwise")
 
 
 def report(
@@ -253,7 +251,7 @@ def _print(d: dict[str, Any]) -> None:
         )
         sigma = d["truth_sigma"]
         if sigma["translation_m"] or sigma["rotation_rad"]:
-            noise = f"{1e3 * sigma['translation_m']:.3g} mm, {1e3 * sigma['rotation_rad']:.3g} mrad per pose"
+            noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose and axis"
             console.print(f"In brackets: with the truth's own noise ({noise}) added to what is stated.")
 
 

@@ -95,6 +95,43 @@ def fit_fixed_transform(A: Array, B: Array, *, lever_arm: bool = True) -> FixedT
     return FixedTransform(se3.orthonormalise(X), float(scale[0]), float(scale[1]), len(A))
 
 
+@dataclass(frozen=True)
+class FixedRotation:
+    """``rotvec_rad`` (3,) from the truth's camera to the log's; ``error_change``: relative change without it of the
+    median error over a second, on the halves of the run that it was not fitted to."""
+
+    angle_deg: float
+    rotvec_rad: tuple[float, ...]
+    error_change: float
+
+
+MATTERS = -0.1
+"""Change of the error from which a fixed rotation is reported."""
+
+
+def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
+    """A fixed rotation between truth and odometry; None where none shows or it does not matter."""
+    A, B = windowed_motions(log, truth)
+    half = len(A) // 2
+    parts = slice(None, half), slice(half, None)
+    try:
+        X = [fit_fixed_transform(A[p], B[p], lever_arm=False).T_log_truth for p in parts]
+        fixed = fit_fixed_transform(A, B, lever_arm=False)
+    except GpvoError:  # too few motions, or a path too straight to tell
+        return None
+    turned = [np.median(_errors_m(A[p], B[p], x)) for p, x in zip(parts, X[::-1])]
+    plain = [np.median(_errors_m(A[p], B[p], np.eye(4))) for p in parts]
+    changes = np.array(turned) / np.maximum(plain, 1e-12) - 1
+    if changes.max() > MATTERS:
+        return None
+    rotvec = se3.so3_log(fixed.T_log_truth[:3, :3])
+    return FixedRotation(fixed.angle_deg, tuple(rotvec.tolist()), float(changes.mean()))
+
+
+def _errors_m(A: Array, B: Array, X: Array) -> Array:
+    return np.asarray(np.linalg.norm(_residuals(A, B, X)[0][:, :3], axis=1))
+
+
 def _start(A: Array, B: Array) -> Array:
     """Rotation that takes the truth's rotation vectors and directions of travel to the log's (W. Kabsch, 1976)."""
     pairs = []

@@ -39,6 +39,7 @@ def _statement(log: VoLog, twins: Sequence[Run]) -> Statement:
 
 def _mean(values: Sequence[Any]) -> Any:
     """Documents of one form averaged number by number; None where none has a number, text from the first."""
+    values = [v for v in values if v is not None] or [None]
     first = values[0]
     if isinstance(first, dict):
         return {key: _mean([v[key] for v in values if key in v]) for key in first}

@@ -30,6 +30,7 @@ HORIZONS_M = (1.0, 10.0, 100.0)
 _MAX_WINDOWS = 60
 # Times that are sums of a frame period must not miss the round number.
 _HAIR = 1 - 1e-9
+_NOISELESS = np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -75,23 +76,23 @@ class Consistency:
     horizons: tuple[Horizon, ...]
 
 
-def truth_noise(T_true: Array, sigma_m: float, sigma_rad: float) -> Array:
-    """(M, 6, 6) covariance that the truth's own noise adds to the error of motions (M, 4, 4).
+def truth_noise(T_true: Array, sigma: Array) -> Array:
+    """(M, 6, 6) covariance that the truth's own noise, ``sigma`` (6,) per pose, adds to errors of motions (M, 4, 4).
 
     Each motion holds the noise of two poses: ``S + Ad(T)^-1 S Ad(T)^-T``, the MA(1) shape of a differenced position.
     """
-    S = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+    S = np.diag(np.asarray(sigma) ** 2)
     A = se3.adjoint(se3.inverse(T_true))
     return S + A @ S @ np.swapaxes(A, -1, -2)
 
 
 def consistency(
     statement: Statement, errors: MotionErrors, log: VoLog, T_true: Array, known: NDArray[np.bool_],
-    noise_sigma: tuple[float, float] = (0.0, 0.0),
+    noise_sigma: Array = _NOISELESS,
 ) -> Consistency | None:  # fmt: skip
     """Scores of one method, None where it says nothing about any motion with truth.
 
-    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise_sigma``: of the truth's poses [m, rad].
+    ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise_sigma`` (6,): of its poses [m, rad].
     """
     C = statement.covariance[errors.index]
     stated = np.isfinite(C).all(axis=(1, 2))
@@ -99,7 +100,7 @@ def consistency(
         return None
     index, d = errors.index[stated], statement.dof
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
-    noise = truth_noise(errors.T_true[stated], *noise_sigma)[:, :d, :d]
+    noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
     per_block = {n: nees(e[:, b], C[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items() if b.stop <= d}
     with_noise = {n: nees(e[:, b], (C + noise)[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items() if b.stop <= d}
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
@@ -166,7 +167,7 @@ def _sum_of(T_prev_cur: Sequence[Array] | Array, errors: Sequence[MotionError]) 
 
 def horizon(
     statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
-    noise_sigma: tuple[float, float],
+    noise_sigma: Array,
 ) -> Horizon:  # fmt: skip
     """NEES over windows of ``span`` of a growing ``progress`` (N,), at most sixty, without lost frames.
 
@@ -193,7 +194,7 @@ def horizon(
             se3.log(se3.inverse(T) @ T_est),
             _sum_of([log.records[k].T_prev_cur for k in window], [statement.errors[k] for k in window]),
         )
-        values.append([float(nees(e, S)) / 6 for S in (C, C + truth_noise(T, *noise_sigma))])
+        values.append([float(nees(e, S)) / 6 for S in (C, C + truth_noise(T, noise_sigma))])
     plain, noisy = np.mean(values, axis=0).tolist() if values else (float("nan"), float("nan"))
     return Horizon(span, plain, noisy, len(values))
 

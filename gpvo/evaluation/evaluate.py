@@ -14,7 +14,9 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import align_rotation
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
+from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
 from gpvo.dataset.rest import without_wandering_truth
+from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.poses import PoseConsistency, pose_consistency, pose_document
@@ -43,7 +45,8 @@ METHODS = (
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """``truth_sigma`` (m, rad) per pose, None for what the source states; ``time_offset_s`` None to estimate it."""
+    """``truth_sigma`` (m, rad) per pose, None for what the source states or the run shows, whichever is more;
+    ``time_offset_s`` None to estimate it."""
 
     segments_m: tuple[float, ...] | None = None
     truth_sigma: tuple[float, float] | None = None
@@ -55,8 +58,10 @@ class EvaluateOptions:
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a
-    model. ``poses``: scores of the covariances of poses, of a log that states these.
+    stands. ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its
+    source states. ``tells_from_m``: length of path from which odometry's errors outweigh it. ``turned``: a fixed
+    rotation between truth and odometry, where it matters. ``in_domain``: share of the predicted frames that lie in the
+    model's training domain, None without a model. ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run
@@ -67,8 +72,11 @@ class Evaluation:
     covered: NDArray[np.bool_]
     T_est: Array
     T_true: Array
-    truth_sigma: tuple[float, float]
+    truth_sigma: Array
+    truth_sigma_stated: Array
     time_offset_s: float
+    tells_from_m: float = 0.0
+    turned: FixedRotation | None = None
     unscored: int = 0
     in_domain: float | None = None
     poses: PoseConsistency | None = None
@@ -106,9 +114,10 @@ def evaluate_run(
             where=run.path,
             cure="use --time-offset auto, or its own truth",
         )
-    sigma = options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad)
     scored = without_wandering_truth(log, truth)
     errors = motion_errors(scored, truth)
+    stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
+    sigma = np.maximum(stated, estimate_truth_noise(errors, scored)) if options.truth_sigma is None else stated
     T_est = log.trajectory()
     made = [*statements(log, predictions, predictor), *further]
     found = {s.method: consistency(s, errors, scored, T_true, known, sigma) for s in made}
@@ -126,6 +135,9 @@ def evaluate_run(
         T_est=lift @ T_est,
         T_true=T_true,
         truth_sigma=sigma,
+        truth_sigma_stated=stated,
+        tells_from_m=telling_distance_m(scored, T_true, known, sigma),
+        turned=fixed_rotation(scored, truth) if options.align == "none" else None,
         time_offset_s=offset_s,
         unscored=int(log.usable.sum() - scored.usable.sum()),
         poses=pose_consistency(log, T_est, T_true, known),
@@ -189,8 +201,12 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       states (see :mod:`gpvo.evaluation.poses`); None where it states none.
     * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers come to, in words.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
-    * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose and axis, as its source states
-      or ``--truth-sigma`` says; 0 for a file that states none.
+    * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
+      as counted in: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
+      (:mod:`gpvo.dataset.truth_noise`), whichever is more. ``truth_sigma_axes``: by axis, x y z [m], then [rad].
+      ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion; None: nowhere.
+    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None where it
+      does not matter; ``error_change``: relative change of the errors over a second without it.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
       {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
       frame or a second do not reach across a gap in the truth.
@@ -229,7 +245,11 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "rmse_origin_m": t.rmse_origin_m,
         "final_error_m": t.final_error_m,
         "time_offset_s": e.time_offset_s,
-        "truth_sigma": {"translation_m": e.truth_sigma[0], "rotation_rad": e.truth_sigma[1]},
+        "truth_sigma": _by_kind(e.truth_sigma),
+        "truth_sigma_axes": e.truth_sigma.tolist(),
+        "truth_sigma_stated": _by_kind(e.truth_sigma_stated),
+        "truth_tells_from_m": e.tells_from_m,
+        "fixed_rotation": None if e.turned is None else _plain(e.turned),
         "rpe": {
             name: {"translation_m": _plain(getattr(t, key).translation_m), "rotation_rad": _plain(getattr(t,
             key).rotation_rad)} for name, key in (("frame", "rpe_frame"), ("1s", "rpe_second"), ("10m", "rpe_10m"))
@@ -239,6 +259,11 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "verdict": asdict(verdict(e)),
         "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
     }  # fmt: skip
+
+
+def _by_kind(sigma: Array) -> dict[str, float]:
+    translation, rotation = np.sqrt((sigma.reshape(2, 3) ** 2).mean(axis=1))
+    return {"translation_m": float(translation), "rotation_rad": float(rotation)}
 
 
 def _methods_of(e: Evaluation) -> list[str]:

@@ -7,7 +7,7 @@ intervals; the truth's noise is declared and counted in; a lost motion is charge
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,9 @@ def score(files: Sequence[tuple[Path, Path]], options: EvaluateOptions | None = 
 def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = None) -> SequenceScore:
     """Scores of one file of stated motions against TUM poses of the same camera."""
     log, poses = read_stated(stated), read_tum(truth)
+    options = options or EvaluateOptions()
+    # The judge declares the truth's noise. An estimate would depend on the method that is judged.
+    options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))
     run = Run(stated, stated.stem, log, TruthLog(poses.t_ns, poses.T_world_body), None, Mounting(), [])
     evaluation = evaluate_run(run, options=options)
     c = evaluation.consistency.get(IMPORTED)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
+from gpvo.types import Array
 
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import Evaluation
@@ -99,9 +100,29 @@ def _line(method: str, c: Consistency) -> str:
 
 
 def _conditions(e: Evaluation) -> Iterator[str]:
-    """What was seen of the run and of the model's domain."""
+    """What was seen of the run, of its truth, and of the model's domain."""
     if e.in_domain is not None:
         yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
     lost = sum(r.status.value == "lost" for r in e.run.log)
     if lost:
         yield f"{lost} of {len(e.run.log)} frames have no motion."
+    if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
+        stated = _up_to(e.truth_sigma_stated) or "none"
+        yield (
+            f"The truth itself has noise of {_up_to(e.truth_sigma)} per pose, by estimate (its source states {stated})."
+            " It is counted in."
+        )
+    if e.tells_from_m > 0:
+        where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
+        yield f"The truth's noise outweighs the odometry's errors {where}: there the truth cannot tell."
+    if e.turned is not None:
+        yield (
+            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg (mounting or calibration)."
+            f" Without it errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
+        )
+
+
+def _up_to(sigma: Array) -> str:
+    """The worst axis of each kind."""
+    translation, rotation = 1e3 * sigma.reshape(2, 3).max(axis=1)
+    return " and ".join(f"{x:.2g} {unit}" for x, unit in ((translation, "mm"), (rotation, "mrad")) if x)

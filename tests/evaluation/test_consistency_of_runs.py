@@ -19,7 +19,7 @@ from gpvo.types import TruthLog, VoLog
 def _scores(log: VoLog, truth: TruthLog, sigma: tuple[float, float] = (0.0, 0.0)) -> dict[str, Consistency]:
     T_true, known = interpolate_truth(truth, log.t_ns)
     errors = motion_errors(log, truth)
-    found = {s.method: consistency(s, errors, log, T_true, known, sigma) for s in statements(log)}
+    found = {s.method: consistency(s, errors, log, T_true, known, np.repeat(sigma, 3)) for s in statements(log)}
     return {m: c for m, c in found.items() if c is not None}
 
 
@@ -110,15 +110,14 @@ def test_predicted_final_error_is_that_of_drawn_runs():
 
 def test_truth_noise_is_that_of_two_noisy_poses():
     sigma_m, sigma_rad = 0.003, 0.001
-    np.testing.assert_allclose(
-        truth_noise(np.eye(4)[None], sigma_m, sigma_rad)[0], np.diag([2 * sigma_m**2] * 3 + [2 * sigma_rad**2] * 3)
-    )
+    sigma = np.repeat([sigma_m, sigma_rad], 3)
+    np.testing.assert_allclose(truth_noise(np.eye(4)[None], sigma)[0], np.diag(2 * sigma**2))
     T = se3.exp(np.array([0.5, -0.2, 1.0, 0.3, -0.4, 0.2]))
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((2, 20_000, 6)) * ([sigma_m] * 3 + [sigma_rad] * 3)
     measured = se3.inverse(se3.exp(noise[0])) @ T @ se3.exp(noise[1])
     sample = np.cov(se3.log(se3.inverse(measured) @ T).T)
-    C = truth_noise(T[None], sigma_m, sigma_rad)[0]
+    C = truth_noise(T[None], sigma)[0]
     scale = np.sqrt(np.outer(np.diagonal(C), np.diagonal(C)))
     np.testing.assert_allclose(sample / scale, C / scale, atol=0.05)
 

@@ -246,14 +246,12 @@ def test_a_gap_in_the_truth_is_no_frame():
     assert found.rpe_second.translation_m.max <= whole.rpe_second.translation_m.max
 
 
-def test_truth_from_a_file_is_said_to_be_taken_as_exact(capsys, run_folder, tmp_path):
+def test_truth_from_a_file_takes_the_noise_that_it_is_given(capsys, run_folder, tmp_path):
     run = read_run(run_folder)
     write_tum(tmp_path / "truth.tum", run.truth.t_ns, run.truth.T_world_cam)
     args = ("evaluate", run_folder, "--truth", tmp_path / "truth.tum")
-    assert "truth.tum states no noise of its own and is taken as exact" in _main(capsys, *args)[1]
-    told = _main(capsys, *args, "--truth-sigma", "0.01")[1]
-    assert "taken as exact" not in told
-    assert "10 mm" in told
+    assert "In brackets" not in _main(capsys, *args)[1]
+    assert "10 mm" in _main(capsys, *args, "--truth-sigma", "0.01")[1]
 
 
 def test_the_model_file_gives_constant_and_the_thesis_row(capsys, tmp_path):

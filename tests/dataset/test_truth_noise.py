@@ -1,0 +1,117 @@
+"""The truth's own noise is found beside odometry that is noisier than it, and never where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.hand_eye import fixed_rotation
+from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m
+from gpvo.evaluation.evaluate import evaluate_run
+from gpvo.evaluation.verdict import verdict
+from gpvo.geometry import se3
+from gpvo.io.run_read import Run, read_run
+from gpvo.types import TruthLog, VoLog
+
+DATA = Path(__file__).parents[2] / "data"
+FLIGHTS = ("tunnel-1", "tunnel-2", "tunnel-3", "tunnel-4", "unseen")
+TRIALS = 15
+
+
+@pytest.fixture(scope="module")
+def flights() -> list[Run]:
+    return [read_run(DATA / name) for name in FLIGHTS]
+
+
+def noisy(truth: TruthLog, seed: int, sigma_m: float, sigma_rad: float, jitter_s: float = 0.0) -> TruthLog:
+    """The truth with white noise on its poses, told at stamps that are off by ``jitter_s``."""
+    rng = np.random.default_rng(seed)
+    late = np.rint(1e9 * jitter_s * rng.standard_normal(len(truth.t_ns))).astype(np.int64)
+    T, _ = interpolate_truth(truth, np.clip(truth.t_ns + late, truth.t_ns[0], truth.t_ns[-1]))
+    xi = rng.standard_normal((len(T), 6)) * np.repeat([sigma_m, sigma_rad], 3)
+    return TruthLog(truth.t_ns, T @ se3.exp(xi))
+
+
+def estimates(flights: list[Run], *noise: float) -> np.ndarray:
+    """(TRIALS, 6) of the flights in turn."""
+    found = []
+    for seed in range(TRIALS):
+        run = flights[seed % len(flights)]
+        assert run.truth is not None
+        found.append(estimate_truth_noise(motion_errors(run.log, noisy(run.truth, seed, *noise)), run.log))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("sigma_m,sigma_rad", [(0.003, 0.0004), (0.03, 0.003)])
+def test_white_noise_is_found_in_size(flights, sigma_m, sigma_rad):
+    """Odometry's own errors are 2 to 14 mm per motion. Each estimate of 200 frames scatters by about 6 %."""
+    relative = estimates(flights, sigma_m, sigma_rad) / np.repeat([sigma_m, sigma_rad], 3)
+    assert (relative > 0).mean() > 0.9
+    assert 0.9 < np.sqrt((relative[relative > 0] ** 2).mean()) < 1.1
+
+
+def test_jitter_of_stamps_shows_along_the_way(flights):
+    """20 ms at about 1 m/s; the camera looks ahead."""
+    found = estimates(flights, 0.0, 0.0, 0.02)
+    assert (found[:, 2] > 0).mean() > 0.9
+    assert 0.015 < np.median(found[:, 2]) < 0.03
+    assert np.median(found[:, 2]) > 5 * np.median(found[:, 1])
+
+
+def test_no_noise_is_found_where_there_is_none(flights):
+    for run in flights:
+        assert run.truth is not None
+        assert not estimate_truth_noise(motion_errors(run.log, run.truth), run.log).any()
+
+
+@pytest.mark.parametrize("what", ["jitter", "scale"])
+def test_errors_of_odometry_are_not_blamed_on_the_truth(flights, what):
+    """Noise that two motions share, which looks like the truth's in the errors alone; motions 10 % too long."""
+    false_alarms = 0
+    for seed, run in enumerate(flights * 2):
+        rng, T = np.random.default_rng(seed), run.log.T_prev_cur
+        jitter = se3.exp(rng.standard_normal((len(T) + 1, 6)) * np.repeat([0.02, 0.002], 3))
+        wrong = se3.inverse(jitter[:-1]) @ T @ jitter[1:] if what == "jitter" else se3.exp(1.1 * se3.log(T))
+        log = VoLog([replace(r, T_prev_cur=t) for r, t in zip(run.log, wrong)], run.log.camera)
+        false_alarms += int((estimate_truth_noise(motion_errors(log, run.truth), log) > 0).sum())
+    assert false_alarms <= 2  # of 60 axes
+
+
+def test_the_truth_tells_over_a_distance(flights):
+    run = flights[4]
+    T_true, known = interpolate_truth(run.truth, run.log.t_ns)
+    distances = [telling_distance_m(run.log, T_true, known, np.repeat([s, 0.0], 3)) for s in (0.0, 1e-4, 0.008, 10.0)]
+    assert distances[:2] == [0.0, 0.0]
+    assert 0.1 < distances[2] < 30.0
+    assert np.isinf(distances[3])
+
+
+def test_evaluate_says_so_and_counts_it_in(flights):
+    run = replace(flights[4], truth=noisy(flights[4].truth, 1, 0.03, 0.0))
+    found = evaluate_run(run)
+    assert 0.025 < found.truth_sigma[:3].mean() < 0.035
+    lines = " ".join(verdict(found).lines)
+    assert "The truth itself has noise of 3" in lines
+    assert "its source states none" in lines
+    assert "outweighs the odometry's errors on this run" in lines
+    c, clean = (evaluate_run(r).consistency["triangulation"] for r in (run, flights[4]))
+    assert c.nees_dof["translation"].mean > 3 * clean.nees_dof["translation"].mean
+    # What the truth adds outweighs what is stated, and counted in it is no surprise.
+    assert 0.7 < c.nees_dof_truth_noise["translation"] < 1.3
+
+
+def test_a_fixed_rotation_is_reported_where_it_matters(flights):
+    turn = se3.exp(np.array([0, 0, 0, 0.02, -0.01, 0.015]))
+    for run in flights:
+        assert fixed_rotation(run.log, run.truth) is None
+    run = flights[4]
+    turned = replace(run, truth=replace(run.truth, T_world_cam=run.truth.T_world_cam @ turn))
+    found = fixed_rotation(turned.log, turned.truth)
+    assert found is not None
+    assert found.angle_deg == pytest.approx(np.rad2deg(np.linalg.norm([0.02, 0.01, 0.015])), rel=0.25)
+    assert found.error_change < -0.2
+    assert any("fixed rotation of 1." in line for line in verdict(evaluate_run(turned)).lines)
