@@ -8,18 +8,15 @@ import numpy as np
 
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.yamlfile import calibration_text
 from gpvo.errors import CalibrationError
 from gpvo.types import Array
 
 
 def read_projections(path: Path) -> dict[str, Array]:
     """``P0`` ... ``P3`` (3, 4) of the file; raw KITTI's ``P_rect_00`` spelling is understood too."""
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise CalibrationError(f"cannot be read: {error.strerror}", where=path) from None
     found: dict[str, Array] = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(calibration_text(path).splitlines(), 1):
         key, _, rest = line.partition(":")
         key = key.strip().replace("P_rect_0", "P")
         if key not in ("P0", "P1", "P2", "P3"):

@@ -105,8 +105,9 @@ def check_pose(T: object, name: str, where: object = None) -> Array:
         raise CalibrationError(f"{name} is not a matrix of numbers", where=where) from None
     if M.shape != (4, 4):
         raise CalibrationError(f"{name} has shape {M.shape}, expected (4, 4)", where=where)
-    if not np.isfinite(M).all():
-        raise CalibrationError(f"{name} holds a number that is not finite", where=where)
+    # Comparisons with NaN are false.
+    if not np.abs(M).max() < 1e6:
+        raise CalibrationError(f"{name} holds a number that is not finite, or beyond a million", where=where)
     R = M[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(M[3], [0, 0, 0, 1]):
         raise CalibrationError(f"{name} is not a rigid transform: its rotation block is no rotation", where=where)

@@ -12,7 +12,7 @@ import yaml
 from gpvo.errors import CalibrationError
 from gpvo.types import Array
 
-_MAX_BYTES = 200_000  # a calibration has a few thousand
+_MAX_BYTES = 100_000  # a calibration has a few thousand
 
 
 class _Loader(yaml.SafeLoader):
@@ -39,6 +39,16 @@ for _tag in ("tag:yaml.org,2002:opencv-matrix", "!opencv-matrix"):
     _Loader.add_constructor(_tag, _opencv_matrix)
 
 
+def calibration_text(path: Path) -> str:
+    """The text of a file. Raises CalibrationError where it cannot be read, or is too large for a calibration."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise CalibrationError("too large for a calibration", where=path)
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise CalibrationError(f"cannot be read: {error.strerror}", where=path) from None
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; ``!!opencv-matrix`` becomes an array (rows, cols).
 
@@ -49,12 +59,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     CalibrationError
         Where the file is missing, too large, not YAML or not a mapping.
     """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise CalibrationError("too large for a calibration", where=path)
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"cannot be read: {error.strerror}", where=path) from None
+    text = calibration_text(path)
     # A leading directive without the document marker, a byte order mark, and tabs are what these files suffer from.
     text = re.sub(r"\A\ufeff?\s*%YAML[: ][^\n]*\n(---[^\n]*\n)?", "", text).expandtabs(4)
     try:

@@ -1,11 +1,14 @@
 """The ``gpvo`` command: one file per group of commands, each thin over the library.
 
-Exit code 0, or 2 with one line that says what is wrong with which file and what would mend it.
+Exit code 0; 1 where the answer of ``gpvo check`` is no; 2 with one line that says what is wrong with which file and
+what would mend it.
 """
 
 from __future__ import annotations
 
 import sys
+import unicodedata
+import warnings
 from typing import NoReturn
 
 import typer
@@ -27,7 +30,7 @@ from gpvo.cli import (
     simulate,
     twin,
 )
-from gpvo.errors import EXTRA_OF, GpvoError, MissingExtraError
+from gpvo.errors import EXTRA_OF, GpvoError, MissingExtraError, printable
 
 app = typer.Typer(
     name="gpvo",
@@ -71,7 +74,9 @@ for group in (
 
 def main() -> None:
     """Entry point of the ``gpvo`` script."""
+    warnings.showwarning = lambda message, *_: print(f"gpvo: {printable(message)}", file=sys.stderr)
     try:
+        _refuse_control_characters(sys.argv[1:])
         app()
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
@@ -86,6 +91,13 @@ def main() -> None:
     except KeyboardInterrupt:
         print("gpvo: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _refuse_control_characters(arguments: list[str]) -> None:
+    """The names of files are repeated on the terminal, which would obey what is in them."""
+    for argument in arguments:
+        if any(unicodedata.category(c) in ("Cc", "Cs") for c in argument):
+            raise GpvoError("a control character in an argument", where=argument, cure="rename the file")
 
 
 def _extra(package: str) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli.output import one_of
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, printable
 
 
 def live(
@@ -121,7 +121,7 @@ def doctor(
         print_json({"schema": 1, "source": source, "topics": rows})
         return
     for name, findings in found.items():
-        print(f"{name}: {len(findings) or 'nothing'} found")
+        print(f"{printable(name)}: {len(findings) or 'nothing'} found")
         for finding in findings:
             print(f"  {finding}")
 

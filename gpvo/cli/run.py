@@ -63,7 +63,7 @@ def run(
     from gpvo import runner
     from gpvo.cli.output import print_json, progress
     from gpvo.io import open_source
-    from gpvo.learning.check import ENOUGH_INSIDE, camera_problems
+    from gpvo.learning.check import ENOUGH_INSIDE
     from gpvo.vo.config import make_config
 
     config = make_config(
@@ -100,7 +100,6 @@ def run(
         from gpvo.online.predictor import Predictor
 
         predictor = Predictor.load(model)
-        _warn(model, camera_problems(predictor.camera, sequence.camera))
     inside: list[bool] = []
     show = None
     if view or record_view is not None:
@@ -128,7 +127,8 @@ def run(
         )
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)
-        _warn(model, [f"only {share:.0f} % of the frames lie inside the training domain"])
+        told = f"{model.name} does not fit: only {share:.0f} % of the frames lie inside the training domain"
+        print(f"gpvo: {told} (gpvo check says more)", file=sys.stderr)
     notes = sequence.report.notes
     more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
     for note in (*notes[:_MOST_NOTES], *more):
@@ -143,11 +143,6 @@ def run(
             print(f"calibration: {line}")
         if summary.calibration:
             print(f"calibration: 'gpvo calibration {out} -o FILE' writes a corrected one")
-
-
-def _warn(model: Path, problems: list[str]) -> None:
-    for problem in problems:
-        print(f"gpvo: {model.name} does not fit: {problem} (gpvo check says more)", file=sys.stderr)
 
 
 def _pixels(option: str, text: str) -> float | None:

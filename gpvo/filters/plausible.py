@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.online.intake import Doubt
 from gpvo.types import Array, ImuLog
 
 MOST_RADPS, MOST_MPS2 = 30.0, 150.0
@@ -28,7 +29,7 @@ class ImuGuard:
         self._t_ns: int | None = None
         self._sample = np.zeros(6)
         self._usual = np.zeros(6)
-        self._odd: tuple[int, Array] | None = None
+        self._doubt: Doubt[tuple[int, Array]] = Doubt()
 
     def judge(self, t_ns: int, sample: Array) -> str:
         """Empty where the sample (6,), gyroscope first, can be used, else what it is: a name to count it by."""
@@ -38,15 +39,16 @@ class ImuGuard:
             return "imu_out_of_range"
         if self._t_ns is not None:
             problem = self._beside(t_ns, sample, self._t_ns, self._sample)
-            confirmed = self._odd is not None and not self._beside(t_ns, sample, *self._odd)
-            if problem and not confirmed:
-                if problem != "imu_repeated":
-                    self._odd = (t_ns, sample)
+            if problem == "imu_repeated" or (problem and not self._doubt.is_settled_by((t_ns, sample), self._agree)):
                 return problem
             if not problem:
                 self._usual += _FORGET * (np.minimum(np.abs(sample - self._sample), _LEAST_STEP) - self._usual)
-        self._t_ns, self._sample, self._odd = t_ns, sample, None
+        self._t_ns, self._sample = t_ns, sample
+        self._doubt.clear()
         return ""
+
+    def _agree(self, before: tuple[int, Array], now: tuple[int, Array]) -> bool:
+        return not self._beside(*now, *before)
 
     def _beside(self, t_ns: int, sample: Array, before_ns: int, before: Array) -> str:
         """What is odd about a sample after the one before."""

@@ -23,6 +23,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecor
 
 # Truth whose vertical is further than this from +z [rad] is taken to be in another frame, and gravity is measured.
 _LEVEL_RAD = 0.17
+_SHORTEST_PATH_M = 0.1  # of which a drift is a part
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the pictures is usual
 
 
@@ -273,7 +274,7 @@ def _score(
     return metrics.Scores(
         ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),
         final_error_m=float(error[-1]),
-        drift_percent=float(100.0 * error[-1] / path) if path > 0 else float("nan"),
+        drift_percent=float(100.0 * error[-1] / path) if path > _SHORTEST_PATH_M else float("nan"),
         nees_position=float(position.mean()) if len(position) else float("nan"),
         nees_attitude=float(attitude.mean()) if len(attitude) else float("nan"),
         nis_dof=float(measured.mean()) if len(measured) else float("nan"),

@@ -18,7 +18,7 @@ from gpvo.filters.gate import Gate, Wait
 from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V
-from gpvo.online.intake import LONGEST_STEP_S
+from gpvo.online.intake import LONGEST_STEP_S, Doubt, follows
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.
@@ -92,7 +92,7 @@ class Timeline:
         self._wait = Wait.since(self.t_ns, filter.batch)
         self._newest_ns: int | None = None
         self._guard = ImuGuard()
-        self._odd_ns: int | None = None
+        self._doubt: Doubt[int] = Doubt()
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
         self._usual_ns = 0
@@ -139,11 +139,10 @@ class Timeline:
 
     def _jumps_ahead(self, t_ns: int) -> bool:
         """Whether a record comes so long after the newest that its stamp is wrong, unless the next one agrees."""
-        odd, self._odd_ns = self._odd_ns, None
-        if t_ns - self.t_ns <= _LONGEST_STEP_NS or (odd is not None and 0 < t_ns - odd <= _LONGEST_STEP_NS):
-            return False
-        self._odd_ns = t_ns
-        return True
+        if t_ns - self.t_ns > _LONGEST_STEP_NS:
+            return not self._doubt.is_settled_by(t_ns, follows)
+        self._doubt.clear()
+        return False
 
     def _already_seen(self, t_ns: int) -> bool:
         return t_ns == self._newest_ns or any(e.record.t_ns == t_ns for e in self._history)

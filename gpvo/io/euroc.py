@@ -11,7 +11,7 @@ from gpvo.cameras.euroc_yaml import read_sensor_pair, read_sensor_pose
 from gpvo.cameras.kalibr import read_imu_noise
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
-from gpvo.cameras.yamlfile import read_yaml
+from gpvo.cameras.yamlfile import calibration_text, read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.images import FileSource, PairFiles
@@ -153,7 +153,7 @@ def _is_plain_name(name: str) -> bool:
 
 def _imu_noise(path: Path, mav: Path) -> ImuNoise | None:
     for candidate in (mav / "imu0" / "sensor.yaml", path / "dso" / "imu_config.yaml", path / "imu.yaml"):
-        if candidate.is_file() and "gyroscope_noise_density" in candidate.read_text(errors="replace"):
+        if candidate.is_file() and "gyroscope_noise_density" in calibration_text(candidate):
             return read_imu_noise(candidate)
     return None
 

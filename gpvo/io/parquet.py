@@ -18,6 +18,7 @@ MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
+_LARGEST = 1e100  # No number of a run is larger: products of two or three stay finite.
 _INTEGERS = {"t_ns", "t_prev_ns", "n_detected", "n_stereo", "n_tracked", "n_inliers"}
 _TYPES = {
     "status": pa.string(),
@@ -98,4 +99,7 @@ def _to_numpy(name: str, column: pa.ChunkedArray) -> NDArray[Any]:
         raise ValueError(f"the column '{name}' holds {column.type}, not {wanted}")
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type) or pa.types.is_dictionary(column.type):
         return np.array(column.to_pylist(), dtype=object)
-    return np.asarray(column.to_numpy())
+    values = np.asarray(column.to_numpy())
+    if values.dtype.kind == "f" and (np.isfinite(values) & (np.abs(values) > _LARGEST)).any():
+        raise ValueError(f"the column '{name}' holds a number beyond {_LARGEST:g}")
+    return values

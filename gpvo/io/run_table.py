@@ -156,8 +156,8 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
             is_reference=bool(columns["is_reference"][k]),
             reason=str(columns["reason"][k] or ""),
             **known(k),
-            covariances={m: C[k] for m, C in cov.items() if not np.isnan(C[k, 0, 0])},
-            v_t={m: C[k] for m, C in v_t.items() if not np.isnan(C[k, 0, 0])},
+            covariances={m: C[k] for m, C in cov.items() if not np.isnan(C[k]).all()},
+            v_t={m: C[k] for m, C in v_t.items() if not np.isnan(C[k]).all()},
             stage_ms={s: float(v[k]) for s, v in stages.items() if not np.isnan(v[k])},
         )
         for k in range(n)

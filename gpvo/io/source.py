@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import SourceError
+from gpvo.errors import SourceError, printable
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TrackFrame, TruthLog
 
 
@@ -41,6 +41,7 @@ class SourceReport:
 
     def note(self, text: str) -> None:
         """Add a remark once, and no more than fifty of them."""
+        text = printable(text)
         if text not in self.notes and len(self.notes) < 50:
             self.notes.append(text)
 

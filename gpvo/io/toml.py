@@ -17,14 +17,17 @@ try:
 except ModuleNotFoundError:  # Python 3.10
     import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
 
+_MAX_BYTES = 200_000
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Settings of a file. Raises GpvoError where it cannot be read."""
     try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise GpvoError("is larger than 200 kB: no settings", where=path)
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as problem:
+    except (OSError, ValueError, RecursionError) as problem:
         raise GpvoError(f"cannot be read as TOML: {problem}", where=path) from None
 
 

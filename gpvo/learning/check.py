@@ -9,11 +9,10 @@ import numpy as np
 
 from gpvo.dataset.build import observe
 from gpvo.io.run_read import Run
+from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
-from gpvo.types import StereoCamera
 
 _RATE = 0.2
-_CAMERA = 0.25
 ENOUGH_INSIDE = 0.9
 """A model fits a run where at least this share of its frames lies in the training domain."""
 
@@ -55,20 +54,6 @@ def check(predictor: Predictor, run: Run) -> Check:
     if inside < ENOUGH_INSIDE:
         problems.append(f"only {100 * inside:.0f} % of the frames lie inside the training domain")
     return Check(len(run.log), int(usable.sum()), inside, farthest, tuple(problems))
-
-
-def camera_problems(trained: StereoCamera | None, here: StereoCamera | None) -> list[str]:
-    """Where a camera differs from the one that a model was trained with, a line each."""
-    if trained is None or here is None:
-        return []
-    out = []
-    for name, a, b in (
-        ("baseline", trained.baseline_m, here.baseline_m),
-        ("focal length over image width", trained.fx_px / trained.width, here.fx_px / here.width),
-    ):
-        if abs(b / a - 1.0) > _CAMERA:
-            out.append(f"{name} is {b:.4g}, the model was trained with {a:.4g}")
-    return out
 
 
 def rate_problems(predictor: Predictor, steps_s: Collection[float]) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, printable
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.bag_reader import pose_of, stamp_ns
@@ -69,7 +69,8 @@ class Stated:
         good = np.isfinite(rows).all(axis=1) & (norm > 1e-6)
         T = np.tile(np.full((4, 4), np.nan), (len(rows), 1, 1))
         T[good] = se3.from_quaternion(rows[good, :3], rows[good, 3:] / norm[good, None])
-        frames = dict.fromkeys((str(m.header.frame_id), str(getattr(m, "child_frame_id", "-"))) for m in kept)
+        pairs = ((m.header.frame_id, getattr(m, "child_frame_id", "-")) for m in kept)
+        frames = dict.fromkeys((printable(parent), printable(child)) for parent, child in pairs)
         v = [_twist(m) for m in kept] if hasattr(kept[0], "twist") else None
         pose, twist = (_covariances(kept, name) for name in ("pose", "twist"))
         t_ns = np.array([stamp_ns(m) for m in kept], dtype=np.int64)

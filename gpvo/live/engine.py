@@ -15,9 +15,10 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import rotate_covariance
 from gpvo.io.jsonfile import read_json, write_json
-from gpvo.learning.check import camera_problems, rate_problems
+from gpvo.learning.check import rate_problems
 from gpvo.live.intake import Arrival
 from gpvo.live.stages import Stage, Taken, lost
+from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 from gpvo.publish.odometry import Odometry, OdometryBuilder
 from gpvo.types import Array, Prediction, Status, VoRecord

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.io.foreign import GAP_STEPS
+from gpvo.online.intake import Doubt
 
 BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""
@@ -57,7 +58,7 @@ class StampWatch:
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._suspect: tuple[int, int] | None = None  # stamp and count of those that agree on another clock
+        self._doubt: Doubt[int] = Doubt(_CONFIRM)
         self._steps: deque[int] = deque(maxlen=_WINDOW)
 
     def see(self, t_ns: int) -> Sequence:
@@ -67,16 +68,13 @@ class StampWatch:
             return Sequence.FIRST
         step = t_ns - self._last
         if -BACK_S * 1e9 <= step <= AHEAD_S * 1e9:
-            self._suspect = None
+            self._doubt.clear()
             if step <= 0:
                 return Sequence.LATE if step else Sequence.REPEATED
             return self._advance(t_ns, step)
-        before, count = self._suspect or (t_ns, 0)
-        agrees = count == 0 or 0 < t_ns - before <= AHEAD_S * 1e9
-        self._suspect = (t_ns, count + 1 if agrees else 1)
-        if self._suspect[1] < _CONFIRM:
+        if not self._doubt.is_settled_by(t_ns, lambda before_ns, now_ns: 0 < now_ns - before_ns <= AHEAD_S * 1e9):
             return Sequence.CLOCK
-        self._last, self._suspect = t_ns, None
+        self._last = t_ns
         self._steps.clear()
         return Sequence.RESTART
 

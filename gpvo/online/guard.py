@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.online.slip import SlipDetector, flag_slips
-from gpvo.types import Array
+from gpvo.types import Array, StereoCamera
 
-__all__ = ["Domain", "SlipDetector", "Whereabouts", "flag_slips"]
+__all__ = ["Domain", "SlipDetector", "Whereabouts", "camera_problems", "flag_slips"]
 
 _RARE = 0.0002
 
+_CAMERA = 0.25
 _MISSING = 2.0  # Standard deviations outside, where training never missed the value.
 DEGRADED_BELOW = 0.5
 """``in_domain`` under which a prediction is called ``degraded``."""
@@ -131,3 +132,17 @@ def growth(distance: Array, power: Array | float) -> Array:
     """Factor on the variance: a power of one plus the distance from the domain; the power one is that of a Brownian
     motion's variance away from data."""
     return (1.0 + distance) ** power
+
+
+def camera_problems(trained: StereoCamera | None, here: StereoCamera | None) -> list[str]:
+    """Where a camera differs from the one that a model was trained with, a line each."""
+    if trained is None or here is None:
+        return []
+    out = []
+    for name, a, b in (
+        ("baseline", trained.baseline_m, here.baseline_m),
+        ("focal length over image width", trained.fx_px / trained.width, here.fx_px / here.width),
+    ):
+        if abs(b / a - 1.0) > _CAMERA:
+            out.append(f"{name} is {b:.4g}, the model was trained with {a:.4g}")
+    return out

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -14,6 +16,28 @@ _FARTHEST_M = 1e5  # No motion between two frames is longer.
 _NOT_RIGID = 1e-3  # Deviation of R^T R from the identity.
 _EYE = np.eye(4)
 _EYE.setflags(write=False)
+T = TypeVar("T")
+
+
+class Doubt(Generic[T]):
+    """Holds what looks odd beside all before, a jump of a clock or of a reading, until ``enough`` in a row agree."""
+
+    def __init__(self, enough: int = 2) -> None:
+        self._enough, self._count = enough, 0
+        self._last: T | None = None
+
+    def is_settled_by(self, odd: T, agrees: Callable[[T, T], bool]) -> bool:
+        """Whether the next odd one is to be believed; ``agrees`` says whether it goes with the odd one before it."""
+        self._count = self._count + 1 if self._last is not None and agrees(self._last, odd) else 1
+        self._last = odd
+        if self._count < self._enough:
+            return False
+        self.clear()
+        return True
+
+    def clear(self) -> None:
+        """What came now is not odd."""
+        self._count, self._last = 0, None
 
 
 class Intake:
@@ -26,7 +50,7 @@ class Intake:
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
-        self._odd_ns: int | None = None
+        self._doubt: Doubt[int] = Doubt()
 
     def step(self, record: VoRecord) -> VoRecord:
         """The record, ``lost`` with the reason where it cannot be. Call once per record."""
@@ -37,20 +61,23 @@ class Intake:
         return record.with_status(Status.LOST, problem) if problem else record
 
     def _clock(self, record: VoRecord) -> str:
-        t_ns, last_ns, odd_ns = record.t_ns, self._last_ns, self._odd_ns
-        follows = last_ns is None or _follows(t_ns, last_ns) or (odd_ns is not None and _follows(t_ns, odd_ns))
-        if not follows and record.status is not Status.START:
-            assert last_ns is not None
-            self._odd_ns = t_ns
+        t_ns, last_ns = record.t_ns, self._last_ns
+        if (
+            last_ns is not None
+            and record.status is not Status.START
+            and not (follows(last_ns, t_ns) or self._doubt.is_settled_by(t_ns, follows))
+        ):
             step_s = (t_ns - last_ns) * 1e-9
             return "the stamp repeats" if step_s == 0 else f"the stamp jumps by {step_s:+.3g} s"
-        self._last_ns, self._odd_ns = t_ns, None
+        self._last_ns = t_ns
+        self._doubt.clear()
         if record.usable and record.t_prev_ns >= t_ns:
             return "the motion ends no later than it begins"
         return ""
 
 
-def _follows(t_ns: int, before_ns: int) -> bool:
+def follows(before_ns: int, t_ns: int) -> bool:
+    """Whether a stamp comes after the one before, and not too long after."""
     return 0 < t_ns - before_ns <= LONGEST_STEP_S * 1e9
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -20,7 +21,7 @@ from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import ErrorModelArrays
 from gpvo.online.features import known_columns
 from gpvo.online.for_filter import arrays_for_filter, arrays_of_base
-from gpvo.online.guard import DEGRADED_BELOW
+from gpvo.online.guard import DEGRADED_BELOW, camera_problems
 from gpvo.online.observer import Observer
 from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord
 
@@ -116,7 +117,10 @@ class Predictor:
         return Predictor(arrays_of_base(self.arrays), self.header)
 
     def reset(self, camera: StereoCamera | None = None) -> None:
-        """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with."""
+        """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with; warns
+        where the two are far apart."""
+        for problem in camera_problems(self.camera, camera):
+            warnings.warn(f"this is another camera: {problem}", stacklevel=2)
         self._observer = Observer(self.features, self.target, camera or self.camera)
         self._adaptive = AdaptiveScale()
         self._last: tuple[VoRecord, Array] | None = None

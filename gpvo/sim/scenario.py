@@ -12,15 +12,10 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gpvo.errors import GpvoError
+from gpvo.io.toml import read_toml
 from gpvo.sim.points import SCENARIOS, PointsScenario, Tolerance
 from gpvo.sim.rig import CAMERAS, RigTolerance, camera_rig
 
-try:
-    import tomllib
-except ModuleNotFoundError:  # Python 3.10
-    import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
-
-_MAX_BYTES = 100_000
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
 Share = Field(0.0, ge=0.0, le=0.5)
@@ -109,10 +104,10 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
         For an unknown name or value, with the nearest one that is known.
     """
     if name.endswith(".toml"):
-        table, where = _read_toml(Path(name)), name
+        table, where = read_toml(Path(name)), name
     elif name in names():
-        text = resources.files("gpvo.sim").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")
-        table, where = tomllib.loads(text), name
+        with resources.as_file(resources.files("gpvo.sim").joinpath("scenarios", f"{name}.toml")) as file:
+            table, where = read_toml(file), name
     else:
         raise GpvoError(f"unknown scenario '{name}'", cure=_nearest(name, names()))
     # A resolved scenario, as it lies beside a sequence, may be flown again.
@@ -126,7 +121,7 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
 
 def stated_seed(name: str) -> int:
     """The seed in a scenario's file, 0 where there is none."""
-    seed = _read_toml(Path(name)).get("seed", 0) if name.endswith(".toml") else 0
+    seed = read_toml(Path(name)).get("seed", 0) if name.endswith(".toml") else 0
     return seed if isinstance(seed, int) and seed >= 0 else 0
 
 
@@ -207,14 +202,3 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
 def _nearest(word: str, known: Any) -> str:
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
     return f"nearest: {close[0]}" if close else f"known: {', '.join(sorted(known))}"
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise GpvoError("is larger than a scenario can be", where=path)
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise GpvoError(f"cannot be read: {error.strerror}", where=path) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise GpvoError(f"is no TOML: {error}", where=path) from None

@@ -42,11 +42,11 @@ def check_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns
         )
     if isinstance(frame, StereoFrame):
         for side, image in (("left", frame.left), ("right", frame.right)):
-            if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
+            dtype, shape = getattr(image, "dtype", type(image).__name__), getattr(image, "shape", ())
+            if dtype != np.uint8 or shape != (camera.height, camera.width):
                 raise SourceError(
-                    f"{side} image is {image.dtype} {image.shape[1]}x{image.shape[0]}, the camera is"
-                    f" uint8 {camera.width}x{camera.height}",
-                    cure="use the calibration of this resolution",
+                    f"the {side} image is {dtype} {shape}, the camera takes uint8 {(camera.height, camera.width)}",
+                    cure="rows before columns: give grey images of the calibration's resolution",
                 )
 
 

@@ -15,6 +15,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -164,10 +165,22 @@ def read_model(path: Path) -> None:
 
 
 def read_run_folder(path: Path) -> None:
+    from gpvo.geometry.covariance import are_positive_definite
     from gpvo.io.run import read_run
 
     run = read_run(path)
     assert np.isfinite(run.log.trajectory()).all(), "a trajectory that is none"
+    told = list(flying_model().replay(run.log).values())
+    assert are_positive_definite(np.array([p.covariance for p in told])).all(), "a covariance that is none"
+    assert np.isfinite([p.mean for p in told]).all(), "a mean that is none"
+
+
+@cache
+def flying_model() -> Any:
+    """The model that comes with gpvo."""
+    from gpvo.online.predictor import Predictor
+
+    return Predictor.load(Path(__file__).parents[2] / "models" / "tunnel.gpvo")
 
 
 def read_source(path: Path) -> None:
@@ -188,6 +201,12 @@ def read_log(path: Path) -> None:
 
     log = read_foreign(path, None, rate_hz=10.0)
     assert all(np.isfinite(r.T_prev_cur).all() for r in to_records(log)[0]), "a motion that is none"
+
+
+def read_planned_path(path: Path) -> None:
+    from gpvo.evaluation.plan import read_plan
+
+    assert np.isfinite(read_plan(path, 0.1).motions).all(), "a motion that is none"
 
 
 def read_settings(path: Path) -> None:
@@ -215,12 +234,14 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Rng], None] | N
     "model": (read_model, odd_model),
     "tracks": (read_source, odd_tracks),
     "run": (read_run_folder, odd_table),
-    "euroc": (read_source, None),
+    "sequence": (read_source, None),
     "calibration": (read_yaml, None),
     "log": (read_log, None),
+    "plan": (read_planned_path, None),
     "settings": (read_settings, None),
     "image": (read_image, None),
     "bag": (read_bag, None),
+    "recording": (read_source, None),
 }
 
 
@@ -260,7 +281,7 @@ def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[s
     def hang(*_: object) -> None:
         raise TimeoutError(f"longer than {SECONDS} s")
 
-    signal.signal(signal.SIGALRM, hang)
+    signal.signal(signal.SIGPROF, hang)
     most_mb = MEGABYTES + 300.0  # of Python and its libraries
     for number in range(first, first + count):
         shutil.rmtree(work, ignore_errors=True)
@@ -269,9 +290,11 @@ def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[s
         kind, target, changed = mutated(seeds, number, work)
         case = {"case": number, "kind": kind, "file": changed.name}
         started, told = time.monotonic(), ""
-        signal.alarm(SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of the processor: the machine may have other work
         try:
-            READERS[kind][0](target)
+            with warnings.catch_warnings(record=True) as beside:
+                warnings.simplefilter("always")
+                READERS[kind][0](target)
         except GpvoError as refusal:
             told = str(refusal)
             if "\n" in told or target.name not in told:
@@ -279,7 +302,10 @@ def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[s
         except BaseException as error:
             yield {**case, "problem": f"{type(error).__name__}: {str(error)[:200]}", "s": time.monotonic() - started}
         finally:
-            signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
+        ours = [w for w in beside if "gpvo" in w.filename]
+        if ours:
+            yield {**case, "problem": f"{ours[0].filename}:{ours[0].lineno}: {ours[0].message}"}
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         if peak_mb > most_mb:
             most_mb = 1.2 * peak_mb
@@ -288,7 +314,6 @@ def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[s
 
 def main() -> None:
     seeds, first, count = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    warnings.simplefilter("ignore")
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     for problem in problems(seeds, first, count, seeds.parent / f"work-{first}"):
         print(json.dumps(problem), flush=True)

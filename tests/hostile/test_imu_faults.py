@@ -121,3 +121,12 @@ def test_a_log_is_usable_but_for_its_faults() -> None:
     for name, fault in FAULTS.items():
         flight = faulty(3, fault, 4.0)
         assert usable(flight.imu).sum() >= len(flight.imu.t_ns) - 101, name
+
+
+def test_a_flight_that_goes_nowhere_has_no_drift_per_distance() -> None:
+    flight = synthetic_flight(3, duration_s=4.0)
+    still = np.tile(flight.T_world_cam[0], (len(flight.T_world_cam), 1, 1))
+    still[:, 0, 3] += 1e-15 * np.arange(len(still))
+    assert np.isnan(
+        fuse_flight(replace(flight, T_world_cam=still), LearnedPolicy(), FuseOptions())[0].scores.drift_percent
+    )

@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from bag_maker import stereo_bag
+from campaign import READERS
 from gpvo.cli import app
 from gpvo.io.run import write_run
 from gpvo.online.predictor import Predictor
@@ -29,7 +31,7 @@ POSE = "  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.
 def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One of each kind, as gpvo writes and reads them."""
     root = tmp_path_factory.mktemp("hostile") / "seeds"
-    for kind in ("model", "tracks", "run", "euroc", "calibration", "log", "settings", "image", "bag"):
+    for kind in READERS:
         (root / kind).mkdir(parents=True)
     shutil.copy(MODEL, root / "model" / "model.gpvo")
     simulate_points("tunnel-bursts", 0, duration_s=2.0, rate_hz=10.0).save(root / "tracks" / "tracks.npz")
@@ -41,8 +43,12 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
         done = CliRunner().invoke(app, ["publish", str(run), "--to", suffix, "-o", str(root / "bag" / f"bag.{suffix}")])
         assert done.exit_code == 0, done.output
     next((root / "bag").glob("*.yaml")).unlink()
+    ros2 = stereo_bag(ros1=False, n=3).write(root / "recording" / "ros2")
+    shutil.copytree(ros2, root / "bag" / "ros2")
+    stereo_bag(ros1=True, n=3).write(root / "recording" / "ros1.bag")
     (root / "calibration" / "camchain.yaml").write_text(f"cam0:\n{CAMERA}cam1:\n{CAMERA}{POSE}")
     shutil.copy(run / "trajectory.tum", root / "log" / "log.tum")
+    shutil.copy(run / "trajectory.tum", root / "plan" / "plan.txt")
     (root / "log" / "log.csv").write_text(
         "t_s,p_x,p_y,p_z,q_x,q_y,q_z,q_w,cov_00\n" + "0.1,1,2,3,0,0,0,1,0.1\n0.2,1,2,3,0,0,0,1,0.1\n"
     )
@@ -51,7 +57,8 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     for suffix in ("png", "jpg", "bmp", "tif", "pgm", "webp"):
         cv2.imwrite(str(root / "image" / f"image.{suffix}"), picture)
-    _euroc(root / "euroc" / "sequence", picture)
+    _euroc(root / "sequence" / "euroc", picture)
+    _kitti(root / "sequence" / "kitti", picture)
     return root
 
 
@@ -71,6 +78,19 @@ def _euroc(path: Path, picture: np.ndarray) -> None:
         )
 
 
+def _kitti(path: Path, picture: np.ndarray) -> None:
+    for k in range(2):
+        (path / f"image_{k}").mkdir(parents=True)
+        for i in range(3):
+            cv2.imwrite(str(path / f"image_{k}" / f"{i:06d}.png"), picture)
+    (path / "calib.txt").write_text(
+        "".join(f"P{k}: 60 0 32 {-6.0 * (k % 2)} 0 60 24 0 0 0 1 0\n" for k in range(4))
+        + "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    )
+    (path / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    (path / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {0.1 * i}\n" for i in range(3)))
+
+
 def fly(seeds: Path, cases: int, workers: int = 2) -> None:
     each = cases // workers
     calls = [
@@ -85,9 +105,6 @@ def fly(seeds: Path, cases: int, workers: int = 2) -> None:
 
 
 def test_every_seed_is_read_as_it_is(seeds: Path) -> None:
-    sys.path.insert(0, str(CAMPAIGN.parent))
-    from campaign import READERS
-
     for kind, (read, _) in READERS.items():
         for path in (seeds / kind).iterdir():
             read(path)

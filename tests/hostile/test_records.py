@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from gpvo.errors import CalibrationError
+from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.predictor import Predictor
 from gpvo.online.sample import TrainingSample
-from gpvo.types import Status, StereoCamera, VoRecord
+from gpvo.types import Status, StereoCamera, StereoFrame, VoRecord
+from gpvo.vo.odometry import StereoOdometry
 from small_model import small_model
 from synthetic_runs import CAMERA, make_run
 
@@ -135,3 +137,19 @@ def test_a_camera_that_cannot_be_is_refused(change: dict) -> None:
     StereoCamera(**good)
     with pytest.raises(CalibrationError):
         StereoCamera(**{**good, **change})
+
+
+def test_another_camera_than_that_of_training_is_told(predictor) -> None:
+    predictor.reset(predictor.camera)
+    with pytest.warns(UserWarning, match=r"another camera: baseline is 1, the model was trained with 0\.1"):
+        predictor.reset(replace(predictor.camera, baseline_m=1.0))
+
+
+@pytest.mark.parametrize(
+    ("shape", "told"), [((48, 64, 3), r"uint8 \(48, 64, 3\)"), ((48,), r"\(48,\)"), (None, "NoneType")]
+)
+def test_a_picture_that_is_none_of_the_camera_is_refused_by_its_shape(shape: tuple | None, told: str) -> None:
+    camera = StereoCamera(60.0, 60.0, 32.0, 24.0, 0.1, 64, 48)
+    picture: Any = None if shape is None else np.zeros(shape, np.uint8)
+    with pytest.raises(SourceError, match=rf"left image is .*{told}.* takes uint8 \(48, 64\)"):
+        StereoOdometry(camera).step(StereoFrame(0, picture, np.zeros((48, 64), np.uint8)))

@@ -51,8 +51,9 @@ def _change(path: Path, column: str, value: float) -> None:
 
 
 @pytest.mark.parametrize(("column", "value"), [
-    ("cov_pointing_matching_01", 1.0), ("cov_pointing_matching_11", 0.0), ("cov_pointing_matching_11", -1.0),
-    ("cov_pointing_matching_12", np.nan), ("cov_pointing_matching_33", np.inf), ("p_x_m", np.nan), ("R_00", 2.0),
+    ("cov_pointing_matching_01", 1.0), ("cov_pointing_matching_00", np.nan), ("cov_pointing_matching_11", 0.0),
+    ("cov_pointing_matching_11", -1.0), ("cov_pointing_matching_12", np.nan), ("cov_pointing_matching_33", np.inf),
+    ("p_x_m", np.nan), ("p_x_m", -1e200), ("R_00", 2.0), ("R_00", 1e300),
 ])  # fmt: skip
 def test_a_covariance_that_is_none_is_refused(column: str, value: float, run: Path) -> None:
     _change(run / "vo_log.parquet", column, value)
@@ -60,7 +61,8 @@ def test_a_covariance_that_is_none_is_refused(column: str, value: float, run: Pa
         read_run(run)
 
 
-@pytest.mark.parametrize(("column", "value"), [("cov_white_00", -1.0), ("mean_x_m", np.inf), ("cov_jitter_01", 1.0)])
+@pytest.mark.parametrize(("column", "value"), [("cov_white_00", -1.0), ("mean_x_m", np.inf), ("cov_jitter_01", 1.0),
+                                               ("cov_bias_00", 1e308)])  # fmt: skip
 def test_a_prediction_that_is_none_is_refused(column: str, value: float, log: VoLog, tmp_path: Path) -> None:
     predictions = list(Predictor.load(MODEL).replay(log).values())
     write_run(tmp_path / "run", log, predictions=predictions)
@@ -161,3 +163,26 @@ def test_nothing_of_a_file_reaches_the_terminal_as_a_command(log: VoLog, tmp_pat
         done = gpvo(*words, cwd=tmp_path)
         assert "\x1b" not in done.stdout + done.stderr, words
     assert "\x1b" not in str(GpvoError(f"no such '{ESC}'", where=name))
+
+
+def test_names_inside_a_bag_reach_neither_terminal_nor_run_raw(tmp_path: Path) -> None:
+    from bag_maker import BagMaker, stereo_bag
+
+    maker: BagMaker = stereo_bag(ros1=True)
+    for k in range(12):
+        T = np.eye(4)
+        T[0, 3] = k
+        maker.odometry(f"/odom{ESC}", 10**18 + k * 10**8, T, np.eye(6), np.eye(6))
+    maker.write(tmp_path / "evil.bag")
+    for words in (("info", "evil.bag"), ("doctor", "evil.bag"), ("run", "evil.bag", "-o", "run")):
+        done = gpvo(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "odom" in done.stdout + done.stderr
+        assert "\x1b" not in done.stdout + done.stderr, words
+
+
+def test_a_file_named_to_fool_the_terminal_is_refused(tmp_path: Path) -> None:
+    done = gpvo("run", f"a{ESC}.npz", "-o", "x", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "a control character in an argument" in done.stderr
+    assert "\x1b" not in done.stderr

@@ -56,7 +56,7 @@ def test_own_file(tmp_path):
     assert (mine.name, mine.world, mine.duration_s) == ("mine", "room", 9.0)
     assert sc.points_scenario(mine).sigma_px == 0.3
     file.write_text("world = [")
-    with pytest.raises(GpvoError, match="no TOML"):
+    with pytest.raises(GpvoError, match="as TOML"):
         sc.load_scenario(str(file))
     with pytest.raises(GpvoError, match="cannot be read"):
         sc.load_scenario(str(tmp_path / "none.toml"))
