@@ -102,7 +102,9 @@ def _refuse_control_characters(arguments: list[str]) -> None:
 
 def _extra(package: str) -> str:
     """The extra that brings all that the command at hand needs, not only the first package that it missed."""
-    of_command = {"train": "train", "simulate": "sim", "reproduce": "all"}.get(sys.argv[1] if sys.argv[1:] else "")
+    of_command = {"run": "vo", "train": "train", "simulate": "sim", "reproduce": "all"}.get(
+        sys.argv[1] if sys.argv[1:] else ""
+    )
     return of_command or ("runs" if EXTRA_OF[package] == "vo" else EXTRA_OF[package])
 
 

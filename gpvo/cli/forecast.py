@@ -122,9 +122,8 @@ def _print(f: Forecast, path: Path, frame: str) -> None:
 
 def _write(out: Path, f: Forecast) -> None:
     """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
-    import os
-
-    from gpvo.io.parquet import make_table, write_table
+    from gpvo.io.csvfile import write_csv
+    from gpvo.io.parquet_write import write_table
 
     position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
     columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}
@@ -132,17 +131,10 @@ def _write(out: Path, f: Forecast) -> None:
     columns |= {f"sigma_{a}_m": sigma[:, i] for i, a in enumerate("xyz")}
     columns |= {"sigma_m": f.sigma_m, "in_domain": [1.0, *f.in_domain]}
     columns |= {f"cov_{i}_{j}": f.covariance[:, i, j] for i in range(6) for j in range(i, 6)}
-    table = make_table(columns)
-    try:
-        if out.suffix == ".parquet":
-            write_table(out, table)
-        else:
-            from pyarrow.csv import write_csv
-
-            write_csv(table, out.with_name(out.name + ".part"))
-            os.replace(out.with_name(out.name + ".part"), out)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror or error}", where=out) from None
+    if out.suffix == ".parquet":
+        write_table(out, columns)
+    else:
+        write_csv(out, columns)
 
 
 def _draw(plot: Path, f: Forecast, title: str) -> None:

@@ -1,66 +1,24 @@
-"""Small Parquet tables: written under a temporary name with page checksums, read back with sizes checked first."""
+"""Small Parquet tables, read with their sizes and checksums checked first."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.atomic import replacing
+from gpvo.io.parquet_write import KIND_OF
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = 1e100  # No number of a run is larger: products of two or three stay finite.
-_INTEGERS = {"t_ns", "t_prev_ns", "n_detected", "n_stereo", "n_tracked", "n_inliers"}
-_TYPES = {
-    "status": pa.string(),
-    "reason": pa.string(),
-    "is_reference": pa.bool_(),
-    "track": pa.int32(),
-    "u_px": pa.float32(),
-    "v_px": pa.float32(),
-    "d_px": pa.float32(),
-    "is_inlier": pa.bool_(),
-}
-
-
-def make_table(columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> pa.Table:
-    """Columns as a table: integers, strings and booleans where their name says so, else float64."""
-    fields, arrays = [], []
-    for name, values in columns.items():
-        kind = pa.int64() if name in _INTEGERS else _TYPES.get(name, pa.float64())
-        arrays.append(pa.array(values, type=kind))
-        fields.append(pa.field(name, kind))
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(metadata or {})))
-
-
-def write_table(path: Path, table: pa.Table) -> None:
-    """Write one table in place of what was there, or not at all."""
-    with replacing(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
-
-
-def concatenate(parts: Sequence[Path], target: Path, metadata: Mapping[str, str] | None = None) -> None:
-    """Join tables of a growing set of columns into one file, a part at a time in memory."""
-    schema = pa.unify_schemas([pq.read_schema(p).remove_metadata() for p in parts])
-    schema = schema.with_metadata(dict(metadata or {}))
-    with (
-        replacing(target) as temporary,
-        pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer,
-    ):
-        for part in parts:
-            table = pq.read_table(part)
-            n = table.num_rows
-            columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
-            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
 
 
 def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
@@ -71,6 +29,9 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     SourceError
         Where the file is missing, damaged or implausibly large.
     """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             shape = file.metadata
@@ -93,9 +54,11 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
 
 
 def _to_numpy(name: str, column: pa.ChunkedArray) -> NDArray[Any]:
-    wanted = _TYPES.get(name, pa.float64())
+    import pyarrow as pa
+
+    wanted = KIND_OF.get(name, "float64")
     is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_null(column.type)
-    if not pa.types.is_string(wanted) and not is_number and not (pa.types.is_boolean(wanted) and column.type == wanted):
+    if wanted != "string" and not is_number and not (wanted == "bool" and pa.types.is_boolean(column.type)):
         raise ValueError(f"the column '{name}' holds {column.type}, not {wanted}")
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type) or pa.types.is_dictionary(column.type):
         return np.array(column.to_pylist(), dtype=object)

@@ -30,7 +30,7 @@ from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_table
 from gpvo.io.folder_lock import FolderLock
 from gpvo.io.jsonfile import read_json, write_json
-from gpvo.io.parquet import concatenate, make_table, write_table
+from gpvo.io.parquet_write import RowGroup, join_tables, write_table
 from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
 from gpvo.io.toml import write_toml
 from gpvo.io.trajectory import tum_line
@@ -152,16 +152,18 @@ class RunWriter:
         state = self._state
         if state.records:
             name = f"{state.chunks:06d}.parquet"
-            write_table(self._chunks / f"log_{name}", make_table(run_table.record_columns(state.records)))
+            self._keep("log", name, run_table.record_columns(state.records))
             if state.predictions:
-                columns = run_table.prediction_columns(state.predictions)
-                write_table(self._chunks / f"predictions_{name}", make_table(columns))
+                self._keep("predictions", name, run_table.prediction_columns(state.predictions))
             if state.tracks:
-                write_table(self._chunks / f"tracks_{name}", make_table(run_table.track_columns(state.tracks)))
+                self._keep("tracks", name, run_table.track_columns(state.tracks))
             with (self.path / "trajectory.tum").open("a", encoding="ascii", newline="\n") as file:
                 file.writelines(line + "\n" for line in state.lines)
             state.chunks += 1
         state.records, state.predictions, state.lines, state.tracks = [], [], [], []
+
+    def _keep(self, kind: str, name: str, columns: Mapping[str, Any]) -> None:
+        self._state.written.setdefault(kind, []).append(write_table(self._chunks / f"{kind}_{name}", columns))
 
     def close(self, *, complete: bool = True) -> None:
         """Join the chunks and finish ``run.json``; ``complete=False`` marks a run that broke off."""
@@ -179,10 +181,9 @@ class RunWriter:
 
     def _finish(self, complete: bool) -> None:
         self.flush()
-        for kind, target in (("log", "vo_log.parquet"), *((k, f"{k}.parquet") for k in ("predictions", "tracks"))):
-            parts = sorted(self._chunks.glob(f"{kind}_*.parquet"))
-            if parts:
-                concatenate(parts, self.path / target, {"schema": str(SCHEMA)})
+        for kind, parts in self._state.written.items():
+            target = "vo_log.parquet" if kind == "log" else f"{kind}.parquet"
+            join_tables(parts, self.path / target, {"schema": str(SCHEMA)})
         shutil.rmtree(self._chunks, ignore_errors=True)
         self._write_meta(complete=complete)
 
@@ -220,6 +221,7 @@ class _State:
     predictions: list[Prediction] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
     tracks: list[StereoTracks] = field(default_factory=list)
+    written: dict[str, list[RowGroup]] = field(default_factory=dict)
     poses: OrderedDict[int, Array] = field(default_factory=OrderedDict)
     statuses: dict[str, int] = field(default_factory=dict)
     stage_ms: dict[str, float] = field(default_factory=dict)
@@ -259,7 +261,7 @@ def write_truth(path: Path, truth: TruthLog) -> None:
         "sigma_translation_m": repr(float(truth.sigma_translation_m)),
         "sigma_rotation_rad": repr(float(truth.sigma_rotation_rad)),
     }
-    write_table(path, make_table(run_table.truth_columns(truth), metadata))
+    write_table(path, run_table.truth_columns(truth), metadata)
 
 
 def write_imu(path: Path, imu: ImuLog) -> None:
@@ -267,12 +269,12 @@ def write_imu(path: Path, imu: ImuLog) -> None:
     metadata = {"schema": str(SCHEMA)}
     if imu.noise is not None:
         metadata["noise"] = json.dumps(asdict(imu.noise))
-    write_table(path, make_table(run_table.imu_columns(imu), metadata))
+    write_table(path, run_table.imu_columns(imu), metadata)
 
 
 def write_predictions(path: str | Path, predictions: Sequence[Prediction]) -> None:
     """Write predictions as a Parquet file of their own, as ``gpvo predict`` does."""
-    write_table(Path(path), make_table(run_table.prediction_columns(predictions), {"schema": str(SCHEMA)}))
+    write_table(Path(path), run_table.prediction_columns(predictions), {"schema": str(SCHEMA)})
 
 
 def _rig(camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[str, Any] | None) -> dict[str, Any]:

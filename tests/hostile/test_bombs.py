@@ -12,6 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.readers import read_stereo_yaml
@@ -20,7 +22,7 @@ from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
 from gpvo.io.jsonfile import read_json
-from gpvo.io.parquet import make_table, read_columns, write_table
+from gpvo.io.parquet import read_columns
 from gpvo.io.run_read import _read_imu
 from gpvo.io.tracks import TracksSource
 
@@ -171,16 +173,14 @@ def test_damaged_array_headers_are_refused(head: bytes, tmp_path: Path) -> None:
 
 def test_a_table_of_run_lengths_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "imu.parquet"
-    write_table(path, make_table({f"c{i}": np.zeros(3_000_000) for i in range(12)}))
+    pq.write_table(pa.table({f"c{i}": np.zeros(3_000_000) for i in range(12)}), path)
     with pytest.raises(SourceError, match=r"imu\.parquet: unpacks"):
         read_columns(path)
 
 
 def test_text_in_the_place_of_numbers_is_refused(tmp_path: Path) -> None:
-    import pyarrow as pa
-
     columns = {f"{k}_{a}_{u}": ["x", "y"] for k, u in (("gyro", "radps"), ("acc", "mps2")) for a in "xyz"}
-    write_table(tmp_path / "imu.parquet", pa.table({"t_ns": [1, 2], **columns}))
+    pq.write_table(pa.table({"t_ns": [1, 2], **columns}), tmp_path / "imu.parquet")
     with pytest.raises(SourceError, match=r"imu\.parquet.*holds string"):
         _read_imu(tmp_path / "imu.parquet")
 

@@ -94,7 +94,7 @@ def test_a_finished_run_stays_until_the_new_one_is_whole(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("gpvo.io.parquet.pq.write_table", full)
+        patch.setattr("gpvo.io.parquet_write._footer", full)
         with pytest.raises(SourceError, match="No space left"):
             write_run(run, VoLog(log.records[:20], log.camera))
     assert bytes_of(run) == before
@@ -116,11 +116,10 @@ def test_what_a_broken_run_left_is_replaced_without_asking(log: VoLog, tmp_path:
 def test_a_full_disk_names_the_file_and_leaves_nothing_half_written(
     log: VoLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(table: pa.Table, where: Path, **_: object) -> None:
-        Path(where).write_bytes(b"PAR1")
+    def full(*_: object) -> None:
         raise OSError("Error writing bytes to file")
 
-    monkeypatch.setattr("gpvo.io.parquet.pq.write_table", full)
+    monkeypatch.setattr("gpvo.io.parquet_write._footer", full)
     with pytest.raises(SourceError, match=r"log_000000\.parquet: cannot be written"):
         write_run(tmp_path / "run", log)
     assert not list(tmp_path.rglob("*.part"))
