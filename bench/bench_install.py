@@ -23,9 +23,9 @@ def run() -> dict[str, dict[str, object]]:
             _pip(python, "install", what)
             size[name] = _megabytes(python) - before
             if name != "numpy":
-                subprocess.run([python, "-m", "gpvo", "--help"], check=True, capture_output=True)
+                subprocess.run([python, "-I", "-m", "gpvo", "--help"], check=True, capture_output=True)
                 start = time.perf_counter()
-                subprocess.run([python, "-m", "gpvo", "--help"], check=True, capture_output=True)
+                subprocess.run([python, "-I", "-m", "gpvo", "--help"], check=True, capture_output=True)
                 answer_s[name] = time.perf_counter() - start
     rows: dict[str, dict[str, object]] = {}
     for name, seconds in answer_s.items():
@@ -42,7 +42,7 @@ def _environment(folder: Path) -> tuple[Path, float]:
 
 
 def _pip(python: Path, *words: str) -> None:
-    subprocess.run([python, "-m", "pip", "--quiet", "--disable-pip-version-check", *words], check=True)
+    subprocess.run([python, "-I", "-m", "pip", "-qq", "--disable-pip-version-check", *words], check=True)
 
 
 def _megabytes(python: Path) -> float:
