@@ -37,12 +37,14 @@ _NOISELESS = np.zeros(6)
 class Horizon:
     """Joint NEES per degree of freedom of the motion over a stretch, from ``count`` windows; NaN where none fits.
 
-    ``span``: metres of path, or seconds. ``nees_dof_truth_noise``: with the truth's own noise added to what is stated.
+    ``span``: metres of path, or seconds. ``nees_dof_truth_noise``: with the truth's own noise added to what is stated;
+    ``z2_truth_noise`` (6,): likewise, the mean squared error of each axis over its variance.
     """
 
     span: float
     nees_dof: float
     nees_dof_truth_noise: float
+    z2_truth_noise: tuple[float, ...]
     count: int
 
 
@@ -194,9 +196,11 @@ def horizon(
             se3.log(se3.inverse(T) @ T_est),
             _sum_of([log.records[k].T_prev_cur for k in window], [statement.errors[k] for k in window]),
         )
-        values.append([float(nees(e, S)) / 6 for S in (C, C + truth_noise(T, noise_sigma))])
-    plain, noisy = np.mean(values, axis=0).tolist() if values else (float("nan"), float("nan"))
-    return Horizon(span, plain, noisy, len(values))
+        with_noise = C + truth_noise(T, noise_sigma)
+        joint = [float(nees(e, S)) / 6 for S in (C, with_noise)]
+        values.append([*joint, *(e**2 / np.diagonal(with_noise))])
+    plain, noisy, *z2 = np.mean(values, axis=0).tolist() if values else [float("nan")] * 8
+    return Horizon(span, plain, noisy, tuple(z2), len(values))
 
 
 def _window(

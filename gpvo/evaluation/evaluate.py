@@ -218,8 +218,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS of vectors; it rewards sharp and honest
       statements alike. ``correlation_gain_nats``: by how much the stated correlations make the errors likelier.
       ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.
-    * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``count``}: joint, of the motion over windows of a second;
-      ``horizons`` are the same over lengths of path.
+    * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``z2_truth_noise``, ``count``}: of the motion over windows
+      of a second, joint and (6,) by axis; ``horizons`` are the same over lengths of path.
     * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
       ``predicted_final_error_independent_m``: the same if all motions were independent.
 
@@ -275,9 +275,8 @@ def _plain(value: Any) -> dict[str, Any]:
 
 
 def _horizon(h: Horizon | None) -> dict[str, Any]:
-    if h is None:
-        return {"nees_dof": None, "nees_dof_truth_noise": None, "count": 0}
-    return {"nees_dof": h.nees_dof, "nees_dof_truth_noise": h.nees_dof_truth_noise, "count": h.count}
+    keys = ("nees_dof", "nees_dof_truth_noise", "z2_truth_noise")
+    return {k: getattr(h, k, None) for k in keys} | {"count": 0 if h is None else h.count}
 
 
 def _method_document(c: Consistency | None) -> dict[str, Any]:

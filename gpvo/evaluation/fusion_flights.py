@@ -33,16 +33,20 @@ _EPISODES, _ACCIDENTS = "episodes.json", "-accidents"
 
 @dataclass(frozen=True)
 class Campaign:
-    """Flights of one scenario, ``duration_s`` long, in ``folder``. ``pictures``: drawn; else landmark tracks."""
+    """Flights of one scenario, ``duration_s`` long, in ``folder``. ``pictures``: drawn; else landmark tracks.
+
+    ``keep_tracks``: the runs keep what odometry saw, so that twins can be made of them.
+    """
 
     scenario: str
     folder: Path
     duration_s: float
     pictures: bool = False
+    keep_tracks: bool = False
 
     def run_path(self, seed: int, accidents: bool) -> Path:
         """Where the run of a flight lies."""
-        kind = "pictures" if self.pictures else "points"
+        kind = ("pictures" if self.pictures else "points") + ("-tracks" if self.keep_tracks else "")
         return self.folder / f"{self.scenario}-{kind}-{seed:04d}{_ACCIDENTS if accidents else ''}"
 
 
@@ -90,7 +94,7 @@ def _make_one(task: tuple[Campaign, int, bool]) -> Path:
         sequence = out.with_name(f"{out.name}.sequence{'' if campaign.pictures else '.npz'}")
         fly = _fly_pictures if campaign.pictures else _fly_points
         episodes = fly(campaign, seed, accidents, sequence)
-        run_vo(open_source(sequence), out)
+        run_vo(open_source(sequence), out, keep_tracks=campaign.keep_tracks)
         write_json(out / _EPISODES, {"schema": 1, "episodes": episodes})
         if campaign.pictures:
             shutil.rmtree(sequence)

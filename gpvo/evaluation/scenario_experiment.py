@@ -3,16 +3,18 @@
     python -m gpvo.evaluation.scenario_experiment --train 10 --test 12 -o scenarios
 
 Per scenario: a model from the training flights, judged on flights whose seeds, and with them path, world, noise and
-calibration, it has never seen; ``--together`` adds one model of all scenarios at the same rate. A flight is the unit of
-every mean and interval, as its calibration is one draw. Flights that the folder holds are not flown again.
+calibration, it has never seen; ``--together`` adds one model of all scenarios at the same rate, and ``--twins 8`` for
+each test flight a model of so many twins of it alone, with the scenario's tolerance. A flight is the unit of every mean
+and interval, as its calibration is one draw. Flights that the folder holds are not flown again.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -26,11 +28,13 @@ from gpvo.evaluation.evaluate import judged, predictions_by_stamp
 from gpvo.evaluation.fusion_flights import Campaign, flights, refuse_training_seeds, training_runs
 from gpvo.evaluation.statements import statements
 from gpvo.io.jsonfile import write_json
-from gpvo.io.run import Run
+from gpvo.io.run import Run, read_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
+from gpvo.sim.scenario import load_scenario, points_scenario
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
+from gpvo.twin.replicate import TwinSettings, make_twins
 
 DURATIONS_S: Mapping[str, float] = {
     "tunnel-clean": 125.0,
@@ -49,43 +53,65 @@ FIRST_TEST_SEED = 2000
 @dataclass(frozen=True)
 class MethodScores:
     """Of one method over F flights: ``nees`` (F, 4) joint NEES per degree of freedom per motion and over 1, 10, 100 m,
-    NaN where no window fits; ``median`` (F,) of the motions' NEES; ``nll`` (F,) per axis [nats]."""
+    NaN where no window fits; ``median`` (F,) of the motions' NEES; ``nll`` (F,) per axis [nats]; ``final_m`` (F, 2)
+    error of the last position, predicted 1 sigma and actual."""
 
     nees: np.ndarray
     median: np.ndarray
     nll: np.ndarray
+    final_m: np.ndarray
 
     def interval(self, column: int) -> Interval:
         """Mean over flights of a column of ``nees``, with its bootstrap interval."""
         values = self.nees[:, column]
         return sequence_bootstrap(values[np.isfinite(values)])
 
+    @property
+    def final_ratio(self) -> float:
+        """Predicted over actual final error, each as root mean square over the flights: a mean of ratios diverges."""
+        predicted, actual = np.sqrt((self.final_m**2).mean(axis=0))
+        return float(predicted / actual)
+
 
 def score_flights(runs: Sequence[Run], predictor: Predictor) -> dict[str, MethodScores]:
     """Every method of :data:`METHODS` that the runs and the model allow."""
-    rows: dict[str, list[list[float]]] = {}
+    return _tabulated([_score_flight(run, predictor) for run in runs])
+
+
+def score_by_twins(runs: Sequence[Run], settings: TwinSettings) -> dict[str, MethodScores]:
+    """Each flight by a model of its own twins alone: :data:`METHODS` as ``METHOD of twins``."""
+    rows = []
     for run in runs:
-        for method, row in _score_flight(run, predictor).items():
-            rows.setdefault(method, []).append(row)
-    tables = {m: np.array(r, dtype=np.float64) for m, r in rows.items()}
-    return {m: MethodScores(t[:, :-2], t[:, -2], t[:, -1]) for m, t in tables.items()}
+        with TemporaryDirectory(prefix="gpvo-twins-") as folder:
+            sets = [build_run(read_run(p)) for p in make_twins(run.path, Path(folder), settings)]
+        rows.append(_score_flight(run, train_sets(sets, TrainConfig(), judge=False).predictor()))
+    return {f"{m} of twins": scores for m, scores in _tabulated(rows).items()}
+
+
+def _tabulated(flights: Sequence[Mapping[str, Sequence[float]]]) -> dict[str, MethodScores]:
+    tables = {m: np.array([row[m] for row in flights], np.float64) for m in flights[0]}
+    return {m: MethodScores(t[:, :-4], t[:, -4], t[:, -3], t[:, -2:]) for m, t in tables.items()}
 
 
 def _score_flight(run: Run, predictor: Predictor) -> dict[str, list[float]]:
-    """NEES per motion and by horizon, its median over the motions, and the NLL, by method."""
+    """NEES per motion and by horizon, its median over the motions, NLL, and final error, by method."""
     if run.truth is None:
         raise GpvoError("has no ground truth to judge by", where=run.path)
     predictions = predictions_by_stamp(run, predictor)
     log = judged(run.log, predictions)
     T_true, known = interpolate_truth(run.truth, log.t_ns)
     errors = motion_errors(log, run.truth)
+    T_est = log.trajectory()
+    off = T_true[0] @ np.linalg.inv(T_est[0]) @ T_est[-1] - T_true[-1]
+    actual_m = float(np.linalg.norm(off[:3, 3]))
     out = {}
     for statement in statements(log, predictions, predictor):
         c = consistency(statement, errors, log, T_true, known) if statement.method in METHODS else None
         joint, nll = (c.nees_dof["joint"], c.nll_per_dim) if c else (None, None)
         if c is not None and joint is not None and nll is not None:
             far = [h.nees_dof for h in c.horizons]
-            out[statement.method] = [joint.mean, *far, float(c.nees_dof_median["joint"] or np.nan), nll]
+            median, final_m = float(c.nees_dof_median["joint"] or np.nan), float(c.predicted_final_error_m or np.nan)
+            out[statement.method] = [joint.mean, *far, median, nll, final_m, actual_m]
     return out
 
 
@@ -99,11 +125,11 @@ class ScenarioFlights:
 
 
 def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRST_TEST_SEED, jobs: int = 1,
-        duration_s: float | None = None) -> ScenarioFlights:  # fmt: skip
+        duration_s: float | None = None, keep_tracks: bool = False) -> ScenarioFlights:  # fmt: skip
     """Simulate as points, run VO; training seeds begin at 1000, test seeds at ``test_seed``."""
     campaign = Campaign(name, folder, duration_s or DURATIONS_S[name])
     seen = training_runs(campaign, train, jobs)
-    unseen = flights(campaign, range(test_seed, test_seed + test), jobs)
+    unseen = flights(replace(campaign, keep_tracks=keep_tracks), range(test_seed, test_seed + test), jobs)
     return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
 
 
@@ -114,13 +140,14 @@ def judge(flown: ScenarioFlights) -> dict[str, MethodScores]:
 
 
 def markdown(results: Mapping[str, Mapping[str, MethodScores]]) -> str:
-    """One row per scenario and method: NEES per degree of freedom with 95 % intervals over flights, median, NLL."""
-    head = ["scenario", "method", "flights", *(f"NEES, {c}" for c in NEES_COLUMNS), "median", "NLL"]
+    """One row per scenario and method: NEES per degree of freedom with 95 % intervals over flights, median, NLL,
+    predicted over actual final error."""
+    head = ["scenario", "method", "flights", *(f"NEES, {c}" for c in NEES_COLUMNS), "median", "NLL", "final"]
     rows = [head, ["---"] * len(head)]
     for scenario, methods in results.items():
         for method, s in methods.items():
             cells = [_cell(s, i) for i in range(len(NEES_COLUMNS))]
-            ends = [f"{s.median.mean():.2f}", f"{s.nll.mean():.3f}"]
+            ends = [f"{s.median.mean():.2f}", f"{s.nll.mean():.3f}", f"{s.final_ratio:.2f}"]
             rows.append([scenario, method, str(len(s.nll)), *cells, *ends])
     return "\n".join(f"| {' | '.join(r)} |" for r in rows)
 
@@ -139,7 +166,8 @@ def document(results: Mapping[str, Mapping[str, MethodScores]]) -> dict[str, Any
         "columns": list(NEES_COLUMNS),
         "scenarios": {
             scenario: {
-                m: {"nees_dof": s.nees, "nees_dof_median": s.median, "nll_per_dim": s.nll} for m, s in methods.items()
+                m: {"nees_dof": s.nees, "nees_dof_median": s.median, "nll_per_dim": s.nll, "final_m": s.final_m}
+                for m, s in methods.items()
             }
             for scenario, methods in results.items()
         },
@@ -155,6 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="seed of the first test flight")
     parser.add_argument("--duration", type=float, help="of a flight [s]; default: far enough for 100 m")
     parser.add_argument("--together", action="store_true", help="also one model of all scenarios of equal rate")
+    parser.add_argument("--twins", type=int, default=0, help="also a model of so many twins of each test flight")
     parser.add_argument("--jobs", type=int, default=1, help="processes that fly")
     parser.add_argument("-o", "--out", type=Path, default=Path("scenarios"), help="folder for runs and results")
     given = parser.parse_args(arguments)
@@ -162,14 +191,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if unknown or given.train < 2 or given.test < 2:
         raise GpvoError(f"cannot judge {unknown or 'so few flights'}", cure="names of --help; two flights at least")
     refuse_training_seeds(given.train, given.test, given.test_seed)
-    results: dict[str, Mapping[str, MethodScores]] = {}
+    results: dict[str, dict[str, MethodScores]] = {}
     flown = []
     for name in given.scenarios:
         flown.append(
             fly(name, given.out, given.train, given.test, test_seed=given.test_seed, jobs=given.jobs,
-                duration_s=given.duration)
+                duration_s=given.duration, keep_tracks=given.twins > 0)
         )  # fmt: skip
         results[name] = judge(flown[-1])
+        if given.twins:
+            tolerance = points_scenario(load_scenario(name)).tolerance
+            results[name] |= score_by_twins(flown[-1].test, TwinSettings(given.twins, tolerance, name))
         print(markdown({name: results[name]}), flush=True)
     if given.together:
         results |= _together(flown)
@@ -177,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(markdown(results))
 
 
-def _together(flown: Sequence[ScenarioFlights]) -> dict[str, Mapping[str, MethodScores]]:
+def _together(flown: Sequence[ScenarioFlights]) -> dict[str, dict[str, MethodScores]]:
     """One model of all scenarios that share the first one's rate, judged on each."""
     step = float(np.median(flown[0].training[0].dt_s))
     alike = [f for f in flown if abs(float(np.median(f.training[0].dt_s)) / step - 1) < 0.01]

@@ -9,7 +9,7 @@ large" (2010). A landmark moves in the (u, v, d) of one of its own views, where 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ _HUBER_SIGMAS = 3.2
 _MIN_DEPTH_M, _MIN_DISPARITY_PX, _MIN_SIGMA_PX = 0.05, 0.05, 0.02
 # Iterations in which weights may change; then they stand, so that the cost has one minimum.
 _CHOOSING = 6
+_PART = 100_000
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,15 @@ class Observations:
         """(count, M) matrix that adds the rows of equal index."""
         m = len(index)
         return sparse.csr_matrix((np.ones(m), (index, np.arange(m))), shape=(count, m))
+
+    def parts(self) -> Iterator[tuple[slice, Observations]]:
+        """A hundred thousand at a time: matrices of each observation would need a gigabyte for a million."""
+        for i in range(0, len(self.frame), _PART):
+            rows = slice(i, i + _PART)
+            yield (
+                rows,
+                Observations(self.camera, self.frame[rows], self.track[rows], self.uvd[rows], self.trusted[rows]),
+            )
 
 
 @dataclass(frozen=True)
@@ -85,6 +95,7 @@ def adjust(
         if robust and 1 < iteration <= _CHOOSING:
             weight, sigma = _robust_weights(seen, now, sigma)
         root = np.sqrt(weight) / sigma[seen.frame]
+        normal = None  # frees the last one before the next is made
         normal = _Normal.of(seen, now, chart, root)
         cost = _cost(seen, now, root)
         for _ in range(8):
@@ -156,38 +167,36 @@ class _Normal:
 
     B: Array  # (F, 6, 6)
     C: Array  # (N, 3, 3)
-    E: sparse.bsr_matrix  # (6 F, 3 N)
-    E_blocks: Array  # (M, 6, 3)
-    pose_sums: sparse.csr_matrix
-    track: NDArray[np.int64]
+    E: sparse.bsr_matrix  # (6 F, 3 N), a block for each observation
+    seen: Observations
     pose_gradient: Array  # (F, 6)
     point_gradient: Array  # (N, 3)
 
     @classmethod
     def of(cls, seen: Observations, now: _Estimate, chart: _Chart, root_weight: Array) -> _Normal:
         n_frames, n_tracks = len(now.T_world_cam), len(now.points_world)
-        P = now.in_camera(seen)
-        r = root_weight[:, None] * ((seen.uvd - seen.camera.project(P)) @ WHITEN.T)
-        by_point = root_weight[:, None, None] * (WHITEN @ _projection_jacobian(P, seen.camera))
-        A = by_point @ np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
-        A[seen.frame == 0] = 0.0  # the first pose stays
+        B, C = np.zeros((n_frames, 6, 6)), np.zeros((n_tracks, 3, 3))
+        by_pose, by_point = np.zeros((n_frames, 6)), np.zeros((n_tracks, 3))
+        blocks = np.empty((len(seen.frame), 6, 3))
         R = now.T_world_cam[:, :3, :3]
         lift = R[seen.frame[chart.view]] @ point_jacobian(now.uvd(chart, seen), seen.camera)
-        D = by_point @ np.swapaxes(R[seen.frame], 1, 2) @ lift[seen.track]
-        At, Dt = np.swapaxes(A, 1, 2), np.swapaxes(D, 1, 2)
-        by_frame, by_track = seen.sums(seen.frame, n_frames), seen.sums(seen.track, n_tracks)
-        blocks = At @ D
+        for rows, part in seen.parts():
+            P, root = now.in_camera(part), root_weight[rows]
+            r = (root[:, None] * ((part.uvd - seen.camera.project(P)) @ WHITEN.T))[:, :, None]
+            slope = root[:, None, None] * (WHITEN @ _projection_jacobian(P, seen.camera))
+            A = slope @ np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
+            A[part.frame == 0] = 0.0  # the first pose stays
+            D = slope @ np.swapaxes(R[part.frame], 1, 2) @ lift[part.track]
+            At, Dt = np.swapaxes(A, 1, 2), np.swapaxes(D, 1, 2)
+            by_frame, by_track = part.sums(part.frame, n_frames), part.sums(part.track, n_tracks)
+            B += _summed(by_frame, At @ A)
+            C += _summed(by_track, Dt @ D)
+            by_pose += _summed(by_frame, (At @ r)[:, :, 0])
+            by_point += _summed(by_track, (Dt @ r)[:, :, 0])
+            blocks[rows] = At @ D
         starts = np.searchsorted(seen.frame, np.arange(n_frames + 1))
-        return cls(
-            B=_summed(by_frame, At @ A),
-            C=_summed(by_track, Dt @ D),
-            E=sparse.bsr_matrix((blocks, seen.track, starts), shape=(6 * n_frames, 3 * n_tracks)),
-            E_blocks=blocks,
-            pose_sums=by_frame,
-            track=seen.track,
-            pose_gradient=_summed(by_frame, (At @ r[:, :, None])[:, :, 0]),
-            point_gradient=_summed(by_track, (Dt @ r[:, :, None])[:, :, 0]),
-        )
+        E = sparse.bsr_matrix((blocks, seen.track, starts), shape=(6 * n_frames, 3 * n_tracks))
+        return cls(B, C, E, seen, by_pose, by_point)
 
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Steps (F, 6) and (N, 3) of the damped equations."""
@@ -208,11 +217,11 @@ class _Normal:
 
     def _taken(self, C_inverse: Array) -> Array:
         """(F, 6, 6) diagonal blocks of ``E C^-1 E^T``, a part of the observations at a time."""
-        total, part = np.zeros_like(self.B), 100_000
-        for i in range(0, len(self.track), part):
-            blocks = self.E_blocks[i : i + part]
-            taken = blocks @ C_inverse[self.track[i : i + part]] @ np.swapaxes(blocks, 1, 2)
-            total += _summed(self.pose_sums[:, i : i + part], taken)
+        total = np.zeros_like(self.B)
+        for rows, part in self.seen.parts():
+            blocks = self.E.data[rows]
+            taken = blocks @ C_inverse[part.track] @ np.swapaxes(blocks, 1, 2)
+            total += _summed(part.sums(part.frame, len(total)), taken)
         return total
 
 

@@ -14,6 +14,8 @@ from gpvo.runner import config_of
 from gpvo.twin.adjustment import Observations, Structure, adjust, without_loose_frames
 from gpvo.types import Array
 from gpvo.vo.config import VoConfig
+from gpvo.vo.rig_error import RigError, RigState
+from gpvo.vo.rig_findings import STATE_FILE, read_state
 
 MIN_POINTS = 12
 """A run whose median motion has fewer inliers is refused: path, landmarks and noise cannot be told apart."""
@@ -22,10 +24,12 @@ MIN_POINTS = 12
 @dataclass(frozen=True)
 class Original:
     """A run with its structure. ``noise_px`` (M, 3): residuals of the observations as large as the noise was;
-    ``first`` (M,) the first observation of each track; ``repeats`` (F,) frames that repeat the one before."""
+    ``first`` (M,) the first observation of each track; ``repeats`` (F,) frames that repeat the one before. ``rig``:
+    what odometry found of its calibration's errors; measurements are ``seen`` without them."""
 
     run: Run
     config: VoConfig
+    rig: RigState
     seen: Observations
     structure: Structure
     noise_px: Array
@@ -54,13 +58,16 @@ def estimate(path: Path) -> Original:
     first[np.unique(track, return_index=True)[1]] = True
     _refuse_too_few(frame[tracks.is_inlier & ~first], len(t_ns), path)
     repeats = np.array(["frozen" in r.reason for r in run.log])
-    seen = Observations(run.log.camera, frame, track, tracks.uvd, tracks.is_inlier & ~repeats[frame])
+    camera = run.log.camera
+    rig = read_state(path, camera) if (path / STATE_FILE).is_file() else RigState.exact()
+    uvd = RigError(camera, rig, learn=False).correct(tracks.uvd)
+    seen = Observations(camera, frame, track, uvd, tracks.is_inlier & ~repeats[frame])
     structure = without_loose_frames(adjust(seen, run.log.trajectory()), seen, t_ns)
     if not np.isfinite(structure.residual_px).all():
         raise SourceError(
             "its structure cannot be estimated: the fit does not hold", where=path, cure="look at the run"
         )
-    return Original(run, config_of(path), seen, structure, _noise(seen, structure), first, repeats)
+    return Original(run, config_of(path), rig, seen, structure, _noise(seen, structure), first, repeats)
 
 
 def _refuse_too_few(frame: NDArray[np.int64], n_frames: int, path: Path) -> None:

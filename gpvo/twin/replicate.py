@@ -20,6 +20,7 @@ from gpvo.io.toml import read_toml
 from gpvo.runner import run as run_odometry
 from gpvo.twin.estimate import Original, estimate
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
+from gpvo.vo.rig_error import N_TERMS, RigError, principal_errors
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
     """One twin. Equal settings and replicate give equal twins."""
     run, seen = original.run, original.seen
     rng = np.random.default_rng([settings.seed, replicate, 29])
-    rig = TrueRig.of(seen.camera, settings.tolerance, rig_errors(settings)[replicate])
-    uvd = _projected(original, rig) + _drawn_noise(original, rng)
+    pixels = _projected(original, settings, replicate)
+    noise = _drawn_noise(original, rng)
+    uv_left, uv_right = pixels[0] + noise[:, :2], pixels[1] + noise[:, :2] - noise[:, 2:] * [1.0, 0.0]
     t_ns = run.log.t_ns
     starts = np.searchsorted(seen.frame, np.arange(len(t_ns) + 1))
     frames: list[TrackFrame] = []
@@ -72,35 +74,45 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
         if original.repeats[k] and frames:
             frames.append(replace(frames[-1], t_ns=int(t)))
             continue
-        left = uvd[rows, :2]
-        right = left - np.stack([uvd[rows, 2], np.zeros(len(left))], axis=1)
-        frames.append(TrackFrame(int(t), seen.track[rows], left, right))
+        frames.append(TrackFrame(int(t), seen.track[rows], uv_left[rows], uv_right[rows]))
     name = f"{run.name}-twin{replicate}"
     truth = TruthLog(t_ns, original.structure.T_world_cam)
     return TwinSource(name, run.path, seen.camera, run.mounting, run.imu, truth, frames, (int(t_ns[0]), int(t_ns[-1])))
 
 
 def rig_errors(settings: TwinSettings) -> Array:
-    """(replicates, 5) how wrong the rig of each twin is, in sigma.
+    """(replicates, 8) how wrong the rig of each twin is, in sigma: baseline, focal length, and what turns the right
+    picture, the largest effects first.
 
-    Drawn at random, then made uncorrelated and of unit size over the replicates (moment matching), as a handful of
-    draws would show a covariance of five numbers wrongly by chance; of five or fewer that cannot be.
+    Drawn at random; then the first five are made uncorrelated and of unit size over the replicates (moment matching),
+    as a handful of draws would show a covariance of five numbers wrongly by chance; of five or fewer that cannot be.
     """
     n = settings.replicates
-    drawn = np.random.default_rng([settings.seed, 29]).standard_normal((n, RIG_ERRORS))
-    if n <= RIG_ERRORS:
-        return drawn
-    return drawn @ np.linalg.inv(np.linalg.cholesky(drawn.T @ drawn / n)).T
+    drawn = np.random.default_rng([settings.seed, 29]).standard_normal((n, 2 + N_TERMS))
+    matched = drawn[:, :RIG_ERRORS]
+    if n > RIG_ERRORS:
+        drawn[:, :RIG_ERRORS] = matched @ np.linalg.inv(np.linalg.cholesky(matched.T @ matched / n)).T
+    return drawn
 
 
-def _projected(original: Original, rig: TrueRig) -> Array:
-    """(M, 3) what the rig sees of the landmarks without noise, as (u, v, d) [px]."""
-    seen, s = original.seen, original.structure
+def _projected(original: Original, settings: TwinSettings, replicate: int) -> tuple[Array, Array]:
+    """Left and right pixels (M, 2) of the landmarks in the rig of a twin, without noise.
+
+    Baseline and focal length are drawn from the tolerance; what displaces the right picture from what odometry found of
+    its rig, mean and covariance; where it looked for nothing (without self-calibration), as a turn from the tolerance.
+    """
+    seen, s, known = original.seen, original.structure, original.rig
+    e, camera = rig_errors(settings)[replicate], seen.camera
+    tolerance = replace(settings.tolerance, rotation_rad=0.0) if known.covariance.any() else settings.tolerance
     T = se3.inverse(s.T_world_cam)[seen.frame]
     P = np.einsum("mij,mj->mi", T[:, :3, :3], s.points_world[seen.track]) + T[:, :3, 3]
     P[:, 2] = np.maximum(P[:, 2], 0.05)
-    left, right = rig.pixels(P)
-    return np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), left[:, 0] - right[:, 0]], axis=1)
+    left, right = TrueRig.of(camera, tolerance, e[:RIG_ERRORS]).pixels(P)
+    drawn = replace(known, mean=known.mean + np.append(principal_errors(known, camera) @ e[2:], np.zeros(N_TERMS)))
+    displaced_d, displaced_row = RigError(camera, drawn, learn=False).errors(
+        np.stack([left[:, 0], left[:, 1], left[:, 0] - right[:, 0]], axis=1)
+    )
+    return left, right + np.stack([-displaced_d, displaced_row], axis=1)
 
 
 def _drawn_noise(original: Original, rng: np.random.Generator) -> Array:

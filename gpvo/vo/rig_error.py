@@ -61,6 +61,16 @@ def prior_covariance(camera: StereoCamera) -> Array:
     return np.diag(free**2) + _TURN_RAD**2 * turns
 
 
+def principal_errors(state: RigState, camera: StereoCamera) -> Array:
+    """(6, 6) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the picture
+    most come first."""
+    values, vectors = np.linalg.eigh(state.covariance[_DX, _DX])
+    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
+    y, x = (f.ravel() for f in np.mgrid[-1:1:7j, -1:1:9j])
+    over = terms(0.5 * camera.width / camera.fx_px * x, 0.5 * camera.height / camera.fy_px * y)
+    return np.asarray(root @ np.linalg.svd(over.T @ root)[2].T, np.float64)
+
+
 @dataclass(frozen=True)
 class RigState:
     """Coefficients of dx and dy as known: ``mean`` (12,) and ``covariance`` (12, 12), in the order of :data:`TERMS`.

@@ -16,7 +16,7 @@ from gpvo.evaluation.scenario_experiment import MethodScores, fly, judge, main, 
 
 
 def _scores(nees: list[list[float]]) -> MethodScores:
-    return MethodScores(np.array(nees), np.ones(len(nees)), np.zeros(len(nees)))
+    return MethodScores(np.array(nees), np.ones(len(nees)), np.zeros(len(nees)), np.ones((len(nees), 2)))
 
 
 def test_a_horizon_that_no_flight_reaches_is_left_blank():

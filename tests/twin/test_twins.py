@@ -18,6 +18,7 @@ from gpvo.twin.estimate import estimate
 from gpvo.twin.replicate import TwinSettings, make_twins, read_tolerance, rig_errors, twin_source
 from gpvo.types import StereoCamera
 from gpvo.vo.config import VoConfig
+from gpvo.vo.rig_error import RigState
 from typer.testing import CliRunner
 
 
@@ -92,7 +93,7 @@ def test_frames_without_tracks_stay_without(flown):
 def test_each_twin_draws_its_own_rig(flown):
     original = estimate(flown[0] / "run")
     wide = TwinSettings(tolerance=Tolerance(baseline=0.05))
-    e = rig_errors(wide)
+    e = rig_errors(wide)[:, :5]
     assert np.allclose(e.T @ e / len(e), np.eye(5))
     assert np.ptp(e[:, 0]) > 1.0
     disparity = [
@@ -100,6 +101,24 @@ def test_each_twin_draws_its_own_rig(flown):
         for k in range(6)
     ]
     assert 0.01 < np.std(disparity) / np.mean(disparity) < 0.15
+
+
+def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(flown):
+    original = estimate(flown[0] / "run")
+    fx = original.seen.camera.fx_px
+    mean, covariance = np.zeros(12), np.zeros((12, 12))
+    mean[[0, 6]], covariance[0, 0] = (2e-3, 1e-3), 3e-4**2  # the right picture too far right, and too low
+
+    def right(rig, k):
+        frames = twin_source(replace(original, rig=rig), TwinSettings(), k).frames
+        return np.concatenate([f.uv_right for f in frames])
+
+    shift = np.stack([right(RigState(mean, covariance, 1.0), k).mean(axis=0) for k in range(8)])
+    noise = np.stack([right(RigState.exact(), k).mean(axis=0) for k in range(8)])
+    x, y = (shift - noise).T / fx
+    assert y == pytest.approx(1e-3, rel=1e-3)
+    # Moment matching: over eight twins the draws have unit size exactly.
+    assert np.sqrt(np.mean((x - 2e-3) ** 2)) == pytest.approx(3e-4, rel=1e-3)
 
 
 def test_ratios_of_real_to_twin_errors(flown):
