@@ -6,6 +6,7 @@ Frame of every motion, covariance, error and feature: the rectified left optical
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
@@ -321,6 +322,8 @@ class MotionError:
       of the bias, then six of errors of calibration, whose L changes sign with the motion.
 
     ``dt_s`` (...): duration. ``status``: of the motion, one for all of a batch; of a ``lost`` one nothing was measured.
+    ``nu``: degrees of freedom of the Student-t that the error of one motion has, ``covariance`` being its second
+    moment; infinite for a Gaussian. Filters go by the covariance.
     """
 
     mean: Array
@@ -330,6 +333,7 @@ class MotionError:
     persistent_tau_s: Array
     dt_s: float | Array = 0.0
     status: Status = Status.OK
+    nu: float = math.inf
 
     @classmethod
     def independent(
@@ -377,6 +381,7 @@ class MotionError:
             persistent_tau_s=self.persistent_tau_s,
             dt_s=self.dt_s,
             status=self.status,
+            nu=self.nu,
         )
 
     def row(self: _Error, k: Any) -> _Error:

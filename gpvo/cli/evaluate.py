@@ -241,7 +241,7 @@ def _print(d: dict[str, Any]) -> None:
             _text(m["nees_dof_median"][block]),
             _pair(m["one_second"]["nees_dof"], m["one_second"]["nees_dof_truth_noise"]),
             " ".join(f"{100 * c:.0f}" for c in m["coverage"].values()),
-            _text(m["nll_per_dim"]),
+            _pair(m["nll_per_dim"], m["nll_stated_per_dim"]),
             _text(m["predicted_final_error_m"]),
         )
     if table.row_count:

@@ -197,11 +197,12 @@ def _print_table(document: dict[str, Any]) -> None:
     table.add_column("method", no_wrap=True)
     for k in range(len(document["folds"])):
         table.add_column(str(k + 1), justify="right")
-    for name in ("mean", "median", "1 sigma", "NLL/axis"):
+    for name in ("mean", "median", "1 sigma", "NLL/axis", "as stated"):
         table.add_column(name, justify="right")
     for method, mean in document["mean"].items():
         per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
-        rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"], mean["nll_per_dim"]]
+        rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"]]
+        rest += [mean["nll_per_dim"], mean["nll_stated_per_dim"]]
         if any(v is not None for v in (*per_fold, *rest)):
             table.add_row(method, *(_text(v) for v in (*per_fold, *rest)))
     console = Console(width=max(Console().width, 120), highlight=False, markup=False)

@@ -21,6 +21,7 @@ from gpvo.stats.consistency import (
     crps_gaussian,
     energy_score,
     nees,
+    nees_median,
     nll_per_dim,
 )
 from gpvo.types import Array, MotionError, VoLog
@@ -54,7 +55,9 @@ class Consistency:
 
     ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise``: the same with the
     truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the axes.
-    ``energy_*``, ``correlation_gain_nats`` and the quartiles ``*_by_difficulty``: see :mod:`gpvo.stats.consistency`.
+    ``nll_per_dim`` is that of a Gaussian, ``nll_stated_per_dim`` that of the stated Student-t, which expects a median
+    of ``nees_dof_median_stated``. ``energy_*``, ``correlation_gain_nats`` and the quartiles ``*_by_difficulty``: see
+    :mod:`gpvo.stats.consistency`.
     ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames.
     """
 
@@ -65,6 +68,8 @@ class Consistency:
     nees_dof_truth_noise: dict[str, float | None]
     coverage: tuple[float, float, float]
     nll_per_dim: float | None
+    nll_stated_per_dim: float | None
+    nees_dof_median_stated: float
     crps_translation_m: float
     crps_rotation_rad: float | None
     energy_translation_m: float
@@ -119,6 +124,8 @@ def consistency(
         nees_dof_truth_noise={n: float(with_noise[n].mean()) if n in with_noise else None for n in BLOCKS},
         coverage=(covered[0], covered[1], covered[2]),
         nll_per_dim=float(nll_per_dim(e, C).mean()) if d == 6 else None,
+        nll_stated_per_dim=float(nll_per_dim(e, C, statement.nu).mean()) if d == 6 else None,
+        nees_dof_median_stated=nees_median(d, statement.nu) / d,
         crps_translation_m=float(crps[:, :3].mean()),
         crps_rotation_rad=float(crps[:, 3:].mean()) if d == 6 else None,
         energy_translation_m=float(energy_score(e[:, :3], C[:, :3, :3]).mean()),

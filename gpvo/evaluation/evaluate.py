@@ -218,6 +218,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS of vectors; it rewards sharp and honest
       statements alike. ``correlation_gain_nats``: by how much the stated correlations make the errors likelier.
       ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.
+    * ``nll_per_dim`` takes every statement as Gaussian; ``nll_stated_per_dim`` is of the stated density, a Student-t
+      for models that learnt their tails, and ``nees_dof_median_stated`` the median NEES/dof that it expects.
     * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``z2_truth_noise``, ``count``}: of the motion over windows
       of a second, joint and (6,) by axis; ``horizons`` are the same over lengths of path.
     * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
@@ -286,6 +288,7 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
         return {
             "nees_dof": none, "nees_dof_interval": none, "nees_dof_median": none, "nees_dof_truth_noise": none,
             "coverage": dict.fromkeys("123"), "nll_per_dim": None,
+            "nll_stated_per_dim": None, "nees_dof_median_stated": None,
             "crps": {"translation_m": None, "rotation_rad": None},
             "energy": {"translation_m": None, "rotation_rad": None}, "correlation_gain_nats": None,
             "by_difficulty": {"nees_dof": None, "coverage": None}, "predicted_final_error_m": None,
@@ -300,6 +303,8 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
         "nees_dof_truth_noise": c.nees_dof_truth_noise,
         "coverage": dict(zip("123", c.coverage, strict=True)),
         "nll_per_dim": c.nll_per_dim,
+        "nll_stated_per_dim": c.nll_stated_per_dim,
+        "nees_dof_median_stated": c.nees_dof_median_stated,
         "crps": {"translation_m": c.crps_translation_m, "rotation_rad": c.crps_rotation_rad},
         "energy": {"translation_m": c.energy_translation_m, "rotation_rad": c.energy_rotation_rad},
         "correlation_gain_nats": c.correlation_gain_nats,

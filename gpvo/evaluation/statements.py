@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -27,6 +28,11 @@ class Statement:
     mean: Array
     covariance: Array
     errors: Sequence[MotionError] | None
+
+    @property
+    def nu(self) -> float:
+        """Stated degrees of freedom of a motion's error: the fewest of all, infinite for Gaussian ones."""
+        return min((e.nu for e in self.errors or ()), default=math.inf)
 
     @property
     def dof(self) -> int:

@@ -110,6 +110,8 @@ def read_predictions(path: str | Path) -> list[Prediction]:
     numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
     if not np.isfinite(numbers).all():
         raise SourceError("holds a prediction that is not finite", where=p)
+    if not all(q.nu > 2.0 for q in predictions):
+        raise SourceError("holds a prediction without a second moment: its 'nu' is not above 2", where=p)
     _check_covariances(np.array([q.covariance for q in predictions]), "predicted covariance", p)
     for part in ("jitter", "white"):
         _check_covariances(np.array([getattr(q, part) for q in predictions]), f"covariance '{part}'", p, semi=True)

@@ -8,6 +8,7 @@ for x, y, z [m] and the rotations about x, y, z [rad]; ``vt_<method>_<i><j>`` is
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -168,7 +169,7 @@ def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
     """Predictions as columns: ``mean_*``, ``cov_total_<i><j>``, ``cov_<part>_<i><j>``, ``bias_tau_*_s``, ...
 
     ``cov_bias`` is all that persists. Of models with errors of calibration, ``root_calibration_<i><j>`` and
-    ``calibration_tau_*_s`` besides.
+    ``calibration_tau_*_s`` besides; ``nu`` where the tails are heavier than a Gaussian's.
     """
     out: Columns = {
         "t_ns": [p.t_ns for p in predictions],
@@ -177,6 +178,8 @@ def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
         "confidence": [float(p.confidence) for p in predictions],
         "in_domain": [float(p.in_domain) for p in predictions],
     }
+    if any(math.isfinite(p.nu) for p in predictions):
+        out["nu"] = [p.nu for p in predictions]
     tau = [p.persistent_tau_s for p in predictions]
     for i, axis in enumerate(_SIGMA6):
         out[f"mean_{axis}"] = [float(p.mean[i]) for p in predictions]
@@ -233,6 +236,7 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
             epistemic=epistemic[k],
             confidence=float(columns["confidence"][k]),
             in_domain=float(columns["in_domain"][k]),
+            nu=float(columns["nu"][k]) if "nu" in columns else math.inf,
         )
         for k in range(n)
     ]

@@ -32,6 +32,8 @@ from gpvo.online.basis import ProjectedGP
 from gpvo.online.division import divide, ln_faster, of_calibration
 from gpvo.online.estimate import NO_CALIBRATION, ErrorModelArrays
 from gpvo.online.guard import Domain
+from gpvo.stats import student_t
+from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
 
@@ -74,6 +76,7 @@ def assemble(
         rate_change_var=rate_changes(rows),
         mean_in_sigma=np.array([True]),
         steady_mean=np.zeros(6),
+        nu=np.zeros(1),
         dt_s=rows.step_s,
         **sums.arrays,
     )
@@ -171,6 +174,7 @@ def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
     whole = _whole(parts, root)
     joint = fit_joint_factor(of.error, whole, of.rows.group)
     losses = pose_losses(*_motions(model, of, parts * joint, root * np.sqrt(joint)))
+    nu = student_t.fit_dof(nees(of.error, whole * joint), of.error.shape[1], of.rows.weight)
     typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
     model = replace(
         model,
@@ -178,6 +182,7 @@ def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
         level=model.level + np.log(joint),
         typical_ln_det=np.array([typical]),
         calibration_patterns=model.calibration_patterns * np.sqrt(joint),
+        nu=np.array([0.0 if np.isinf(nu) else nu]),
     )
     return _Consistent(model, added, joint, losses)
 
@@ -249,6 +254,7 @@ def _calibration(rows: Rows, scale: Scale, found: _Consistent, sums: _Sums, scor
         "log_scale_spread": scale.spread,
         "joint_factor": found.joint,
         "added_factor": found.added,
+        "nu": float(found.model.nu[0]) or None,
         "calibration_part": sums.patterns is not None,
         "geometry_correlation_weight": sums.geometry_weight,
         "interval_levels": LEVELS,

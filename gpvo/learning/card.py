@@ -101,11 +101,12 @@ def _scores(table: Mapping[str, Any]) -> str:
     lines = [
         "## Scores on sequences left out",
         "",
-        "| method | NEES/dof | median | within 1 sigma | NLL per axis |",
-        "| --- | --- | --- | --- | --- |",
+        "| method | NEES/dof | median | within 1 sigma | NLL per axis, Gaussian | as stated |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for method, s in table["mean"].items():
-        numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"], s["nll_per_dim"]]
+        numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"]]
+        numbers += [s["nll_per_dim"], s["nll_stated_per_dim"]]
         if any(v is not None for v in numbers):
             lines.append(f"| {method} | " + " | ".join(_number(v) for v in numbers) + " |")
     c = table["comparison"]
@@ -143,10 +144,17 @@ def _calibration(h: Mapping[str, Any]) -> str:
             "## Calibration",
             "",
             f"By {c['by']} ({c['groups']} left out in turn).{marked}",
+            _tails(h["calibration"]),
             f"Half widths in sigma that covered left-out data on the first axis: {widths}.",
             *(["These sequences differ in the camera's calibration; errors of that are a part of their own."] * apart),
         ]
     )
+
+
+def _tails(calibration: Mapping[str, Any]) -> str:
+    nu = calibration.get("nu")
+    shape = "Gaussian" if nu is None else f"a Student-t with {nu:.1f} degrees of freedom"
+    return f"The error of one motion is stated as {shape}; the covariance is its second moment."
 
 
 def _domain(h: Mapping[str, Any]) -> str:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from gpvo.stats.consistency import coverage, crps_gaussian, nees, nll_per_dim
+from gpvo.stats.consistency import coverage, crps_gaussian, nees, nees_median, nll_per_dim
 from gpvo.types import Array
 
 _BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
 
 
-def score(error: Array, mean: Array, covariance: Array) -> dict[str, Any]:
-    """Of errors (n, 6), predicted means (n, 6) and covariances (n, 6, 6) about them.
+def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) -> dict[str, Any]:
+    """Of errors (n, 6), predicted means (n, 6) and covariances (n, 6, 6) about them, and the stated degrees of freedom.
+
+    ``nll_per_dim`` is that of the Gaussian of these covariances, ``nll_stated_per_dim`` that of the stated Student-t;
+    ``nees_dof_median_stated`` the median that the latter expects of NEES.
 
     A covariance that speaks of the translation alone is (n, 3, 3): fields that need the rotation are then None.
     Rows whose covariance is not finite are left out; with none left every field is None.
@@ -35,6 +39,8 @@ def score(error: Array, mean: Array, covariance: Array) -> dict[str, Any]:
         "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in _BLOCKS},
         "coverage": {str(k + 1): float(c) for k, c in enumerate(level)},
         "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if d == 6 else None,
+        "nll_stated_per_dim": float(np.mean(nll_per_dim(residual, covariance, nu))) if d == 6 else None,
+        "nees_dof_median_stated": nees_median(d, nu) / d,
         "crps": {
             "translation_m": float(crps[:, :3].mean()),
             "rotation_rad": float(crps[:, 3:].mean()) if d == 6 else None,
@@ -51,6 +57,8 @@ def empty() -> dict[str, Any]:
         "nees_dof_median": dict.fromkeys(_BLOCKS),
         "coverage": dict.fromkeys("123"),
         "nll_per_dim": None,
+        "nll_stated_per_dim": None,
+        "nees_dof_median_stated": None,
         "crps": dict.fromkeys(("translation_m", "rotation_rad")),
         "rmse_raw": dict.fromkeys(("translation_m", "rotation_rad")),
         "rmse_corrected": dict.fromkeys(("translation_m", "rotation_rad")),

@@ -55,6 +55,7 @@ _OWN = (
     "steady_mean",
     "calibration_patterns",
     "calibration_tau_s",
+    "nu",
 )
 
 
@@ -89,7 +90,7 @@ class ErrorModelArrays:
     GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
     ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``calibration_patterns`` (6, 6, 6):
     the ways of a calibration to be wrong (see :func:`gpvo.online.division.of_calibration`), and ``calibration_tau_s``
-    (6,), how long each stays the same.
+    (6,), how long each stays the same. ``nu`` (1,): degrees of freedom of a single motion's error, 0 for a Gaussian.
     """
 
     columns: tuple[str, ...]
@@ -114,6 +115,7 @@ class ErrorModelArrays:
     steady_mean: Array
     calibration_patterns: Array
     calibration_tau_s: Array
+    nu: Array
     dt_s: float
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -138,7 +140,8 @@ class ErrorModelArrays:
         try:
             # Velocities that have nothing to do with each other, where an older file does not say.
             unrelated = np.tile(2.0 * arrays["usual_rate_var"], (len(COASTED), 1))
-            arrays = {"steady_mean": np.zeros(6), "rate_change_var": unrelated, **NO_CALIBRATION, **arrays}
+            absent = {"nu": np.zeros(1), "steady_mean": np.zeros(6), "rate_change_var": unrelated}
+            arrays = {**absent, **NO_CALIBRATION, **arrays}
             own = {name: arrays[name] for name in _OWN}
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
@@ -176,6 +179,7 @@ class ErrorModelArrays:
             persistent_root=stated.persistent_root,
             persistent_tau_s=stated.persistent_tau_s,
             dt_s=v.dt_s,
+            nu=self.degrees_of_freedom,
             epistemic=variance * (1.0 - v.known / unlimited),
             confidence=place.in_domain * precision,
             in_domain=place.in_domain,
@@ -197,6 +201,11 @@ class ErrorModelArrays:
             return np.ones(len(inside))
         k = self._base_place[0][-1]
         return np.asarray(np.exp(inside[:, k] * self.domain.scale[k] + self.domain.centre[k]))
+
+    @cached_property
+    def degrees_of_freedom(self) -> float:
+        """Of the Student-t that a single motion's error has; infinite for a Gaussian."""
+        return float(self.nu[0]) or np.inf
 
     @cached_property
     def _has_steady_mean(self) -> bool:

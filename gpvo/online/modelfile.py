@@ -13,8 +13,8 @@ files lack what is marked optional:
 * ``inputs``, ``factor``, ``outside_power``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``growth``,
   ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``, ``usual_rate_var``,
   ``mean_in_sigma``: see :class:`gpvo.online.estimate.ErrorModelArrays`;
-* ``steady_mean`` (6,), ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,)
-  (all optional): the same class;
+* ``steady_mean`` (6,), ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,),
+  ``nu`` (1,) (all optional): the same class;
 * ``for_filter.*`` (optional): those of these arrays in which the model for filters differs;
 * ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;

@@ -252,6 +252,7 @@ class Predictor:
             persistent_root=said.persistent_root * scale[:, None],
             persistent_tau_s=said.persistent_tau_s,
             dt_s=record.dt_s,
+            nu=said.nu,
             status=status,
             t_ns=t_ns,
             epistemic=np.minimum(said.epistemic * scale**2, variance),

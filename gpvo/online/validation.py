@@ -107,6 +107,7 @@ _ARRAYS: dict[str, ArraySpec] = {
     "steady_mean": ArraySpec((6,), low=-1e6, high=1e6),
     "calibration_patterns": ArraySpec((6, 6, 6), low=-1e6, high=1e6),
     "calibration_tau_s": _positive(6),
+    "nu": ArraySpec((1,), low=0.0, high=1e6),
     "theta": _not_negative(6, 5),
     "theta_plain": _not_negative(6, 5),
     "domain.scale": _positive("d"),

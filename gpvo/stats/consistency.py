@@ -1,4 +1,4 @@
-"""Is a stated covariance honest? NEES, coverage, NLL and CRPS of Gaussian statements.
+"""Is a stated covariance honest? NEES, coverage, CRPS of Gaussian statements; NLL of those and of Student-t ones.
 
 NEES: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
 section 5.4.2. CRPS of a Gaussian and energy score: T. Gneiting, A. Raftery, "Strictly Proper Scoring Rules,
@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from gpvo.stats import student_t
 from gpvo.types import Array
 
 _SQRT2 = math.sqrt(2.0)
@@ -37,14 +38,24 @@ def nees(error: Array, covariance: Array) -> Array:
     return (whiten(error, covariance) ** 2).sum(-1)
 
 
-def nll_per_dim(error: Array, covariance: Array) -> Array:
-    """Joint Gaussian negative log-likelihood divided by the dimension [nats]. -> (...)."""
+def nees_median(d: int, nu: float = math.inf) -> float:
+    """Median of the NEES of a d-variate t with ``nu`` degrees of freedom and the stated second moment: by summing up
+    its density over the squared distance."""
+    ln_squared = np.linspace(-30.0, 40.0, 20_001)
+    ln_share = 0.5 * d * ln_squared - student_t.joint_nll(np.exp(ln_squared), d, nu)
+    below = np.cumsum(np.exp(ln_share - ln_share.max()))
+    return float(np.exp(np.interp(0.5 * below[-1], below, ln_squared)))
+
+
+def nll_per_dim(error: Array, covariance: Array, nu: float = math.inf) -> Array:
+    """Joint negative log-likelihood divided by the dimension [nats], of a Student-t with ``nu`` degrees of freedom
+    whose second moment is ``covariance``; of a Gaussian by default. -> (...)."""
     error, covariance = _checked(error, covariance)
     L = np.linalg.cholesky(covariance)
     z = np.linalg.solve(L, error[..., None])[..., 0]
     log_det = 2.0 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
     d = error.shape[-1]
-    return 0.5 * ((z**2).sum(-1) + log_det + d * math.log(2 * math.pi)) / d
+    return (student_t.joint_nll((z**2).sum(-1), d, nu) + 0.5 * log_det) / d
 
 
 def coverage(error: Array, sigma: Array, levels: tuple[float, ...] = (1.0, 2.0, 3.0)) -> Array:

@@ -20,6 +20,9 @@ NU = 5.0
 NU_MIN = 3.0
 """Below this the second moment of a fit says more about the fit than about the data."""
 
+LEAST_NU = 2.5
+"""Of a stated density: with fewer, nearly all of its second moment lies in errors that are hardly ever seen."""
+
 NU_GAUSSIAN = 60.0
 """From here on a Gaussian is taken: the second moments differ by 3 %."""
 
@@ -70,6 +73,32 @@ def fit(ratio: Array, count: Array | None = None, *, heavy: bool = True) -> tupl
     if nu >= NU_GAUSSIAN or _loss(ratio, count, nu) >= 0.5 * (gaussian[1] + 1.0 + math.log(2 * np.pi)):
         return gaussian
     return nu, _log_scale(ratio, count, nu)
+
+
+def joint_nll(squared: Array, d: int, nu: float) -> Array:
+    """Negative log density [nats] of a d-variate t of unit second moment, from squared Mahalanobis distances (...).
+
+    S. Kotz, S. Nadarajah, "Multivariate t Distributions and Their Applications" (2004), equation 1.1, whose scale
+    matrix has the second moment ``nu / (nu - 2)``.
+    """
+    if math.isinf(nu):
+        return np.asarray(0.5 * (squared + d * math.log(2.0 * math.pi)))
+    constant = math.lgamma(0.5 * nu) - math.lgamma(0.5 * (nu + d)) + 0.5 * d * math.log((nu - 2.0) * math.pi)
+    return np.asarray(constant + 0.5 * (nu + d) * np.log1p(squared / (nu - 2.0)))
+
+
+def fit_dof(squared: Array, d: int, count: Array) -> float:
+    """Degrees of freedom of a d-variate t of unit second moment, by squared Mahalanobis distances (n,).
+
+    ``count`` (n,): how often each row counts. The tails alone are fitted: the second moment is given.
+    """
+
+    def loss(ln_excess: float) -> float:
+        return float(count @ joint_nll(squared, d, 2.0 + math.exp(ln_excess)))
+
+    ln_excess = _minimum(loss, math.log(LEAST_NU - 2.0), math.log(2.0 * NU_GAUSSIAN))
+    nu = 2.0 + math.exp(ln_excess)
+    return math.inf if nu >= NU_GAUSSIAN or loss(ln_excess) >= count @ joint_nll(squared, d, math.inf) else nu
 
 
 def second_moment(square: Array) -> float:

@@ -89,6 +89,7 @@ def some_model(
         mean_in_sigma=np.array([in_sigma]),
         steady_mean=np.zeros(6),
         **NO_CALIBRATION,
+        nu=np.array([4.5]),
         dt_s=0.1,
     )
 
@@ -185,6 +186,7 @@ class CEstimate(ctypes.Structure):
         ("epistemic", ctypes.c_double * 6),
         ("in_domain", ctypes.c_double),
         ("confidence", ctypes.c_double),
+        ("nu", ctypes.c_double),
         ("distance", ctypes.c_double),
     ]
 
@@ -225,6 +227,7 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
     for name in ("covariance", *PARTS):
         shaped[name] = shaped[name].reshape(-1, 6, 6)
     assert_equal(shaped, model.estimate(X, geometry, dt_s))
+    assert {o.nu for o in found} == {model.nu[0]}
     none = CEstimate()
     run(np.ascontiguousarray(X[0]).ctypes.data_as(pointer), None, ctypes.c_double(0.0), ctypes.byref(none))
     np.testing.assert_allclose(np.array(none.covariance).reshape(6, 6), model.estimate(X[:1]).covariance[0], rtol=1e-5)

@@ -55,6 +55,29 @@ def test_consistent_on_unseen_flights():
     assert 0.8 <= np.mean(per_flight) <= 1.25
 
 
+def test_heavy_tails_are_stated_and_carried_to_the_prediction(tmp_path):
+    """Each motion's error by a draw of its own wider or narrower: a Student-t of four degrees of freedom."""
+
+    def heavy(seeds):
+        rng = np.random.default_rng(seeds[0])
+        for s in training_sets(seeds, n=400):
+            yield replace(s, Y=s.Y * np.sqrt(2.0 / rng.chisquare(4.0, (len(s), 1))))
+
+    trained = train_sets(list(heavy(range(6))), QUICK, judge=False)
+    save_model(trained, tmp_path / "t.gpvo")
+    predictor = Predictor.load(tmp_path / "t.gpvo")
+    error, stated = zip(*((s.Y, _said(predictor, s)) for s in heavy(range(100, 106))), strict=True)
+    nu = stated[0].nu
+    assert 3.0 < nu < 6.0
+    table = score(
+        np.concatenate(error), *(np.concatenate([getattr(e, n) for e in stated]) for n in ("mean", "covariance")), nu
+    )
+    assert table["nees_dof_median"]["joint"] == pytest.approx(table["nees_dof_median_stated"], rel=0.15)
+    assert table["nll_stated_per_dim"] < table["nll_per_dim"] - 0.05
+    # Where there are no tails none are stated.
+    assert small_model().predictor().model.degrees_of_freedom > 15.0
+
+
 def test_velocities_change_as_in_training():
     """Forty flights whose turn rate is a first-order Gauss-Markov process of 0.3 rad/s, memory 0.95 per motion."""
     found = rate_changes(Rows.stack(training_sets(range(40), n=300)))
@@ -145,7 +168,8 @@ def test_table_has_every_row_and_every_key(tmp_path):
         assert tuple(fold["methods"]) == METHODS
         for method in METHODS:
             assert set(fold["methods"][method]) == {
-                "nees_dof", "nees_dof_median", "coverage", "nll_per_dim", "crps", "rmse_raw", "rmse_corrected",
+                "nees_dof", "nees_dof_median", "nees_dof_median_stated", "coverage", "nll_per_dim",
+                "nll_stated_per_dim", "crps", "rmse_raw", "rmse_corrected",
             }  # fmt: skip
         assert fold["methods"]["triangulation"]["nll_per_dim"] is None
         assert fold["methods"]["learned"]["nll_per_dim"] < fold["methods"]["pointing_matching"]["nll_per_dim"]

@@ -56,4 +56,5 @@ def export_model(
         to_c(predictor.model, path, name=prefix, units=units, note=note)
     else:
         metadata = {"digest": predictor.digest, "units": ",".join(units), "purpose": purpose}
+        metadata["nu"] = f"{float(predictor.model.nu[0]):g}"
         to_onnx(predictor.model, path, metadata=metadata)

@@ -105,6 +105,7 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         "LEAST_VAR": _number(LEAST_VAR),
         "SHORTEST_S": _number(DURATIONS_S[0]),
         "LONGEST_S": _number(DURATIONS_S[1]),
+        "NU": _number(model.nu[0]),
         "MEAN_IN_SIGMA": int(model.mean_in_sigma[0]),
     }
     return [

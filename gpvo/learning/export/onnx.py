@@ -28,8 +28,8 @@ def to_onnx(model: ErrorModelArrays, path: str | os.PathLike[str], *, metadata: 
 
     Inputs, all double: ``features`` (N, d), NaN where missing; ``geometry`` (N, 6, 6), NaN where unknown; ``dt_s``
     (N,). Outputs: ``mean`` (N, 6), ``covariance`` (N, 6, 6), its parts ``jitter``, ``white``, ``bias``, ``epistemic``
-    (N, 6), ``in_domain``, ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names. Raises
-    MissingExtraError without the package onnx.
+    (N, 6), ``in_domain``, ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names; the degrees
+    of freedom ``nu``, 0 for a Gaussian, are among it. Raises MissingExtraError without the package onnx.
     """
     try:
         import onnx

@@ -10,6 +10,7 @@ typedef struct {
     double epistemic[6]; /* share of each variance that comes from being away from the training data */
     double in_domain;    /* 0..1 */
     double confidence;   /* 0..1 */
+    double nu;           /* degrees of freedom of the Student-t of that covariance; 0: Gaussian */
     double distance;     /* from the training domain, in training standard deviations */
 } gpvo_estimate;
 
@@ -230,6 +231,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     gpvo_correlations(geometry, R);
     gpvo_limits(features, duration, limit);
     out->distance = distance;
+    out->nu = GPVO_NU;
     out->in_domain = exp(-0.5 * distance * distance);
     outside = 1.0 - out->in_domain;
     growth = pow(1.0 + distance, GPVO_OUTSIDE_POWER);
