@@ -43,8 +43,9 @@ def nees_median(d: int, nu: float = math.inf) -> float:
     its density over the squared distance."""
     ln_squared = np.linspace(-30.0, 40.0, 20_001)
     ln_share = 0.5 * d * ln_squared - student_t.joint_nll(np.exp(ln_squared), d, nu)
-    below = np.cumsum(np.exp(ln_share - ln_share.max()))
-    return float(np.exp(np.interp(0.5 * below[-1], below, ln_squared)))
+    share = np.exp(ln_share - ln_share.max())
+    below = np.cumsum(share) - 0.5 * share
+    return float(np.exp(np.interp(0.5 * share.sum(), below, ln_squared)))
 
 
 def nll_per_dim(error: Array, covariance: Array, nu: float = math.inf) -> Array:
