@@ -1,24 +1,14 @@
-"""Regressors: gradients, repeatability, units, weights, streaming, choice by name."""
+"""Regressors: gradients, repeatability, units, choice by name."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pandas as pd
 import pytest
-import torch
 from gpvo.errors import GpvoError
 from gpvo.learning.regressors import Hyperparameters, Regressor, get_regressor, regressor_names
-from gpvo.learning.regressors.collapsed import CollapsedBound, Eigenbasis, accumulate, chunks
-from gpvo.learning.regressors.exact import Spectrum
 from gpvo.learning.regressors.inducing import greedy_points
-from gpvo.learning.regressors.likelihood import ExactEvidence
 from gpvo.learning.regressors.numerics import pack
-from gpvo.learning.regressors.rows import ArrayRows, ParquetRows, draw
-from gpvo.learning.regressors.sparse import SparseRegressor
-from gpvo.learning.regressors.streamed import streamed_scaling
-from gpvo.learning.regressors.svgp import SvgpRegressor
+from gpvo.learning.regressors.sparse import CollapsedBound, Posterior, SparseRegressor
 from synthetic_errors import gaussian_nll, make_problem
 
 QUICK = {
@@ -44,41 +34,33 @@ def numerical(f, theta: np.ndarray, h: float = 1e-5) -> np.ndarray:
 
 
 @pytest.mark.parametrize("isotropic", [True, False])
-@pytest.mark.parametrize("kind", ["exact", "bound"])
-def test_gradient_is_the_derivative(kind: str, isotropic: bool) -> None:
+@pytest.mark.parametrize("inducing", [15, 60])
+def test_gradient_is_the_derivative(inducing: int, isotropic: bool) -> None:
     X, Y = rows(60)
-    rng = np.random.default_rng(1)
-    w, count = rng.uniform(0.5, 2.0, 60), rng.uniform(0.5, 3.0, 60)
-    if kind == "exact":
-        objective = ExactEvidence(X, Y, w, torch.device("cpu")).value_and_gradient
-    else:
-        objective = CollapsedBound(X, Y, w, count, X[:15] + 0.1).value_and_gradient
+    objective = CollapsedBound(X, Y, X[:inducing] + 0.1).value_and_gradient
     theta = np.concatenate([np.full(1 if isotropic else 8, 0.6), [-0.3, 0.2, 0.1], [-0.7, -0.5, -1.0]])
     value, gradient = objective(theta)
     expected = numerical(lambda t: objective(t)[0], theta)
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * abs(value))
 
 
-def test_gradient_of_variances_in_the_eigenbasis() -> None:
+@pytest.mark.parametrize("inducing", [20, 60])
+def test_gradient_of_variances_in_the_posterior(inducing: int) -> None:
     X, Y = rows(60)
-    points = greedy_points(X / 2.0, 20)
-    sums = accumulate(chunks(X, Y, np.ones(60), np.ones(60)), points, np.full(8, 2.0))
-    basis = Eigenbasis.of(sums, points)
+    posterior = Posterior.of(X, Y, greedy_points(X / 2.0, inducing), np.full(8, 2.0))
     theta = np.array([-0.4, -0.9])
-    _, gradient = basis.value_and_gradient(sums, 1, theta)
-    np.testing.assert_allclose(gradient, numerical(lambda t: basis.value_and_gradient(sums, 1, t)[0], theta), rtol=1e-6)
+    _, gradient = posterior.value_and_gradient(1, theta)
+    expected = numerical(lambda t: posterior.value_and_gradient(1, t)[0], theta)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-6)
 
 
-def test_gradient_of_variances_in_the_spectrum() -> None:
+def test_the_bound_is_the_same_by_either_way() -> None:
     X, Y = rows(60)
-    w, device = np.random.default_rng(1).uniform(0.5, 2.0, 60), torch.device("cpu")
     hyper = Hyperparameters(np.full(8, 2.0), np.array([0.5, 0.7, 0.9]), np.array([0.4, 0.3, 0.2]))
-    spectrum = Spectrum.of(X, Y, w, hyper, device)
-    theta = np.array([-0.4, -0.9])
-    _, gradient = spectrum.value_and_gradient(1, theta)
-    np.testing.assert_allclose(gradient, numerical(lambda t: spectrum.value_and_gradient(1, t)[0], theta), rtol=1e-6)
-    value, _ = ExactEvidence(X, Y, w, device).value_and_gradient(pack(hyper, isotropic=False))
-    assert spectrum.log_evidence(hyper) == pytest.approx(-value, rel=1e-8)
+    for inducing in (20, 60):
+        points = greedy_points(X / 2.0, inducing)
+        value, _ = CollapsedBound(X, Y, points * 2.0).value_and_gradient(pack(hyper, isotropic=False))
+        assert Posterior.of(X, Y, points, hyper.lengthscale).bound(hyper) == pytest.approx(-180 * value, rel=1e-8)
 
 
 def test_a_rough_function_is_not_called_noise() -> None:
@@ -88,22 +70,6 @@ def test_a_rough_function_is_not_called_noise() -> None:
     Y = (np.sin(3 * X[:, :1]) * np.cos(3 * X[:, 1:])) + 0.02 * rng.standard_normal((600, 1))
     assert get_regressor("sparse", inducing=512).fit(X, Y).hyper.noise_var[0] < 0.05
     assert get_regressor("exact").fit(X, Y).hyper.noise_var[0] < 0.03**2
-
-
-def test_a_row_counted_twice_is_two_rows() -> None:
-    X, Y = rows(80)
-    twice = np.where(np.arange(80) < 30, 2.0, 1.0)
-    doubled_X, doubled_Y = np.vstack([X, X[:30]]), np.vstack([Y, Y[:30]])
-    fixed = get_regressor("sparse", inducing=20).fit(X, Y).hyper
-    a = SparseRegressor(hyper=fixed, inducing=200).fit(X, Y, sample_weight=twice)
-    b = SparseRegressor(hyper=fixed, inducing=200).fit(doubled_X, doubled_Y)
-    for one, other in zip(a.predict(X), b.predict(X), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6)
-    points, unit = X[:20], np.ones(8)
-    one = accumulate(chunks(X, Y, np.full(80, 1.5), twice), points, unit)
-    other = accumulate(chunks(doubled_X, doubled_Y, np.full(110, 1.5), np.ones(110)), points, unit)
-    for name, value in vars(one).items():
-        np.testing.assert_allclose(value, vars(other)[name], rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -161,57 +127,6 @@ def test_greedy_points_are_rows_without_repeats() -> None:
     assert {p.tobytes() for p in points} <= {u.tobytes() for u in U}
 
 
-@pytest.fixture
-def parquet(tmp_path: Path) -> Path:
-    X, Y = rows(700)
-    frame = pd.DataFrame(np.hstack([X, Y]), columns=[f"x{i}" for i in range(8)] + ["a", "b", "c"])
-    frame["w"] = np.random.default_rng(0).uniform(0.5, 2.0, 700)
-    path = tmp_path / "rows.parquet"
-    frame.to_parquet(path, row_group_size=128)
-    return path
-
-
-def streamed(path: Path, **more: object) -> ParquetRows:
-    return ParquetRows(path, [f"x{i}" for i in range(8)], ["a", "b", "c"], noise_weight="w", **more)
-
-
-def test_streaming_from_parquet_equals_memory(parquet: Path) -> None:
-    X, Y = rows(700)
-    w = pd.read_parquet(parquet)["w"].to_numpy()
-    for regressor in (SparseRegressor(inducing=32), SvgpRegressor(inducing=16, steps=5, batch=100)):
-        one = regressor.fit_rows(streamed(parquet, chunk_rows=100))
-        again = regressor.fit_rows(streamed(parquet, chunk_rows=100))
-        assert one.gp.weights.tobytes() == again.gp.weights.tobytes()
-    in_memory, from_file = (SparseRegressor(inducing=32) for _ in range(2))
-    a, b = in_memory.fit(X, Y, noise_weight=w), from_file.fit_rows(streamed(parquet, chunk_rows=100))
-    for m, n in zip(a.predict(X), b.predict(X), strict=True):
-        np.testing.assert_allclose(m, n, rtol=1e-3, atol=1e-4)
-
-
-def test_streamed_moments_and_draws(parquet: Path) -> None:
-    X, Y = rows(700)
-    scaling = streamed_scaling(ArrayRows(X, Y, np.ones(700), np.ones(700), chunk_rows=64), centre_outputs=True)
-    np.testing.assert_allclose(scaling.x_centre, X.mean(0), atol=1e-12)
-    np.testing.assert_allclose(scaling.y_scale, Y.std(0), rtol=1e-12)
-    some = draw(streamed(parquet, chunk_rows=90), 50, seed=1)
-    assert [part.shape for part in some] == [(50, 8), (50, 3), (50,), (50,)]
-
-
-def test_parquet_rows_that_are_not_finite_are_skipped(parquet: Path) -> None:
-    frame = pd.read_parquet(parquet)
-    frame.loc[::10, "x3"] = np.nan
-    frame.to_parquet(parquet)
-    assert sum(len(chunk[0]) for chunk in streamed(parquet)) == 630
-    assert len(draw(streamed(parquet), 5000, seed=0)[0]) == 630
-
-
-def test_parquet_complaints(parquet: Path, tmp_path: Path) -> None:
-    with pytest.raises(GpvoError, match="lacks the columns z"):
-        ParquetRows(parquet, ["x0", "z"], ["a"])
-    with pytest.raises(GpvoError, match="no such file"):
-        ParquetRows(tmp_path / "none.parquet", ["x0"], ["a"])
-
-
 def test_choice_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert get_regressor("auto", n_rows=2000).name == "exact"
     assert get_regressor("auto", n_rows=2001).name == "sparse"
@@ -241,5 +156,3 @@ def test_bad_shapes_and_values_are_refused(name: str) -> None:
         regressor.fit(X, Y[:19])
     with pytest.raises(ValueError, match="finite"):
         regressor.fit(np.where(X[0, 0] == X, np.nan, X), Y)
-    with pytest.raises(ValueError, match="noise_weight"):
-        regressor.fit(X, Y, noise_weight=np.zeros(20))

@@ -29,7 +29,7 @@ py-modules = ["mine"]
 MODULE = '''
 from pathlib import Path
 from gpvo.io.tracks import TracksSource
-from gpvo.learning.regressors.exact import ExactRegressor
+from gpvo.learning.regressors.sparse import SparseRegressor
 from gpvo.online.features import Feature, FeatureGroup, twist
 
 class ListedSource(TracksSource):
@@ -48,7 +48,7 @@ def start(camera):
 
 HURRY = FeatureGroup("hurry", (Feature("hurry_radps", "rad/s"),), start)
 
-class Copied(ExactRegressor):
+class Copied(SparseRegressor):
     name = "copied"
 '''
 

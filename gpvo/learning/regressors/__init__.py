@@ -15,7 +15,7 @@ EXACT_ROWS = 2000
 """Above this many rows ``auto`` takes ``sparse``."""
 
 _BUILT_IN = {
-    "exact": "gpvo.learning.regressors.exact:ExactRegressor",
+    "exact": "gpvo.learning.regressors.sparse:exact",
     "sparse": "gpvo.learning.regressors.sparse:SparseRegressor",
     "svgp": "gpvo.learning.regressors.svgp:SvgpRegressor",
     "sklearn": "gpvo.learning.regressors.sklearn_gp:SklearnRegressor",
@@ -37,8 +37,8 @@ def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Re
     """A regressor by name; ``auto`` is ``exact`` up to 2,000 rows and ``sparse`` above.
 
     ``options`` go to the regressor: all take ``isotropic``, ``threads`` and ``hyper`` (fixed hyperparameters);
-    ``sparse`` and ``svgp`` also ``inducing``; ``exact`` and ``svgp`` ``device`` ("auto", "cpu", "cuda"). Raises
-    GpvoError for unknown names.
+    ``sparse`` and ``svgp`` also ``inducing``; ``svgp`` ``device`` ("auto", "cpu", "cuda"). Raises GpvoError for
+    unknown names.
     """
     if name == "auto":
         name = "exact" if n_rows is not None and n_rows <= EXACT_ROWS else "sparse"

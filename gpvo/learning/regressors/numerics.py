@@ -1,10 +1,9 @@
-"""Shared pieces of the regressors: threads, scaling, the unit kernel and its gradient, factorisations."""
+"""Shared pieces of the regressors: threads, the unit kernel and its gradient, safe factors, the optimiser's numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -35,64 +34,6 @@ def fixed_threads(n: int) -> Iterator[None]:
 def pick_device(name: str) -> torch.device:
     """``auto`` is CUDA where there is one."""
     return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """Affine maps that give inputs and outputs zero mean and unit variance: centres and scales (d,), (D,)."""
-
-    x_centre: Array
-    x_scale: Array
-    y_centre: Array
-    y_scale: Array
-
-    @classmethod
-    def of(cls, X: Array, Y: Array, weight: Array | None = None) -> Scaling:
-        """Weighted moments of the columns; constant columns get scale 1."""
-        w = np.ones(len(X)) if weight is None else np.asarray(weight, dtype=np.float64)
-        w = w / w.sum()
-        x_centre, y_centre = w @ X, w @ Y
-        x_scale, y_scale = np.sqrt(w @ (X - x_centre) ** 2), np.sqrt(w @ (Y - y_centre) ** 2)
-        x_scale[~(x_scale > 1e-12 * (1 + np.abs(x_centre)))] = 1.0
-        y_scale[~(y_scale > 0)] = 1.0
-        return cls(x_centre, x_scale, y_centre, y_scale)
-
-    def inputs(self, X: Array) -> Array:
-        """Standardised inputs."""
-        return (X - self.x_centre) / self.x_scale
-
-    def outputs(self, Y: Array) -> Array:
-        """Standardised outputs."""
-        return (Y - self.y_centre) / self.y_scale
-
-    def scaled(self, hyper: Hyperparameters) -> Hyperparameters:
-        """Hyperparameters of the data as those of the standardised data."""
-        y2 = self.y_scale**2
-        return Hyperparameters(hyper.lengthscale / self.x_scale, hyper.signal_var / y2, hyper.noise_var / y2)
-
-    def unscaled(self, hyper: Hyperparameters) -> Hyperparameters:
-        """Hyperparameters of the standardised data as those of the data."""
-        y2 = self.y_scale**2
-        return Hyperparameters(hyper.lengthscale * self.x_scale, hyper.signal_var * y2, hyper.noise_var * y2)
-
-
-def checked(
-    X: Array, Y: Array, noise_weight: Array | None, sample_weight: Array | None
-) -> tuple[Array, Array, Array, Array]:
-    """X (n, d), Y (n, D), noise weights (n,) and sample weights (n,) as float64, or ValueError with the shapes got."""
-    X, Y = np.asarray(X, dtype=np.float64), np.asarray(Y, dtype=np.float64)
-    Y = Y[:, None] if Y.ndim == 1 else Y
-    if X.ndim != 2 or Y.ndim != 2 or len(X) != len(Y) or len(X) < 2:
-        raise ValueError(f"expected X (n, d) and Y (n, D) with n >= 2, got {X.shape} and {Y.shape}")
-    if not (np.isfinite(X).all() and np.isfinite(Y).all()):
-        raise ValueError("X and Y must be finite")
-    weights = []
-    for name, given in (("noise_weight", noise_weight), ("sample_weight", sample_weight)):
-        w = np.ones(len(X)) if given is None else np.asarray(given, dtype=np.float64)
-        if w.shape != (len(X),) or not (np.isfinite(w) & (w > 0)).all():
-            raise ValueError(f"{name} must be {len(X)} positive numbers, got shape {w.shape}")
-        weights.append(w)
-    return X, Y, weights[0], weights[1]
 
 
 def unit_kernel(A: Tensor, B: Tensor) -> Tensor:
