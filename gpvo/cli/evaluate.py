@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.twin import Replicates, ToleranceOption, settings_of
+from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, settings_of
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def evaluate(
     ] = False,
     replicates: Replicates = 8,
     tolerance: ToleranceOption = "none",
+    gap: GapOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the twins.")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -61,7 +62,9 @@ def evaluate(
 
     options = options_of(segments, truth_sigma, align, time_offset)
     if twins:
-        documents, found = _with_twins(*_loaded(runs, model, truth), options, settings_of(replicates, tolerance, seed))
+        documents, found = _with_twins(
+            *_loaded(runs, model, truth), options, settings_of(replicates, tolerance, seed, gap)
+        )
     else:
         found = _evaluate(runs, model, truth, options)
         documents = document(found)["runs"]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.twin import Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
+from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ def train(
     ] = False,
     replicates: Replicates = 8,
     tolerance: ToleranceOption = "none",
+    gap: GapOption = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
     backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
@@ -78,7 +79,9 @@ def train(
     if update is not None:
         settings = _settings_of(update) | {k: v for k, v in settings.items() if _is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
-    with in_place_of_runs_without_truth(runs if twins else [], settings_of(replicates, tolerance, seed), jobs) as found:
+    with in_place_of_runs_without_truth(
+        runs if twins else [], settings_of(replicates, tolerance, seed, gap), jobs
+    ) as found:
         trained = _with_origin(_train(found if twins else runs, settings, update), found if twins else runs)
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}

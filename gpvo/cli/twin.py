@@ -25,15 +25,25 @@ ToleranceOption = Annotated[
     ),
 ]
 
+GapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--gap",
+        help="By how much real errors exceed those of twins: the JSON of 'gpvo twin --against' on runs with truth.",
+    ),
+]
+
 
 def twin(
     runs: Annotated[list[Path], typer.Argument(help="Run folders made with --keep-tracks.")],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for the twins.")] = None,
     against: Annotated[
-        bool, typer.Option("--against", help="Compare with the runs' ground truth: ratios of real to twin error.")
+        bool,
+        typer.Option("--against", help="Compare with the runs' ground truth: real errors over what twins predict."),
     ] = False,
     replicates: Replicates = 8,
     tolerance: ToleranceOption = "none",
+    gap: GapOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Twins to make in parallel; -1 for one per core.")] = 1,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -46,7 +56,7 @@ def twin(
     """
     from gpvo.cli.output import print_json
 
-    settings = settings_of(replicates, tolerance, seed)
+    settings = settings_of(replicates, tolerance, seed, gap)
     if out is None and not against:
         raise GpvoError("nowhere to put the twins", cure="give a folder with -o, or compare with --against")
     with nullcontext(out) if out is not None else TemporaryDirectory(prefix="gpvo-twins-") as folder:
@@ -61,38 +71,41 @@ def twin(
 
 
 def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: bool) -> None:
+    import numpy as np
     from rich.console import Console
     from rich.table import Table
 
     from gpvo.cli.output import print_json
+    from gpvo.evaluation.by_twins import SPANS, ratios
     from gpvo.io.run import read_run
     from gpvo.online.features import AXES
-    from gpvo.twin.against import SPANS, compare
+    from gpvo.twin.gap import pooled
 
-    found = compare([read_run(r) for r in runs], [[read_run(t) for t in of_run] for of_run in twins])
-    mean, spread = found.pooled
+    found = np.array([ratios(read_run(r), [read_run(t) for t in made]) for r, made in zip(runs, twins, strict=True)])
+    names = [r.resolve().name for r in runs]
+    mean, spread = pooled(found)
     if json_:
-        by_run = {n: dict(zip(SPANS, r.tolist())) for n, r in zip(found.runs, found.ratio)}
-        pooled = {s: {"ratio": m.tolist(), "spread": d.tolist()} for s, m, d in zip(SPANS, mean, spread)}
-        print_json({"schema": 1, "axes": AXES, "runs": by_run, "pooled": pooled})
+        of_all = {s: {"ratio": m, "spread": d} for s, m, d in zip(SPANS, mean, spread)}
+        each = [{"run": n, "ratio": dict(zip(SPANS, r))} for n, r in zip(names, found)]
+        print_json({"schema": 1, "axes": AXES, "runs": each, "pooled": of_all})
         return
     table = Table("run", "over", *AXES)
-    for name, ratio in zip(found.runs, found.ratio):
-        for span, row in zip(SPANS, ratio):
+    for name, of_run in zip(names, found):
+        for span, row in zip(SPANS, of_run):
             table.add_row(name, span, *(f"{v:.2f}" for v in row))
     for span, m, d in zip(SPANS, mean, spread):
-        if len(runs) > 1:
-            table.add_row("all, times or over", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
+        table.add_row("all, times or over", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
     Console(width=120, highlight=False).print(table)
-    print("real over twin error, root mean square; the real one holds the errors of the truth as well")
+    print("real over predicted error, root mean square; the truth's own noise is counted in")
 
 
-def settings_of(replicates: int, tolerance: str, seed: int) -> TwinSettings:
-    """The flags, parsed. Raises GpvoError for an unknown tolerance."""
+def settings_of(replicates: int, tolerance: str, seed: int, gap: Path | None = None) -> TwinSettings:
+    """The flags, parsed. Raises GpvoError for an unknown tolerance or a file without a gap."""
+    from gpvo.twin.gap import read_gap
     from gpvo.twin.replicate import TwinSettings, read_tolerance
 
     name, sigma = read_tolerance(tolerance)
-    return TwinSettings(replicates, sigma, name, seed)
+    return TwinSettings(replicates, sigma, name, seed, None if gap is None else read_gap(gap))
 
 
 def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int = 1) -> list[Path]:

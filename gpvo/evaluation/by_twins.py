@@ -1,4 +1,5 @@
-"""A run judged by its twins: what each stated covariance would score, and the twins' own as one more method."""
+"""A run judged by its twins: what each stated covariance would score, and the twins' own as one more method. And twins
+judged by a run with truth: by how much its errors exceed what a model of its twins predicts."""
 
 from __future__ import annotations
 
@@ -7,12 +8,36 @@ from typing import Any
 
 import numpy as np
 
+from gpvo.dataset.build import build_run
+from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, document, evaluate_run
 from gpvo.evaluation.statements import Statement, plain_statement
 from gpvo.io.run import Run
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
 from gpvo.twin.covariance import METHOD, twin_covariance
-from gpvo.types import VoLog
+from gpvo.twin.gap import SPAN
+from gpvo.types import Array, VoLog
+
+SPANS = (SPAN, "10 m")
+
+
+def ratios(run: Run, twins: Sequence[Run]) -> Array:
+    """(2, 6) root of the mean squared error over its variance, by :data:`SPANS` and axis, of a run with truth, as a
+    model of its twins alone predicts it, the truth's own noise counted in; NaN where the run is too short.
+
+    Raises
+    ------
+    SourceError
+        Where the run has no truth.
+    """
+    if run.truth is None:
+        raise SourceError("has no ground truth to compare twins with", where=run.path, cure="leave out --against")
+    model = train_sets([build_run(t) for t in twins], TrainConfig(), judge=False)
+    found = evaluate_run(run, model.predictor()).consistency["learned"]
+    windows = (found.one_second, *(h for h in found.horizons if SPANS[1] == f"{h.span:g} m"))
+    return np.sqrt([(np.nan,) * 6 if h is None else h.z2_truth_noise for h in windows])
 
 
 def with_twins(run: Run, twins: Sequence[Run], predictor: Predictor | None, options: EvaluateOptions) -> Evaluation:

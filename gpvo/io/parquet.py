@@ -18,7 +18,7 @@ MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
-_LARGEST = 1e100  # No number of a run is larger: products of two or three stay finite.
+_LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
 
 
 def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:

@@ -61,7 +61,8 @@ def _simulated(h: Mapping[str, Any]) -> str:
     told = []
     for s in h.get("simulated_truth") or ():
         rig = ", ".join(f"{k} {v:g}" for k, v in s["tolerance"].items())
-        told.append(f"* {s['twins']} twins of `{s['of']}`; tolerance of the rig `{s['tolerance_name']}` ({rig})")
+        gap = f"; errors times {', '.join(f'{v:.2f}' for v in s['gap']['ratio'])} by axis" if s.get("gap") else ""
+        told.append(f"* {s['twins']} twins of `{s['of']}`; tolerance of the rig `{s['tolerance_name']}` ({rig}){gap}")
     if not told:
         return ""
     head = "Truth was simulated: these sequences are twins, made of the tracks of a run. Twins of one run left out"

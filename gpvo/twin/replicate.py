@@ -19,18 +19,21 @@ from gpvo.io.source import SourceReport
 from gpvo.io.toml import read_toml
 from gpvo.runner import run as run_odometry
 from gpvo.twin.estimate import Original, estimate
+from gpvo.twin.gap import Gap, widened
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
 from gpvo.vo.rig_error import N_TERMS, RigError, principal_errors
 
 
 @dataclass(frozen=True)
 class TwinSettings:
-    """``replicates`` of each run; ``tolerance`` of the rig, drawn for each replicate, by the ``tolerance_name``."""
+    """``replicates`` of each run; ``tolerance`` of the rig, drawn for each replicate, by the ``tolerance_name``;
+    ``gap``: by how much real errors exceed those of twins, drawn for each replicate too."""
 
     replicates: int = 8
     tolerance: Tolerance = field(default_factory=Tolerance)
     tolerance_name: str = "none"
     seed: int = 0
+    gap: Gap | None = None
 
 
 @dataclass
@@ -148,7 +151,14 @@ def make_twins(
 def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path) -> Path:
     source = twin_source(original, settings, replicate)
     about = {**asdict(settings), "of": original.run.name, "replicate": replicate}
-    run_odometry(source, out / source.name, original.config, amend=_Conditions(original).amend, meta={"twin": about})
+    conditions, truth = _Conditions(original), source.truth
+    factor = np.ones(6) if settings.gap is None else settings.gap.factors(settings.replicates)[replicate]
+
+    def amend(record: VoRecord) -> VoRecord:
+        assert truth is not None
+        return widened(conditions.amend(record), truth, factor)
+
+    run_odometry(source, out / source.name, original.config, amend=amend, meta={"twin": about})
     return out / source.name
 
 
@@ -156,8 +166,9 @@ def simulated_truth(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Which of some runs, by their ``run.json``, are twins: of what, how many, with which tolerance."""
     found: dict[str, dict[str, Any]] = {}
     for about in (m["twin"] for m in metas if m.get("twin")):
-        key = json.dumps([about["of"], about["tolerance_name"], about["tolerance"]])
-        kept = {k: about[k] for k in ("of", "tolerance_name", "tolerance", "seed")}
+        kept = {k: about[k] for k in ("of", "tolerance_name", "tolerance", "gap")}
+        key = json.dumps(kept)
+        kept["seed"] = about["seed"]
         found.setdefault(key, {**kept, "twins": 0})["twins"] += 1
     return list(found.values())
 

@@ -1,0 +1,68 @@
+"""The gap to reality: by how much real errors exceed what twins predict, learnt where truth exists."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import NormalDist
+
+import numpy as np
+
+from gpvo.errors import SourceError
+from gpvo.geometry import se3
+from gpvo.io.jsonfile import read_json
+from gpvo.types import Array, TruthLog, VoRecord
+
+SPAN = "1 s"
+"""The span whose ratios are carried: beyond a frame or two, where the truth's own noise no longer counts."""
+_LARGEST = 100.0
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Log-normal factors on errors, by axis: ``ratio`` (6) the median, ``spread`` (6) one sigma, as a factor."""
+
+    ratio: tuple[float, ...]
+    spread: tuple[float, ...]
+
+    def factors(self, count: int) -> Array:
+        """(count, 6) one draw for each replicate: quantiles in its middle of as many equal parts, the same part on all
+        axes, as the runs that are off on one axis are off on the others."""
+        at = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+        return np.asarray(self.ratio) * np.asarray(self.spread) ** at[:, None]
+
+
+def pooled(ratios: Array) -> tuple[Array, Array]:
+    """Geometric mean (...) of ratios (R, ...) over runs, and the factor by which they spread about it: 1 for one run;
+    NaN where no run is long enough."""
+    logs = np.log(ratios)
+    known = np.isfinite(logs)
+    count = known.sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        mean = np.where(known, logs, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan)
+    variance = np.where(known, (logs - mean) ** 2, 0.0).sum(axis=0) / np.maximum(count - 1, 1)
+    return np.exp(mean), np.exp(np.sqrt(variance))
+
+
+def read_gap(path: Path) -> Gap:
+    """The gap in what ``gpvo twin --against --json`` prints. Raises SourceError where the file holds none."""
+    try:
+        found = read_json(path)["pooled"][SPAN]
+        gap = Gap(*(tuple(float(v) for v in found[key]) for key in ("ratio", "spread")))
+    except (KeyError, TypeError, ValueError):
+        gap = Gap((), ())
+    values = np.array([*gap.ratio, *gap.spread])
+    if values.shape != (12,) or not ((values > 1 / _LARGEST) & (values < _LARGEST)).all():
+        raise SourceError("holds no gap", where=path, cure="give the file of 'gpvo twin RUN... --against --json'")
+    return gap
+
+
+def widened(record: VoRecord, truth: TruthLog, factor: Sequence[float] | Array) -> VoRecord:
+    """A record whose error is ``factor`` (6,) times as large; the truth holds its two stamps."""
+    if not record.usable:
+        return record
+    i, j = np.searchsorted(truth.t_ns, [record.t_prev_ns, record.t_ns])
+    T_true = se3.inverse(truth.T_world_cam[i]) @ truth.T_world_cam[j]
+    xi = se3.log(se3.inverse(T_true) @ record.T_prev_cur)
+    return replace(record, T_prev_cur=T_true @ se3.exp(np.asarray(factor) * xi))
