@@ -17,7 +17,6 @@ from gpvo.learning.calibrate import (
     fit_outside_power,
     fit_scale,
 )
-from gpvo.learning.geometryweight import choose_geometry_weight, divided
 from gpvo.learning.logvariance import basis_of, log_ratio
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
@@ -29,12 +28,15 @@ from gpvo.learning.spans import at_most
 from gpvo.learning.velocities import rate_changes, usual_rate_var
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import ProjectedGP
-from gpvo.online.division import divide, ln_faster, of_calibration
+from gpvo.online.division import ln_faster, of_calibration
 from gpvo.online.estimate import NO_CALIBRATION, ErrorModelArrays
 from gpvo.online.guard import Domain
 from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
+
+_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
+_LEAST_KNOWN = 0.5
 
 
 def assemble(
@@ -71,6 +73,7 @@ def assemble(
         factor=scale.factor,
         outside_power=np.array([outside_power]),
         high=high,
+        geometry_weight=np.zeros(1),
         typical_ln_det=np.zeros(1),
         usual_rate_var=usual_rate_var(rows),
         rate_change_var=rate_changes(rows),
@@ -80,7 +83,7 @@ def assemble(
         dt_s=rows.step_s,
         **sums.arrays,
     )
-    sums, found = _with_calibration(model, of, (sums, _consistent(model, of)))
+    sums, found = _with_calibration(model, of, (sums, _most_likely(model, of)))
     return found.model, _calibration(rows, scale, found, sums, np.abs(z) / np.sqrt(found.joint))
 
 
@@ -123,12 +126,11 @@ class _Residuals:
 
 @dataclass(frozen=True)
 class _Sums:
-    """How errors add up: their parts, the correlation (3, 6, 6) of each, how much of the geometry's to believe, the log
-    of the typical speed (1,), and the patterns of wrong calibration."""
+    """How errors add up: their parts, the correlation (3, 6, 6) of each, the log of the typical speed (1,), and the
+    patterns of wrong calibration."""
 
     parts: Parts
     correlation: Array
-    geometry_weight: float
     ln_speed: Array
     patterns: Patterns | None
 
@@ -143,7 +145,6 @@ class _Sums:
             }
         return {
             "correlation": self.correlation,
-            "geometry_weight": np.array([self.geometry_weight]),
             "share": self.parts.share,
             "growth": self.parts.growth,
             "level": self.parts.level,
@@ -162,6 +163,15 @@ class _Consistent:
     added: float
     joint: float
     losses: Array
+
+
+def _most_likely(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
+    """The model made right, with as much of the geometry's correlation as makes poses and motions likeliest; none where
+    the geometry is mostly unknown."""
+    if of.geometry is None or np.isfinite(of.geometry).all(axis=(1, 2)).mean() < _LEAST_KNOWN:
+        return _consistent(model, of)
+    tried = [_consistent(replace(model, geometry_weight=np.array([w])), of) for w in _WEIGHTS]
+    return min(tried, key=lambda found: found.losses.mean())
 
 
 def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
@@ -212,7 +222,7 @@ def _with_calibration(bare: ErrorModelArrays, of: _Residuals, plain: _Found) -> 
         return plain
     of = replace(of, patterns=patterns)
     sums = _sums_of(of)
-    found = _consistent(replace(bare, **sums.arrays), of)
+    found = _most_likely(replace(bare, **sums.arrays), of)
     return (sums, found) if significant_gain(plain[1].losses - found.losses) else plain
 
 
@@ -227,13 +237,7 @@ def _sums_of(of: _Residuals) -> _Sums:
     lasting = None if root is None else rows.chains(root)
     parts = fit_parts(rows.chains(of.error), sigmas, rows.chains(faster), rows.step_s, lasting)
     correlation = part_correlations(errors, sigmas, parts, rows.step_s)
-    share = divide(parts.share, parts.growth, 2.0 * np.log(sigma) - parts.level, faster)
-    weight = 0.0
-    if of.geometry is not None:
-        each = divided(errors, rows.chains(rest), rows.chains(share), rows.chains(of.geometry))
-        phi = float(np.exp(-rows.step_s / parts.tau_s[0]))
-        weight = choose_geometry_weight(each, correlation, phi)
-    return _Sums(parts, correlation, weight, ln_speed, of.patterns)
+    return _Sums(parts, correlation, ln_speed, of.patterns)
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
@@ -256,7 +260,7 @@ def _calibration(rows: Rows, scale: Scale, found: _Consistent, sums: _Sums, scor
         "added_factor": found.added,
         "nu": float(found.model.nu[0]) or None,
         "calibration_part": sums.patterns is not None,
-        "geometry_correlation_weight": sums.geometry_weight,
+        "geometry_correlation_weight": float(found.model.geometry_weight[0]),
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
         "interval_guaranteed": [sure for _, sure in axes],

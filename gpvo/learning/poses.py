@@ -20,7 +20,8 @@ from gpvo.learning.spans import SPANS, cut
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
-_LONG, _LEAST_WINDOWS = 10, 3
+_LONG = tuple(m for m in SPANS if m >= 10)
+_LEAST_WINDOWS = 3
 _PRIOR_SPREAD = 0.3
 """Expected deviation of the factor's log from 0."""
 _LEAST_FACTOR, _LEAST_JITTER = 0.25, 0.01
@@ -47,7 +48,7 @@ def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
     Spans of ten motions and more count alike, as they count the same errors; and so do sequences. The factor is drawn
     towards 1, and is 1 unless its gain is beyond chance. No axis is left without jitter.
     """
-    spans = _spans(chains, phi)
+    spans = _spans(chains, phi, _LONG)
     if not spans:
         return 1.0
     most = max((1.0 - _LEAST_JITTER) / float((share[1] + share[2]).max()), 1.0)
@@ -62,17 +63,14 @@ def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
 
 
 def pose_losses(chains: Sequence[Motions], phi: Array) -> Array:
-    """(S,) mean negative log-likelihood of a sequence's poses after ten motions and more, without its constant; empty
-    where there are too few."""
-    spans = _spans(chains, phi)
-    return _losses(spans, 1.0) if spans else np.empty(0)
+    """(S,) mean negative log-likelihood of a sequence's motions, and of its poses after ten of them and more, without
+    its constant; all spans count alike."""
+    return _losses(_spans(chains, phi, (1, *_LONG)), 1.0)
 
 
-def _spans(chains: Sequence[Motions], phi: Array) -> list[_Poses]:
-    """The poses over each span that has windows enough; none of fewer than two sequences."""
-    if len({c.sequence for c in chains}) < 2:
-        return []
-    return [_Poses.over(chains, m, phi) for m in SPANS if m >= _LONG and _count(chains, m) >= _LEAST_WINDOWS]
+def _spans(chains: Sequence[Motions], phi: Array, spans: Sequence[int]) -> list[_Poses]:
+    """The poses over each of the spans that has windows enough."""
+    return [_Poses.over(chains, m, phi) for m in spans if _count(chains, m) >= _LEAST_WINDOWS]
 
 
 def _losses(spans: Sequence[_Poses], factor: float) -> Array:

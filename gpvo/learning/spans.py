@@ -65,13 +65,6 @@ def carried(amplitude: Array, phi: Array) -> Array:
     return out
 
 
-def lagged(root: Array, phi: Array) -> Array:
-    """(w, n, n) what the motions of each window have in common with those before, and those with them: of biases of
-    unit variance that act by roots (w, m, n, d)."""
-    before = np.einsum("wkij,wknj->win", root, carried(root, phi))
-    return np.asarray(before + np.swapaxes(before, -1, -2))
-
-
 def span_variances(z: Chains) -> SpanVariances:
     """Of the sums over each of :data:`SPANS` that occurs three times at least; sequences count by their length."""
     spans, mean_square, doubt = [], [], []

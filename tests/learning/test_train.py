@@ -78,6 +78,22 @@ def test_heavy_tails_are_stated_and_carried_to_the_prediction(tmp_path):
     assert small_model().predictor().model.degrees_of_freedom > 15.0
 
 
+@pytest.mark.parametrize("right", [True, False])
+def test_the_geometry_is_believed_where_it_is_right(right):
+    """Of each motion sideways error and yaw go together by 0.8, with a sign that changes at random."""
+    sets = []
+    for i, s in enumerate(training_sets(range(4), n=400)):
+        rng = np.random.default_rng(i)
+        R = np.tile(np.eye(6), (len(s), 1, 1))
+        R[:, 0, 4] = R[:, 4, 0] = 0.8 * rng.choice([-1.0, 1.0], len(s))
+        drawn = np.linalg.cholesky(R) @ rng.standard_normal((len(s), 6, 1))
+        sigma = np.array([1.0, 1.0, 2.0, 0.4, 0.4, 0.4]) * 1e-3
+        stated = (R if right else rng.permutation(R)) * np.outer(sigma, sigma)
+        sets.append(replace(s, Y=drawn[..., 0] * sigma, covariances=dict.fromkeys(s.covariances, stated)))
+    weight = fit_model(sets, QUICK).model.geometry_weight[0]
+    assert weight >= 0.75 if right else weight <= 0.25
+
+
 def test_velocities_change_as_in_training():
     """Forty flights whose turn rate is a first-order Gauss-Markov process of 0.3 rad/s, memory 0.95 per motion."""
     found = rate_changes(Rows.stack(training_sets(range(40), n=300)))
