@@ -66,7 +66,8 @@ class StereoCamera:
         for name in field_names(type(self)):
             value = getattr(self, name)
             number = float(value) if isinstance(value, int | float | np.number) else np.nan
-            if not abs(number) < 1e9 or (number <= 0 and name not in ("cx_px", "cy_px")):
+            least = {"cx_px": -1e9, "cy_px": -1e9, "width": 1.0, "height": 1.0}.get(name, 1e-9)
+            if not least <= number < 1e9:
                 raise CalibrationError(f"the camera's {name} is {value!r}, which cannot be")
 
     @property

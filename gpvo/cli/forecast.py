@@ -138,16 +138,11 @@ def _write(out: Path, f: Forecast) -> None:
 
 
 def _draw(plot: Path, f: Forecast, title: str) -> None:
-    import os
-
     from gpvo.evaluation.forecast_figure import draw
+    from gpvo.io.atomic import replacing
 
-    temporary = plot.with_name(plot.name + ".part")
-    try:
+    with replacing(plot) as temporary:
         draw(f, title).savefig(temporary, dpi=110, format="png")
-        os.replace(temporary, plot)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror or error}", where=plot) from None
 
 
 def register(app: typer.Typer) -> None:

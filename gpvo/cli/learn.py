@@ -62,11 +62,14 @@ def train(
 ) -> None:
     """Train an error model; score it by leaving each run out.
 
+    A training that was broken off goes on from its finished folds when it is started again.
+
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
     from gpvo.cli.output import print_json
-    from gpvo.learning.store import save_model
+    from gpvo.learning.store import check_writable, folds_path, save_model
 
+    check_writable(out)
     settings: dict[str, Any] = {
         "features": features,
         "target": target,
@@ -79,6 +82,7 @@ def train(
     if update is not None:
         settings = _settings_of(update) | {k: v for k, v in settings.items() if _is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
+    settings["keep"] = str(folds_path(out)) if backend == "local" else None
     with in_place_of_runs_without_truth(
         runs if twins else [], settings_of(replicates, tolerance, seed, gap), jobs
     ) as found:

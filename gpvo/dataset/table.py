@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -16,6 +15,7 @@ import pyarrow.parquet as pq
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import SourceError
+from gpvo.io.atomic import replacing
 from gpvo.types import StereoCamera
 
 SCHEMA = 1
@@ -25,7 +25,7 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
     """One file of all sequences, in place of what was there; a row group per sequence, one at a time in memory."""
     path = Path(path)
     about, schemas = [], []
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+    with replacing(path) as whole, tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         for i, s in enumerate(sets):
             table = _table(i, s)
             pq.write_table(table, Path(folder) / str(i), row_group_size=max(len(s), 1))
@@ -43,14 +43,12 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
             )
         metadata = {"gpvo": json.dumps({"schema": SCHEMA, "sequences": about}, sort_keys=True)}
         schema = pa.unify_schemas(schemas).with_metadata(metadata)
-        temporary = Path(folder) / "whole"
-        with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        with pq.ParquetWriter(whole, schema, compression="zstd") as writer:
             for i in range(len(about)):
                 table = pq.read_table(Path(folder) / str(i))
                 n = table.num_rows
                 columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
                 writer.write_table(pa.Table.from_arrays(columns, schema=schema), row_group_size=max(n, 1))
-        os.replace(temporary, path)
 
 
 def read_sets(path: str | Path) -> list[TrainingSet]:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from gpvo.filters.policies import LEARNED
 from gpvo.filters.study import Study
+from gpvo.io.atomic import replacing
 
 _HONEST = (0.7, 1.5)
 
@@ -17,12 +18,8 @@ _HONEST = (0.7, 1.5)
 def plot_experiment(result: Study, title: str, path: Path) -> None:
     """Draw to an image file."""
     figure = experiment_figure(result, title)
-    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        figure.savefig(temporary, dpi=120, bbox_inches="tight")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120, bbox_inches="tight", format=path.suffix[1:])
 
 
 def experiment_figure(result: Study, title: str) -> Figure:

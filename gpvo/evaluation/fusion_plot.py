@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import Trace
 from gpvo.evaluation.fusion_report import nis_band, nis_over_runs
+from gpvo.io.atomic import replacing
 
 
 def require_picture(path: Path) -> None:
@@ -27,12 +28,8 @@ def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
     require_picture(target)
     figure = figure_of(traces)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.stem}.part{target.suffix}")
-    try:
-        figure.savefig(temporary, dpi=120, bbox_inches="tight")
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(target) as temporary:
+        figure.savefig(temporary, dpi=120, bbox_inches="tight", format=target.suffix[1:].lower())
 
 
 def figure_of(traces: Sequence[Trace]) -> Figure:

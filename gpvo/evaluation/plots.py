@@ -13,6 +13,7 @@ from matplotlib.patches import Ellipse
 from gpvo.evaluation import curves
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.io.atomic import replacing
 from gpvo.stats.series import allan_deviation, autocorrelation
 from gpvo.types import Array, Status
 
@@ -189,6 +190,7 @@ def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]
     out = []
     for figure, draw in FIGURES.items():
         path = folder / f"{name or e.run.name}_{figure}.png"
-        draw(e).savefig(path, dpi=110)
+        with replacing(path) as temporary:
+            draw(e).savefig(temporary, dpi=110, format="png")
         out.append(path)
     return out

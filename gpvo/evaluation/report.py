@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,24 +13,16 @@ from gpvo import __version__
 from gpvo.evaluation import curves, panels, plots
 from gpvo.evaluation.evaluate import Evaluation, document
 from gpvo.evaluation.matches import MatchPicture
+from gpvo.io.atomic import write_text
 from gpvo.types import Array
 
 _MAX_POINTS = 600
 
 
 def write_report(evaluations: Sequence[Evaluation], path: Path, pictures: Sequence[MatchPicture] = ()) -> None:
-    """Write the page, by way of a temporary name. ``pictures``: matches of single frames of the only run."""
+    """Write the page, whole or not at all. ``pictures``: matches of single frames of the only run."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = render(evaluations, pictures)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_text(path, render(evaluations, pictures))
 
 
 def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] = ()) -> str:

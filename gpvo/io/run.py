@@ -93,16 +93,20 @@ class RunWriter:
                 )
             self.path = self._target.with_name(f".{self._target.name}.new")
         self._chunks = self.path / "chunks"
-        _prepare(self.path)
-        # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
-        self._write_meta(complete=False)
-        self._chunks.mkdir()
-        write_json(self.path / "rig.json", _rig(camera, mounting or Mounting(), calibration))
-        if truth is not None:
-            write_truth(self.path / "truth.parquet", truth)
-        if imu is not None:
-            write_imu(self.path / "imu.parquet", imu)
-        write_toml(self.path / "config.toml", dict(config or {}))
+        try:
+            _prepare(self.path)
+            # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
+            self._write_meta(complete=False)
+            self._chunks.mkdir()
+            write_json(self.path / "rig.json", _rig(camera, mounting or Mounting(), calibration))
+            if truth is not None:
+                write_truth(self.path / "truth.parquet", truth)
+            if imu is not None:
+                write_imu(self.path / "imu.parquet", imu)
+            write_toml(self.path / "config.toml", dict(config or {}))
+        except BaseException:
+            self._release()
+            raise
 
     def __enter__(self) -> RunWriter:
         return self
@@ -174,10 +178,13 @@ class RunWriter:
             if complete and replaces:
                 _put_in_place(self.path, self._target)
         finally:
-            if replaces:
-                # Where the new run is not whole, the finished one that it was to replace is worth more.
-                shutil.rmtree(self.path, ignore_errors=True)
-            self._lock.release()
+            self._release()
+
+    def _release(self) -> None:
+        if self.path != self._target:
+            # Where the new run is not whole, the finished one that it was to replace is worth more.
+            shutil.rmtree(self.path, ignore_errors=True)
+        self._lock.release()
 
     def _finish(self, complete: bool) -> None:
         self.flush()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.errors import GpvoError
@@ -39,6 +40,7 @@ class TrainConfig:
     ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
     which the truth moves. ``inducing``: points of its GP. ``max_rows``: held in memory, of larger
     files the rest streams. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
+    ``keep``: folder for finished folds, which a training that was broken off does not fit again; None keeps none.
     """
 
     features: str = "auto"
@@ -52,6 +54,11 @@ class TrainConfig:
     jobs: int = 1
     backend: str = "local"
     scheduler: str | None = None
+    keep: str | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """Those that decide the model, not where its folds are fitted and kept."""
+        return {k: v for k, v in asdict(self).items() if k not in ("jobs", "backend", "scheduler", "keep")}
 
     def rows_of(self, run: Run) -> TrainingSet:
         """The training set of a run as these settings want it."""

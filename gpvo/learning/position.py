@@ -72,7 +72,7 @@ def _fit(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[dict[str, An
         "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
         "versions": versions(),
         "training_digest": training_digest(sets),
-        "config": {k: v for k, v in asdict(config).items() if k not in ("jobs", "backend", "scheduler")},
+        "config": config.settings(),
     }
     return arrays, header
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 from gpvo.dataset.table import read_sets, write_sets
@@ -22,15 +24,26 @@ def rows_path(model: Path) -> Path:
     return model.with_name(model.name + ".rows.parquet")
 
 
+def folds_path(model: Path) -> Path:
+    """Of the folder with the folds of a training under way."""
+    return model.with_name(f".{model.name}.folds")
+
+
+def check_writable(path: Path) -> None:
+    """Raise ModelError, before any work, where no model can be written to ``path``."""
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ModelError("cannot be written: not a file in a folder that is there and may be written", where=path)
+
+
 def save_model(trained: TrainedModel, path: str | Path) -> None:
-    """``path``, ``path.md`` and ``path.rows.parquet``; each replaced whole or not at all."""
+    """``path``, ``path.md`` and ``path.rows.parquet``; each replaced whole or not at all. Kept folds are done with."""
     path = Path(path)
-    if path.is_dir() or not path.parent.is_dir():
-        raise ModelError("cannot be written: not a file in an existing folder", where=path)
+    check_writable(path)
     write_sets(rows_path(path), trained.sets)
     text = model_card(trained.header, trained.table, path.name)
     write_text(card_path(path), text)
     modelfile.save(path, trained.arrays, trained.header)
+    shutil.rmtree(folds_path(path), ignore_errors=True)
 
 
 def training_rows(path: str | Path) -> list[TrainingSet]:

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from gpvo import __version__
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
 from gpvo.errors import GpvoError
+from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.run_read import Run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
@@ -109,11 +111,25 @@ def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, A
     With a single sequence there is nothing to leave out: no folds.
     """
     jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(sets) if train_on]
-    folds = map_jobs(_fold, jobs, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler)
+    folds = map_jobs(_kept_fold, jobs, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler)
     if not folds:
         return {"folds": [], "mean": {m: empty() for m in METHODS}, "comparison": None}
     mean = {m: average([f["methods"][m] for f in folds]) for m in METHODS}
     return {"folds": folds, "mean": mean, "comparison": _compare(folds, mean)}
+
+
+def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
+    """A fold, from ``config.keep`` where a training that was broken off has left it."""
+    if config.keep is None:
+        return _fold(held_out, train_on, config)
+    sha = hashlib.sha256(repr((versions(), config.settings())).encode())
+    for s in (held_out, *train_on):
+        sha.update(repr((s.digest(), s.counts, s.camera)).encode() + s.lost_xi.tobytes() + s.lost_jump.tobytes())
+    path = Path(config.keep) / f"{sha.hexdigest()}.json"
+    if not path.is_file():
+        path.parent.mkdir(exist_ok=True)
+        write_json(path, _fold(held_out, train_on, config))
+    return read_json(path)
 
 
 @fixed_threads(1)
@@ -226,5 +242,5 @@ def _header(
         "comparison": table.get("comparison"),
         "versions": versions(),
         "training_digest": training_digest(sets),
-        "config": {k: v for k, v in asdict(config).items() if k not in ("jobs", "backend", "scheduler")},
+        "config": config.settings(),
     }

@@ -70,8 +70,10 @@ def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], heade
             stream.write(blob)
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as problem:
         Path(temporary).unlink(missing_ok=True)
+        if isinstance(problem, OSError):
+            raise ModelError(f"cannot be written: {problem.strerror}", where=path) from None
         raise
     return digest
 

@@ -6,10 +6,8 @@ row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optiona
 
 from __future__ import annotations
 
-import os
 import socket
 import struct
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ import numpy as np
 from gpvo.errors import GpvoError, MissingExtraError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FRD_FLU, rotate_covariance
+from gpvo.io.atomic import replacing
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 
@@ -158,25 +157,13 @@ def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 
     path = Path(path)
     if path.is_dir():
         raise GpvoError("is a folder, and a telemetry log is a file", where=path, cure="choose another -o")
-    sender = Sender(system)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
-    try:
-        with os.fdopen(handle, "wb") as file:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
 
-            def emit(t_ns: int, message: bytes) -> None:
-                file.write(struct.pack(">Q", t_ns // 1000) + message)
+        def emit(t_ns: int, message: bytes) -> None:
+            file.write(struct.pack(">Q", t_ns // 1000) + message)
 
-            count = stream(odometry, sender, emit)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    return count
+        return stream(odometry, Sender(system), emit)
 
 
 @dataclass

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import tempfile
 import textwrap
 from collections.abc import Iterable
@@ -96,19 +97,20 @@ def _replacing(path: Path, fill: Any) -> int:
     """Write beside the target and move it there when done; an older bag of ours is replaced, nothing else."""
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise GpvoError("is a folder that holds something else", where=path, cure="choose another -o")
+    holder: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         holder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
-    try:
         # A bag's files carry its name inside, so the temporary one has the same name in a folder of its own.
         count: int = fill(holder / path.name)
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(holder / path.name, path)
+    except (OSError, sqlite3.Error) as error:
+        raise GpvoError(f"cannot be written: {getattr(error, 'strerror', error)}", where=path) from None
     finally:
-        shutil.rmtree(holder, ignore_errors=True)
+        if holder is not None:
+            shutil.rmtree(holder, ignore_errors=True)
     return count
 
 

@@ -80,9 +80,6 @@ def fly_points(scenario: Scenario, seed: int, out: Path) -> Flight:
     from gpvo.sim.points import simulate_points
 
     flight = simulate_points(points_scenario(scenario), seed)
-    try:
-        flight.save(out)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror}", where=out) from None
+    flight.save(out)
     steps = np.linalg.norm(np.diff(flight.motion.position_m, axis=0), axis=1)
     return Flight(seed, out, len(flight.t_s), float(steps.sum()))

@@ -7,8 +7,6 @@ the two motions that share a frame share its noise, as in reality.
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from gpvo.cameras.tolerance import RIG_ERRORS, Tolerance, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.io.atomic import replacing
 from gpvo.sim import clouds, imu
 from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3
@@ -118,15 +117,8 @@ class PointsFlight:
             "episodes_s": np.array([[e.begin_s, e.end_s] for e in self.episodes]).reshape(-1, 2),
         }  # fmt: skip
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with replacing(target) as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
         return target
 
 

@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from evaluation_runs import make_run
+from gpvo.errors import SourceError
 from gpvo.evaluation import panels, plots
 from gpvo.evaluation.evaluate import Evaluation, document, evaluate_run
 from gpvo.evaluation.report import render, scene, write_report
@@ -155,8 +156,8 @@ def test_the_file_is_whole_or_absent(evaluation, tmp_path, monkeypatch):
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("gpvo.evaluation.report.os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr("gpvo.io.atomic.os.replace", fail)
+    with pytest.raises(SourceError, match=r"report\.html: cannot be written: disk full"):
         write_report([evaluation], target)
     assert target.read_bytes() == before
     assert [p.name for p in target.parent.iterdir()] == ["report.html"]

@@ -303,7 +303,7 @@ def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[s
             yield {**case, "problem": f"{type(error).__name__}: {str(error)[:200]}", "s": time.monotonic() - started}
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
-        ours = [w for w in beside if "gpvo" in w.filename]
+        ours = [w for w in beside if "gpvo" in w.filename and issubclass(w.category, RuntimeWarning)]
         if ours:
             yield {**case, "problem": f"{ours[0].filename}:{ours[0].lineno}: {ours[0].message}"}
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -116,16 +116,20 @@ CASES = {
 
 
 def some_inputs(model: ErrorModelArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows inside, at the edge, far outside and with missing values; geometry with some unknown; durations."""
+    """Rows inside, at the edge, far outside, with missing values and of nothing else; geometry with some unknown;
+    durations, some of them impossible."""
     rng = np.random.default_rng(1)
     n, d = 60, len(model.columns)
     X = model.domain.centre + model.domain.scale * rng.standard_normal((n, d))
     X[20:30] += 4.0 * model.domain.scale
     X[30:40, rng.integers(0, d, 10)] = np.nan
+    X[40:48] = np.array([np.nan, np.inf, -np.inf, 0.0, 1e11, 1e13, 1e160, -1e300])[:, None]
     A = rng.standard_normal((n, 6, 9)) * 0.01
     geometry = A @ A.transpose(0, 2, 1)
     geometry[::5] = np.nan
-    return X, geometry, rng.uniform(0.05, 0.3, n)
+    dt_s = rng.uniform(0.05, 0.3, n)
+    dt_s[50:54] = 0.0, -1.0, np.nan, 1e300
+    return X, geometry, dt_s
 
 
 def test_the_steady_mean_goes_with_the_noise_of_the_residuals() -> None:

@@ -23,7 +23,7 @@ from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
 from gpvo.learning.steadymean import significantly_positive
-from gpvo.learning.store import card_path, rows_path, save_model
+from gpvo.learning.store import card_path, folds_path, rows_path, save_model
 from gpvo.learning.train import _slips, train_sets
 from gpvo.learning.update import config_of, update
 from gpvo.learning.velocities import rate_changes
@@ -148,11 +148,27 @@ def test_parts_of_a_known_mixture():
     assert 1.0 < parts.tau_s.mean() < 8.0
 
 
-def test_same_data_and_seed_give_the_same_bytes(tmp_path):
-    sets = training_sets(range(3), n=120)
-    for name in ("a", "b"):
-        save_model(train_sets(sets, QUICK, judge=False), tmp_path / name)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+def test_a_training_goes_on_from_its_finished_folds_and_the_same_data_give_the_same_bytes(tmp_path, monkeypatch):
+    sets, path = training_sets(range(2), n=120), tmp_path / "model.gpvo"
+    config = replace(QUICK, keep=str(folds_path(path)))
+    whole, fitted = training._fold, []
+
+    def fold(held_out, *rest):
+        if len(fitted) == 1 and not broken_off:
+            broken_off.append(held_out.name)
+            raise KeyboardInterrupt
+        fitted.append(held_out.name)
+        return whole(held_out, *rest)
+
+    broken_off: list[str] = []
+    monkeypatch.setattr(training, "_fold", fold)
+    with pytest.raises(KeyboardInterrupt):
+        train_sets(sets, config)
+    save_model(train_sets(sets, config), path)
+    assert fitted == [s.name for s in sets]
+    assert not folds_path(path).exists()
+    save_model(train_sets(sets, QUICK), tmp_path / "other.gpvo")
+    assert path.read_bytes() == (tmp_path / "other.gpvo").read_bytes()
 
 
 def test_linear_algebra_runs_on_one_thread_so_that_bytes_do_not_depend_on_the_machine(monkeypatch):

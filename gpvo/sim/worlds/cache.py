@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gpvo.errors import SourceError
+from gpvo.io.atomic import replacing
 from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
 
 _LARGEST_BYTES = 2_000_000_000
@@ -35,7 +36,7 @@ def cached(kind: str, seed: int, params: Mapping[str, object], build: Callable[[
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         pass
     world = build()
-    with suppress(OSError):  # a full or read-only home costs time at the next run, nothing else
+    with suppress(OSError, SourceError):  # a full or read-only home costs time at the next run, nothing else
         save_world(world, path)
     return world
 
@@ -75,14 +76,8 @@ def save_world(world: World, path: Path) -> None:
         header["light_map"] = (world.light_map.origin, world.light_map.texel, world.light_map.material)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def load_world(path: Path) -> World:
