@@ -1,13 +1,19 @@
-"""Commands killed at random moments: nothing half-written is taken for whole, and a second run gives the same bytes."""
+"""Commands killed at random moments: nothing half-written is taken for whole, and a second run gives the same bytes.
+
+``GPVO_KILLS`` is about how many there are in all, by default 24.
+"""
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +24,58 @@ from gpvo.online.predictor import Predictor
 from gpvo.sim.points import simulate_points
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+KILLS = int(os.environ.get("GPVO_KILLS", "24"))
 TABLES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "config.toml")
+GPVO = [sys.executable, "-m", "gpvo.cli"]
+# A reproduction of one row, without pictures.
+REPRODUCE = """
+import sys
+from pathlib import Path
+from gpvo.reproduce.plan import Plan
+from gpvo.reproduce.result import reproduce
+training = {"images": 0, "points": 2}
+reproduce(Plan(seeds=0, points_seeds=2, training=training, duration_s=5.0, only=("4.3",)), Path(sys.argv[1]))
+"""
 
 
-def start(*words: object) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-m", "gpvo.cli", *map(str, words)], stdout=-1, stderr=-1)
+def start(*command: object) -> subprocess.Popen[bytes]:
+    """In a process group of its own: workers outlive the process that made them, and Ctrl-C reaches all of them."""
+    return subprocess.Popen([*map(str, command)], stdout=-1, stderr=-1, start_new_session=True)
 
 
-def finish(*words: object) -> float:
+def finish(*command: object) -> float:
     """Run to the end; the seconds that it took."""
     began = time.monotonic()
-    call = start(*words)
-    _, err = call.communicate(timeout=300)
+    _, err = (call := start(*command)).communicate(timeout=600)
     assert call.returncode == 0, err.decode()
     return time.monotonic() - began
 
 
-def kill_after(seconds: float, how: signal.Signals, *words: object) -> None:
-    call = start(*words)
+def kill_after(seconds: float, how: signal.Signals, *command: object) -> None:
+    call = start(*command)
     try:
         call.wait(timeout=seconds)
     except subprocess.TimeoutExpired:
-        call.send_signal(how)
+        os.killpg(call.pid, how)
+        call.wait(timeout=60)
+        with suppress(ProcessLookupError):  # workers that wait for a process that is no more
+            os.killpg(call.pid, signal.SIGKILL)
     _, err = call.communicate(timeout=60)
     assert b"Traceback" not in err, err.decode()
+
+
+def killed(share: float, command: list[object], look: Callable[[], None], takes_s: float) -> None:
+    """Kill a command at so large a share of all kills; after each, ``look`` at what is there. Then let it finish."""
+    times, rng = max(2, round(share * KILLS)), random.Random(str(command[-1]))
+    for k in range(times):
+        kill_after(rng.uniform(0.3, 1.0) * takes_s, SIGNALS[k % 3], *command)
+        look()
+    finish(*command)
+
+
+def bytes_of(path: Path) -> dict[str, bytes]:
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    return {str(p.relative_to(path)): p.read_bytes() for p in files}
 
 
 def content(run: Path) -> dict[str, Any]:
@@ -56,68 +90,144 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flights")
     for seed in range(2):
         simulate_points("tunnel-bursts", seed, duration_s=30.0, rate_hz=10.0).save(folder / f"{seed}.npz")
-        finish("run", folder / f"{seed}.npz", "-o", folder / f"run{seed}")
+        finish(*GPVO, "run", folder / f"{seed}.npz", "-o", folder / f"run{seed}")
     return folder
 
 
-def frames_left(run: Path) -> int:
-    """How many records a killed run left, 0 where it did not get so far; no other error is allowed."""
-    try:
-        return len(read_run(run).log)
-    except GpvoError:
-        return 0
-
-
-def killed_runs(flights: Path, folder: Path, times: int) -> None:
-    """A run killed over and over, each time begun anew over what the last one left."""
-    words = ("run", flights / "0.npz", "-o", folder / "run0")
-    takes_s = finish(*words)
-    wanted = content(folder / "run0")
+@pytest.mark.slow
+def test_runs(flights: Path, tmp_path: Path) -> None:
+    """Each is begun anew over what the last one left, of which every whole chunk can be read."""
+    command, run = [*GPVO, "run", flights / "0.npz", "-o", tmp_path / "run0"], tmp_path / "run0"
+    takes_s = finish(*command)
+    wanted = content(run)
     assert wanted == content(flights / "run0")
-    shutil.rmtree(folder / "run0")
-    rng = random.Random(0)
-    for k in range(times):
-        kill_after(rng.uniform(0.3, 1.0) * takes_s, SIGNALS[k % 3], *words)
-        assert frames_left(folder / "run0") <= len(wanted["records"])
-        if is_finished(folder / "run0"):
-            assert content(folder / "run0") == wanted
-            shutil.rmtree(folder / "run0")
-    if not is_finished(folder / "run0"):
-        finish(*words)
-    assert content(folder / "run0") == wanted
+    shutil.rmtree(run)
+
+    def look() -> None:
+        try:
+            left = read_run(run).log.records
+        except GpvoError:  # it did not get so far; no other error is allowed
+            left = []
+        assert [str(r.T_prev_cur) for r in left] == [r["T_prev_cur"] for r in wanted["records"][: len(left)]]
+        if is_finished(run):
+            assert content(run) == wanted
+            shutil.rmtree(run)
+
+    killed(0.35, command, look, takes_s)
+    assert content(run) == wanted
 
 
-def killed_replacements(flights: Path, folder: Path, times: int) -> None:
+@pytest.mark.slow
+def test_replacements(flights: Path, tmp_path: Path) -> None:
     """A finished run that is being replaced is there, whole, whenever the command is killed."""
-    words = ("run", flights / "0.npz", "-o", folder / "run0", "--overwrite")
-    takes_s = finish(*words)
-    wanted = content(folder / "run0")
-    rng = random.Random(1)
-    for k in range(times):
-        kill_after(rng.uniform(0.3, 1.0) * takes_s, SIGNALS[k % 3], *words)
-        assert content(folder / "run0") == wanted
-    finish(*words)
-    assert [p.name for p in folder.iterdir()] == ["run0"]
+    command, run = [*GPVO, "run", flights / "0.npz", "--overwrite", "-o", tmp_path / "run0"], tmp_path / "run0"
+    takes_s = finish(*command)
+    wanted = content(run)
+
+    def look() -> None:
+        assert content(run) == wanted
+
+    killed(0.15, command, look, takes_s)
+    assert [p.name for p in tmp_path.iterdir()] == ["run0"]
 
 
 @pytest.mark.slow
-def test_runs_killed_many_times(flights: Path, tmp_path: Path) -> None:
-    killed_runs(flights, tmp_path, 24)
+def test_trainings(flights: Path, tmp_path: Path) -> None:
+    """The old model stays; the new one goes on from the folds that were finished."""
+    model = tmp_path / "m.gpvo"
+    command = [*GPVO, "train", flights / "run0", flights / "run1", "--features", "n_inliers", "-o", model]
+    takes_s = finish(*command)
+    wanted = model.read_bytes()
+
+    def look() -> None:
+        Predictor.load(model)
+
+    killed(0.1, command, look, takes_s)
+    assert model.read_bytes() == wanted
+    assert {p.name for p in tmp_path.iterdir()} <= {model.name, f"{model.name}.md", f"{model.name}.rows.parquet"} | {
+        p.name
+        for p in tmp_path.glob(".m.gpvo*")  # of a model being written when it was killed
+    }
 
 
 @pytest.mark.slow
-def test_replacements_killed_many_times(flights: Path, tmp_path: Path) -> None:
-    killed_replacements(flights, tmp_path, 12)
+@pytest.mark.parametrize(("kind", "share"), [("sequence", 0.1), ("campaign of two workers", 0.2)])
+def test_simulations(kind: str, share: float, tmp_path: Path) -> None:
+    pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+    scene = ["tunnel-clean", "--duration", "4", "--rate", "5", "--set", "speed_mps=0.5"]
+    many = ["--seeds", "0..1", "--jobs", "2"] if "campaign" in kind else []
+    finish(*GPVO, "simulate", *scene, *many, "-o", tmp_path / "warm")  # the world is built once, into the cache
+    takes_s = finish(*GPVO, "simulate", *scene, *many, "-o", tmp_path / "wanted")
+    wanted = bytes_of(tmp_path / "wanted")
+    out = tmp_path / "out"
+
+    def look() -> None:
+        """What stands under its name is whole."""
+        folders = [p for p in out.glob("seed_*") if p.suffix not in (".part", ".lock")] if many else [out]
+        for folder in folders:
+            if (folder / "scenario.toml").is_file():
+                place = f"{folder.name}/" if many else ""
+                assert bytes_of(folder) == {
+                    k.removeprefix(place): v for k, v in wanted.items() if k.startswith(place)
+                }, folder
+        if bytes_of(out) == wanted:
+            shutil.rmtree(out)
+
+    killed(share, [*GPVO, "simulate", *scene, *many, "-o", out], look, takes_s)
+    assert {k: v for k, v in bytes_of(out).items() if ".part" not in k and ".lock" not in k} == wanted
 
 
 @pytest.mark.slow
-def test_a_training_that_is_killed_leaves_the_old_model(flights: Path, tmp_path: Path) -> None:
-    words = ("train", flights / "run0", flights / "run1", "-o", tmp_path / "m.gpvo", "--seed", "0")
-    takes_s = finish(*words)
-    wanted = (tmp_path / "m.gpvo").read_bytes()
-    rng = random.Random(2)
-    for k in range(3):
-        kill_after(rng.uniform(0.3, 1.0) * takes_s, SIGNALS[k % 3], *words)
-        Predictor.load(tmp_path / "m.gpvo")
-    finish(*words)
-    assert (tmp_path / "m.gpvo").read_bytes() == wanted
+def test_reproductions(tmp_path: Path) -> None:
+    """One goes on where the last one was killed; its tables are those of one that was left in peace."""
+    command = [sys.executable, "-c", REPRODUCE]
+    takes_s = finish(*command, tmp_path / "wanted")
+    killed(0.1, [*command, tmp_path / "out"], lambda: None, takes_s)
+    one, other = ({p.name: p.read_bytes() for p in (tmp_path / n).glob("tables.*")} for n in ("wanted", "out"))
+    assert one
+    assert one == other
+    for kind in ("models", "bounds"):
+        whole, again = ({p.name: p.read_bytes() for p in (tmp_path / n / "stages" / kind).glob("[!.]*")}
+                        for n in ("wanted", "out"))  # fmt: skip
+        assert whole == again
+
+
+# -- a disk that is full, as a limit on the size of a file; folders that may not be written --
+
+WRITERS = {
+    "run": ("run", "0.npz", "--overwrite", "-o"),
+    "import": ("import", "run0/trajectory.tum", "--overwrite", "-o"),
+    "points": ("simulate", "tunnel-bursts", "--points", "--duration", "5", "-o"),
+    "report.html": ("report", "run0", "-o"),
+    "log.bag": ("publish", "run0", "-o"),
+    "log.tlog": ("publish", "run0", "-o"),
+    "model.h": ("export", "tunnel.gpvo", "-o"),
+    "model.onnx": ("export", "tunnel.gpvo", "-o"),
+    "said.parquet": ("predict", "tunnel.gpvo", "run0", "-o"),
+    "forecast.csv": ("forecast", "tunnel.gpvo", "--path", "run0/trajectory.tum", "-o"),
+    "fused.png": ("fuse", "run0", "--model", "tunnel.gpvo", "--policies", "learned", "--plot"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_costs_one_line_and_leaves_what_was_there(name: str, flights: Path, tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parents[2] / "models" / "tunnel.gpvo", flights)
+    out = tmp_path / ("points.npz" if name == "points" else name)
+    if name in ("run", "import"):
+        shutil.copytree(flights / "run0", out)
+    before = bytes_of(tmp_path)
+    for limit_bytes in (0, 1_000, 30_000):
+        limited = f"import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
+        code = f"{limited}; runpy.run_module('gpvo.cli', run_name='__main__')"
+        call = subprocess.run(
+            [sys.executable, "-c", code, *WRITERS[name], out], capture_output=True, text=True, cwd=flights, timeout=300
+        )
+        if call.returncode == 0:
+            assert limit_bytes > 0
+            break
+        assert call.returncode == 2, call.stderr
+        assert len(call.stderr.strip().splitlines()) == 1, call.stderr
+        assert str(out.parent) in call.stderr
+        assert "File too large" in call.stderr
+        assert bytes_of(tmp_path) == before
