@@ -7,9 +7,10 @@ what would mend it.
 from __future__ import annotations
 
 import sys
+import traceback
 import unicodedata
 import warnings
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -17,12 +18,14 @@ from rich.console import Console
 from gpvo import __version__
 from gpvo.cli import (
     calibration,
+    common,
     evaluate,
     files,
     forecast,
     fuse,
     learn,
     live,
+    output,
     reproduce,
     run,
     score,
@@ -34,6 +37,7 @@ from gpvo.errors import EXTRA_OF, GpvoError, MissingExtraError, printable
 
 app = typer.Typer(
     name="gpvo",
+    cls=common.Groups,
     help="Tells your filter how wrong stereo visual odometry is, right now.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -70,6 +74,12 @@ for group in (
     selftest,
 ):
     group.register(app)
+for registered in app.registered_commands:
+    assert registered.callback is not None
+    registered.callback = common.with_common_options(registered.callback)
+
+
+_ANY_CLICK_ERROR: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
@@ -77,7 +87,13 @@ def main() -> None:
     warnings.showwarning = lambda message, *_: print(f"gpvo: {printable(message)}", file=sys.stderr)
     try:
         _refuse_control_characters(sys.argv[1:])
-        app()
+        sys.exit(app(standalone_mode=False) or 0)
+    except _ANY_CLICK_ERROR as error:
+        if error.ctx is not None and not sys.argv[1:]:
+            error.show()  # the help of a command without arguments
+            sys.exit(2)
+        where = f"{error.ctx.command_path} --help" if error.ctx is not None else "gpvo --help"
+        _fail(f"{' '.join(error.format_message().split())} ({where})")
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRA_OF:
@@ -88,7 +104,7 @@ def main() -> None:
     except OSError as error:  # a full disk, a folder in place of a file; a broken pipe has ended inside quietly
         place = f"{error.filename}: " if error.filename else ""
         _fail(place + " ".join((error.strerror or str(error)).split()))
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         print("gpvo: interrupted", file=sys.stderr)
         sys.exit(130)
 
@@ -109,6 +125,8 @@ def _extra(package: str) -> str:
 
 
 def _fail(text: str) -> NoReturn:
+    if output.is_verbose():
+        traceback.print_exc()
     Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"gpvo: {text}")
     sys.exit(2)
 

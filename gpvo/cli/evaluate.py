@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,6 +85,9 @@ def evaluate(
     else:
         for about in documents:
             _print(about)
+        if len(documents) > 1:
+            _print_pooled(document(found)["pooled"], len(found))
+    _tell_misfits(model, found)
 
 
 def report(
@@ -107,6 +111,7 @@ def report(
     found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
     write_report(found, out, [] if frames is None else _pictures(runs, frames, sequence))
     print(out)
+    _tell_misfits(model, found)
 
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
@@ -170,7 +175,23 @@ def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options:
     from gpvo.evaluation.evaluate import evaluate_run
 
     loaded, predictor = _loaded(runs, model, truth)
+    if predictor is not None and model is not None:
+        from gpvo.learning.check import check
+
+        for run in loaded:
+            for problem in check(predictor, run).problems:
+                warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
     return [evaluate_run(run, predictor, options) for run in loaded]
+
+
+def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
+    """At the end as well, where it is read."""
+    from gpvo.learning.check import ENOUGH_INSIDE
+
+    outside = [e for e in found if e.in_domain is not None and e.in_domain < ENOUGH_INSIDE]
+    if model is not None and outside:
+        names = ", ".join(f"{e.run.name} ({100 * (e.in_domain or 0):.0f} %)" for e in outside)
+        warnings.warn(f"{model.name} knows too few of the frames of {names}: do not fly it there", stacklevel=2)
 
 
 def _with_twins(
@@ -199,74 +220,88 @@ def _with_twins(
 
 
 def _print(d: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from gpvo.cli.output import say
 
-    console = Console(width=max(Console().width, 130), highlight=False, markup=False)
     if about := d.get("simulated_truth"):
-        console.print(
+        say(
             f"{d['run']} has no ground truth: means over {about['twins']} twins, whose truth is simulated"
             f" (tolerance {about['tolerance_name']})"
         )
-    console.print(
+    say(
         f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {d['path_length_m']:.1f} m;"
         f" ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )
     if found := d.get("verdict"):
-        console.print("\n    ".join([f"  {found['headline']}", *found["lines"]]))
+        for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):
+            say(line)
     if d["truth_moves_at_rest"]:
-        console.print(
-            f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands there, and the truth moves"
-        )
+        say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands there, and the truth moves")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
     relative = (f"{name} {_text(m)} m, {_text(math.degrees(rad))} deg" for name, m, rad in errors)
-    console.print(f"  relative error (rms) over a {'; '.join(relative)}")
+    say(f"  relative error (rms) over a {'; '.join(relative)}")
     for s in (s for s in d["segments"] if s["count"]):
-        console.print(
+        say(
             f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"
             f" ({s['count']})"
         )
     if poses := d.get("poses"):
         blocks = ("position", "orientation", "joint")
         shown = ", ".join(f"{b} {poses[b]['nees_dof']:.3g} (median {poses[b]['median']:.3g})" for b in blocks)
-        console.print(f"  covariances of poses, after alignment: NEES/dof {shown}")
-    table = Table("method", "NEES/dof", "interval", "median", "over 1 s", "1, 2, 3 sigma [%]", "NLL", "final [m]")
+        say(f"  covariances of poses, after alignment: NEES/dof {shown}")
+    _print_methods(d)
+
+
+def _print_methods(d: dict[str, Any]) -> None:
+    from gpvo.cli.output import console, new_table, say
+
+    sigma = d["truth_sigma"]
+    noisy = bool(sigma["translation_m"] or sigma["rotation_rad"])
+    given = ("+truth", "1 s", "coverage", "NLL", "stated")
+    table = new_table("method", "NEES", "interval", *given[0 if noisy else 1 :])
     for method, m in d["methods"].items():
         block = "joint" if m["nees_dof"]["joint"] is not None else "translation"
         if m["nees_dof"][block] is None:
             continue
         low, high = m["nees_dof_interval"][block]
-        table.add_row(
-            method + (" (translation)" if block == "translation" else ""),
-            _pair(m["nees_dof"][block], m["nees_dof_truth_noise"][block]),
-            f"{_text(low)} to {_text(high)}",
-            _text(m["nees_dof_median"][block]),
-            _pair(m["one_second"]["nees_dof"], m["one_second"]["nees_dof_truth_noise"]),
+        rest = (
+            m["nees_dof_truth_noise"][block],
+            m["one_second"]["nees_dof_truth_noise"],
             " ".join(f"{100 * c:.0f}" for c in m["coverage"].values()),
-            _pair(m["nll_per_dim"], m["nll_stated_per_dim"]),
-            _text(m["predicted_final_error_m"]),
+            m["nll_per_dim"],
+            m["nll_stated_per_dim"],
         )
+        cells = [c if isinstance(c, str) else _text(c) for c in rest[0 if noisy else 1 :]]
+        table.add_row(method, _text(m["nees_dof"][block]), f"{_text(low, 2)}-{_text(high, 2)}", *cells)
+    if not table.row_count:
+        return
+    console().print(table)
+    say("NEES: per degree of freedom of one motion; 1 is right. _vt: of the translation alone.")
+    say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
+    say("NLL: nats per axis of a Gaussian; stated: of the stated density, where it has heavier tails.")
+    if noisy:
+        noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose and axis"
+        say(f"+truth: with the truth's own noise ({noise}) counted in, as over 1 s.")
+
+
+def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
+    from gpvo.cli.output import console, new_table, say
+
+    table = new_table("method", "NLL", "interval", "NEES", "interval")
+    for method, scores in pooled.items():
+        cells = []
+        for s in (scores["nll_per_dim"], scores["nees_dof"]):
+            cells += [_text(s["mean"]), "-" if s["low"] is None else f"{_text(s['low'])} to {_text(s['high'])}"]
+        table.add_row(method, *cells)
     if table.row_count:
-        console.print(table)
-        console.print(
-            "over 1 s: NEES of the motion over a second. final: predicted error of the last position, 1 sigma."
-        )
-        sigma = d["truth_sigma"]
-        if sigma["translation_m"] or sigma["rotation_rad"]:
-            noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose and axis"
-            console.print(f"In brackets: with the truth's own noise ({noise}) added to what is stated.")
+        say(f"mean of the {runs} runs" + ("" if runs > 2 else ": too few for an interval"))
+        console().print(table)
 
 
-def _text(value: float | None) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
-
-
-def _pair(plain: float | None, with_truth_noise: float | None) -> str:
-    """Both in one cell; one number where the truth has no noise."""
-    if plain is None or _text(plain) == _text(with_truth_noise):
-        return _text(plain)
-    return f"{_text(plain)} ({_text(with_truth_noise)})"
+def _text(value: float | None, digits: int = 3) -> str:
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.{digits}g}"
 
 
 def register(app: typer.Typer) -> None:

@@ -93,11 +93,11 @@ def _row(f: Forecast, k: int) -> dict[str, float]:
 
 
 def _print(f: Forecast, path: Path, frame: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from gpvo.cli.output import console as new_console
+    from gpvo.cli.output import new_table
 
     p = f.plan
-    console = Console(width=max(Console().width, 110), highlight=False, markup=False)
+    console = new_console()
     console.print(
         f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m of the {frame}, {len(p.t_s) - 1} motions at"
         f" {1 / p.step_s:.3g} Hz"
@@ -109,7 +109,7 @@ def _print(f: Forecast, path: Path, frame: str) -> None:
             f"  {o.feature}: {a[0]:.3g} to {a[1]:.3g}, the training knows {b[0]:.3g} to {b[1]:.3g}"
             f" ({100 * o.share:.0f} % beyond)"
         )
-    table = Table("time [s]", "distance [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
+    table = new_table("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
     for k in _stops(len(p.t_s)):
         row = _row(f, k)
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))

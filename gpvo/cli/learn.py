@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +13,9 @@ from gpvo.errors import GpvoError
 if TYPE_CHECKING:
     from gpvo.learning.config import TrainConfig
     from gpvo.learning.train import TrainedModel
+    from gpvo.types import Prediction
+
+_MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth, or one file of training rows.")]
 Model = Annotated[Path, typer.Argument(help="Model file.")]
@@ -122,19 +124,18 @@ def _settings_of(model: Path) -> dict[str, Any]:
 def _is_given(ctx: typer.Context, option: str) -> bool:
     """Whether the user wrote an option, or it stands at its default."""
     source = ctx.get_parameter_source(option)
-    return source is not None and source.name == "COMMANDLINE"
+    return source is not None and source.name != "DEFAULT"
 
 
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> TrainedModel:
+    from gpvo.cli.output import note
     from gpvo.io.run import read_run
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
     _refuse_twice(paths)
     if config.regressor != "auto" and config.target != "position":
-        print(
-            "gpvo: --regressor has a say with --target position alone: the log-variance GP is sparse", file=sys.stderr
-        )
+        note("gpvo: --regressor applies to --target position alone: the log-variance GP is sparse")
     if update is not None and config.target == "position":
         raise GpvoError("a model of positions cannot be updated", where=update, cure="train anew from all runs")
     if any(p.is_file() for p in paths):
@@ -149,7 +150,7 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     if update is not None:
         from gpvo.learning.update import update as update_model
 
-        return update_model(update, runs, config, tell=lambda what: print(f"gpvo: {what}", file=sys.stderr))
+        return update_model(update, runs, config, tell=lambda what: note(f"gpvo: {what}"))
     from gpvo.learning.train import train as train_model
 
     return train_model(runs, config)
@@ -194,26 +195,28 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
 
 
 def _print_table(document: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from gpvo.cli.output import console as new_console
+    from gpvo.cli.output import new_table
 
     if not document["folds"]:
-        print("one run alone: nothing could be left out, so there is no table")
+        print("one short run alone: nothing could be left out, so there is no table")
         return
-    table = Table()
-    table.add_column("method", no_wrap=True)
-    for k in range(len(document["folds"])):
-        table.add_column(str(k + 1), justify="right")
-    for name in ("mean", "median", "1 sigma", "NLL/axis", "as stated"):
-        table.add_column(name, justify="right")
+    few = len(document["folds"]) <= _MOST_COLUMNS
+    columns = [str(k + 1) for k in range(len(document["folds"]))] if few else ["least", "most"]
+    table = new_table("method", *columns, "mean", "median", "1 sigma", "NLL/axis", "as stated")
     for method, mean in document["mean"].items():
         per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
         rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"]]
         rest += [mean["nll_per_dim"], mean["nll_stated_per_dim"]]
+        if not few and (known := [v for v in per_fold if v is not None]):
+            per_fold = [min(known), max(known)]
         if any(v is not None for v in (*per_fold, *rest)):
             table.add_row(method, *(_text(v) for v in (*per_fold, *rest)))
-    console = Console(width=max(Console().width, 120), highlight=False, markup=False)
-    console.print("NEES per degree of freedom on each run left out (1 is right), then means over the runs")
+    console = new_console()
+    what = (
+        "run" if document.get("folds_are") != "time blocks" else "part of the one run (nothing is said of another one)"
+    )
+    console.print(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
     console.print(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     console.print(table)
     resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
@@ -241,7 +244,8 @@ def _print_table(document: dict[str, Any]) -> None:
 
 def _interval(comparison: dict[str, Any], name: str) -> str:
     d = comparison[name]
-    return f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
+    interval = "(too few for an interval)" if d["low"] is None else f"[{d['low']:+.3f}, {d['high']:+.3f}]"
+    return f"{d['mean']:+.3f} {interval}"
 
 
 def _nees(block: dict[str, float | None]) -> float | None:
@@ -254,39 +258,48 @@ def _text(value: float | None) -> str:
 
 def predict(
     model: Model,
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file of predictions to write.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file to write; of several runs, a folder of them.")],
     json_: Json = False,
 ) -> None:
     """Predict the error of every motion of a run.
 
     Example: gpvo predict errors.gpvo runs/flight -o predictions.parquet
     """
-    import numpy as np
-
     from gpvo.cli.output import print_json
+    from gpvo.evaluation.evaluate import distinct
     from gpvo.io.run import read_run, write_predictions
     from gpvo.online.predictor import Predictor
 
-    if out.suffix.lower() != ".parquet":
+    if len(runs) == 1 and out.suffix.lower() != ".parquet":
         raise GpvoError("is no name for a Parquet file", where=out, cure="give -o a name that ends in .parquet")
-    predictions = list(Predictor.load(model).replay(read_run(run).log).values())
-    write_predictions(out, predictions)
+    predictor, documents = Predictor.load(model), []
+    for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
+        predictions = list(predictor.replay(read_run(path).log).values())
+        target = out if len(runs) == 1 else out / f"{name}.parquet"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_predictions(target, predictions)
+        documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
+    if json_:
+        print_json({"schema": 1, **({"runs": documents} if len(runs) > 1 else documents[0])})
+        return
+    for d in documents:
+        inside = 100 * (d["in_domain"] or 0)
+        print(f"{d['file']}: {d['predictions']} predictions, {inside:.0f} % inside the training domain")
+        length, angle = (1e3 * sum(x**2 for x in sigma) ** 0.5 for sigma in d["median_sigma"].values())
+        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad per motion")
+
+
+def _summary(predictions: list[Prediction]) -> dict[str, Any]:
+    import numpy as np
+
     moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
     sigma = np.median([p.sigma for p in moving], axis=0) if moving else np.full(6, np.nan)
-    inside = float(np.mean([p.in_domain > 0.5 for p in moving])) if moving else None
-    document = {
-        "schema": 1,
+    return {
         "predictions": len(predictions),
-        "in_domain": inside,
+        "in_domain": float(np.mean([p.in_domain > 0.5 for p in moving])) if moving else None,
         "median_sigma": {"translation_m": sigma[:3], "rotation_rad": sigma[3:]},
     }
-    if json_:
-        print_json(document)
-    else:
-        print(f"{out}: {len(predictions)} predictions, {100 * (inside or 0):.0f} % inside the training domain")
-        length, angle = (1e3 * np.linalg.norm(s) for s in (sigma[:3], sigma[3:]))
-        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad per motion")
 
 
 def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")], json_: Json = False) -> None:

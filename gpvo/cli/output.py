@@ -1,14 +1,83 @@
-"""What the commands share: JSON on standard output, a progress bar on a terminal."""
+"""What the commands print: JSON and tables on standard output, notes and a progress bar beside it."""
 
 from __future__ import annotations
 
 import json
 import math
+import shutil
+import sys
+import textwrap
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gpvo.errors import GpvoError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+_loud = {"quiet": False, "verbose": False}
+
+
+@contextmanager
+def loudness(*, quiet: bool, verbose: bool) -> Iterator[None]:
+    """How much the commands say in the block, and of ``verbose`` ones what it took."""
+    _loud.update(quiet=quiet, verbose=verbose)
+    start = time.perf_counter()
+    yield
+    detail(f"took {time.perf_counter() - start:.1f} s{_peak_memory()}")
+
+
+def is_verbose() -> bool:
+    """Whether the command at hand was called with ``-v``."""
+    return _loud["verbose"]
+
+
+def note(text: str) -> None:
+    """A remark beside the result, on standard error; not with ``-q``."""
+    if not _loud["quiet"]:
+        print(text, file=sys.stderr)
+
+
+def detail(text: str) -> None:
+    """The same, with ``-v`` alone."""
+    if _loud["verbose"]:
+        print(f"gpvo: {text}", file=sys.stderr)
+
+
+def _peak_memory() -> str:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return ""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    return f" and {peak:.0f} MB"
+
+
+def say(text: str) -> None:
+    """A line of the result; on a terminal, broken between words with what follows indented."""
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else math.inf
+    indent = " " * (len(text) - len(text.lstrip()) + 2)
+    print(text if len(text) <= width else textwrap.fill(text, int(width), subsequent_indent=indent))
+
+
+def console() -> Console:
+    """Where tables are printed: as wide as the terminal, 80 columns in a pipe."""
+    from rich.console import Console
+
+    return Console(highlight=False, markup=False)
+
+
+def new_table(*columns: str) -> Table:
+    """A table without rules between its columns, numbers to the right; the first column holds names."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for k, column in enumerate(columns):
+        table.add_column(column, justify="right" if k else "left", overflow="fold")
+    return table
 
 
 def jsonable(value: Any) -> Any:
@@ -43,7 +112,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    if not console.is_terminal:
+    if _loud["quiet"] or not console.is_terminal:
         yield lambda: None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -61,6 +61,7 @@ def run(
     Example: gpvo run MH_01_easy/ -o runs/mh01
     """
     from gpvo import runner
+    from gpvo.cli import output
     from gpvo.cli.output import print_json, progress
     from gpvo.io import open_source
     from gpvo.learning.check import ENOUGH_INSIDE
@@ -132,7 +133,7 @@ def run(
     notes = sequence.report.notes
     more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
     for note in (*notes[:_MOST_NOTES], *more):
-        print(f"source: {note}", file=sys.stderr)
+        output.note(f"source: {note}")
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:

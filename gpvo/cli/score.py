@@ -36,17 +36,17 @@ def score(
 
 
 def _print(found: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from gpvo.cli.output import console as new_console
+    from gpvo.cli.output import new_table
 
-    table = Table("sequence", "motions", "lost", "energy [mm]", "[mrad]", "NLL", "NEES/dof", "1 s", "10 m", "100 m")
+    table = new_table("sequence", "motions", "lost", "energy [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
         over = (s["nees_dof_over"][name] for name in ("1s", "10m", "100m"))
         numbers = (*energy, s["nll_per_dim"], s["nees_dof"], *over)
         cells = ("-" if x is None else f"{x:.3g}" for x in numbers)
         table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *cells)
-    console = Console(highlight=False, markup=False)
+    console = new_console()
     console.print(table)
     pooled = found["pooled"]
     for name, unit, factor in (
@@ -55,10 +55,10 @@ def _print(found: dict[str, Any]) -> None:
         ("nees_dof", "", 1.0),
     ):
         i = pooled[name]
-        console.print(
-            f"{name}: {factor * i['mean']:.4g} {unit} [{factor * i['low']:.4g}, {factor * i['high']:.4g}]"
-            " (95 %, by whole sequences)"
-        )
+        told = "too few sequences for an interval"
+        if i["low"] is not None:
+            told = f"[{factor * i['low']:.4g}, {factor * i['high']:.4g}] (95 %, by whole sequences)"
+        console.print(f"{name}: {factor * i['mean']:.4g} {unit} {told}")
 
 
 def register(app: typer.Typer) -> None:

@@ -72,10 +72,8 @@ def twin(
 
 def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: bool) -> None:
     import numpy as np
-    from rich.console import Console
-    from rich.table import Table
 
-    from gpvo.cli.output import print_json
+    from gpvo.cli.output import console, new_table, print_json
     from gpvo.evaluation.by_twins import SPANS, ratios
     from gpvo.io.run import read_run
     from gpvo.online.features import AXES
@@ -89,13 +87,13 @@ def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: 
         each = [{"run": n, "ratio": dict(zip(SPANS, r))} for n, r in zip(names, found)]
         print_json({"schema": 1, "axes": AXES, "runs": each, "pooled": of_all})
         return
-    table = Table("run", "over", *AXES)
+    table = new_table("run", "over", *AXES)
     for name, of_run in zip(names, found):
         for span, row in zip(SPANS, of_run):
             table.add_row(name, span, *(f"{v:.2f}" for v in row))
     for span, m, d in zip(SPANS, mean, spread):
         table.add_row("all, times or over", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
-    Console(width=120, highlight=False).print(table)
+    console().print(table)
     print("real over predicted error, root mean square; the truth's own noise is counted in")
 
 

@@ -25,6 +25,7 @@ from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
 from gpvo.evaluation.verdict import verdict
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
+from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Prediction, Status, TruthLog, VoLog
 
 METHODS = (
@@ -191,7 +192,8 @@ def distinct(names: Sequence[str]) -> list[str]:
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """The result as scripts read it; what could not be computed is None. SI units; the names are part of the interface.
 
-    Of each run, beside its name, counts, path length, ATE and segments:
+    ``pooled``: of each method ``nll_per_dim`` and ``nees_dof`` (with the truth's noise) {``mean``, ``low``, ``high``}
+    over the runs. Of each run, beside its name, counts, path length, ATE and segments:
 
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
     * ``truth_moves_at_rest``: motions that are not scored, as the vehicle stands and the truth moves; they count in
@@ -228,7 +230,21 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     ``constant`` is said of the motion of one frame: a motion that bridges lost frames has as many times its covariance.
     ``gp_thesis`` needs a model file that holds it, as all written by this version do.
     """
-    return {"schema": 1, "runs": [_run_document(e) for e in evaluations]}
+    runs = [_run_document(e) for e in evaluations]
+    return {"schema": 1, "runs": runs, "pooled": _pooled([r["methods"] for r in runs])}
+
+
+def _pooled(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over the runs, with 95 % intervals by whole runs, of the methods that speak of the motions of every run."""
+    out: dict[str, Any] = {}
+    for method in runs[0] if runs else ():
+        scores = {
+            "nll_per_dim": [r[method]["nll_per_dim"] for r in runs if method in r],
+            "nees_dof": [r[method]["nees_dof_truth_noise"]["joint"] for r in runs if method in r],
+        }
+        if all(len(values) == len(runs) and None not in values for values in scores.values()):
+            out[method] = {n: sequence_bootstrap(np.array(v, np.float64)).document() for n, v in scores.items()}
+    return out
 
 
 def _run_document(e: Evaluation) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def score(files: Sequence[tuple[Path, Path]], options: EvaluateOptions | None = 
         Where a file is malformed, or states nothing while its truth lasts.
     """
     scores = [score_sequence(stated, truth, options) for stated, truth in files]
-    pooled = {name: asdict(sequence_bootstrap(np.array([getattr(s, name) for s in scores]))) for name in POOLED}
+    pooled = {name: sequence_bootstrap(np.array([getattr(s, name) for s in scores])).document() for name in POOLED}
     return {
         "schema": 1,
         "sequences": [asdict(s) for s in scores],

@@ -96,41 +96,62 @@ def _number(value: float | None, digits: str = ".3g") -> str:
     return "-" if value is None else format(value, digits)
 
 
+_HEAD = (
+    "| | NEES/dof | median | within 1 sigma | NLL per axis, Gaussian | as stated |",
+    "| --- | --- | --- | --- | --- | --- |",
+)
+
+
 def _scores(table: Mapping[str, Any]) -> str:
     if not table.get("folds"):
-        return "## Scores\n\nOne sequence: nothing could be left out, so nothing is known about another one."
+        return "## Scores\n\nOne short sequence: nothing could be left out, so nothing is known about another one."
+    blocks = table.get("folds_are") == "time blocks"
     lines = [
-        "## Scores on sequences left out",
+        "## Scores on sequences left out" if not blocks else "## Scores on parts of the one sequence, left out in turn",
         "",
-        "| method | NEES/dof | median | within 1 sigma | NLL per axis, Gaussian | as stated |",
-        "| --- | --- | --- | --- | --- | --- |",
+        *(["They say nothing about another flight.", ""] if blocks else []),
+        *_HEAD,
     ]
     for method, s in table["mean"].items():
-        numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"]]
-        numbers += [s["nll_per_dim"], s["nll_stated_per_dim"]]
-        if any(v is not None for v in numbers):
-            lines.append(f"| {method} | " + " | ".join(_number(v) for v in numbers) + " |")
+        lines += _row(method, s)
     c = table["comparison"]
     d = c["nll_per_dim_difference"]
     lines += [
         "",
-        f"Best row by NLL: `{c['best_row']}`. `learned` minus `{c['rival']}`: "
-        f"{d['mean']:+.3f} nats per axis [{d['low']:+.3f}, {d['high']:+.3f}].",
+        f"Best row by NLL: `{c['best_row']}`. `learned` minus `{c['rival']}`: {_difference(d)}.",
         _gain_of_gp(c["learned_less_base"]),
+        "",
+        "`learned` on each:",
+        "",
+        *_HEAD,
     ]
+    for fold in table["folds"]:
+        lines += _row(fold["held_out"], fold["methods"]["learned"])
     return "\n".join(lines)
 
 
-def _gain_of_gp(d: Mapping[str, float]) -> str:
+def _row(name: str, s: Mapping[str, Any]) -> list[str]:
+    numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"]]
+    numbers += [s["nll_per_dim"], s["nll_stated_per_dim"]]
+    return [f"| {name} | " + " | ".join(_number(v) for v in numbers) + " |"] if any(numbers) else []
+
+
+def _difference(d: Mapping[str, float | None]) -> str:
+    interval = "(too few for an interval)" if d["low"] is None else f"[{d['low']:+.3f}, {d['high']:+.3f}]"
+    return f"{d['mean']:+.3f} nats per axis {interval}"
+
+
+def _gain_of_gp(d: Mapping[str, float | None]) -> str:
     """What the Gaussian process adds to its own mean function, in plain words."""
-    interval = f"{d['mean']:+.3f} nats per axis [{d['low']:+.3f}, {d['high']:+.3f}]"
-    if d["mean"] == d["low"] == d["high"] == 0.0:
+    low, high = d["low"], d["high"]
+    if d["mean"] == 0.0 and not low and not high:
         verdict = "the Gaussian process is not at work"
-    elif d["high"] < 0:
+    elif high is not None and high < 0:
         verdict = "the Gaussian process gains"
     else:
-        verdict = "the Gaussian process loses" if d["low"] > 0 else "what the Gaussian process changes may be chance"
-    return f"`learned` minus `base` (the Gaussian process held at its mean): {interval}: {verdict}."
+        loses = low is not None and low > 0
+        verdict = "the Gaussian process loses" if loses else "what the Gaussian process changes may be chance"
+    return f"`learned` minus `base` (the Gaussian process held at its mean): {_difference(d)}: {verdict}."
 
 
 def _calibration(h: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
-from gpvo.dataset.build import TrainingSet
+from gpvo.dataset.build import MIN_ROWS, TrainingSet
 from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.io.jsonfile import read_json, write_json
@@ -32,6 +32,8 @@ from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 from gpvo.stats.consistency import nees
 from gpvo.types import Array, Prediction
 
+JUDGED_BLOCKS = 3
+"""Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
 """A translation error longer than so many medians of its sequence counts as a slip in the report; if nobody called it
 one, only where it is so many sigma longer than was stated: an error that is expected is noise."""
@@ -108,14 +110,34 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
 def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
     """``folds`` (a sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
 
-    With a single sequence there is nothing to leave out: no folds.
+    Of a single sequence, blocks of time are left out: they say less, and have no intervals. ``folds_are`` tells.
     """
-    jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(sets) if train_on]
+    parts = sets if len(sets) > 1 else time_blocks(sets[0])
+    jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(parts) if train_on]
     folds = map_jobs(_kept_fold, jobs, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler)
     if not folds:
-        return {"folds": [], "mean": {m: empty() for m in METHODS}, "comparison": None}
+        return {"folds": [], "folds_are": None, "mean": {m: empty() for m in METHODS}, "comparison": None}
     mean = {m: average([f["methods"][m] for f in folds]) for m in METHODS}
-    return {"folds": folds, "mean": mean, "comparison": _compare(folds, mean)}
+    comparison = _compare(folds, mean)
+    if len(sets) == 1:  # blocks of one flight are no sample of flights
+        for name in ("nll_per_dim_difference", "learned_less_base"):
+            comparison[name] |= {"low": None, "high": None}
+    return {
+        "folds": folds,
+        "folds_are": "sequences" if len(sets) > 1 else "time blocks",
+        "mean": mean,
+        "comparison": comparison,
+    }
+
+
+def time_blocks(s: TrainingSet) -> list[TrainingSet]:
+    """A sequence in ``JUDGED_BLOCKS`` parts, one after the other; one part where it is short."""
+    if len(s) < JUDGED_BLOCKS * 2 * MIN_ROWS:
+        return [s]
+    counts = {**s.counts, "lost": 0, "slips": 0, "truth_moves_at_rest": 0}
+    bare = replace(s, counts=counts, lost_xi=np.zeros((0, 6)), lost_jump=np.zeros((0, 6)))
+    rows = np.array_split(np.arange(len(s)), JUDGED_BLOCKS)
+    return [replace(bare.rows(r), name=f"{s.name}, part {k + 1}") for k, r in enumerate(rows)]
 
 
 def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
@@ -182,7 +204,7 @@ def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Arr
     }
 
 
-def _compare(folds: Sequence[dict[str, Any]], mean: Mapping[str, Any]) -> dict[str, Any] | None:
+def _compare(folds: Sequence[dict[str, Any]], mean: Mapping[str, Any]) -> dict[str, Any]:
     """Mean NLL of ``learned`` minus that of the best other row and of ``base``, with paired bootstrap intervals over
     the sequences."""
     scored = {m: mean[m]["nll_per_dim"] for m in METHODS if mean[m]["nll_per_dim"] is not None}
@@ -192,8 +214,8 @@ def _compare(folds: Sequence[dict[str, Any]], mean: Mapping[str, Any]) -> dict[s
     return {
         "rival": best,
         "best_row": min(scored, key=scored.__getitem__),
-        "nll_per_dim_difference": asdict(paired_nll(folds, "learned", best)),
-        "learned_less_base": asdict(paired_nll(folds, "learned", "base")),
+        "nll_per_dim_difference": paired_nll(folds, "learned", best).document(),
+        "learned_less_base": paired_nll(folds, "learned", "base").document(),
     }
 
 

@@ -23,6 +23,11 @@ class Interval:
     def __str__(self) -> str:
         return f"{self.mean:.3g} [{self.low:.3g}, {self.high:.3g}]"
 
+    def document(self) -> dict[str, float | None]:
+        """As scripts read it: ``mean``, ``low``, ``high``; the latter None where there is no interval."""
+        low, high = (x if np.isfinite(x) else None for x in (self.low, self.high))
+        return {"mean": self.mean, "low": low, "high": high}
+
     def contains(self, value: float) -> bool:
         """Whether ``value`` lies inside, ends included."""
         return self.low <= value <= self.high
@@ -56,11 +61,11 @@ def block_bootstrap(
 def sequence_bootstrap(values: Array, *, level: float = 0.95, draws: int = 10000, seed: int = 0) -> Interval:
     """Interval for the mean over sequences (n,): whole sequences are drawn with replacement.
 
-    For a paired comparison pass the differences.
+    For a paired comparison pass the differences. Fewer than three sequences show no spread: (-inf, inf).
     """
     values = np.asarray(values, dtype=np.float64)
     n = len(values)
-    if n < 2:
+    if n < 3:
         return Interval(float(values.mean()) if n else np.nan, -np.inf, np.inf)
     rng = np.random.default_rng(seed)
     means = values[rng.integers(0, n, (draws, n))].mean(axis=1)

@@ -294,6 +294,24 @@ def test_few_sequences_are_calibrated_by_blocks_and_marked():
     trained = train_sets(training_sets([0], n=200), QUICK)
     assert trained.header["calibration"]["by"] == "time blocks"
     assert trained.header["by_few_sequences"]
+    assert trained.table["folds_are"] == "time blocks"
+    assert [f["held_out"][-6:] for f in trained.table["folds"]] == ["part 1", "part 2", "part 3"]
+    assert trained.table["comparison"]["learned_less_base"]["low"] is None
+    card = model_card(trained.header, trained.table, "m")
+    assert "say nothing about another flight" in card
+    assert "too few for an interval" in card
+
+
+def test_two_sequences_give_scores_and_no_interval():
+    trained = train_sets(training_sets(range(2), n=120), QUICK)
+    assert len(trained.table["folds"]) == 2
+    found = trained.table["comparison"]["nll_per_dim_difference"]
+    assert found["mean"] is not None
+    assert (found["low"], found["high"]) == (None, None)
+
+
+def test_a_short_sequence_alone_has_no_scores():
+    trained = train_sets(training_sets([0], n=100), QUICK)
     assert trained.table["folds"] == []
 
 

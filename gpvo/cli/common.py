@@ -1,0 +1,111 @@
+"""What all commands have in common: ``--config``, ``-q``, ``-v``, and a ``--help`` in groups."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+from typer.core import TyperGroup
+
+from gpvo.cli import output
+from gpvo.errors import GpvoError
+
+GROUPS = {
+    "Record": ("run", "import", "simulate", "info", "calibration"),
+    "Judge": ("evaluate", "report", "score", "doctor"),
+    "Learn": ("train", "twin", "check", "predict", "forecast"),
+    "Fly": ("fuse", "publish", "live", "export"),
+    "More": ("selftest", "reproduce"),
+}
+
+
+class Groups(TyperGroup):
+    """The commands by what one wants to do; options of a file stand before those of the command line."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the options of ``--config FILE`` behind the name of the command, where later ones replace them."""
+        name = next((a for a in args if not a.startswith("-")), None)
+        command = self.get_command(ctx, name) if name else None
+        paths = [w for w, before in zip(args[1:], args) if before == "--config"]
+        paths += [a.partition("=")[2] for a in args if a.startswith("--config=")]
+        if command is not None and paths:
+            at = args.index(str(name)) + 1
+            args = [*args[:at], *options_of_file(Path(paths[-1]), str(name), command.params), *args[at:]]
+        return list(super().parse_args(ctx, args))
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one section per group."""
+        for title, names in GROUPS.items():
+            commands = ((name, self.get_command(ctx, name)) for name in names)
+            with formatter.section(title):
+                formatter.write_dl([(n, (c.help or "").split("\n\n")[0].strip()) for n, c in commands if c is not None])
+
+
+Config = Annotated[
+    Path | None, typer.Option(help="TOML file of options, a table per command, as in [run]; the line comes before it.")
+]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Also print settings, time and memory.")]
+_OPTIONS = {"config": (Config, None), "quiet": (Quiet, False), "verbose": (Verbose, False)}
+
+
+def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A command that also takes ``--config``, ``-q`` and ``-v``."""
+
+    @wraps(function)
+    def command(**given: Any) -> Any:
+        quiet, verbose, _ = given.pop("quiet"), given.pop("verbose"), given.pop("config")
+        with output.loudness(quiet=quiet, verbose=verbose):
+            output.detail(", ".join(f"{k.rstrip('_')}={v}" for k, v in given.items() if isinstance(v, _PLAIN)))
+            return function(**given)
+
+    hints = get_type_hints(function, include_extras=True)
+    own = [p.replace(annotation=hints[n]) for n, p in inspect.signature(function).parameters.items()]
+    own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+    more = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in _OPTIONS.items()
+    ]
+    command.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in (*own, *more)}
+    return command
+
+
+_PLAIN = (str, int, float, bool, list, Path)
+
+
+def options_of_file(path: Path, name: str, parameters: Sequence[Any]) -> list[str]:
+    """Options of the command ``name`` from its table in a TOML file, as words of a command line.
+
+    Raises
+    ------
+    GpvoError
+        One line for what is no table of a command, no option of it, or no value for it.
+    """
+    from gpvo.io.toml import read_toml
+
+    found = read_toml(path)
+    words: list[str] = []
+    for key, value in found.items():
+        if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
+            raise GpvoError(f"'{key}' is no table of a command", where=path, cure=f"write options under [{name}]")
+    known = {word.lstrip("-").replace("-", "_"): p for p in parameters for word in p.opts if word.startswith("--")}
+    del known["config"]
+    for key, value in found.get(name, {}).items():
+        option = known.get(key.replace("-", "_"))
+        if option is None:
+            near = get_close_matches(key.replace("-", "_"), known, 1)
+            cure = f"did you mean {near[0]}?" if near else f"gpvo {name} --help lists them"
+            raise GpvoError(f"[{name}] has no option '{key}'", where=path, cure=cure)
+        if option.is_flag and not isinstance(value, bool):
+            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give true or false")
+        if option.is_flag:
+            words += [option.opts[0]] if value else option.secondary_opts[:1]
+        else:
+            words += [w for one in (value if isinstance(value, list) else [value]) for w in (option.opts[0], str(one))]
+    return words

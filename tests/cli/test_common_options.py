@@ -1,0 +1,121 @@
+"""Every command takes --config, -q and -v; what a file gets wrong is one line; tables fit 80 columns."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer.main
+from gpvo.cli import app
+from gpvo.cli.common import GROUPS
+
+ROOT = Path(__file__).parents[2]
+UNSEEN, MODEL = str(ROOT / "data" / "unseen"), str(ROOT / "models" / "tunnel.gpvo")
+
+
+def call(*words: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "gpvo", *words]
+    env = {**os.environ, "COLUMNS": "80"}
+    return subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=folder, env=env)
+
+
+def test_every_command_is_in_one_group_and_has_the_common_options():
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    grouped = [name for group in GROUPS.values() for name in group]
+    assert sorted(grouped) == sorted(commands)
+    for command in commands.values():
+        words = {word for p in command.params for word in p.opts}
+        assert {"--config", "--quiet", "--verbose", "-q", "-v"} <= words
+
+
+def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
+    (tmp_path / "o.toml").write_text('[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
+    config = ("--config", str(tmp_path / "o.toml"))
+    given = call("evaluate", UNSEEN, *config)
+    assert "  5 m segments" in given.stdout, given.stderr
+    replaced = call("evaluate", UNSEEN, *config, "--segments", "7")
+    assert "  7 m segments" in replaced.stdout
+    assert "  5 m segments" not in replaced.stdout
+
+
+@pytest.mark.parametrize(
+    "text,told",
+    [
+        ('[evaluate]\nsegmens = "5"', "[evaluate] has no option 'segmens' (did you mean segments?)"),
+        ("seed = 3", "'seed' is no table of a command"),
+        ("[fly]\nseed = 3", "'fly' is no table of a command"),
+        ("[evaluate]\ntwins = 2", "[evaluate] twins is 2 (give true or false)"),
+        ('[evaluate]\nseed = "x"', "'--seed'"),
+        ("[evaluate]\nconfig = 'o.toml'", "has no option 'config'"),
+        ("[evaluate", "cannot be read as TOML"),
+    ],
+)
+def test_what_a_file_gets_wrong_is_one_line(tmp_path: Path, text: str, told: str):
+    (tmp_path / "o.toml").write_text(text)
+    done = call("evaluate", UNSEEN, "--config", str(tmp_path / "o.toml"))
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert told in done.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [("evaluate",), ("nonsense",), ("evaluate", "--seed", "x", "r"), ("run", "--nothing")]
+)
+def test_a_wrong_line_is_one_line(words: tuple[str, ...]):
+    done = call(*words)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "--help" in done.stderr
+
+
+def test_verbose_says_what_it_took_and_shows_where_it_failed():
+    done = call("info", UNSEEN, "-v")
+    assert "gpvo: took" in done.stderr
+    failed = call("evaluate", "nowhere", "-v")
+    assert failed.returncode == 2
+    assert "Traceback" in failed.stderr
+
+
+def test_tables_fit_80_columns():
+    done = call("evaluate", UNSEEN, "--model", MODEL, "--truth-sigma", "0.01")
+    rows = [
+        line for line in done.stdout.splitlines() if line.startswith(("method", "triangulation_", "pointing_", "base"))
+    ]
+    assert len(rows) >= 6
+    assert all(len(line) <= 80 for line in rows)
+    assert any("+truth" in line for line in rows)
+
+
+def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
+    runs = [str(ROOT / "data" / f"tunnel-{k}") for k in (1, 2, 3)]
+    done = call("predict", MODEL, *runs, "-o", str(tmp_path / "out"))
+    assert done.returncode == 0, done.stderr
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [f"tunnel-{k}.parquet" for k in (1, 2, 3)]
+    told = call("evaluate", *runs).stdout
+    assert "mean of the 3 runs" in told
+    two = call("evaluate", *runs[:2]).stdout
+    assert "mean of the 2 runs: too few for an interval" in two
+
+
+def test_a_model_that_does_not_fit_is_named_at_once_and_at_the_end(tmp_path: Path):
+    from dataclasses import replace
+
+    from gpvo.io.run import read_run, write_run
+    from gpvo.types import VoLog
+
+    run = read_run(UNSEEN)
+    assert run.log.camera is not None
+    wide = replace(run.log.camera, baseline_m=0.6)
+    records = [replace(r, disparity_p50_px=9 * r.disparity_p50_px, brightness=0.01, contrast=9.0) for r in run.log]
+    write_run(tmp_path / "other", VoLog(records, wide), truth=run.truth, imu=run.imu, mounting=run.mounting)
+    for words in (("evaluate",), ("report", "-o", str(tmp_path / "r.html"))):
+        done = call(words[0], str(tmp_path / "other"), "--model", MODEL, *words[1:])
+        assert done.returncode == 0, done.stderr
+        lines = done.stderr.strip().splitlines()
+        assert "tunnel.gpvo does not fit other: baseline is 0.6" in done.stderr
+        assert "do not fly it there" in lines[-1]
+    fused = call("fuse", str(tmp_path / "other"), "--model", MODEL, "--policies", "triangulation,learned")
+    assert "the model does not fit: baseline is 0.6" in fused.stderr
