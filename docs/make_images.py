@@ -1,4 +1,4 @@
-"""The picture of the README: ``python docs/make_images.py`` (a minute or two; needs ``gpvo[sim]``).
+"""The pictures of README and documentation: ``python docs/make_images.py`` (a minute or two; needs ``gpvo[sim]``).
 
 Four simulated flights teach, a fifth is shown: where it went and how sure odometry says it is, the error of each motion
 and its predicted bound, and what a filter makes of it.
@@ -14,6 +14,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from failures import draw_all
 from gpvo.dataset.build import build_run
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run
 from gpvo.evaluation.fusion import FusionSettings, fuse_runs
@@ -99,7 +100,8 @@ def main() -> None:
     bottom.sharex(middle)
     fig.tight_layout()
     fig.savefig(OUT)
-    print(OUT)
+    draw_all()
+    print(OUT.parent)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,10 @@ def evaluate(
     truth_sigma: TruthSigma = None,
     align: Align = "none",
     time_offset: TimeOffset = "0",
-    plots: Annotated[Path | None, typer.Option(help="Folder for plots, one set per run.")] = None,
+    plots: Annotated[Path | None, typer.Option(help="Folder for plots, as PNG and PDF, one set per run.")] = None,
+    tables: Annotated[
+        Path | None, typer.Option(help="Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX).")
+    ] = None,
     stated: Annotated[
         Path | None, typer.Option(help="Folder for the stated covariances of each method, as files for gpvo score.")
     ] = None,
@@ -75,6 +78,11 @@ def evaluate(
 
         for evaluation, name in zip(found, names, strict=True):
             write_statements(evaluation, stated, name)
+    if tables is not None:
+        from gpvo.evaluation.tables import write_tables
+
+        for evaluation, name in zip(found, names, strict=True):
+            write_tables(evaluation, tables, name)
     if plots is not None:
         from gpvo.evaluation.plots import save_all
 

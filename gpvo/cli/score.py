@@ -11,28 +11,60 @@ from gpvo.errors import GpvoError
 
 
 def score(
-    stated: Annotated[list[Path], typer.Argument(help="Files of stated motions, one per sequence.")],
-    truth: Annotated[list[Path], typer.Option("--truth", help="TUM poses of the same camera, in the same order.")],
+    stated: Annotated[
+        list[Path], typer.Argument(help="Files of stated motions (or CSV), one per sequence; or one folder of methods.")
+    ],
+    truth: Annotated[
+        list[Path] | None, typer.Option("--truth", help="TUM poses of the same camera, in the same order.")
+    ] = None,
     truth_sigma: Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians].")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Of a folder of methods: write METHOD.json and board.csv here.")
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Score anybody's stated covariances from files alone.
 
-    `gpvo evaluate RUN --stated FOLDER` writes such files for every method of a run.
+    `gpvo evaluate RUN --stated FOLDER` writes such files for every method of a
+    run. Such a folder, METHOD/SEQUENCE.txt beside truth/SEQUENCE.txt, is scored
+    as a whole.
 
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
     from gpvo.cli.evaluate import options_of
     from gpvo.cli.output import print_json
+    from gpvo.evaluation.score import board, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
 
+    truth = truth or []
+    options = options_of(None, truth_sigma, "none", "0")
+    if len(stated) == 1 and stated[0].is_dir() and not truth:
+        methods = score_folder(stated[0], options)
+        if out is not None:
+            write_board(methods, out)
+        if json_:
+            print_json({"schema": 1, "methods": list(methods.values())})
+        else:
+            _print_board(board(methods))
+        return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
-    found = score_files(list(zip(stated, truth)), options_of(None, truth_sigma, "none", "0"))
+    found = score_files(list(zip(stated, truth)), options)
     if json_:
         print_json(found)
     else:
         _print(found)
+
+
+def _print_board(columns: dict[str, list[Any]]) -> None:
+    from gpvo.cli.output import console, new_table
+
+    table = new_table("method", "E [mm]", "E [mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
+    for row in zip(*columns.values()):
+        table.add_row(*(x if isinstance(x, str) else "-" if x is None else f"{x:.3g}" for x in row))
+    console().print(table)
+    print("E: energy score. NEES per motion, then over a second and lengths of path; 1 is right.")
+    print("easy, hard: share within 1 sigma (0.68 is right) in the calmest and the worst quarter.")
 
 
 def _print(found: dict[str, Any]) -> None:

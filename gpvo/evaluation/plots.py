@@ -185,12 +185,14 @@ FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
 
 
 def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]:
-    """Every figure of a run as ``<name>_<figure>.png``; ``name``: by default the run's."""
+    """Every figure of a run as ``<name>_<figure>.png`` and ``.pdf``; ``name``: by default the run's."""
     folder.mkdir(parents=True, exist_ok=True)
     out = []
     for figure, draw in FIGURES.items():
-        path = folder / f"{name or e.run.name}_{figure}.png"
+        drawn, path = draw(e), folder / f"{name or e.run.name}_{figure}.png"
         with replacing(path) as temporary:
-            draw(e).savefig(temporary, dpi=110, format="png")
+            drawn.savefig(temporary, dpi=110, format="png")
+        with replacing(path.with_suffix(".pdf")) as temporary:
+            drawn.savefig(temporary, format="pdf", metadata={"CreationDate": None})
         out.append(path)
     return out

@@ -6,7 +6,7 @@ intervals; the truth's noise is declared and counted in; a lost motion is charge
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,9 @@ import numpy as np
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run
 from gpvo.geometry import se3
+from gpvo.io.csvfile import write_csv
+from gpvo.io.foreign import read_foreign, to_records
+from gpvo.io.jsonfile import write_json
 from gpvo.io.run_read import Run
 from gpvo.io.stated import read_stated, write_stated
 from gpvo.io.trajectory import read_tum, write_tum
@@ -63,7 +66,7 @@ def score(files: Sequence[tuple[Path, Path]], options: EvaluateOptions | None = 
 
 def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = None) -> SequenceScore:
     """Scores of one file of stated motions against TUM poses of the same camera."""
-    log, poses = read_stated(stated), read_tum(truth)
+    log, poses = _read(stated), read_tum(truth)
     options = options or EvaluateOptions()
     # The judge declares the truth's noise. An estimate would depend on the method that is judged.
     options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))
@@ -90,6 +93,74 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
         correlation_gain_nats=c.correlation_gain_nats,
         ate_rmse_m=evaluation.trajectory.ate_rmse_m,
     )
+
+
+def _read(stated: Path) -> VoLog:
+    """A file of stated motions; or a CSV with a header, its covariances those of motions in the axes of the frame."""
+    if stated.suffix.lower() != ".csv":
+        return read_stated(stated)
+    return VoLog(to_records(read_foreign(stated, "csv", covariance_of="motion", covariance_axes="body"))[0])
+
+
+def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[str, dict[str, Any]]:
+    """Scores of every ``METHOD/SEQUENCE.txt`` (or ``.csv``) of a folder against its ``truth/SEQUENCE.txt``, by method,
+    the likeliest first.
+
+    Raises
+    ------
+    SourceError
+        Where there is no truth, or a method leaves a sequence out: then the means could not be compared.
+    """
+    truths = sorted((folder / "truth").glob("*.txt"))
+    if not truths:
+        raise SourceError(
+            "holds no truth/SEQUENCE.txt", where=folder, cure="gpvo evaluate RUN --stated makes such folders"
+        )
+    found = {}
+    for method in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "truth"):
+        pairs = [(_of_sequence(method, truth), truth) for truth in truths]
+        found[method.name] = {"method": method.name, **score(pairs, options)}
+    return dict(sorted(found.items(), key=lambda item: item[1]["pooled"]["nll_per_dim"]["mean"]))
+
+
+def _of_sequence(method: Path, truth: Path) -> Path:
+    for path in (method / truth.name, method / f"{truth.stem}.csv"):
+        if path.is_file():
+            return path
+    raise SourceError(
+        f"says nothing of the sequence {truth.stem}", where=method, cure="each method must state them all"
+    )
+
+
+def write_board(found: Mapping[str, Mapping[str, Any]], folder: Path) -> None:
+    """``METHOD.json`` each, and ``board.csv`` with a line per method."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for method, scores in found.items():
+        write_json(folder / f"{method}.json", dict(scores))
+    write_csv(folder / "board.csv", board(found))
+
+
+def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Columns of the table of methods, to three digits: means over the sequences."""
+    out: dict[str, list[Any]] = {}
+    for method, scores in found.items():
+        pooled, sequences = scores["pooled"], scores["sequences"]
+        row: dict[str, Any] = {
+            "energy [mm]": 1e3 * pooled["energy_translation_m"]["mean"],
+            "energy [mrad]": 1e3 * pooled["energy_rotation_rad"]["mean"],
+            "NLL": pooled["nll_per_dim"]["mean"],
+            "NEES": pooled["nees_dof"]["mean"],
+        }
+        for span in ("1s", "10m", "100m"):
+            known = [v for s in sequences if (v := s["nees_dof_over"][span]) is not None]
+            row[f"NEES {span}"] = float(np.mean(known)) if known else None
+        row["easy"], row["hard"] = (
+            float(np.mean([s["coverage_by_difficulty"][k] for s in sequences])) for k in (0, -1)
+        )
+        out.setdefault("method", []).append(method)
+        for name, value in row.items():
+            out.setdefault(name, []).append(None if value is None else float(f"{value:.3g}"))
+    return out
 
 
 def _mean_with(mean: float, count: int, charged: Array) -> float:

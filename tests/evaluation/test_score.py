@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo import cli
+from gpvo.dataset.build import build_run
+from gpvo.dataset.errors import motion_errors
 from gpvo.errors import SourceError
+from gpvo.evaluation.baselines import baselines
 from gpvo.evaluation.evaluate import evaluate_run
-from gpvo.evaluation.score import score, score_sequence, write_statements
+from gpvo.evaluation.score import score, score_folder, score_sequence, write_statements
 from gpvo.geometry import se3
-from gpvo.io.run_read import Run
+from gpvo.io.run_read import Run, read_run
 from gpvo.io.stated import HEADER, read_stated, write_stated
 from gpvo.io.trajectory import tum_line, write_tum
 from gpvo.types import Mounting
 
+ROOT = Path(__file__).parents[2]
 N = 300
 
 
@@ -82,7 +87,7 @@ def test_somebody_elses_file_of_29_columns(tmp_path: Path, capsys) -> None:
     assert found["pooled"]["motions"] == 2 * 59
     assert found["pooled"]["nees_dof"]["mean"] < 1e-3
     cli.app(["score", *words], standalone_mode=False)
-    assert "by whole sequences" in capsys.readouterr().out
+    assert "too few sequences for an interval" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -107,3 +112,66 @@ def test_a_file_without_the_header_is_refused(tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
     with pytest.raises(SourceError, match="gpvo-stated"):
         score([(tmp_path / "poses.txt", tmp_path / "poses.txt")])
+
+
+def _call(capsys, *words: object) -> str:
+    cli.app(["score", *map(str, words)], standalone_mode=False)
+    return capsys.readouterr().out
+
+
+def test_a_folder_of_methods_is_scored_in_one_command(written, tmp_path: Path, capsys) -> None:
+    folder, evaluation = written
+    out = tmp_path / "board"
+    told = _call(capsys, folder, "-o", out)
+    assert told.splitlines()[1].startswith("triangulation")
+    results = json.loads((out / "triangulation.json").read_text())
+    assert results["pooled"]["nll_per_dim"]["mean"] == pytest.approx(
+        evaluation.consistency["triangulation"].nll_per_dim, abs=1e-4
+    )
+    assert (out / "board.csv").read_text().splitlines()[0].startswith("method,energy [mm]")
+
+
+def test_somebody_elses_csv_is_scored_in_one_command(written, tmp_path: Path, capsys) -> None:
+    folder, evaluation = written
+    T, log = evaluation.T_est, evaluation.run.log
+    q = se3.rotation_to_quaternion_xyzw(T[:, :3, :3])
+    names = [f"cov_{i}{j}" for i in range(6) for j in range(6)]
+    lines = ["t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(names)]
+    for k, r in enumerate(log):
+        numbers = [*T[k, :3, 3], *q[k], *stated_covariance().ravel()]
+        if r.status.value != "lost":
+            lines.append(",".join([str(r.t_ns), *(f"{x:.12g}" for x in numbers)]))
+    path = tmp_path / "theirs.csv"
+    path.write_text("\n".join(lines) + "\n")
+    found = json.loads(_call(capsys, path, "--truth", folder / "truth" / "hall.txt", "--json"))
+    assert 0.9 < found["sequences"][0]["nees_dof"] < 1.1
+    # Beside ours, in the same folder.
+    board = tmp_path / "all"
+    shutil.copytree(folder, board)
+    (board / "theirs").mkdir()
+    shutil.copy(path, board / "theirs" / "hall.csv")
+    assert "\ntheirs " in _call(capsys, board)
+
+
+def test_a_method_that_leaves_a_sequence_out_is_refused(written, tmp_path: Path) -> None:
+    folder, _ = written
+    shutil.copytree(folder, tmp_path / "all")
+    shutil.copy(tmp_path / "all" / "truth" / "hall.txt", tmp_path / "all" / "truth" / "other.txt")
+    with pytest.raises(SourceError, match="says nothing of the sequence other"):
+        score_folder(tmp_path / "all")
+    with pytest.raises(SourceError, match="holds no truth"):
+        score_folder(tmp_path / "all" / "triangulation")
+
+
+@pytest.mark.slow
+def test_the_scoreboard_of_the_documentation_comes_from_its_files(tmp_path: Path) -> None:
+    """What needs no model, from the flights again: files are stated, scored alone, and give the numbers shown."""
+    runs = {name: read_run(ROOT / "data" / name) for name in ("tunnel-1", "tunnel-2", "tunnel-3", "tunnel-4", "unseen")}
+    for name, run in runs.items():
+        training = [build_run(other) for n, other in runs.items() if n != name]
+        further = baselines(run.log, motion_errors(run.log, run.truth), training)
+        write_statements(evaluate_run(run, further=further), tmp_path, name)
+    for method, scores in score_folder(tmp_path).items():
+        shown = json.loads((ROOT / "docs" / "scoreboard" / f"{method}.json").read_text())
+        for name in ("nll_per_dim", "nees_dof", "energy_translation_m"):
+            assert scores["pooled"][name]["mean"] == pytest.approx(shown["pooled"][name]["mean"], rel=1e-3), method
