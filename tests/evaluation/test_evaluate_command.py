@@ -107,7 +107,7 @@ def test_the_table_names_the_methods(capsys, run_folder):
         "triangulation",
         "learned",
         "1 s: over a second",
-        "final: ",
+        "NLL: ",
     ):
         assert word in out
 
