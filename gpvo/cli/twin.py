@@ -26,10 +26,10 @@ ToleranceOption = Annotated[
 ]
 
 GapOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--gap",
-        help="By how much real errors exceed those of twins: the JSON of 'gpvo twin --against' on runs with truth.",
+        help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
     ),
 ]
 
@@ -97,7 +97,7 @@ def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: 
     print("real over predicted error, root mean square; the truth's own noise is counted in")
 
 
-def settings_of(replicates: int, tolerance: str, seed: int, gap: Path | None = None) -> TwinSettings:
+def settings_of(replicates: int, tolerance: str, seed: int, gap: str | None = None) -> TwinSettings:
     """The flags, parsed. Raises GpvoError for an unknown tolerance or a file without a gap."""
     from gpvo.twin.gap import read_gap
     from gpvo.twin.replicate import TwinSettings, read_tolerance

@@ -33,6 +33,13 @@ class Gap:
         return np.asarray(self.ratio) * np.asarray(self.spread) ** at[:, None]
 
 
+GAPS = {
+    # Six KITTI drives with tracks of one front end, eight twins each, 24 November 2026 (docs/concepts/twins.rst).
+    "drives": Gap((2.77, 3.45, 1.94, 1.57, 1.76, 1.81), (1.94, 1.72, 1.31, 1.29, 1.50, 1.44)),
+}
+"""By name."""
+
+
 def pooled(ratios: Array) -> tuple[Array, Array]:
     """Geometric mean (...) of ratios (R, ...) over runs, and the factor by which they spread about it: 1 for one run;
     NaN where no run is long enough."""
@@ -45,8 +52,12 @@ def pooled(ratios: Array) -> tuple[Array, Array]:
     return np.exp(mean), np.exp(np.sqrt(variance))
 
 
-def read_gap(path: Path) -> Gap:
-    """The gap in what ``gpvo twin --against --json`` prints. Raises SourceError where the file holds none."""
+def read_gap(text: str) -> Gap:
+    """A named gap, or that of a file of what ``gpvo twin --against --json`` prints. Raises SourceError where the file
+    holds none."""
+    if text in GAPS:
+        return GAPS[text]
+    path = Path(text)
     try:
         found = read_json(path)["pooled"][SPAN]
         gap = Gap(*(tuple(float(v) for v in found[key]) for key in ("ratio", "spread")))

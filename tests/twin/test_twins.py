@@ -127,7 +127,7 @@ def test_ratios_of_real_errors_to_those_that_twins_predict(flown, tmp_path):
     folder, real, _ = flown
     made = gpvo("twin", folder / "run", "--against", "--replicates", 3, "--json")
     (tmp_path / "gap.json").write_text(made.stdout)
-    gap = read_gap(tmp_path / "gap.json")
+    gap = read_gap(str(tmp_path / "gap.json"))
     # Seven windows of a second: a standard deviation is known to a quarter.
     assert all(0.4 < r < 2.5 for r in gap.ratio)
     assert gap.spread == (1.0,) * 6  # one run alone shows none
@@ -149,6 +149,7 @@ def test_a_gap_makes_the_errors_of_twins_larger(flown, tmp_path):
 
 
 def test_gaps_pool_over_runs_and_bad_files_are_refused(tmp_path):
+    assert len(read_gap("drives").ratio) == 6
     mean, spread = pooled(np.array([[2.0, np.nan], [8.0, np.nan]]))
     assert mean[0] == pytest.approx(4.0)
     assert spread[0] == pytest.approx(np.exp(np.log(2.0) * np.sqrt(2)))
@@ -157,11 +158,11 @@ def test_gaps_pool_over_runs_and_bad_files_are_refused(tmp_path):
     for text in ("{}", '{"pooled": {"1 s": {"ratio": [1], "spread": [1]}}}', '{"pooled": {"1 s": null}}'):
         file.write_text(text)
         with pytest.raises(SourceError, match="holds no gap"):
-            read_gap(file)
+            read_gap(str(file))
     values = {"ratio": [1.0] * 6, "spread": [1.0] * 5 + [1e9]}
     file.write_text(json.dumps({"pooled": {"1 s": values}}))
     with pytest.raises(SourceError, match="holds no gap"):
-        read_gap(file)
+        read_gap(str(file))
 
 
 @pytest.mark.slow
