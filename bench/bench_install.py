@@ -16,7 +16,8 @@ def run() -> dict[str, dict[str, object]]:
     with tempfile.TemporaryDirectory() as folder:
         _pip(Path(sys.executable), "wheel", "--no-deps", "--wheel-dir", folder, str(_ROOT))
         wheel = next(Path(folder).glob("gpvo-*.whl"))
-        packages = {"numpy": "numpy", "gpvo": str(wheel), "gpvo[vo]": f"{wheel}[vo]", "gpvo[runs]": f"{wheel}[runs]"}
+        packages = {"numpy": "numpy", "gpvo": str(wheel)}
+        packages |= {f"gpvo with {extra}": f"{wheel}[{extra}]" for extra in ("vo", "runs")}
         size, answer_s = {}, {}
         for name, what in packages.items():
             python, before = _environment(Path(folder) / name)

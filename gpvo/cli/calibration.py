@@ -13,7 +13,7 @@ def calibration(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Corrected Kalibr camera chain to write.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
 ) -> None:
-    """Print what a run found wrong between the cameras; write a corrected calibration.
+    """Print the calibration errors that a run found; write a corrected calibration.
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """

@@ -47,7 +47,7 @@ class Groups(TyperGroup):
 
 
 Config = Annotated[
-    Path | None, typer.Option(help="TOML file of options, a table per command, as in [run]; the line comes before it.")
+    Path | None, typer.Option(help="TOML file of options, one table per command. The command line takes precedence.")
 ]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Also print settings, time and memory.")]

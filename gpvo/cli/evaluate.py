@@ -47,9 +47,7 @@ def evaluate(
     ] = None,
     twins: Annotated[
         bool,
-        typer.Option(
-            "--twins", help="Judge by twins: each run simulated again from its own tracks, so that no truth is needed."
-        ),
+        typer.Option("--twins", help="Use twins as the truth: each run is simulated again from its own tracks."),
     ] = False,
     replicates: Replicates = 8,
     tolerance: ToleranceOption = "none",

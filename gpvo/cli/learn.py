@@ -29,7 +29,7 @@ def train(
     features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto",
     target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame",
     regressor: Annotated[
-        str, typer.Option(help="Of --target position: auto, exact, sparse, svgp or sklearn.")
+        str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
     ] = "auto",
     align: Annotated[
         str, typer.Option(help="Fit a fixed rotation between log and truth first: rotation or none.")

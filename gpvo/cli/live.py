@@ -102,7 +102,7 @@ def doctor(
     seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
     json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
-    """Find what is wrong with anyone's covariance, and say what each filter makes of it.
+    """Check anyone's covariance, and what each filter would do with it.
 
     Example: gpvo doctor flight.mcap
     """

@@ -29,10 +29,14 @@ def run(
     sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
     self_calibration: Annotated[
-        bool | None, typer.Option(help="Estimate what the calibration has wrong; on, but for preset thesis.")
+        bool | None,
+        typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
     ] = None,
     calibration_state: Annotated[
-        Path | None, typer.Option(help="Start from what an earlier run found: its folder or calibration_state.json.")
+        Path | None,
+        typer.Option(
+            help="Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
+        ),
     ] = None,
     kind: flags.Kind = None,
     calibration: flags.Calibration = None,
