@@ -12,6 +12,7 @@ from gpvo.types import Array, Status, VoRecord
 
 LONGEST_STEP_S = 60.0
 """A record that comes later than this after the one before is believed when the next one confirms its clock."""
+_LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 _FARTHEST_M = 1e5  # No motion between two frames is longer.
 _NOT_RIGID = 1e-3  # Deviation of R^T R from the identity.
 _EYE = np.eye(4)
@@ -78,7 +79,7 @@ class Intake:
 
 def follows(before_ns: int, t_ns: int) -> bool:
     """Whether a stamp comes after the one before, and not too long after."""
-    return 0 < t_ns - before_ns <= LONGEST_STEP_S * 1e9
+    return 0 < t_ns - before_ns <= _LONGEST_STEP_NS
 
 
 def _is_motion(T: Array) -> bool:
