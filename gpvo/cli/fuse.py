@@ -144,12 +144,12 @@ def publish(
 
 
 def _line(compared: Comparison) -> str:
-    """A comparison in words; over one run it has no interval."""
+    """A comparison in words; over fewer than three runs it has no interval."""
     difference = compared.difference_m
     if difference.high < float("inf"):
         return str(compared)
     change = f"ATE {difference.mean:+.4f} m, gain {compared.gain_percent:.1f} %"
-    return f"{compared.policy} less {compared.against}: {change} (one run: no interval)"
+    return f"{compared.policy} less {compared.against}: {change} (too few runs for an interval)"
 
 
 def _teller() -> Callable[[str], None] | None:

@@ -193,24 +193,34 @@ def has_noise(flight: Flight, policy: Policy) -> bool:
 
 
 def table(study: Study) -> str:
-    """Mean of every policy and, below, the ATE of every run."""
-    names = list(study.scores)
+    """Mean of every policy that could run and, below, its ATE on every run; at most 80 columns for six runs."""
+    names = [name for name, scores in study.scores.items() if any(scores)]
     columns = (
-        ("ATE m", "ate_rmse_m", 4),
-        ("final m", "final_error_m", 4),
-        ("drift %", "drift_percent", 3),
-        ("NEES pos", "nees_position", 2),
-        ("NEES att", "nees_attitude", 2),
-        ("NIS", "nis_dof", 2),
-        ("rejected", "rejected", 1),
+        ("ATE m", "ate_rmse_m", 4, 7),
+        ("final m", "final_error_m", 4, 8),
+        ("drift %", "drift_percent", 3, 8),
+        ("NEES p", "nees_position", 2, 7),
+        ("NEES a", "nees_attitude", 2, 7),
+        ("NIS", "nis_dof", 2, 6),
+        ("reject", "rejected", 1, 7),
     )
-    lines = [f"{'policy':<20}" + "".join(f"{title:>10}" for title, _, _ in columns) + f"{'diverged':>10}"]
+    lines = [f"{'policy':<20}" + "".join(f"{title:>{width}}" for title, _, _, width in columns) + f"{'diverged':>9}"]
     for name in names:
-        values = "".join(f"{study.mean(name, key):>10.{digits}f}" for _, key, digits in columns)
+        values = "".join(_cell(study.mean(name, key), digits, width) for _, key, digits, width in columns)
         diverged = study.diverged(name)
-        lines.append(f"{name:<20}{values}{'nan' if diverged is None else diverged:>10}")
-    lines += ["", "ATE m of every run", f"{'run':<28}" + "".join(f"{n[:18]:>19}" for n in names)]
-    for i, run in enumerate(study.runs):
-        ate = [study.column(n, "ate_rmse_m")[i] for n in names]
-        lines.append(f"{run[:27]:<28}" + "".join(f"{a:>19.4f}" for a in ate))
+        lines.append(f"{name:<20}{values}{'-' if diverged is None else diverged:>9}")
+    lines.append("NEES p, a: of position and attitude, per degree of freedom; 1 is right.")
+    runs = ", ".join(f"{i + 1}: {run}" for i, run in enumerate(study.runs))
+    lines += ["", f"ATE m on {runs}", " " * 20 + "".join(f"{i + 1:>10}" for i in range(len(study.runs)))]
+    for name in names:
+        lines.append(f"{name:<20}" + "".join(_cell(v, 4, 10) for v in study.column(name, "ate_rmse_m")))
     return "\n".join(lines)
+
+
+def _cell(value: float, digits: int, width: int) -> str:
+    """Right in its column, with as many digits as fit; what is not known is a dash."""
+    if not np.isfinite(value):
+        return f"{'-':>{width}}"
+    while digits and len(f"{value:.{digits}f}") >= width:
+        digits -= 1
+    return f"{value:>{width}.{digits}f}"

@@ -88,6 +88,8 @@ def test_study_tells_a_better_policy_and_leaves_out_what_cannot_run() -> None:
     assert set(result.scores["triangulation"]) == {None}
     text = table(result)
     assert all(f.name in text for f in flights)
+    assert "nan" not in text
+    assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith("ATE m on"))
     assert not has_noise(flights[0], GeometricPolicy("triangulation"))
     assert has_noise(with_geometric(flights[0], np.eye(6)), GeometricPolicy("triangulation"))
     assert has_noise(flights[0], LearnedPolicy())
