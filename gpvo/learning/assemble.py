@@ -25,11 +25,11 @@ from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
 from gpvo.learning.rows import Rows
 from gpvo.learning.selection import significant_gain
 from gpvo.learning.spans import at_most
-from gpvo.learning.velocities import rate_changes, usual_rate_var
+from gpvo.learning.velocities import learn_velocities
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.basis import ProjectedGP
-from gpvo.online.division import ln_faster, of_calibration
-from gpvo.online.estimate import NO_CALIBRATION, ErrorModelArrays
+from gpvo.online.division import Division, ln_faster, of_calibration
+from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import Domain
 from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
@@ -46,7 +46,7 @@ def assemble(
     inputs: Sequence[str],
     gp: ProjectedGP | None,
     variance: Array,
-) -> tuple[ErrorModelArrays, dict[str, Any]]:
+) -> tuple[ErrorModel, dict[str, Any]]:
     """Parts, correlation and calibration by the out-of-fold ``variance`` (n, 6); then everything in one place.
 
     ``base``, and ``gp`` of ``inputs`` where there is one: what states the variance of another sequence.
@@ -64,24 +64,22 @@ def assemble(
     if gp is not None:
         high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
     sums = _sums_of(of)
-    model = ErrorModelArrays(
+    model = ErrorModel(
         columns=columns,
         inputs=places,
         basis=basis_of(gp),
         domain=domain,
         base=base,
+        division=sums.division,
+        velocities=learn_velocities(rows),
         factor=scale.factor,
         outside_power=np.array([outside_power]),
         high=high,
-        geometry_weight=np.zeros(1),
         typical_ln_det=np.zeros(1),
-        usual_rate_var=usual_rate_var(rows),
-        rate_change_var=rate_changes(rows),
         mean_in_sigma=np.array([True]),
         steady_mean=np.zeros(6),
         nu=np.zeros(1),
         dt_s=rows.step_s,
-        **sums.arrays,
     )
     sums, found = _with_calibration(model, of, (sums, _most_likely(model, of)))
     return found.model, _calibration(rows, scale, found, sums, np.abs(z) / np.sqrt(found.joint))
@@ -110,17 +108,17 @@ class _Residuals:
             root[fold], rest[fold] = of_calibration(self.variance[fold], patterns, twist[fold])
         return root, rest, self.error - self.patterns.error
 
-    def divided(self, model: ErrorModelArrays) -> tuple[Array, Array]:
-        """Covariances of the parts and root of the calibration, as :meth:`ErrorModelArrays.divided`; the latter by the
+    def divided(self, model: ErrorModel) -> tuple[Array, Array]:
+        """Covariances of the parts and root of the calibration, as :meth:`Division.covariances`; the latter by the
         patterns of the other flights."""
         if self.patterns is None:
-            return model.divided(self.variance, self.X, self.geometry)
+            return model.division.covariances(self.variance, model.twist(self.X), self.geometry)
         parts, root = np.empty((len(self.error), 3, 6, 6)), np.empty((len(self.error), 6, 6))
         for k, patterns in enumerate(self.patterns.without):
             fold = self.patterns.fold == k
             geometry = None if self.geometry is None else self.geometry[fold]
-            of_fold = replace(model, calibration_patterns=patterns)
-            parts[fold], root[fold] = of_fold.divided(self.variance[fold], self.X[fold], geometry)
+            of_fold = replace(model.division, calibration_patterns=patterns)
+            parts[fold], root[fold] = of_fold.covariances(self.variance[fold], model.twist(self.X[fold]), geometry)
         return parts, root
 
 
@@ -135,23 +133,22 @@ class _Sums:
     patterns: Patterns | None
 
     @property
-    def arrays(self) -> dict[str, Any]:
-        """The model's arrays that say so."""
-        of_calibration = NO_CALIBRATION
-        if self.patterns is not None:
-            of_calibration = {
-                "calibration_patterns": self.patterns.usual,
-                "calibration_tau_s": np.full(6, LASTING_S),
-            }
-        return {
-            "correlation": self.correlation,
-            "share": self.parts.share,
-            "growth": self.parts.growth,
-            "level": self.parts.level,
-            "ln_speed": self.ln_speed,
-            "bias_tau_s": self.parts.tau_s,
-            **of_calibration,
+    def division(self) -> Division:
+        """The same as the model has it, without the geometry's correlation."""
+        lasting = self.patterns is not None and {
+            "calibration_patterns": self.patterns.usual,
+            "calibration_tau_s": np.full(6, LASTING_S),
         }
+        return Division(
+            share=self.parts.share,
+            growth=self.parts.growth,
+            level=self.parts.level,
+            ln_speed=self.ln_speed,
+            correlation=self.correlation,
+            geometry_weight=np.zeros(1),
+            bias_tau_s=self.parts.tau_s,
+            **(lasting or {}),
+        )
 
 
 @dataclass(frozen=True)
@@ -159,27 +156,27 @@ class _Consistent:
     """A model that is right of poses and of all six axes together, the factors of both, and how likely the poses of
     each sequence are by it (S,)."""
 
-    model: ErrorModelArrays
+    model: ErrorModel
     added: float
     joint: float
     losses: Array
 
 
-def _most_likely(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
+def _most_likely(model: ErrorModel, of: _Residuals) -> _Consistent:
     """The model made right, with as much of the geometry's correlation as makes poses and motions likeliest; none where
     the geometry is mostly unknown."""
     if of.geometry is None or np.isfinite(of.geometry).all(axis=(1, 2)).mean() < _LEAST_KNOWN:
         return _consistent(model, of)
-    tried = [_consistent(replace(model, geometry_weight=np.array([w])), of) for w in _WEIGHTS]
+    tried = [_consistent(_with_division(model, geometry_weight=np.array([w])), of) for w in _WEIGHTS]
     return min(tried, key=lambda found: found.losses.mean())
 
 
-def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
+def _consistent(model: ErrorModel, of: _Residuals) -> _Consistent:
     """The model made right of poses and of all six axes together."""
     parts, root = of.divided(model)
     factor = fit_joint_factor(of.error, _whole(parts, root), of.rows.group)
-    added = added_factor(*_motions(model, of, parts * factor, root * np.sqrt(factor)), model.share)
-    model = replace(model, share=with_added(model.share, added))
+    added = added_factor(*_motions(model, of, parts * factor, root * np.sqrt(factor)), model.division.share)
+    model = _with_division(model, share=with_added(model.division.share, added))
     parts, root = of.divided(model)
     whole = _whole(parts, root)
     joint = fit_joint_factor(of.error, whole, of.rows.group)
@@ -189,12 +186,16 @@ def _consistent(model: ErrorModelArrays, of: _Residuals) -> _Consistent:
     model = replace(
         model,
         factor=model.factor * joint,
-        level=model.level + np.log(joint),
         typical_ln_det=np.array([typical]),
-        calibration_patterns=model.calibration_patterns * np.sqrt(joint),
         nu=np.array([0.0 if np.isinf(nu) else nu]),
     )
+    rooted = model.division.calibration_patterns * np.sqrt(joint)
+    model = _with_division(model, level=model.division.level + np.log(joint), calibration_patterns=rooted)
     return _Consistent(model, added, joint, losses)
+
+
+def _with_division(model: ErrorModel, **changed: Array) -> ErrorModel:
+    return replace(model, division=replace(model.division, **changed))
 
 
 def _whole(parts: Array, root: Array) -> Array:
@@ -202,19 +203,19 @@ def _whole(parts: Array, root: Array) -> Array:
     return np.asarray(parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2))
 
 
-def _motions(model: ErrorModelArrays, of: _Residuals, parts: Array, root: Array) -> tuple[list[Motions], Array]:
+def _motions(model: ErrorModel, of: _Residuals, parts: Array, root: Array) -> tuple[list[Motions], Array]:
     """All chains with what is stated of them, and the correlations (2, 6) of bias and calibration from one motion to
     the next."""
     T_prev_cur = of.rows.motions()
     chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
     chains = [Motions(i, T_prev_cur[c], of.error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
-    return chains, np.exp(-of.rows.step_s / np.array([model.bias_tau_s, model.calibration_tau_s]))
+    return chains, np.exp(-of.rows.step_s / model.division.persistent_tau_s.reshape(2, 6))
 
 
 _Found = tuple[_Sums, _Consistent]
 
 
-def _with_calibration(bare: ErrorModelArrays, of: _Residuals, plain: _Found) -> _Found:
+def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Found) -> _Found:
     """The same with a part of wrong calibration, where by the patterns of other flights the poses are likelier, beyond
     chance."""
     patterns = learn_patterns(of.rows, of.error, of.variance)
@@ -222,7 +223,7 @@ def _with_calibration(bare: ErrorModelArrays, of: _Residuals, plain: _Found) -> 
         return plain
     of = replace(of, patterns=patterns)
     sums = _sums_of(of)
-    found = _most_likely(replace(bare, **sums.arrays), of)
+    found = _most_likely(replace(bare, division=sums.division), of)
     return (sums, found) if significant_gain(plain[1].losses - found.losses) else plain
 
 
@@ -260,7 +261,7 @@ def _calibration(rows: Rows, scale: Scale, found: _Consistent, sums: _Sums, scor
         "added_factor": found.added,
         "nu": float(found.model.nu[0]) or None,
         "calibration_part": sums.patterns is not None,
-        "geometry_correlation_weight": float(found.model.geometry_weight[0]),
+        "geometry_correlation_weight": float(found.model.division.geometry_weight[0]),
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
         "interval_guaranteed": [sure for _, sure in axes],

@@ -24,7 +24,7 @@ from gpvo.learning.selection import significant_gain, simplest_sufficient
 from gpvo.learning.steadymean import steady_mean
 from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import ErrorModel
 from gpvo.online.for_filter import BASE, FOR_FILTER, different_arrays
 from gpvo.online.guard import Domain
 from gpvo.stats.student_t import negative_log_likelihood
@@ -67,8 +67,8 @@ class Learned:
     ``arrays``: what goes into the file; ``choices``: how each choice was made; ``calibration``: what it rests on.
     """
 
-    model: ErrorModelArrays
-    base: ErrorModelArrays
+    model: ErrorModel
+    base: ErrorModel
     arrays: Mapping[str, NDArray[Any]]
     choices: dict[str, Any]
     calibration: dict[str, Any] = field(default_factory=dict)

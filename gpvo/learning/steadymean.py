@@ -8,14 +8,14 @@ from scipy.stats import t as t_distribution
 
 from gpvo.geometry.covariance import turn_first_root
 from gpvo.learning.rows import Rows
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import ErrorModel
 from gpvo.types import Array
 
 _MOST_SIGMAS = 4.0
 
 
-def steady_mean(rows: Rows, model: ErrorModelArrays, variance: Array) -> Array:
-    """(6,) of :meth:`gpvo.online.estimate.ErrorModelArrays.steady`, zero on axes where it may be chance.
+def steady_mean(rows: Rows, model: ErrorModel, variance: Array) -> Array:
+    """(6,) of :meth:`gpvo.online.estimate.ErrorModel.steady`, zero on axes where it may be chance.
 
     From the errors and their out-of-fold variances (n, 6) before calibration. Least squares over all motions, errors
     in units of their own root of the covariance; kept where those of a left-out sequence surely lean the same way.

@@ -25,7 +25,7 @@ from gpvo.learning.parallel import map_jobs
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import units
 from gpvo.online.predictor import Predictor
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
@@ -177,7 +177,7 @@ def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainC
     }
 
 
-def estimate_set(model: ErrorModelArrays, s: TrainingSet) -> Prediction:
+def estimate_set(model: ErrorModel, s: TrainingSet) -> Prediction:
     """The online predictor's own arithmetic over the rows of a sequence."""
     return model.estimate(s.select(model.columns), s.covariances.get(model.base.method or ""), s.dt_s)
 
@@ -191,7 +191,8 @@ def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Arr
     gross_lost = lost_length > SLIP_MEDIANS * np.median(length)
     dt_s = learned.model.dt_s
     rate_var = np.diagonal(estimate.covariance, axis1=1, axis2=2).mean(axis=0) / dt_s**2
-    lost_var = [learned.model.lost_variance(dt_s, dt_s, np.zeros(6), rate_var, jump) for jump in s.lost_jump]
+    velocities = learned.model.velocities
+    lost_var = [velocities.lost_variance(dt_s, dt_s, dt_s, np.zeros(6), rate_var, jump) for jump in s.lost_jump]
     learned_all = np.concatenate(
         [nees(s.Y - estimate.mean, estimate.covariance), (s.lost_xi**2 / np.reshape(lost_var, (-1, 6))).sum(1)]
     )

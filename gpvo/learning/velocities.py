@@ -1,4 +1,4 @@
-"""How fast the vehicle usually is, and how its velocity changes: all there is to say of a motion that was lost."""
+"""Learning how fast the vehicle usually is, and how its velocity changes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ import numpy as np
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.rows import Rows
 from gpvo.online.base import TWIST_COLUMNS
-from gpvo.online.estimate import COASTED
+from gpvo.online.velocity import COASTED, Velocities
 from gpvo.types import Array
 
 _LEAST = 1e-6
+
+
+def learn_velocities(rows: Rows) -> Velocities:
+    """Of all sequences alike."""
+    return Velocities(usual_rate_var(rows), rate_changes(rows))
 
 
 def usual_rate_var(rows: Rows) -> Array:

@@ -2,13 +2,108 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
-from gpvo.types import Array
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpvo.geometry.covariance import correlation as correlation_of
+from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise
+from gpvo.types import Array, MotionError, field_names
 
 PARTS = ("jitter", "white", "bias")
 LN_FASTEST = float(np.log(20.0))
+NO_CALIBRATION: Mapping[str, Array] = {
+    "calibration_patterns": np.zeros((6, 6, 6)),
+    "calibration_tau_s": np.ones(6),
+}
+"""Arrays of a model without a part of its own for errors of calibration."""
+_RIDGE = 1e-6 * np.eye(6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Division:
+    """What has to be known to tell the parts of an error from its variance; axes in the order of the tangent vector.
+
+    ``share`` (3, 6): how the variance divides among jitter, white and bias at the log variance ``level`` (6,) and the
+    typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6): how that changes (see :func:`divide`).
+    ``correlation`` (3, 6, 6) of the parts, the first two mixed with the geometry's by ``geometry_weight`` (1,).
+    ``bias_tau_s`` (6,): of the bias. ``calibration_patterns`` (6, 6, 6): the ways of a calibration to be wrong (see
+    :func:`of_calibration`), and ``calibration_tau_s`` (6,): how long each stays the same.
+    """
+
+    share: Array
+    growth: Array
+    level: Array
+    ln_speed: Array
+    correlation: Array
+    geometry_weight: Array
+    bias_tau_s: Array
+    calibration_patterns: Array = field(default_factory=lambda: NO_CALIBRATION["calibration_patterns"])
+    calibration_tau_s: Array = field(default_factory=lambda: NO_CALIBRATION["calibration_tau_s"])
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file."""
+        left_out = () if self._calibrated else NO_CALIBRATION
+        return {name: getattr(self, name) for name in field_names(Division) if name not in left_out}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Division:
+        """The inverse of :meth:`to_arrays`. Raises KeyError where one is missing."""
+        return cls(**{name: {**NO_CALIBRATION, **arrays}[name] for name in field_names(cls)})
+
+    @cached_property
+    def persistent_tau_s(self) -> Array:
+        """(12,) time constants of the bias and of errors of calibration."""
+        return np.concatenate([self.bias_tau_s, self.calibration_tau_s])
+
+    def split(self, variance: Array, twist: Array, geometry: Array | None) -> MotionError:
+        """The errors of motions by their parts, without a mean, from variances (n, 6).
+
+        ``twist`` (n, 6): velocities. ``geometry`` (n, 6, 6): covariances, NaN where unknown. Pixel noise, which is
+        jitter and white, is correlated as the geometry says; the bias has its own pattern.
+        """
+        root, rest = np.zeros((len(variance), 6, 6)), variance
+        if self._calibrated:
+            root, rest = of_calibration(variance, self.calibration_patterns, twist)
+        share = divide(self.share, self.growth, np.log(rest) - self.level, ln_faster(twist[:, :3], self.ln_speed))
+        sigma = np.sqrt(share * rest[:, None, :])
+        noise = self._correlations(len(variance), geometry) * sigma[:, :2, :, None] * sigma[:, :2, None, :]
+        return MotionError(
+            mean=np.zeros((len(variance), 6)),
+            jitter=noise[:, 0],
+            white=noise[:, 1],
+            persistent_root=np.concatenate([sigma[:, 2, :, None] * self._bias_root, root], axis=-1),
+            persistent_tau_s=self.persistent_tau_s,
+        )
+
+    def covariances(self, variance: Array, twist: Array, geometry: Array | None) -> tuple[Array, Array]:
+        """Covariances (n, 3, 6, 6) of jitter, white and bias, the bias without that of calibration, and the root
+        (n, 6, 6) of the latter."""
+        e = self.split(variance, twist, geometry)
+        bias = e.persistent_root[..., :6]
+        return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
+
+    def _correlations(self, n: int, geometry: Array | None) -> Array:
+        """(n, 2, 6, 6) of jitter and white."""
+        out = np.repeat(self.correlation[None, :2], n, axis=0)
+        w = float(self.geometry_weight[0])
+        if geometry is not None and w > 0:
+            R = _correlations(geometry)
+            known = np.isfinite(R).all(axis=(1, 2))
+            out[known] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
+        return _regular(out)
+
+    @cached_property
+    def _calibrated(self) -> bool:
+        return bool(self.calibration_patterns.any())
+
+    @cached_property
+    def _bias_root(self) -> Array:
+        return scaled_root(_regular(self.correlation[2]))
 
 
 def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
@@ -51,3 +146,20 @@ def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
     speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
     ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical
     return np.where(np.isfinite(ratio), np.minimum(np.maximum(ratio, 0.0), LN_FASTEST), 0.0)
+
+
+def _regular(correlation: Array) -> Array:
+    """One part in a million of the identity keeps a nearly singular geometry positive definite after rounding."""
+    return correlation * (1.0 - 1e-6) + _RIDGE
+
+
+def _correlations(geometry: Array) -> Array:
+    """(n, 6, 6) correlations of covariances; NaN throughout where one is not positive semidefinite."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        R = symmetrise(correlation_of(geometry))
+    ridge = R + _RIDGE
+    try:
+        np.linalg.cholesky(ridge)
+    except np.linalg.LinAlgError:
+        R[[not is_positive_definite(C) for C in ridge]] = np.nan
+    return R

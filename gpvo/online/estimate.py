@@ -11,24 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
-from gpvo.geometry.covariance import correlation as correlation_of
-from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise, turn_first_root
+from gpvo.geometry.covariance import turn_first_root
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
-from gpvo.online.division import divide, ln_faster, of_calibration
-from gpvo.online.guard import Domain, Whereabouts, growth
+from gpvo.online.division import Division
+from gpvo.online.guard import Domain, DomainCheck, growth
 from gpvo.online.validation import LARGEST, check_arrays, check_related
+from gpvo.online.velocity import Velocities
 from gpvo.types import Array, MotionError, Prediction
 
-_EYE = np.eye(6)
-_RIDGE = 1e-6 * _EYE
-NO_CALIBRATION: Mapping[str, Array] = {
-    "calibration_patterns": np.zeros((6, 6, 6)),
-    "calibration_tau_s": np.ones(6),
-}
-"""Arrays of a model without a part of its own for errors of calibration."""
-COASTED = (1, 2, 5, 10, 20, 50)
-"""Over so many usual motions training tells how much a velocity changes."""
 LN_LARGEST = 60.0
 """Log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
 LEAST_VAR = 1e-24
@@ -41,20 +32,9 @@ _OWN = (
     "factor",
     "outside_power",
     "high",
-    "correlation",
-    "geometry_weight",
-    "share",
-    "growth",
-    "level",
-    "ln_speed",
-    "bias_tau_s",
     "typical_ln_det",
-    "usual_rate_var",
-    "rate_change_var",
     "mean_in_sigma",
     "steady_mean",
-    "calibration_patterns",
-    "calibration_tau_s",
     "nu",
 )
 
@@ -65,7 +45,7 @@ class Variances:
     variance, ``total`` with ignorance of it, ``mean`` and its ``mean_var``; ``limit``, as wrong as a motion can be.
     ``dt_s`` (n,): durations that were used."""
 
-    place: Whereabouts
+    place: DomainCheck
     unit: Array
     known: Array
     total: Array
@@ -76,21 +56,15 @@ class Variances:
 
 
 @dataclass(frozen=True)
-class ErrorModelArrays:
+class ErrorModel:
     """Everything the arithmetic needs; axes in the order of the tangent vector.
 
     ``columns``: all features, in order; ``inputs``: positions of those the GP sees. ``factor`` (6,): calibration of the
     variance; ``outside_power`` (1,): its growth away from the training domain. ``high`` (6,): log
-    ratio to the base that few training rows exceeded. ``correlation`` (3, 6, 6) of jitter, white and bias, the first
-    two mixed with the geometry's by ``geometry_weight`` (1,). ``share`` (3, 6): how the variance divides among them at
-    the log variance ``level`` (6,) and the typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6) how
-    that changes (see :func:`gpvo.online.division.divide`); ``bias_tau_s`` (6,). ``typical_ln_det`` (1,): median over
-    the training rows. ``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2];
-    ``rate_change_var`` (K, 6): of the true one's changes over ``COASTED`` motions. ``mean_in_sigma`` (1,): whether the
-    GP's mean is in units of the base's standard deviation, not the error's own at the usual duration ``dt_s``.
-    ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``calibration_patterns`` (6, 6, 6):
-    the ways of a calibration to be wrong (see :func:`gpvo.online.division.of_calibration`), and ``calibration_tau_s``
-    (6,), how long each stays the same. ``nu`` (1,): degrees of freedom of a single motion's error, 0 for a Gaussian.
+    ratio to the base that few training rows exceeded. ``typical_ln_det`` (1,): median over the training rows.
+    ``mean_in_sigma`` (1,): whether the GP's mean is in units of the base's standard deviation, not the error's own at
+    the usual duration ``dt_s``. ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``nu`` (1,):
+    degrees of freedom of a single motion's error, 0 for a Gaussian.
     """
 
     columns: tuple[str, ...]
@@ -98,32 +72,23 @@ class ErrorModelArrays:
     basis: SharedBasis
     domain: Domain
     base: BaseVariance
+    division: Division
+    velocities: Velocities
     factor: Array
     outside_power: Array
     high: Array
-    correlation: Array
-    geometry_weight: Array
-    share: Array
-    growth: Array
-    level: Array
-    ln_speed: Array
-    bias_tau_s: Array
     typical_ln_det: Array
-    usual_rate_var: Array
-    rate_change_var: Array
     mean_in_sigma: NDArray[np.bool_]
     steady_mean: Array
-    calibration_patterns: Array
-    calibration_tau_s: Array
     nu: Array
     dt_s: float
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file."""
-        left_out = () if self._calibrated else NO_CALIBRATION
-        own = {name: np.asarray(getattr(self, name)) for name in _OWN if name not in left_out}
         return {
-            **own,
+            **{name: np.asarray(getattr(self, name)) for name in _OWN},
+            **self.division.to_arrays(),
+            **self.velocities.to_arrays(),
             "theta": self.base.theta,
             "theta_plain": self.base.plain,
             **self.basis.to_arrays("basis."),
@@ -133,16 +98,14 @@ class ErrorModelArrays:
     @classmethod
     def from_arrays(
         cls, arrays: Mapping[str, NDArray[Any]], columns: tuple[str, ...], method: str | None, dt_s: float
-    ) -> ErrorModelArrays:
+    ) -> ErrorModel:
         """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or is not what the schema of
         :mod:`gpvo.online.validation` says."""
         check_arrays(arrays, len(columns))
         try:
-            # Velocities that have nothing to do with each other, where an older file does not say.
-            unrelated = np.tile(2.0 * arrays["usual_rate_var"], (len(COASTED), 1))
-            absent = {"nu": np.zeros(1), "steady_mean": np.zeros(6), "rate_change_var": unrelated}
-            arrays = {**absent, **NO_CALIBRATION, **arrays}
+            arrays = {"nu": np.zeros(1), "steady_mean": np.zeros(6), **arrays}
             own = {name: arrays[name] for name in _OWN}
+            division, velocities = Division.from_arrays(arrays), Velocities.from_arrays(arrays)
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
         except KeyError as missing:
             raise ModelError(f"the model file lacks the array {missing}") from None
@@ -152,7 +115,16 @@ class ErrorModelArrays:
         domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
         if basis.n_inputs != len(own["inputs"]) or basis.n_outputs != 6:
             raise ModelError("the model file's GPs do not fit its inputs and the six axes")
-        return cls(columns=columns, basis=basis, domain=domain, base=base, dt_s=dt_s, **own)
+        return cls(
+            columns=columns,
+            basis=basis,
+            domain=domain,
+            base=base,
+            division=division,
+            velocities=velocities,
+            dt_s=dt_s,
+            **own,
+        )
 
     def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Prediction:
         """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown.
@@ -211,12 +183,12 @@ class ErrorModelArrays:
     def _has_steady_mean(self) -> bool:
         return bool(self.steady_mean.any())
 
-    def locate(self, X: Array, dt_s: Array | None = None) -> Whereabouts:
+    def locate(self, X: Array, dt_s: Array | None = None) -> DomainCheck:
         """Where rows X (n, d) lie, given how well their motions are known."""
         duration = self._duration(X, dt_s)
         return self._locate(X, self.base(self._base_columns(X), duration), duration)
 
-    def _locate(self, X: Array, base: Array, duration: Array) -> Whereabouts:
+    def _locate(self, X: Array, base: Array, duration: Array) -> DomainCheck:
         return self.domain.locate(X, feature_noise(self._motion_noise, base, duration))
 
     @cached_property
@@ -248,24 +220,8 @@ class ErrorModelArrays:
         mean_var = (said.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
         # What odometry says of itself means what it meant in training only where the surroundings are alike.
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
-        # VO's motion less the true one is no longer than both together, whatever is said of its variance.
-        moved = (columns[:, :6] ** 2 + self.usual_rate_var) * duration[:, None] ** 2
-        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, _block_sums(moved), duration)
-
-    def lost_variance(self, dt_s: float, age_s: float, rate: Array, rate_var: Array, jump: Array) -> Array:
-        """(6,) variance of a lost motion of duration ``dt_s``, of which nothing was measured.
-
-        The vehicle has gone on with the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, known to ``rate_var``
-        (6,), but for what velocities changed in training over such a time, and more if it is faster than was usual
-        there; at most, and after longer times than training shows, it is as wrong as the vehicle is fast. ``jump`` (6,)
-        [m, rad]: by how much the motion given differs from that velocity's.
-        """
-        lags = self.dt_s * np.array(COASTED)
-        change = np.array([np.interp(age_s, lags, of_axis, right=np.inf) for of_axis in self.rate_change_var.T])
-        speed2 = _block_sums(rate**2)
-        faster = np.maximum(speed2 / _block_sums(self.usual_rate_var), 1.0)
-        changed = np.minimum(change * faster, np.maximum(self.usual_rate_var, speed2))
-        return np.asarray((changed + rate_var) * dt_s**2 + _block_sums(jump**2))
+        limit = self.velocities.largest_error_var(columns[:, :6], duration)
+        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit, duration)
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones by :attr:`absent`, geometric log variances never below the training's
@@ -293,82 +249,13 @@ class ErrorModelArrays:
         worst[6:] = high[6:]
         return np.where(d.may_miss[at], d.centre[at], worst)
 
-    def faster(self, X: Array) -> Array:
-        """(n, 1) log of the speed over the typical one (see :func:`ln_faster`)."""
-        at = self._base_place[0][:3]
-        return ln_faster(X[:, at], self.ln_speed)
+    def twist(self, X: Array) -> Array:
+        """(n, 6) velocities of rows X (n, d)."""
+        return X[:, self._base_place[0][:6]]
 
     def split(self, variance: Array, X: Array, geometry: Array | None) -> MotionError:
-        """The errors of rows X by their parts, without a mean, from variances (n, 6).
-
-        Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own pattern.
-        """
-        sigma, correlation, of_wrong = self._divided(variance, X, geometry)
-        noise = correlation * sigma[:, :2, :, None] * sigma[:, :2, None, :]
-        return MotionError(
-            mean=np.zeros((len(X), 6)),
-            jitter=noise[:, 0],
-            white=noise[:, 1],
-            persistent_root=np.concatenate([sigma[:, 2, :, None] * self._bias_root, of_wrong], axis=-1),
-            persistent_tau_s=self.persistent_tau_s,
-        )
-
-    def divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array]:
-        """Covariances (n, 3, 6, 6) of jitter, white and bias, the bias without that of calibration, and the root
-        (n, 6, 6) of the latter."""
-        e = self.split(variance, X, geometry)
-        bias = e.persistent_root[..., :6]
-        return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
-
-    def _divided(self, variance: Array, X: Array, geometry: Array | None) -> tuple[Array, Array, Array]:
-        """Deviations (n, 3, 6) of jitter, white and bias, correlations (n, 2, 6, 6) of the first two, and the root
-        (n, 6, 6) of what a wrong calibration has of the variance."""
-        out = np.repeat(self.correlation[None, :2], len(variance), axis=0)
-        w = float(self.geometry_weight[0])
-        if geometry is not None and w > 0:
-            R = _correlations(geometry)
-            known = np.isfinite(R).all(axis=(1, 2))
-            out[known] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
-        root, rest = np.zeros((len(variance), 6, 6)), variance
-        if self._calibrated:
-            root, rest = of_calibration(variance, self.calibration_patterns, X[:, self._base_place[0][:6]])
-        share = divide(self.share, self.growth, np.log(rest) - self.level, self.faster(X))
-        return np.sqrt(share * rest[:, None, :]), _regular(out), root
-
-    @cached_property
-    def _calibrated(self) -> bool:
-        return bool(self.calibration_patterns.any())
-
-    @cached_property
-    def _bias_root(self) -> Array:
-        return scaled_root(_regular(self.correlation[2]))
-
-    @cached_property
-    def persistent_tau_s(self) -> Array:
-        """(12,) time constants of the bias and of errors of calibration."""
-        return np.concatenate([self.bias_tau_s, self.calibration_tau_s])
-
-
-def _regular(correlation: Array) -> Array:
-    """One part in a million of the identity keeps a nearly singular geometry positive definite after rounding."""
-    return correlation * (1.0 - 1e-6) + _RIDGE
-
-
-def _correlations(geometry: Array) -> Array:
-    """(n, 6, 6) correlations of covariances; NaN throughout where one is not positive semidefinite."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        R = symmetrise(correlation_of(geometry))
-    ridge = R + _RIDGE
-    try:
-        np.linalg.cholesky(ridge)
-    except np.linalg.LinAlgError:
-        R[[not is_positive_definite(C) for C in ridge]] = np.nan
-    return R
-
-
-def _block_sums(values: Array) -> Array:
-    """(..., 6) sums over the axes of the translation, three times, and over those of the rotation."""
-    return np.repeat(values.reshape(*values.shape[:-1], 2, 3).sum(axis=-1), 3, axis=-1)
+        """The errors of rows X by their parts, without a mean, from variances (n, 6)."""
+        return self.division.split(variance, self.twist(X), geometry)
 
 
 def within(variance: Array, limit: Array) -> Array:

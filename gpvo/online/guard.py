@@ -14,7 +14,7 @@ from gpvo.errors import ModelError
 from gpvo.online.slip import SlipDetector, flag_slips
 from gpvo.types import Array, StereoCamera
 
-__all__ = ["Domain", "SlipDetector", "Whereabouts", "camera_problems", "flag_slips"]
+__all__ = ["Domain", "DomainCheck", "SlipDetector", "camera_problems", "flag_slips"]
 
 _RARE = 0.0002
 
@@ -25,7 +25,7 @@ DEGRADED_BELOW = 0.5
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class DomainCheck:
     """Of n rows: ``inside`` (n, d) standardised features drawn into the domain; ``distance`` (n,) to it, in training
     standard deviations; ``in_domain`` (n,) in [0, 1], 1 inside."""
 
@@ -80,7 +80,7 @@ class Domain:
         low, high, least, most = low - pad, high + pad, least - pad, most + pad
         return cls(centre, scale, low, high, least, most, whitening, radius, np.asarray(np.isnan(X).any(axis=0)))
 
-    def locate(self, X: Array, noise: Array | float = 0.0) -> Whereabouts:
+    def locate(self, X: Array, noise: Array | float = 0.0) -> DomainCheck:
         """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it.
 
         ``noise`` (n, d): variance with which the features themselves are known. A value that this explains is no sign
@@ -96,7 +96,7 @@ class Domain:
         length = np.sqrt(((inside @ self.whitening) ** 2).sum(axis=1))
         joint = np.maximum(length - self.radius[0], 0.0)
         distance = np.sqrt(beyond + joint**2)
-        return Whereabouts(inside, distance, np.exp(-0.5 * distance**2))
+        return DomainCheck(inside, distance, np.exp(-0.5 * distance**2))
 
     @cached_property
     def charge_of_missing(self) -> Array:

@@ -12,7 +12,7 @@ files lack what is marked optional:
 * ``theta``, ``theta_plain`` (6, 5): the base variance, see :class:`gpvo.online.base.BaseVariance`;
 * ``inputs``, ``factor``, ``outside_power``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``growth``,
   ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``, ``usual_rate_var``,
-  ``mean_in_sigma``: see :class:`gpvo.online.estimate.ErrorModelArrays`;
+  ``mean_in_sigma``: see :class:`gpvo.online.estimate.ErrorModel`;
 * ``steady_mean`` (6,), ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,),
   ``nu`` (1,) (all optional): the same class;
 * ``for_filter.*`` (optional): those of these arrays in which the model for filters differs;

@@ -7,6 +7,7 @@ import hashlib
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
-from gpvo.online.estimate import ErrorModelArrays
+from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import known_columns
 from gpvo.online.for_filter import arrays_for_filter, arrays_of_base
 from gpvo.online.guard import DEGRADED_BELOW, camera_problems
@@ -96,7 +97,7 @@ class Predictor:
         except (KeyError, TypeError, ValueError) as problem:
             raise ModelError(f"the model's header is incomplete: {problem}") from None
         _check_known(self.features)
-        self.model = ErrorModelArrays.from_arrays(arrays, self.features, method, dt_s)
+        self.model = ErrorModel.from_arrays(arrays, self.features, method, dt_s)
         self.target = str(target)
         self.reset()
 
@@ -279,11 +280,12 @@ class Predictor:
         xi, slip = se3.log(record.T_prev_cur), self._observer.slip
         # A record that is lost for its stamps has no duration to go by.
         dt_s = record.dt_s if record.dt_s > 0 else self.model.dt_s
+        lost_variance = partial(self.model.velocities.lost_variance, self.model.dt_s)
         if slip.expected is None:
-            variance = self.model.lost_variance(dt_s, np.inf, xi / dt_s, np.zeros(6), np.zeros(6))
+            variance = lost_variance(dt_s, np.inf, xi / dt_s, np.zeros(6), np.zeros(6))
         else:
             jump = xi - slip.expected * dt_s
-            variance = self.model.lost_variance(dt_s, slip.age_s, slip.expected, self._rate_var, jump)
+            variance = lost_variance(dt_s, slip.age_s, slip.expected, self._rate_var, jump)
         return np.maximum(variance, _NO_MOTION_VAR)
 
     def _at_rest(self, record: VoRecord) -> Prediction:
@@ -295,8 +297,8 @@ class Predictor:
             mean=np.zeros(6),
             jitter=np.zeros((6, 6)),
             white=white,
-            persistent_root=np.zeros((6, len(self.model.persistent_tau_s))),
-            persistent_tau_s=self.model.persistent_tau_s,
+            persistent_root=np.zeros((6, len(self.model.division.persistent_tau_s))),
+            persistent_tau_s=self.model.division.persistent_tau_s,
             dt_s=record.dt_s,
             status=record.status,
             t_ns=record.t_ns,

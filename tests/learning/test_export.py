@@ -17,11 +17,12 @@ from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
-from gpvo.online.division import PARTS
-from gpvo.online.estimate import COASTED, NO_CALIBRATION, ErrorModelArrays
+from gpvo.online.division import PARTS, Division
+from gpvo.online.estimate import ErrorModel
 from gpvo.online.for_filter import FOR_FILTER
 from gpvo.online.guard import Domain
 from gpvo.online.predictor import Predictor
+from gpvo.online.velocity import COASTED, Velocities
 from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner
@@ -48,8 +49,13 @@ def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> Project
 
 
 def some_model(
-    *, method: str | None = "triangulation", noise: str = "own", residual: bool = False, in_sigma: bool = True
-) -> ErrorModelArrays:
+    *,
+    method: str | None = "triangulation",
+    noise: str = "own",
+    residual: bool = False,
+    in_sigma: bool = True,
+    calibration: dict[str, np.ndarray] | None = None,
+) -> ErrorModel:
     """A model of random but sensible numbers."""
     rng = np.random.default_rng(0)
     columns = (*base_columns(method, residual), "acceleration_mps2", "inliers", "sharpness")
@@ -67,28 +73,29 @@ def some_model(
     correlation = np.array([np.corrcoef(rng.standard_normal((6, 30))) for _ in range(3)])
     theta = rng.uniform(1e-4, 1.0, (6, 5)) * [1.0 if method else 0.0, 1e-4, 1e-3, 1e-3, 1.0 if residual else 0.0]
     share = rng.uniform(0.1, 1.0, (3, 6))
-    return ErrorModelArrays(
+    return ErrorModel(
         columns=columns,
         inputs=inputs,
         basis=SharedBasis(mean, None if noise == "constant" else second, rng.standard_normal(6)),
         domain=Domain.learn(X),
         base=BaseVariance(theta, theta[::-1] * [1.0, 1.0, 1.0, 1.0, 0.0], method, residual),
+        division=Division(
+            correlation=correlation,
+            geometry_weight=np.array([0.4 if method else 0.0]),
+            share=share / share.sum(0),
+            growth=rng.uniform(0.0, 1.0, (2, 6)),
+            ln_speed=np.array([0.2]),
+            level=rng.uniform(-4.0, 0.0, 6),
+            bias_tau_s=np.ones(6),
+            **calibration or {},
+        ),
+        velocities=Velocities(rng.uniform(0.5, 2.0, 6), rng.uniform(0.5, 2.0, (len(COASTED), 6))),
         factor=rng.uniform(0.5, 2.0, 6),
         outside_power=np.array([0.6]),
         high=rng.uniform(0.0, 2.0, 6),
-        correlation=correlation,
-        geometry_weight=np.array([0.4 if method else 0.0]),
-        share=share / share.sum(0),
-        growth=rng.uniform(0.0, 1.0, (2, 6)),
-        ln_speed=np.array([0.2]),
-        level=rng.uniform(-4.0, 0.0, 6),
-        bias_tau_s=np.ones(6),
         typical_ln_det=np.array([-60.0]),
-        usual_rate_var=rng.uniform(0.5, 2.0, 6),
-        rate_change_var=rng.uniform(0.5, 2.0, (len(COASTED), 6)),
         mean_in_sigma=np.array([in_sigma]),
         steady_mean=np.zeros(6),
-        **NO_CALIBRATION,
         nu=np.array([4.5]),
         dt_s=0.1,
     )
@@ -110,12 +117,12 @@ CASES = {
     "noise of the residuals": some_model(residual=True),
     "a mean of its own": some_model(in_sigma=False),
     "a steady mean": replace(some_model(residual=True), steady_mean=np.array([0.02, -0.1, 0.3, -0.2, 0.4, 0.1])),
-    "errors of calibration": replace(some_model(), **some_calibration()),
+    "errors of calibration": some_model(calibration=some_calibration()),
     "a steady mean without residuals": replace(some_model(), steady_mean=np.array([0.0, 0.1, 0.0, -0.2, 0.0, 0.3])),
 }
 
 
-def some_inputs(model: ErrorModelArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def some_inputs(model: ErrorModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows inside, at the edge, far outside, with missing values and of nothing else; geometry with some unknown;
     durations, some of them impossible."""
     rng = np.random.default_rng(1)

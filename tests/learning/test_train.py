@@ -29,8 +29,8 @@ from gpvo.learning.update import config_of, update
 from gpvo.learning.velocities import rate_changes
 from gpvo.online.base import TWIST_COLUMNS
 from gpvo.online.division import divide
-from gpvo.online.estimate import COASTED
 from gpvo.online.predictor import Predictor
+from gpvo.online.velocity import COASTED
 from gpvo.stats.consistency import nees
 from gpvo.types import VoLog
 from small_model import small_model, training_sets
@@ -90,7 +90,7 @@ def test_the_geometry_is_believed_where_it_is_right(right):
         sigma = np.array([1.0, 1.0, 2.0, 0.4, 0.4, 0.4]) * 1e-3
         stated = (R if right else rng.permutation(R)) * np.outer(sigma, sigma)
         sets.append(replace(s, Y=drawn[..., 0] * sigma, covariances=dict.fromkeys(s.covariances, stated)))
-    weight = fit_model(sets, QUICK).model.geometry_weight[0]
+    weight = fit_model(sets, QUICK).model.division.geometry_weight[0]
     assert weight >= 0.75 if right else weight <= 0.25
 
 
@@ -113,10 +113,11 @@ def test_consistent_over_many_frames():
     """Sums over 1, 10 and 100 frames against what jitter, white and bias say of them."""
     predictor = small_model().predictor()
     flights = [(s, _said(predictor, s)) for s in training_sets(range(100, 112), n=300)]
-    tau = predictor.model.bias_tau_s / predictor.model.dt_s
+    tau = predictor.model.division.bias_tau_s / predictor.model.dt_s
     variance = np.mean([(e.sigma**2).mean(axis=0) for _, e in flights], axis=0)
     model = predictor.model
-    share = divide(model.share, model.growth, np.log(variance)[None] - model.level, np.zeros((1, 1)))[0]
+    parts = model.division
+    share = divide(parts.share, parts.growth, np.log(variance)[None] - parts.level, np.zeros((1, 1)))[0]
     for m in (1, 10, 100):
         ratio = []
         for s, e in flights:
@@ -487,7 +488,7 @@ def test_a_wrong_scale_is_a_part_of_its_own(tmp_path):
         sets.append(replace(s, X=X, Y=Y))
     save_model(train_sets(sets, QUICK, judge=False), tmp_path / "model.gpvo")
     model = Predictor.load(tmp_path / "model.gpvo").model
-    forward = np.sqrt((model.calibration_patterns[:, 2, 2] ** 2).sum())
+    forward = np.sqrt((model.division.calibration_patterns[:, 2, 2] ** 2).sum())
     assert forward == pytest.approx(1.5 * np.mean([s.Y[:, 2].std() for s in plain]), rel=0.3)
     rows = Rows.stack(sets).select(model.columns)
     said = model.estimate(rows[[0, 100]])

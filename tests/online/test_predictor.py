@@ -179,10 +179,13 @@ def test_a_lost_motion_is_as_wrong_as_velocities_change(predictor, gone):
 def test_a_lost_motion_is_at_most_as_wrong_as_the_vehicle_is_fast(predictor):
     """Longer ago than training shows, the last velocity says nothing but how fast the vehicle is."""
     rate, none = np.array([0.0, 0.0, 1.5, 0.0, 0.1, 0.0]), np.zeros(6)
-    variance = predictor.model.lost_variance(2.0, 1e3, rate, none, none)
-    most = 4.0 * np.maximum(predictor.model.usual_rate_var, np.repeat([2.25, 0.01], 3))
+    variance = predictor.model.velocities.lost_variance(predictor.model.dt_s, 2.0, 1e3, rate, none, none)
+    most = 4.0 * np.maximum(predictor.model.velocities.usual_rate_var, np.repeat([2.25, 0.01], 3))
     np.testing.assert_allclose(variance, most)
-    ages = [predictor.model.lost_variance(2.0, age, rate, none, none) for age in np.geomspace(0.01, 100.0, 40)]
+    ages = [
+        predictor.model.velocities.lost_variance(predictor.model.dt_s, 2.0, age, rate, none, none)
+        for age in np.geomspace(0.01, 100.0, 40)
+    ]
     assert (np.diff(ages, axis=0) >= 0).all()
     assert (ages[0] < 0.5 * most).all()
 

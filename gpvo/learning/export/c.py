@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from gpvo.errors import GpvoError
 from gpvo.io.atomic import write_text
 from gpvo.online.base import motion_noise, positions
-from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModelArrays
+from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.rowplan import StackedBasis
 from gpvo.online.validation import LARGEST
 
@@ -34,7 +34,7 @@ _NOT_IN_COMMENTS = re.compile(r"[^A-Za-z0-9_./^,;:=() -]")
 
 
 def to_c(
-    model: ErrorModelArrays,
+    model: ErrorModel,
     path: str | os.PathLike[str],
     *,
     name: str = PREFIX,
@@ -44,7 +44,7 @@ def to_c(
     """Write the header. ``name`` prefixes every symbol, so that one program can hold several models.
 
     ``units``: of the features, for the comment at the top; ``note``: one more line there. The numbers equal those of
-    ``ErrorModelArrays.estimate`` to about 1e-6: projections are kept in single precision. GpvoError where ``name``
+    ``ErrorModel.estimate`` to about 1e-6: projections are kept in single precision. GpvoError where ``name``
     is no C identifier.
     """
     if not _NAME.fullmatch(name) or f" {name} " in _KEYWORDS:
@@ -55,7 +55,7 @@ def to_c(
     write_text(Path(path), code)
 
 
-def _preamble(model: ErrorModelArrays, units: tuple[str, ...], note: str) -> list[str]:
+def _preamble(model: ErrorModel, units: tuple[str, ...], note: str) -> list[str]:
     units = units or ("",) * len(model.columns)
     features = [
         f" *  {i:3d}  {_comment(c)} {f'[{_comment(u)}]' if u else ''}".rstrip()
@@ -81,7 +81,7 @@ def _comment(text: object) -> str:
     return _NOT_IN_COMMENTS.sub("?", str(text).replace("..", " to "))[:200]
 
 
-def _constants(model: ErrorModelArrays) -> list[str]:
+def _constants(model: ErrorModel) -> list[str]:
     stacked, domain, d = model.basis.stacked(), model.domain, len(model.columns)
     columns = positions(model.columns, model.base.columns)
     by_velocity, by_acceleration = motion_noise(model.columns)
@@ -96,10 +96,10 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         "DIRECTIONS": "{" + ", ".join(str(len(gp.flat_projection)) for gp in stacked.kernels) + "}",
         "RADIUS": _number(domain.radius[0]),
         "DT_S": _number(model.dt_s),
-        "GEOMETRY_WEIGHT": _number(model.geometry_weight[0]),
+        "GEOMETRY_WEIGHT": _number(model.division.geometry_weight[0]),
         "TYPICAL_LN_DET": _number(model.typical_ln_det[0]),
         "OUTSIDE_POWER": _number(model.outside_power[0]),
-        "LN_SPEED": _number(model.ln_speed[0]),
+        "LN_SPEED": _number(model.division.ln_speed[0]),
         "LN_LARGEST": _number(LN_LARGEST),
         "LARGEST": _number(LARGEST),
         "LEAST_VAR": _number(LEAST_VAR),
@@ -126,15 +126,15 @@ def _constants(model: ErrorModelArrays) -> list[str]:
         *_array("by_acceleration", by_acceleration),
         *_array("theta", model.base.theta),
         *_array("theta_plain", model.base.plain),
-        *_array("usual_rate_var", model.usual_rate_var),
+        *_array("usual_rate_var", model.velocities.usual_rate_var),
         *_array("factor", model.factor),
         *_array("high", model.high),
-        *_array("correlation", model.correlation),
-        *_array("share", model.share),
-        *_array("growth", model.growth),
-        *_array("level", model.level),
+        *_array("correlation", model.division.correlation),
+        *_array("share", model.division.share),
+        *_array("growth", model.division.growth),
+        *_array("level", model.division.level),
         *_array("steady_mean", model.steady_mean),
-        *_array("calibration_patterns", model.calibration_patterns),
+        *_array("calibration_patterns", model.division.calibration_patterns),
         *_basis_arrays(stacked),
         "",
     ]

@@ -14,7 +14,7 @@ from gpvo.geometry.covariance import TURN_FIRST
 from gpvo.io.atomic import replacing
 from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
 from gpvo.online.division import LN_FASTEST, PARTS
-from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModelArrays
+from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.validation import LARGEST
 from gpvo.types import Array
 
@@ -23,7 +23,7 @@ _INT64 = 7  # TensorProto.INT64
 _USUAL_DURATIONS = tuple(zip(("GreaterOrEqual", "LessOrEqual"), DURATIONS_S, strict=True))
 
 
-def to_onnx(model: ErrorModelArrays, path: str | os.PathLike[str], *, metadata: dict[str, str] | None = None) -> None:
+def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[str, str] | None = None) -> None:
     """Write the graph.
 
     Inputs, all double: ``features`` (N, d), NaN where missing; ``geometry`` (N, 6, 6), NaN where unknown; ``dt_s``
@@ -106,8 +106,8 @@ class _Graph:
         return bytes(model.SerializeToString(deterministic=True))
 
 
-def _predict(g: _Graph, model: ErrorModelArrays) -> None:
-    """The whole graph; line by line ``ErrorModelArrays.estimate``."""
+def _predict(g: _Graph, model: ErrorModel) -> None:
+    """The whole graph; line by line ``ErrorModel.estimate``."""
     g.dt = g("Where", g("And", *(g(op, "dt_s", s) for op, s in _USUAL_DURATIONS)), "dt_s", model.dt_s)
     base, plain = (g("Max", _base(g, model, theta), LEAST_VAR) for theta in (model.base.theta, model.base.plain))
     inside, distance, in_domain = _locate(g, model, base)
@@ -142,7 +142,7 @@ def _predict(g: _Graph, model: ErrorModelArrays) -> None:
     g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
 
 
-def _locate(g: _Graph, model: ErrorModelArrays, base: str) -> tuple[str, str, str]:
+def _locate(g: _Graph, model: ErrorModel, base: str) -> tuple[str, str, str]:
     domain = model.domain
     by_velocity, by_acceleration = (g.constant(m / domain.scale**2) for m in motion_noise(model.columns))
     squared_dt = g.expand(g("Mul", g.dt, g.dt), 1)
@@ -162,7 +162,7 @@ def _locate(g: _Graph, model: ErrorModelArrays, base: str) -> tuple[str, str, st
     return inside, distance, g("Exp", g("Mul", squared, -0.5), out="in_domain")
 
 
-def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, str, str]:
+def _basis(g: _Graph, model: ErrorModel, inputs: str) -> tuple[str, str, str, str]:
     stacked = model.basis.stacked()
     kernels, squares = [], []
     for gp in stacked.kernels:
@@ -186,13 +186,13 @@ def _basis(g: _Graph, model: ErrorModelArrays, inputs: str) -> tuple[str, str, s
     )
 
 
-def _limit(g: _Graph, model: ErrorModelArrays) -> str:
+def _limit(g: _Graph, model: ErrorModel) -> str:
     """(N, 6): no motion is more wrong than VO's and the usual one are long."""
     at = positions(model.columns, model.base.columns)[:6]
     rate = g.take("features", at, axis=1)
     rate = g("Where", g.known(rate), rate, g.constant(model.absent[:6]))
     dt = g.expand(g.dt, 1)
-    moved = g("Mul", g("Add", g("Mul", rate, rate), g.constant(model.usual_rate_var)), g("Mul", dt, dt))
+    moved = g("Mul", g("Add", g("Mul", rate, rate), g.constant(model.velocities.usual_rate_var)), g("Mul", dt, dt))
     return g("MatMul", moved, g.constant(np.kron(np.eye(2), np.ones((3, 3)))))
 
 
@@ -201,7 +201,7 @@ def _within(g: _Graph, variance: str, limit: str) -> str:
     return g("Div", g("Mul", limit, ratio), g("Sqrt", g("Add", g("Mul", ratio, ratio), 1.0)))
 
 
-def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:
+def _base(g: _Graph, model: ErrorModel, theta: Array) -> str:
     domain = model.domain
     at = positions(model.columns, model.base.columns)
     columns = g.take("features", at, axis=1)
@@ -222,9 +222,9 @@ def _base(g: _Graph, model: ErrorModelArrays, theta: Array) -> str:
     return g.add(*terms, g.constant(theta[:, 1]))
 
 
-def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
+def _correlations(g: _Graph, model: ErrorModel) -> list[str]:
     """Of each part (N, 6, 6)."""
-    weight = float(model.geometry_weight[0])
+    weight = float(model.division.geometry_weight[0])
     flat = g("Reshape", "geometry", g.constant([-1, 36], np.int64))
     both = g("Mul", g("Add", "geometry", g("Transpose", "geometry", perm=[0, 2, 1])), 0.5)
     own = g("Div", both, g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
@@ -234,7 +234,7 @@ def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
     known = g.expand(g.expand(definite, 1), 1)
     own = g("Mul", g("Where", known, own, 0.0), weight)
     out = []
-    for i, R in enumerate(model.correlation):
+    for i, R in enumerate(model.division.correlation):
         typical = g.constant(R)
         mixed = g("Add", own, g.constant(R * (1.0 - weight))) if weight > 0 and i < 2 else typical
         chosen = g("Mul", g("Where", known, mixed, typical), 1.0 - 1e-6)
@@ -242,37 +242,38 @@ def _correlations(g: _Graph, model: ErrorModelArrays) -> list[str]:
     return out
 
 
-def _of_calibration(g: _Graph, model: ErrorModelArrays, variance: str) -> tuple[str, str]:
+def _of_calibration(g: _Graph, model: ErrorModel, variance: str) -> tuple[str, str]:
     """Its root (N, 6, 6) and what is left of the variance (N, 6); ``gpvo.online.division.of_calibration``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:6], axis=1)
-    patterns = np.transpose(model.calibration_patterns, (2, 1, 0)).reshape(6, 36)
+    patterns = np.transpose(model.division.calibration_patterns, (2, 1, 0)).reshape(6, 36)
     flat = g("MatMul", g("Where", g.known(v), v, 0.0), g.constant(patterns))
     root = g("Reshape", flat, g.constant([-1, 6, 6], np.int64))
     left = g("Div", variance, g("Add", variance, g.sum(g("Mul", root, root), 2)))
     return g("Mul", root, g.expand(g("Sqrt", left), 2), out="calibration_root"), g("Mul", variance, left)
 
 
-def _shares(g: _Graph, model: ErrorModelArrays, variance: str) -> list[str]:
+def _shares(g: _Graph, model: ErrorModel, variance: str) -> list[str]:
     """Of jitter, white and bias (N, 6); line by line ``gpvo.online.division.divide`` and ``ln_faster``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:3], axis=1)
     there = g.known(v)
     known = g("Equal", g("ReduceMin", g("Cast", there, to=_INT64), axes=[1]), g.constant(1, np.int64))
     v = g("Where", there, v, 0.0)
     speed = g("Sqrt", g.expand(g.sum(g("Mul", v, v), 1), 1))
-    ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), g.constant(model.ln_speed))
+    ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), g.constant(model.division.ln_speed))
     faster = g("Where", known, g("Max", g("Min", ratio, LN_FASTEST), 0.0), 0.0)
-    by_speed = g("Mul", faster, g.constant(model.growth[0]))
-    above = g("Mul", g("Sub", g("Log", variance), g.constant(model.level)), g.constant(model.growth[1]))
+    by_speed = g("Mul", faster, g.constant(model.division.growth[0]))
+    above = g("Sub", g("Log", variance), g.constant(model.division.level))
+    above = g("Mul", above, g.constant(model.division.growth[1]))
     by_noise = g("Max", g("Min", above, 60.0), -60.0)
-    jitter = g.constant(model.share[0])
-    white = g("Mul", g("Exp", by_speed), g.constant(model.share[1]))
-    bias = g("Mul", g("Exp", g("Add", by_speed, by_noise)), g.constant(model.share[2]))
+    jitter = g.constant(model.division.share[0])
+    white = g("Mul", g("Exp", by_speed), g.constant(model.division.share[1]))
+    bias = g("Mul", g("Exp", g("Add", by_speed, by_noise)), g.constant(model.division.share[2]))
     whole = g.add(jitter, white, bias)
     return [g("Div", part, whole) for part in (jitter, white, bias)]
 
 
-def _residual_px(g: _Graph, model: ErrorModelArrays, inside: str) -> str:
-    """(N, 1), or (1, 1) where the base does not look at the residuals; ``ErrorModelArrays.residual_px``."""
+def _residual_px(g: _Graph, model: ErrorModel, inside: str) -> str:
+    """(N, 1), or (1, 1) where the base does not look at the residuals; ``ErrorModel.residual_px``."""
     if not model.base.residual:
         return g.constant([[1.0]])
     k = positions(model.columns, (RESIDUAL_COLUMN,))
