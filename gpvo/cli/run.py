@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gpvo.cli import source_options as flags
-from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
     from gpvo.types import Prediction
@@ -28,6 +27,12 @@ def run(
     sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1",
     sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
+    min_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is lost; at least 4.")] = 8,
+    weak_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is degraded.")] = 20,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
+    ] = None,
     self_calibration: Annotated[
         bool | None,
         typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
@@ -69,16 +74,19 @@ def run(
     from gpvo.cli.output import print_json, progress
     from gpvo.io import open_source
     from gpvo.learning.check import ENOUGH_INSIDE
-    from gpvo.vo.config import make_config
+    from gpvo.vo.config import make_config, read_settings
 
-    config = make_config(
-        preset,
-        methods=tuple(m.strip() for m in methods.split(",") if m.strip()),
-        sigma_px=sigma,
-        sigma_p_px=_pixels("--sigma-p", sigma_p),
-        sigma_m_px=_pixels("--sigma-m", sigma_m),
-        **({} if self_calibration is None else {"self_calibration": self_calibration}),
-    )
+    shorthand = {
+        "methods": methods,
+        "sigma_px": sigma,
+        "sigma_p_px": sigma_p,
+        "sigma_m_px": sigma_m,
+        "min_inliers": min_inliers,
+        "weak_inliers": weak_inliers,
+    }
+    if self_calibration is not None:
+        shorthand["self_calibration"] = self_calibration
+    config = make_config(preset, **read_settings([*(f"{k}={v}" for k, v in shorthand.items()), *(settings or ())]))
     options = flags.source_options(
         size,
         calibration=calibration,
@@ -148,16 +156,6 @@ def run(
             print(f"calibration: {line}")
         if summary.calibration:
             print(f"calibration: 'gpvo calibration {out} -o FILE' writes a corrected one")
-
-
-def _pixels(option: str, text: str) -> float | None:
-    """A number of pixels, or None for ``auto``."""
-    if text == "auto":
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        raise GpvoError(f"{option} is '{text}'", cure="give pixels, such as 0.1, or auto") from None
 
 
 def register(app: typer.Typer) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_type_hints
 
 from gpvo.errors import GpvoError
 
@@ -24,7 +26,7 @@ class VoConfig:
     max_disparity_share: float = 0.25  # of the image width
     ransac_threshold_px: float = 2.0
     ransac_iterations: int = 150
-    min_inliers: int = 8  # fewer: lost
+    min_inliers: int = 8  # fewer: lost; P3P needs four
     weak_inliers: int = 20  # fewer: degraded
     keyframe_parallax_px: float = 1.0  # keep the reference while the median image motion is below this; 0: never
     methods: tuple[str, ...] = ("triangulation", "pointing_matching")
@@ -33,6 +35,7 @@ class VoConfig:
     sigma_m_px: float | None = 0.5  # matching; None: likewise
     sigma_pairs_px: tuple[tuple[float, float], ...] = ()  # further pairs, each stated as a method of its own
     self_calibration: bool = True  # estimate what the calibration has wrong between the cameras
+    persistent_noise: bool = True  # estimate the error of disparity that a point keeps while it is followed
     seed: int = 0
 
     @property
@@ -49,8 +52,33 @@ def pair_method(sigma_p_px: float, sigma_m_px: float) -> str:
 PRESETS: dict[str, VoConfig] = {
     "fast": VoConfig(),
     # What the thesis describes, to the letter: every frame is matched afresh to the one before.
-    "thesis": VoConfig(preset="thesis", keyframe_parallax_px=0.0, max_features=500, self_calibration=False),
+    "thesis": VoConfig(
+        preset="thesis", keyframe_parallax_px=0.0, max_features=500, self_calibration=False, persistent_noise=False
+    ),
 }
+
+
+# What values may be, both ends included; those of OpenCV stop the process where they are out of range.
+_LIMITS: dict[str, tuple[float, float]] = {
+    "max_features": (8, 20_000),
+    "min_distance_px": (1, 1000),
+    "corner_quality": (1e-6, 1),
+    "klt_window_px": (3, 101),
+    "klt_levels": (1, 10),
+    "max_row_error_px": (0.01, 1000),
+    "min_disparity_px": (1e-3, 1000),
+    "max_disparity_share": (0.01, 1),
+    "ransac_threshold_px": (0.01, 1000),
+    "ransac_iterations": (1, 100_000),
+    "min_inliers": (4, 10_000),
+    "weak_inliers": (0, 10_000),
+    "keyframe_parallax_px": (0, 1000),
+    "sigma_px": (1e-6, 100),
+    "sigma_p_px": (1e-6, 100),
+    "sigma_m_px": (1e-6, 100),
+    "seed": (0, 2**31 - 1),
+}
+_SWITCH = {"on": True, "true": True, "off": False, "false": False}
 
 
 def make_config(preset: str = "fast", **overrides: object) -> VoConfig:
@@ -59,7 +87,7 @@ def make_config(preset: str = "fast", **overrides: object) -> VoConfig:
     Raises
     ------
     GpvoError
-        For an unknown preset, setting or covariance method.
+        For an unknown preset, setting or covariance method, or a value out of its range.
     """
     if preset not in PRESETS:
         raise GpvoError(f"unknown preset '{preset}'", cure=f"choose one of {', '.join(PRESETS)}")
@@ -70,8 +98,43 @@ def make_config(preset: str = "fast", **overrides: object) -> VoConfig:
     for method in config.methods:
         if method not in METHODS:
             raise GpvoError(f"unknown covariance method '{method}'", cure=f"choose from {', '.join(METHODS)}")
-    for name in ("sigma_px", "sigma_p_px", "sigma_m_px"):
+    for name, (low, high) in _LIMITS.items():
         value = getattr(config, name)
-        if value is not None and not 0 < value < 100:
-            raise GpvoError(f"{name} is {value}", cure="give a standard deviation between 0 and 100 pixels")
+        if value is not None and not low <= value <= high:
+            raise GpvoError(f"{name} is {value}", cure=f"give a value from {low:g} to {high:g}")
     return config
+
+
+def read_settings(texts: Sequence[str]) -> dict[str, Any]:
+    """Values of :class:`VoConfig` from texts such as ``klt_window_px=21``; ``auto`` is None, commas part lists.
+
+    Raises
+    ------
+    GpvoError
+        For an unknown name, or a value of the wrong type.
+    """
+    kinds = get_type_hints(VoConfig)
+    names = [f.name for f in fields(VoConfig) if f.name not in ("preset", "sigma_pairs_px")]
+    out: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals or name not in names:
+            raise GpvoError(f"unknown odometry setting '{text}'", cure=f"give NAME=VALUE, NAME of {', '.join(names)}")
+        try:
+            out[name] = _read(value, kinds[name])
+        except (KeyError, ValueError):
+            raise GpvoError(f"{name} cannot be '{value}'", cure=f"its default is {getattr(VoConfig(), name)}") from None
+    return out
+
+
+def _read(text: str, kind: Any) -> object:
+    """One value of this type."""
+    if kind is bool:
+        return _SWITCH[text.lower()]
+    if kind is int:
+        return int(text)
+    if kind is float:
+        return float(text)
+    if kind == float | None:
+        return None if text == "auto" else float(text)
+    return tuple(part.strip() for part in text.split(",") if part.strip())

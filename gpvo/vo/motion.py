@@ -72,14 +72,27 @@ def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transf
     return Transfer(uvd, H, G, in_front)
 
 
-def residual_covariance(G: Array, S_prev: Array, S_cur: Array) -> Array:
-    """Covariance (3, 3, N) of (measured - predicted): ``G S_prev G^T + S_cur``."""
+def residual_covariance(G: Array, S_prev: Array, S_cur: Array, persistent: float = 0.0) -> Array:
+    """Covariance (3, 3, N) of (measured - predicted): ``G S_prev G^T + S_cur + persistent g g^T``.
+
+    ``persistent``: variance of the error of disparity that a point has in both frames alike, ``g`` the residual's
+    derivative by it, :func:`persistent_direction`.
+    """
     GS = np.einsum("ikn,kl->iln", G, S_prev)
-    C = np.empty_like(G)
+    C, g = np.empty_like(G), persistent_direction(G)
     for i in range(3):
         for j in range(i, 3):
-            C[i, j] = C[j, i] = GS[i, 0] * G[j, 0] + GS[i, 1] * G[j, 1] + GS[i, 2] * G[j, 2] + S_cur[i, j]
+            C[i, j] = C[j, i] = (
+                GS[i, 0] * G[j, 0] + GS[i, 1] * G[j, 1] + GS[i, 2] * G[j, 2] + S_cur[i, j] + persistent * g[i] * g[j]
+            )
     return C
+
+
+def persistent_direction(G: Array) -> Array:
+    """Derivative (3, N) of the residuals by an error of disparity that a point has in both frames: ``e_d - G e_d``."""
+    g = -G[:, 2]
+    g[2] += 1.0
+    return g
 
 
 def whitener(C: Array) -> Array:
@@ -110,7 +123,7 @@ class Motion:
     ``T_prev_cur`` (4, 4); ``inliers`` (N,); ``scale_px``: robust standard deviation of one image coordinate;
     ``residuals`` (M, 3) of (u, v, d) [px] of the inliers; ``uvd_prev`` (M, 3) their measurements in the reference
     frame, smoothed by those in the current one; ``information`` (6, 6) at unit pixel noise; ``converged``,
-    ``iterations``.
+    ``iterations``; ``persistent`` as given to :func:`refine`.
     """
 
     T_prev_cur: Array
@@ -121,6 +134,7 @@ class Motion:
     information: Array
     converged: bool
     iterations: int
+    persistent: float
 
     def __str__(self) -> str:
         t = np.linalg.norm(self.T_prev_cur[:3, 3])
@@ -141,11 +155,14 @@ def refine(
     max_iterations: int = 12,
     robust: bool = True,
     S_uvd: Array | None = None,
+    persistent: float = 0.0,
 ) -> Motion | None:
     """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
 
-    Each point's stacked residual is weighted with the full inverse of ``G S G^T + S`` at unit pixel noise, or with
-    ``S_uvd``. The derivatives are taken at the points as smoothed by both frames, not as measured in the first: else
+    Each point's stacked residual is weighted with the full inverse of its covariance at unit pixel noise, or with
+    ``S_uvd``. ``persistent``: variance of the error of disparity that a point keeps while it is followed, over that of
+    an image coordinate: a patch that looks different on the right is misplaced by the same in each frame. The
+    derivatives are taken at the points as smoothed by both frames, not as measured in the first: else
     the noise of far points, entering the derivative, biases the motion (errors in variables; B. Triggs et al., "Bundle
     adjustment, a modern synthesis", 2000, section 6.1: this is the two-frame problem with the points eliminated).
 
@@ -160,7 +177,7 @@ def refine(
         moved = transfer(T, smoothed, camera)
         back = (uvd_prev - smoothed).T
         r = uvd_cur.T - moved.uvd - np.einsum("ikn,kn->in", moved.G, back)
-        W = whitener(residual_covariance(moved.G, S, S))
+        W = whitener(residual_covariance(moved.G, S, S, persistent))
         z = apply_whitener(W, r)
         if not robust:
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
@@ -175,11 +192,11 @@ def refine(
         T = T @ se3.exp(step)
         # What is left of the residual is shared between the two frames: S G^T C^-1 (r - H step).
         left = z - np.einsum("ijn,j->in", A, step)
-        smoothed = uvd_prev + _smoothing(S, moved.G, W, left)
+        smoothed = uvd_prev + _smoothing(S, moved.G, W, left, persistent)
         if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
             converged = True
             break
-    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, iteration)
+    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, iteration, persistent)
 
 
 def _solve_step(A: Array, z: Array, weight: Array) -> tuple[Array, Array | None]:
@@ -195,8 +212,11 @@ def _solve_step(A: Array, z: Array, weight: Array) -> tuple[Array, Array | None]
     return information, step if np.isfinite(step).all() and np.abs(step[3:]).max() < 2.0 else None
 
 
-def _smoothing(S: Array, G: Array, W: Array, left: Array) -> Array:
-    """Correction (N, 3) of the reference measurements, ``S G^T W^T z`` for whitened residuals z (3, N)."""
+def _smoothing(S: Array, G: Array, W: Array, left: Array, persistent: float) -> Array:
+    """Correction (N, 3) of the reference measurements for whitened residuals z (3, N).
+
+    Less the expected noise of the reference given the residual: ``(S G^T - persistent e_d g^T) W^T z``.
+    """
     lifted = np.stack(
         [
             W[0, 0] * left[0] + W[1, 0] * left[1] + W[2, 0] * left[2],
@@ -204,13 +224,17 @@ def _smoothing(S: Array, G: Array, W: Array, left: Array) -> Array:
             W[2, 2] * left[2],
         ]
     )
-    return np.einsum("ikn,in->nk", G, lifted) @ S
+    out = np.einsum("ikn,in->nk", G, lifted) @ S
+    out[:, 2] -= persistent * (persistent_direction(G) * lifted).sum(0)
+    return out
 
 
 def _robust_weights(m2: Array, in_front: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float, Array]:
     """Inliers, noise scale [px] and Huber weights from squared Mahalanobis distances at unit noise."""
     # Floor: below a fiftieth of a pixel the residual is rounding, and everything would look like an outlier.
-    scale2 = max(float(np.median(m2[in_front])) / _CHI2_3_MEDIAN if in_front.any() else 1.0, 0.02**2)
+    # Six of the residuals' degrees of freedom went to the motion.
+    freedom = max(1.0 - 2.0 / max(int(in_front.sum()), 1), 1 / 3)
+    scale2 = max(float(np.median(m2[in_front])) / _CHI2_3_MEDIAN / freedom if in_front.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
     keep = in_front & (ratio < _CHI2_3_999)
     distance = np.sqrt(np.maximum(ratio, 1e-12))

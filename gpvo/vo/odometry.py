@@ -14,14 +14,16 @@ from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, Frontend, Matches, Observation
 from gpvo.vo.imu_moments import ImuMoments
-from gpvo.vo.motion import Motion, refine
+from gpvo.vo.motion import Motion, refine, transfer
 from gpvo.vo.pairwatch import PairWatch
 from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import areas, unexplained
-from gpvo.vo.sigmas import SigmaEstimator
+from gpvo.vo.sigmas import PersistentNoise, ResidualMoments, SigmaEstimator
+
+_GUESS_S = 0.5  # for so long a velocity is taken to last
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class StereoOdometry:
             self.rig_error = RigError(camera, known or RigState.exact(), learn=False)
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
+        self._persistent = PersistentNoise()
         self._state: _State | None = None
         self._imu = ImuMoments.of(None)  # since the reference
         self.pair = PairWatch(camera)
@@ -194,7 +197,8 @@ class StereoOdometry:
         close = among & agrees(T_prev_cur, matches, camera, 2 * config.ransac_threshold_px)
         if close.sum() < config.min_inliers:
             return None
-        motion = refine(T_prev_cur, matches.uvd_prev[close], matches.uvd_cur[close], camera)
+        uvd_prev, uvd_cur = matches.uvd_prev[close], matches.uvd_cur[close]
+        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, persistent=self._persistent.ratio)
         if motion is None:
             return None
         inliers = np.zeros(len(close), bool)
@@ -207,7 +211,9 @@ class StereoOdometry:
         state, config = self._state, self.config
         record = VoRecord(t_ns, state.t_ref_ns, verdict.status, guess, reason=verdict.reason)
         if motion is not None:
-            record = replace(record, **motion_fields(matches, motion, self.camera))
+            G = transfer(motion.T_prev_cur, motion.uvd_prev, self.camera).G
+            moments = ResidualMoments.of(motion.residuals, G)
+            record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
             C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, state.twist)
             return replace(
@@ -216,7 +222,9 @@ class StereoOdometry:
                 covariances=dict.fromkeys(config.stated, C),
                 v_t=dict.fromkeys(config.stated, C[:3, :3]),
             )
-        self._sigmas.update(record.residual_sigma_p_px, record.residual_sigma_m_px)
+        if self.config.persistent_noise:
+            self._persistent.update(motion.residuals, G)
+        self._sigmas.update(moments)
         sigma_p_px, sigma_m_px = self._sigmas.values
         by_method = covariances_by_method(
             config.methods,
@@ -248,9 +256,12 @@ class StereoOdometry:
             state.t_last_ns = record.t_ns
             if "frozen" in record.reason:
                 return False, (matches.n_tracked, matches.n_tracked)
-            # A good picture that fits nothing known is a new beginning; a bad one leaves the old reference standing.
-            counts = self._frontend.promote(None, at_least=config.weak_inliers)
-            if counts[1] < config.weak_inliers:
+            # A good picture that fits nothing known is a new beginning; a bad one leaves the old reference standing
+            # while it may be found again.
+            keep = state.is_fresh(record.t_ns, config.weak_inliers)
+            enough = config.weak_inliers if keep else config.min_inliers
+            counts = self._frontend.promote(None, at_least=enough)
+            if counts[1] < enough:
                 return False, counts
             state.restart(record.t_ns, counts[1])
             return True, counts
@@ -290,9 +301,13 @@ class _State:
             return "frozen right picture"
         return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
 
+    def is_fresh(self, t_ns: int, many: int) -> bool:
+        """Whether the reference has ``many`` points, and the last believed motion can still be prolonged."""
+        return self.reference_points >= many and (t_ns - self.t_believed_ns) * 1e-9 < _GUESS_S
+
     def guess(self, t_ns: int) -> Array:
         """Motion from the reference to time ``t_ns`` at constant velocity, for at most half a second."""
-        dt_s = min((t_ns - self.t_believed_ns) * 1e-9, 0.5)
+        dt_s = min((t_ns - self.t_believed_ns) * 1e-9, _GUESS_S)
         return self.T_ref_believed @ se3.exp(self.twist * dt_s)
 
     def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int) -> None:

@@ -13,10 +13,12 @@ from gpvo.types import StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import Frontend, Matches, TrackFrontend
 from gpvo.vo.image import ImageStats
-from gpvo.vo.motion import Motion, transfer
+from gpvo.vo.motion import Motion
 from gpvo.vo.quality import log10_condition
 from gpvo.vo.rig_error import RigError
-from gpvo.vo.sigmas import residual_sigmas
+from gpvo.vo.sigmas import ResidualMoments
+
+_ENOUGH_FOR_SIGMAS = 8  # points
 
 
 class Stopwatch:
@@ -70,13 +72,12 @@ def make_frontend(
     return KltFrontend(camera, rig_error, config, mask)
 
 
-def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera) -> dict[str, Any]:
+def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moments: ResidualMoments) -> dict[str, Any]:
     """Fields of a :class:`gpvo.types.VoRecord` that describe the match and the solution."""
     uvd = matches.uvd_cur[motion.inliers]
     p10, p50, p90 = (float(p) for p in np.percentile(uvd[:, 2], [10, 50, 90]))
     depth_m = camera.fx_px * camera.baseline_m / max(float(p50), 1e-3)
-    G = transfer(motion.T_prev_cur, motion.uvd_prev, camera).G
-    sigma_p, sigma_m = residual_sigmas(motion.residuals, G)
+    sigma_p, sigma_m = moments.sigmas if len(uvd) >= _ENOUGH_FOR_SIGMAS else (np.nan, np.nan)
     return {
         "n_tracked": matches.n_tracked,
         "n_inliers": len(uvd),

@@ -143,7 +143,7 @@ class RigError:
         """
         fx = self._camera.fx_px
         moved = transfer(motion.T_prev_cur, motion.uvd_prev, self._camera)
-        W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT)) / max(motion.scale_px, 0.1)
+        W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT, motion.persistent)) / max(motion.scale_px, 0.1)
         z, A = apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H)
         # At the points as smoothed by both frames: their noise is independent of the residual, that of the measured
         # ones is not and would be taken for an error of the rig.
@@ -156,7 +156,8 @@ class RigError:
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
         if self._learn:
-            near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * motion.scale_px, 3)
+            sigma_px = motion.scale_px * np.sqrt(1.0 + motion.persistent)
+            near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px, 3)
             if near.sum() >= 3 * 8:
                 self._learn_from(A[near], B[near], self._terms(moved.uvd.T) * self._camera.fy_px, row_error)
         return added

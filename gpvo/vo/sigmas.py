@@ -1,49 +1,122 @@
-"""Pointing and matching noise from the residuals of a motion."""
+"""Pointing, matching and persistent noise from the residuals of motions."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from gpvo.types import Array
+from gpvo.vo.motion import apply_whitener, persistent_direction, residual_covariance, whitener
+from gpvo.vo.points import triangulation_pixel_covariance
 
-_START_PX = (0.1, 0.5)
 _MEMORY = 0.97  # of the running mean: about thirty frames
+_S_UNIT = triangulation_pixel_covariance(1.0)
+# Of squares with one degree of freedom, cut off at four; of means of two, at 6.6 medians.
+_CUT_ALONG, _LEFT_ALONG = 4.0, 0.9195
+_CUT_ACROSS, _LEFT_ACROSS = 6.644, 0.99
+_USUAL_RATIO = 10.0  # prior deviation: an error of disparity three times the noise of an image coordinate
 
 
-def residual_sigmas(residuals: Array, G: Array) -> tuple[float, float]:
-    """(sigma_p, sigma_m) [px] that explain the residuals (M, 3) of (u, v, d).
+@dataclass(frozen=True)
+class ResidualMoments:
+    """Two linear equations ``A [p^2, m^2] = sums`` for the variances of pointing and matching [px^2].
 
-    Method of moments: a residual's covariance is ``G S G^T + S`` with ``S = diag(p^2, p^2, m^2)``, so the sums of
-    squares of its image and of its disparity part are two linear equations in p^2 and m^2. Six degrees of freedom go
-    to the motion.
+    A residual's covariance is ``G S G^T + S`` with ``S = diag(p^2, p^2, m^2)``: the sums of squares of its image and of
+    its disparity part. ``freedom``: degrees of freedom of the residuals, after six went to the motion.
     """
-    count = len(residuals)
-    if count < 8:
-        return float("nan"), float("nan")
-    g2 = (G**2).sum(axis=2)
-    A = np.array([[g2[:2, :2].sum() + 2 * count, g2[:2, 2].sum()], [g2[2, :2].sum(), g2[2, 2] + count]])
-    freedom = 1.0 - 6.0 / (3.0 * count)
-    sums = (residuals**2).sum(axis=0) / freedom
-    p2, m2 = np.linalg.solve(A, [sums[0] + sums[1], sums[2]])
-    return float(np.sqrt(max(p2, 1e-6))), float(np.sqrt(max(m2, 1e-6)))
+
+    A: Array
+    sums: Array
+    freedom: float
+
+    @classmethod
+    def of(cls, residuals: Array, G: Array) -> ResidualMoments:
+        """Of the residuals (M, 3) of one motion, and their derivatives (3, 3, M) by the reference measurement."""
+        count, g2 = len(residuals), (G**2).sum(axis=2)
+        A = np.array([[g2[:2, :2].sum() + 2 * count, g2[:2, 2].sum()], [g2[2, :2].sum(), g2[2, 2] + count]])
+        freedom = max(3.0 * count - 6.0, 0.0)
+        squares = (residuals**2).sum(axis=0)
+        return cls(A * freedom / (3.0 * count), np.array([squares[0] + squares[1], squares[2]]), freedom)
+
+    def plus(self, other: ResidualMoments, memory: float = 1.0) -> ResidualMoments:
+        """Both together, this one fading."""
+        return ResidualMoments(
+            memory * self.A + other.A, memory * self.sums + other.sums, memory * self.freedom + other.freedom
+        )
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """(sigma_p, sigma_m) [px] that explain the residuals."""
+        p2, m2 = np.linalg.solve(self.A, self.sums)
+        # Few points tell the sum of both better than the share of each, which may come out negative.
+        least, most = _RATIO2
+        ratio2 = float(np.clip(max(p2, 0.0) / max(m2, 1e-9), least, most))
+        m_px = float(np.sqrt(max(self.sums.sum() / (self.A @ [ratio2, 1.0]).sum(), 1e-6)))
+        return m_px * ratio2**0.5, m_px
+
+
+_RATIO2 = 0.1**2, 2.0**2  # what the square of pointing over matching may be
+# To begin with 0.1 and 0.5 px, worth two points.
+_START = ResidualMoments(np.diag([8.0, 4.0]), np.array([8.0 * 0.1**2, 4.0 * 0.5**2]), 6.0)
 
 
 class SigmaEstimator:
-    """Fixed sigmas where given, else the running root mean square of what the residuals have shown so far."""
+    """Fixed sigmas where given, else those of the residuals so far, fading."""
 
     def __init__(self, sigma_p_px: float | None, sigma_m_px: float | None) -> None:
         self._fixed = (sigma_p_px, sigma_m_px)
-        self._running: Array | None = None
+        self._running = _START
 
-    def update(self, sigma_p_px: float, sigma_m_px: float) -> None:
-        """Take in one motion's estimates; NaN is ignored."""
-        new = np.array([sigma_p_px, sigma_m_px]) ** 2
-        if np.isfinite(new).all():
-            self._running = new if self._running is None else _MEMORY * self._running + (1 - _MEMORY) * new
+    def update(self, moments: ResidualMoments) -> None:
+        """Take in one motion's residuals."""
+        self._running = self._running.plus(moments, _MEMORY)
 
     @property
     def values(self) -> tuple[float, float]:
-        """(sigma_p, sigma_m) [px] to use now."""
-        running = np.array(_START_PX) if self._running is None else np.sqrt(self._running)
+        """(sigma_p, sigma_m) [px] to use now.
+
+        Estimated ones are those of the second moment: the predictive of a motion is a Student-t with the degrees of
+        freedom of the residuals, whose variance is ``nu / (nu - 2)`` times as large.
+        """
+        nu = self._running.freedom
+        running = np.array(self._running.sigmas) * np.sqrt(nu / (nu - 2.0))
         p, m = (float(r) if f is None else f for f, r in zip(self._fixed, running, strict=True))
         return p, m
+
+
+class PersistentNoise:
+    """Running estimate of the error of disparity that points keep while they are followed.
+
+    Such an error shows as the flow that it predicts wrongly: more scatter along ``g``, the residual's derivative by it,
+    than across. ``ratio`` is its variance over that of an image coordinate, 0 while it is not beyond chance, and drawn
+    towards 0 by a prior.
+    """
+
+    def __init__(self) -> None:
+        self._sums: Array = np.zeros(3)
+
+    def update(self, residuals: Array, G: Array) -> None:
+        """Take in the residuals (M, 3) of one motion and their derivatives (3, 3, M) by the reference measurement."""
+        W = whitener(residual_covariance(G, _S_UNIT, _S_UNIT))
+        z, g = apply_whitener(W, residuals.T), apply_whitener(W, persistent_direction(G))
+        g2 = (g * g).sum(0)
+        along2 = (g * z).sum(0) ** 2 / np.maximum(g2, 1e-12)
+        across2 = 0.5 * ((z * z).sum(0) - along2)
+        # Squares are cut off against outliers; the divisors are what a Gaussian has left of its variance.
+        limit = _CUT_ACROSS * float(np.median(across2))
+        sigma2 = max(float(np.minimum(across2, limit).mean()) / _LEFT_ACROSS, 1e-6)
+        expected = 1.0 + self.ratio * g2
+        along2 = np.minimum(along2 / sigma2, _CUT_ALONG * expected) / _LEFT_ALONG
+        weight = g2 / expected**2
+        now = np.array([weight @ (along2 - 1.0), weight @ g2, 3.0 * weight @ weight])
+        self._sums = _MEMORY * self._sums + now
+
+    @property
+    def ratio(self) -> float:
+        """Variance over that of an image coordinate, shrunk by its own uncertainty."""
+        excess, information, variance = self._sums
+        if excess <= 2.0 * variance**0.5:
+            return 0.0
+        # Between pictures of nearly the same place hardly anything tells: then the prior does.
+        return float((excess - 4.0 * variance / excess) * information / (information**2 + variance / _USUAL_RATIO**2))

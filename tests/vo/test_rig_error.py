@@ -12,16 +12,20 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.jsonfile import write_json
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.motion import refine
+from gpvo.vo.motion import refine, transfer
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance
 from gpvo.vo.rig_findings import camchain, corrected, document, findings, read_state, rig_of
+from gpvo.vo.sigmas import PersistentNoise
 
 CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
 
 
-def _fly(coefficients: Array, seed: int, frames: int = 60, sigma_px: float = 0.15) -> RigError:
-    """A rig wrong by ``coefficients`` (12,) over motions with fresh points and fresh noise."""
+def _fly(
+    coefficients: Array, seed: int, frames: int = 60, sigma_px: float = 0.15, persistent_px: float = 0.0
+) -> RigError:
+    """A rig wrong by ``coefficients`` (12,) over motions with fresh points and fresh noise, white and persistent."""
     rng = np.random.default_rng(seed)
+    noise = PersistentNoise()
     rig = RigError(CAMERA)
     truth = RigError(CAMERA, RigState(coefficients, 1e-12 * np.eye(2 * N_TERMS), 1.0), learn=False)
     for _ in range(frames):
@@ -29,16 +33,17 @@ def _fly(coefficients: Array, seed: int, frames: int = 60, sigma_px: float = 0.1
         Z = rng.uniform(1.0, 5.0, 200)
         uv = rng.uniform([60, 40], [580, 440], (200, 2))
         P = np.column_stack([(uv - [CAMERA.cx_px, CAMERA.cy_px]) / CAMERA.fx_px * Z[:, None], Z])
-        seen = []
+        seen, shared = [], rng.normal(0, persistent_px, len(P)) if persistent_px else 0.0
         for X in (P, se3.transform(se3.inverse(T), P)):
             uvd = CAMERA.project(X)
             d_error, row = truth.errors(uvd)
             left, right = rng.normal(0, sigma_px, (2, len(P), 2))
             row_error = row + right[:, 1] - left[:, 1]
             u, v = uvd[:, 0] + left[:, 0], uvd[:, 1] + left[:, 1] + 0.5 * row_error
-            seen.append(np.column_stack([u, v, uvd[:, 2] + d_error + left[:, 0] - right[:, 0]]))
-        motion = refine(T, rig.correct(seen[0]), rig.correct(seen[1]), CAMERA)
+            seen.append(np.column_stack([u, v, uvd[:, 2] + d_error + shared + left[:, 0] - right[:, 0]]))
+        motion = refine(T, rig.correct(seen[0]), rig.correct(seen[1]), CAMERA, persistent=noise.ratio)
         assert motion is not None
+        noise.update(motion.residuals, transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA).G)
         rig.update(motion, row_error[motion.inliers], 0.5)
     return rig
 
@@ -55,6 +60,13 @@ def test_an_exact_rig_is_left_alone() -> None:
     assert rig.state.probability < 0.01
     assert np.abs(rig.state.mean[:N_TERMS]).max() * CAMERA.fx_px < 0.01
     assert findings(rig.state, CAMERA) == []
+
+
+def test_persistent_errors_of_single_points_are_no_error_of_the_rig() -> None:
+    """Each point's disparity is off by 0.5 px in both frames alike: taken for white noise, this bends the estimate."""
+    states = [_fly(np.zeros(12), seed=seed, sigma_px=0.1, persistent_px=0.5).state for seed in range(5)]
+    assert np.mean([state.probability for state in states]) < 0.5
+    assert np.abs([state.mean[0] for state in states]).max() * CAMERA.fx_px < 0.03
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
+from gpvo.sim.points import simulate_points
 from gpvo.types import ImuLog, Status, StereoFrame, TrackFrame, VoLog, VoRecord
-from gpvo.vo.config import make_config
+from gpvo.vo.config import make_config, read_settings
 from gpvo.vo.odometry import StereoOdometry
 
 pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
@@ -171,11 +173,51 @@ def test_refuses_what_it_cannot_mean(clip: Clip) -> None:
     with pytest.raises(SourceError, match="not later"):
         odometry.step(clip.frames[0])
     small = replace(clip.frames[1], left=clip.frames[1].left[:100])
-    with pytest.raises(SourceError, match="the camera is"):
+    with pytest.raises(SourceError, match="the camera takes"):
         odometry.step(small)
     for wrong in ({"preset": "best"}, {"nonsense": 1}, {"methods": ("magic",)}, {"sigma_px": -1.0}):
         with pytest.raises(GpvoError):
             make_config(**wrong)  # type: ignore[arg-type]
+
+
+def test_settings_are_read_from_text() -> None:
+    read = read_settings(
+        ["klt_window_px=21", "sigma_p_px=auto", "self_calibration=off", "methods=spherical, triangulation"]
+    )
+    assert read == {
+        "klt_window_px": 21,
+        "sigma_p_px": None,
+        "self_calibration": False,
+        "methods": ("spherical", "triangulation"),
+    }
+    assert make_config(**read).klt_window_px == 21
+
+
+@pytest.mark.parametrize(
+    "text", ["nonsense=1", "seed", "seed=x", "min_inliers=3", "sigma_px=nan", "self_calibration=2"]
+)
+def test_bad_settings_are_refused(text: str) -> None:
+    with pytest.raises(GpvoError, match=text.split("=")[0][:6]):
+        make_config(**read_settings([text]))
+
+
+def test_a_scene_of_few_landmarks_recovers() -> None:
+    """Twelve tracks, dark for half a second: most motions are found, and the pixel noise of 0.25 px states them."""
+    flight = simulate_points("room-t265", 0, duration_s=20.0, rate_hz=10.0, tracks=12, drop=0.2, dark=(8.0, 8.5))
+    cuts = np.searchsorted(flight.frame, np.arange(len(flight.t_s) + 1))
+    odometry = StereoOdometry(flight.scenario.camera, make_config(min_inliers=4, sigma_px=0.25))
+    scores, lost, index = [], 0, {}
+    for k, (a, b) in enumerate(pairwise(cuts)):
+        t_ns = round(flight.t_s[k] * 1e9) + 1
+        index[t_ns] = k
+        record = odometry.step(TrackFrame(t_ns, flight.track[a:b], flight.uv_left[a:b], flight.uv_right[a:b]))
+        if record.usable and k > 0:
+            T_true = se3.inverse(flight.T_world_cam[index[record.t_prev_ns]]) @ flight.T_world_cam[k]
+            e = se3.log(se3.inverse(T_true) @ record.T_prev_cur)
+            scores.append(e @ np.linalg.solve(record.covariances["triangulation"], e) / 6)
+        lost += record.status is Status.LOST
+    assert lost < 0.1 * len(flight.t_s)
+    assert 0.5 < np.median(scores) < 2.0
 
 
 def test_sigmas_follow_the_residuals(clip: Clip) -> None:
