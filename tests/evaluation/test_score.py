@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import make_run, stated_covariance
+from evaluation_runs import CAMERA, make_run, stated_covariance
 from gpvo import cli
 from gpvo.dataset.build import build_run
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import SourceError
-from gpvo.evaluation.baselines import baselines
+from gpvo.evaluation.baselines import baselines, rtabmap_covariance
 from gpvo.evaluation.evaluate import evaluate_run
-from gpvo.evaluation.score import score, score_folder, score_sequence, write_statements
+from gpvo.evaluation.score import board, score, score_folder, score_sequence, write_statements
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run, read_run
 from gpvo.io.stated import HEADER, read_stated, write_stated
 from gpvo.io.trajectory import tum_line, write_tum
-from gpvo.types import Mounting
+from gpvo.types import Mounting, Status, StereoTracks, VoLog, VoRecord
 
 ROOT = Path(__file__).parents[2]
 N = 300
@@ -161,6 +162,61 @@ def test_a_method_that_leaves_a_sequence_out_is_refused(written, tmp_path: Path)
         score_folder(tmp_path / "all")
     with pytest.raises(SourceError, match="holds no truth"):
         score_folder(tmp_path / "all" / "triangulation")
+
+
+SHOWN = ROOT / "docs" / "scoreboard"
+
+
+def test_the_table_of_the_documentation_is_made_of_its_scores() -> None:
+    """Every baseline has a line, and the line holds what its JSON says."""
+    shown = {path.stem: json.loads(path.read_text()) for path in SHOWN.glob("*.json")}
+    lines = {row["method"]: row for row in csv.DictReader((SHOWN / "board.csv").open())}
+    assert set(shown) == set(lines) == {path.name for path in (SHOWN / "stated").iterdir()} - {"truth"}
+    assert set(lines) >= {
+        "constant", "constant_hindsight", "rtabmap", "scatter", "nearest", "triangulation", "pointing_matching",
+        "gp_thesis", "learned", "twin",
+    }  # fmt: skip
+    again = board(shown)
+    for k, method in enumerate(again["method"]):
+        for name in ("energy [mm]", "NLL", "NEES", "NEES 1s", "easy", "hard"):
+            assert float(lines[method][name]) == again[name][k]
+
+
+@pytest.mark.parametrize("method", ["learned", "rtabmap"])
+def test_files_alone_give_the_scores_of_the_documentation(method: str) -> None:
+    truths = sorted((SHOWN / "stated" / "truth").glob("*.txt"))
+    found = score([(SHOWN / "stated" / method / truth.name, truth) for truth in truths])
+    shown = json.loads((SHOWN / f"{method}.json").read_text())
+    for name, of_all in found["pooled"].items():
+        if isinstance(of_all, dict):
+            assert of_all["mean"] == pytest.approx(shown["pooled"][name]["mean"], rel=1e-6), name
+
+
+def test_the_rule_of_rtabmap_is_the_scatter_of_the_points() -> None:
+    """Points that the motion carries 3 cm off have 2.1981 times its square, however many they are."""
+    rng = np.random.default_rng(0)
+    P = rng.uniform([-2, -1, 4], [2, 1, 8], (80, 3))
+    T = se3.exp(np.array([0.1, 0.0, 0.3, 0.0, 0.02, 0.0]))
+    carried = se3.transform(se3.inverse(T), P)
+    off = 0.03 * np.array([1.0, 0.0, 0.0])
+    records = [VoRecord(0, 0, Status.START, np.eye(4)), VoRecord(100, 0, Status.OK, T, n_inliers=40)]
+    for n in (40, 80):
+        uvd = [_measured(P[:n]), _measured(carried[:n] + off)]
+        tracks = StereoTracks(
+            np.repeat([0, 100], n), np.tile(np.arange(n), 2), np.concatenate(uvd), np.ones(2 * n, bool)
+        )
+        C = rtabmap_covariance(VoLog(records, CAMERA), tracks)
+        assert np.isnan(C[0]).all()
+        np.testing.assert_allclose(np.diag(C[1])[:3], 2.1981 * 0.03**2 + 1e-6, rtol=1e-6)
+        assert 1e-6 < C[1, 3, 3] < 2.1981 * (0.03 / 3) ** 2
+
+
+def _measured(P: np.ndarray) -> np.ndarray:
+    """(N, 3) left column, row and disparity of points in the camera."""
+    f, b = CAMERA.fx_px, CAMERA.baseline_m
+    return np.stack(
+        [CAMERA.cx_px + f * P[:, 0] / P[:, 2], CAMERA.cy_px + f * P[:, 1] / P[:, 2], f * b / P[:, 2]], axis=1
+    )
 
 
 @pytest.mark.slow
