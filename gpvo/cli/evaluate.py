@@ -110,12 +110,14 @@ def report(
 ) -> None:
     """Write a report: one HTML page that opens with a verdict.
 
+    A run without ground truth is shown with what was stated of it, unjudged.
+
     Example: gpvo report runs/mh01 -o report.html
     """
     from gpvo.evaluation.report import write_report
 
-    found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset))
-    write_report(found, out, [] if frames is None else _pictures(runs, frames, sequence))
+    found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset), unjudged=True)
+    write_report(found, out, [] if frames is None else _pictures(runs, frames, sequence), model.name if model else "")
     print(out)
     _tell_misfits(model, found)
 
@@ -177,8 +179,12 @@ def _loaded(runs: list[Path], model: Path | None, truth: Path | None) -> tuple[l
     return loaded, predictor
 
 
-def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions) -> list[Evaluation]:
+def _evaluate(
+    runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions, unjudged: bool = False
+) -> list[Evaluation]:
+    """``unjudged``: runs without truth are shown and not refused."""
     from gpvo.evaluation.evaluate import evaluate_run
+    from gpvo.evaluation.unjudged import unjudged_run
 
     loaded, predictor = _loaded(runs, model, truth)
     if predictor is not None and model is not None:
@@ -187,7 +193,10 @@ def _evaluate(runs: list[Path], model: Path | None, truth: Path | None, options:
         for run in loaded:
             for problem in check(predictor, run).problems:
                 warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
-    return [evaluate_run(run, predictor, options) for run in loaded]
+    return [
+        unjudged_run(run, predictor) if unjudged and run.truth is None else evaluate_run(run, predictor, options)
+        for run in loaded
+    ]
 
 
 def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:

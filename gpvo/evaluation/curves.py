@@ -22,6 +22,12 @@ def full_statements(e: Evaluation) -> list[Statement]:
     return [s for s in e.statements if s.errors is not None and _stated(e, s).sum() >= 2]
 
 
+def stated_sigma(s: Statement) -> tuple[Array, Array]:
+    """(N,) one stated standard deviation of translation [m] and of rotation [rad], root mean square over axes."""
+    variance = np.diagonal(s.covariance, axis1=1, axis2=2)
+    return np.sqrt(variance[:, :3].mean(axis=1)), np.sqrt(variance[:, 3:].mean(axis=1))
+
+
 def best_statement(e: Evaluation) -> Statement | None:
     """The statement to draw bounds of: ``learned`` where there is one, else ``triangulation``, else any full one."""
     full = {s.method: s for s in e.statements if s.errors is not None}

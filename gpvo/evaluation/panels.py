@@ -31,20 +31,25 @@ def groups(e: Evaluation) -> list[dict[str, Any]]:
     statement = curves.best_statement(e)
     method = "no method" if statement is None else statement.method
     return [
-        {"title": "From above and from the side", "note": f"3-sigma ellipses of {method}.", "panels": views(e)},
+        {"title": "Top and side view", "note": f"Green: 3-sigma ellipses of {method}.", "panels": views(e)},
         {
-            "title": "Error of each motion against its bound",
-            "note": f"Line: error. Green: what {method} states, 3 sigma.",
+            "title": "Error of each motion and its bound",
+            "note": f"Line: error. Green: three standard deviations as stated by {method}.",
             "panels": errors(e),
         },
         {
-            "title": "Does it know?",
-            "note": "Overconfident is: below the diagonal; a NEES (mean over 0.5 s) above 1.",
-            "panels": [reliability(e), nees(e)],
+            "title": "What each method states",
+            "note": "One standard deviation per axis of each motion.",
+            "panels": stated(e),
         },
         {
-            "title": "How the error remembers",
-            "note": "A dip at the first lag: shared pixel noise. An Allan deviation that is flat or rises: bias.",
+            "title": "Is it honest?",
+            "note": "Overconfident: below the diagonal; in NEES over time (mean over 0.5 s), above 1.",
+            "panels": [reliability(e), nees(e)] if len(e.errors.index) else [],
+        },
+        {
+            "title": "How errors are correlated in time",
+            "note": "A dip at the first lag is shared pixel noise. A flat or rising Allan deviation is a bias.",
             "panels": memory(e),
         },
         {"title": "What odometry saw", "note": "Amber: degraded. Red: lost.", "panels": inputs(e)},
@@ -54,7 +59,7 @@ def groups(e: Evaluation) -> list[dict[str, Any]]:
 def views(e: Evaluation) -> list[Panel]:
     """Top and side view of truth and estimate, with 3-sigma ellipses."""
     to_plane, names = level(e)
-    origin = e.T_true[e.covered][0, :3, 3]
+    origin = (e.T_true[e.covered] if e.covered.any() else e.T_est)[0, :3, 3]
     p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
     statement = curves.best_statement(e)
     stated = None if statement is None else statement.pose_covariance(e.run.log)
@@ -65,8 +70,11 @@ def views(e: Evaluation) -> list[Panel]:
         for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
             R = to_plane @ e.T_est[k, :3, :3]
             ring = _ring((R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]) + p[k, [i, j]]
-            lines.append({**_line(ring[:, 0], ring[:, 1], "", _GREEN, 0.8), "aside": True})
-        lines.append(_line(*_thin(q[:, i], q[:, j]), "truth", _BLACK, 1.6))
+            # Whole ellipses lie inside the picture, unless they are far larger than the path.
+            far = bool(np.ptp(ring, axis=0).max() > 2 * np.ptp(p, axis=0).max())
+            lines.append({**_line(ring[:, 0], ring[:, 1], "", _GREEN, 0.8), "aside": far})
+        if len(q):
+            lines.append(_line(*_thin(q[:, i], q[:, j]), "truth", _BLACK, 1.6))
         lines.append(_line(*_thin(p[:, i], p[:, j]), "visual odometry", _RED))
         panels.append(_panel("", f"{names[i]} [m]", f"{names[j]} [m]", lines, equal=True))
     return panels
@@ -75,6 +83,8 @@ def views(e: Evaluation) -> list[Panel]:
 def errors(e: Evaluation) -> list[Panel]:
     """The error of each motion and what is stated of it, axis by axis."""
     statement, t, panels = curves.best_statement(e), curves.error_times_s(e), []
+    if not len(t):
+        return []
     for k, axis in enumerate(AXES):
         error = 1e3 * e.errors.xi[:, k]
         bands = []
@@ -84,14 +94,29 @@ def errors(e: Evaluation) -> list[Panel]:
             keep = _spread(len(t))
             low, high = (mean - reach)[keep], (mean + reach)[keep]
             bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
-        reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6) if len(error) else 1.0
+        reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
         if bands:
-            # A bound that is far too wide still has its edges in the picture.
-            reach = max(reach, min(1.15 * float(np.nanmedian(np.abs(high))), 30.0 * reach))
+            # The bound's usual edges are always in the picture; its peaks unless the error would be a flat line.
+            edge = np.abs(np.concatenate([low, high]))
+            edge = edge[np.isfinite(edge)]
+            if len(edge):
+                reach = max(reach, 1.15 * float(np.median(edge)), min(1.05 * float(edge.max()), 4.0 * reach))
         lines = [_line(*_thin(t, error), "", _BLACK, 1.0)]
         unit = "mm" if k < 3 else "mrad"
         panels.append(_panel(axis, "time [s]", f"{axis} [{unit}]", lines, bands=bands, limit=[-reach, reach]))
     return panels
+
+
+def stated(e: Evaluation) -> list[Panel]:
+    """What each method states of every motion, translation and rotation."""
+    t = (e.run.log.t_ns - e.run.log.t_ns[0]) * 1e-9
+    lines: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
+    for s in (s for s in e.statements if s.errors is not None):
+        for of_kind, sigma in zip(lines, curves.stated_sigma(s)):
+            keep = _spread(len(t))
+            of_kind.append(_line(t[keep], 1e3 * sigma[keep], s.method, colour(s.method)))
+    names = ("translation [mm]", "rotation [mrad]")
+    return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
 
 
 def reliability(e: Evaluation) -> Panel:
@@ -132,13 +157,13 @@ def inputs(e: Evaluation) -> list[Panel]:
     log = e.run.log
     t, shades = (log.t_ns - log.t_ns[0]) * 1e-9, _shades(e)
     wanted = {
-        "points": ("n_stereo", "n_tracked", "n_inliers"),
-        "disparity [px]": ("disparity_p10_px", "disparity_p50_px", "disparity_p90_px"),
-        "image, 0 to 1": ("brightness", "contrast", "noise_level"),
+        "points": {"n_stereo": "matched in stereo", "n_tracked": "followed", "n_inliers": "inliers"},
+        "disparity [px]": {"disparity_p10_px": "10 %", "disparity_p50_px": "median", "disparity_p90_px": "90 %"},
+        "image, 0 to 1": {"brightness": "brightness", "contrast": "contrast", "noise_level": "noise"},
     }
     panels = []
     for label, names in wanted.items():
-        columns = {n: np.where(c < 0, np.nan, c) for n in names for c in [log.column(n).astype(np.float64)]}
+        columns = {names[n]: np.where(c < 0, np.nan, c) for n in names for c in [log.column(n).astype(np.float64)]}
         known = [(n, c) for n, c in columns.items() if np.isfinite(c).any()]
         lines = [_line(*_thin(t, c), n, _SIX[k]) for k, (n, c) in enumerate(known)]
         if lines:

@@ -20,7 +20,8 @@ from gpvo.types import Array, Status
 AXES = ("x", "y", "z", "rot x", "rot y", "rot z")
 _COLOURS = {
     "constant": "#888888", "triangulation": "#1f77b4", "pointing_matching": "#ff7f0e", "spherical": "#8c564b",
-    "triangulation_scaled": "#17becf", "pointing_matching_scaled": "#bcbd22", "learned": "#2ca02c",
+    "triangulation_scaled": "#17becf", "pointing_matching_scaled": "#bcbd22", "learned": "#2ca02c", "base": "#e377c2",
+    "imported": "#d62728", "imported_scaled": "#c49c94", "twin": "#3f51b5",
 }  # fmt: skip
 
 
@@ -64,7 +65,8 @@ def trajectory(e: Evaluation) -> Figure:
 
 def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
     """Axes to draw in. Truth in a camera's world (y down, as KITTI's) is turned so that the third axis points up."""
-    down = e.T_true[e.covered][0, :3, :3] @ np.array([0.0, 1.0, 0.0])
+    first = e.T_true[e.covered][0] if e.covered.any() else e.T_est[0]
+    down = first[:3, :3] @ np.array([0.0, 1.0, 0.0])
     if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
         return R_FLU_OPTICAL, ("forward z", "left -x", "up -y")
     return np.eye(3), ("x", "y", "z")

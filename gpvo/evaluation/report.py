@@ -8,24 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo import __version__
 from gpvo.evaluation import curves, panels, plots
 from gpvo.evaluation.evaluate import Evaluation, document
 from gpvo.evaluation.matches import MatchPicture
+from gpvo.evaluation.verdict import TRUE
 from gpvo.io.atomic import write_text
 from gpvo.types import Array
 
 _MAX_POINTS = 600
 
 
-def write_report(evaluations: Sequence[Evaluation], path: Path, pictures: Sequence[MatchPicture] = ()) -> None:
-    """Write the page, whole or not at all. ``pictures``: matches of single frames of the only run."""
+def write_report(
+    evaluations: Sequence[Evaluation], path: Path, pictures: Sequence[MatchPicture] = (), model: str = ""
+) -> None:
+    """Write the page, whole or not at all. ``pictures``: matches of single frames of the only run; ``model``: name of
+    the error model behind ``learned``."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, render(evaluations, pictures))
+    write_text(path, render(evaluations, pictures, model))
 
 
-def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] = ()) -> str:
+def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] = (), model: str = "") -> str:
     """The page as text. Its table shows the numbers of ``gpvo evaluate --json``."""
     from jinja2 import Environment, PackageLoader, select_autoescape
 
@@ -33,9 +38,10 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
         loader=PackageLoader("gpvo.evaluation"), autoescape=select_autoescape(default=True), trim_blocks=True
     )
     environment.filters["number"] = _number
+    environment.filters["tone"] = _tone
     runs = []
     for entry, evaluation in zip(document(evaluations)["runs"], evaluations, strict=True):
-        groups = panels.groups(evaluation)
+        groups = [group for group in panels.groups(evaluation) if group["panels"]]
         for group in groups:
             group["panels"] = [_embedded(panel) for panel in group["panels"]]
         statement = curves.best_statement(evaluation)
@@ -45,23 +51,24 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
                 "groups": groups,
                 "scene": _embedded(scene(evaluation)),
                 "bounds_of": "no method" if statement is None else statement.method,
-                "verdict": _worded(entry["verdict"]),
+                "verdict": _worded(entry["verdict"], bool(evaluation.covered.any())),
                 "camera": _camera(evaluation),
+                "judged": bool(evaluation.covered.any()),
             }
         )
     return environment.get_template("report.html").render(
-        runs=runs, pictures=pictures, version=__version__, made=_made(evaluations)
+        runs=runs, pictures=pictures, version=__version__, made=_made(evaluations), model=model
     )
 
 
 def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
     to_plane, _ = plots.level(e)
-    keep = np.unique(np.linspace(0, len(e.T_est) - 1, _MAX_POINTS).astype(int))
-    covered = np.flatnonzero(e.covered)
-    shown = covered[np.unique(np.linspace(0, len(covered) - 1, _MAX_POINTS).astype(int))]
+    keep, covered = _spread(len(e.T_est)), np.flatnonzero(e.covered)
+    shown = covered[_spread(len(covered))]
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T
-    centre = (true.max(0) + true.min(0)) / 2
+    path = true if len(true) else est
+    centre = (path.max(0) + path.min(0)) / 2
     statement = curves.best_statement(e)
     ellipsoids: list[dict[str, Any]] = []
     if statement is not None and (bounds := statement.pose_covariance(e.run.log)) is not None:
@@ -71,13 +78,19 @@ def scene(e: Evaluation) -> dict[str, Any]:
             ellipsoids.append({"at": _rounded(to_plane @ e.T_est[k, :3, 3] - centre), "axes": _rounded(axes)})
     # Whole ellipsoids lie inside the view, unless they are far larger than the path.
     reach = [np.abs(o["at"]).max() + np.linalg.norm(o["axes"], axis=1).max() for o in ellipsoids]
-    path = max(float(np.abs(true - centre).max()), 1e-6)
-    size = max(path, min(max(map(float, reach), default=0.0), 3.0 * path))
+    half = max(float(np.abs(path - centre).max()), 1e-6)
+    size = max(half, min(max(map(float, reach), default=0.0), 3.0 * half))
     return {"est": _rounded(est - centre), "true": _rounded(true - centre), "ellipsoids": ellipsoids, "size": size}
 
 
-def _worded(found: dict[str, Any]) -> dict[str, Any]:
-    return {**found, "word": {"green": "true", "amber": "partly true", "red": "not true"}[found["colour"]]}
+def _spread(n: int) -> NDArray[np.int64]:
+    """At most ``_MAX_POINTS`` of n indices, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, _MAX_POINTS).astype(np.int64)) if n else np.zeros(0, np.int64)
+
+
+def _worded(found: dict[str, Any], judged: bool) -> dict[str, Any]:
+    words = {"green": "true", "amber": "partly true", "red": "not true"}
+    return {**found, "word": words[found["colour"]] if judged else "not judged"}
 
 
 def _camera(e: Evaluation) -> str:
@@ -106,6 +119,13 @@ def _rounded(values: Array) -> Any:
 def _embedded(value: Any) -> str:
     """JSON that cannot end the element it stands in."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _tone(nees: float | None) -> str:
+    """Colour of a NEES per degree of freedom, as in the verdict."""
+    if nees is None or not np.isfinite(nees):
+        return ""
+    return "red" if nees > TRUE[1] else "amber" if nees < TRUE[0] else "green"
 
 
 def _number(value: float | None) -> str:

@@ -38,6 +38,12 @@ def verdict(e: Evaluation) -> Verdict:
         colour: Colour = "green" if _word(joint) == "true" else "red" if joint > TRUE[1] else "amber"
         line = f"NEES/dof {joint:.3g} over {e.poses.count} poses, median {e.poses.nees_dof_median['joint']:.3g}."
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
+    if not e.covered.any():
+        told_of_none = (
+            *_conditions(e),
+            "gpvo evaluate --twins judges a run by twins, if it was run with --keep-tracks.",
+        )
+        return Verdict("amber", "There is no ground truth, so no covariance can be judged.", told_of_none)
     if not judged:
         return Verdict("red", "No covariance was stated, so nothing can be judged.", tuple(_conditions(e)))
     best = min(judged, key=lambda m: judged[m].nll_per_dim or 0.0)
@@ -45,12 +51,13 @@ def verdict(e: Evaluation) -> Verdict:
     told = "learned" if "learned" in judged else best
     wrong = _wrong(judged[told])
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
-    lines = [*_conditions(e), *(_line(m, c) for m, c in judged.items() if m in (told, best) or m in _ALWAYS)]
+    shown = dict.fromkeys((told, best, *(m for m in judged if m in _ALWAYS)))
+    lines = [*_conditions(e), *(_line(m, judged[m]) for m in shown)]
     if not wrong and not outside:
         return Verdict("green", f"The {told} covariance is true here, per motion and over distance.", tuple(lines))
     if told != best and not _wrong(judged[best]):
         lines.append(f"Use {best} here: it is true, and its likelihood is the best of all.")
-    elif outside:
+    if outside:
         lines.append("Train on runs of this camera and these conditions, with truth or with twins.")
     per_motion = _word(_nees(judged[told]))
     headline = f"The {told} covariance is {per_motion} per motion"
@@ -95,8 +102,10 @@ def _line(method: str, c: Consistency) -> str:
     nees = _nees(c)
     off = max(nees, 1.0 / nees) ** 0.5 if nees > 0 else float("inf")
     by = "" if _word(nees) == "true" else f" by a factor of {off:.1f} in sigma"
-    over = ", ".join(f"{h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
-    return f"{method}: {_word(nees)}{by}; NEES/dof {nees:.2f} per motion" + (f", {over}" if over else "") + "."
+    wrong = [w for w in _wrong(c) if w != "one motion"]
+    then = f", not true over {', '.join(wrong)}" if wrong else ""
+    over = "".join(f", {h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
+    return f"{method}: {_word(nees)}{by} per motion{then}; NEES/dof {nees:.2f}{over}."
 
 
 def _conditions(e: Evaluation) -> Iterator[str]:
@@ -105,7 +114,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
     lost = sum(r.status.value == "lost" for r in e.run.log)
     if lost:
-        yield f"{lost} of {len(e.run.log)} frames have no motion."
+        yield f"{lost} of {len(e.run.log)} frames {'has' if lost == 1 else 'have'} no motion."
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
         yield (

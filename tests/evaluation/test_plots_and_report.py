@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,8 @@ from gpvo.errors import SourceError
 from gpvo.evaluation import panels, plots
 from gpvo.evaluation.evaluate import Evaluation, document, evaluate_run
 from gpvo.evaluation.report import render, scene, write_report
-from gpvo.io.run import read_run, write_run
-from gpvo.types import VoLog
+from gpvo.io.run import Run, read_run, write_run
+from gpvo.types import Mounting, VoLog
 from matplotlib.figure import Figure
 
 AXES = {
@@ -173,8 +172,23 @@ def test_every_panel_is_on_the_page(evaluation, page):
     assert _embedded(page)[1:] == wanted
     labels = {panel["y"] for panel in wanted}
     assert labels >= {"x [mm]", "rot z [mrad]", "share of errors inside", "NEES / dof", "autocorrelation", "points"}
-    # Both views, six axes, reliability and NEES, two memories, points alone: no images, no disparities.
-    assert len(wanted) == 2 + 6 + 2 + 2 + 1
+    # Both views, six axes, two of what is stated, reliability and NEES, two of time, points alone: no images.
+    assert len(wanted) == 2 + 6 + 2 + 2 + 2 + 1
+
+
+@pytest.mark.parametrize("factor", [0.01, 1.0, 400.0])
+def test_bounds_and_ellipses_lie_inside_their_pictures(factor):
+    log, truth = make_run(300)
+    records = [replace(r, covariances={m: factor * C for m, C in r.covariances.items()}) for r in log]
+    e = evaluate_run(Run(Path("hall"), "hall", VoLog(records, log.camera), truth, None, Mounting(), []))
+    for panel in panels.errors(e):
+        (band,), (_, top) = panel["bands"], panel["limit"]
+        inside = np.mean(np.abs(np.array(band["high"], float)) < top)
+        assert inside > 0.9, panel["y"]
+    for panel in panels.views(e):
+        rings = [line for line in panel["lines"] if not line["name"]]
+        assert len(rings) == 11
+        assert not any(line["aside"] for line in rings)
 
 
 def test_a_panel_shows_the_lost_frame(evaluation):
@@ -208,65 +222,3 @@ def test_what_is_embedded_cannot_end_its_element(evaluation):
     nasty = render([evaluate_run(replace(run, log=log))])
     assert "</script><b>" not in nasty
     assert all(isinstance(block, dict) for block in _embedded(nasty))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("width", [360, 1200])
-def test_a_browser_shows_the_page_without_errors(page, tmp_path, width):
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here to open the report with")
-    # At the end of the scripts: did they run, does anything stick out sideways, and was anything fetched?
-    probe = """<script>
-    document.body.dataset.wide = document.documentElement.scrollWidth - window.innerWidth;
-    document.body.dataset.drawn = document.querySelectorAll("figure.panel svg path").length;
-    document.body.dataset.fetched = performance.getEntriesByType("resource").length;
-    const drawn = () => document.querySelectorAll("figure.panel svg path").length, before = drawn();
-    document.querySelector("figure.panel figcaption button").click();
-    document.body.dataset.hidden = before - drawn();
-    document.querySelector("figure.panel figcaption button").click();
-    document.body.dataset.back = before - drawn();
-    const svg = document.querySelector("svg.timed"), box = svg.getBoundingClientRect();
-    const move = (type, share) => svg.dispatchEvent(new PointerEvent(type,
-      { clientX: box.left + share * box.width, pointerType: "mouse", bubbles: true }));
-    move("pointermove", 0.5);
-    document.body.dataset.values = svg.parentElement.querySelector(".values").textContent.split("\\n").length;
-    const timed = () => [...document.querySelectorAll("svg.timed")];
-    const ticks = () => timed().map(s => s.querySelector("text").textContent).join();
-    const whole = ticks();
-    move("pointerdown", 0.4);
-    move("pointerup", 0.6);
-    document.body.dataset.zoomed = ticks() !== whole;
-    document.querySelector("svg.timed").dispatchEvent(new MouseEvent("dblclick"));
-    document.body.dataset.unzoomed = ticks() === whole;
-    document.body.dataset.verdict = document.querySelector(".verdict strong").textContent;
-    document.body.dataset.letters = getComputedStyle(document.querySelector("figure text")).fontSize;
-    </script></body>"""
-    (tmp_path / "report.html").write_text(page.replace("</body>", probe), encoding="utf-8")
-    command = [
-        browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
-        f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
-        "--dump-dom", (tmp_path / "report.html").as_uri(),
-    ]  # fmt: skip
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    found = dict(
-        re.findall(
-            r'data-(wide|drawn|fetched|letters|hidden|back|values|zoomed|unzoomed|verdict)="([^"]*)"', shown.stdout
-        )
-    )
-    assert int(found["wide"]) <= 0
-    assert int(found["drawn"]) >= 13
-    assert found["fetched"] == "0"
-    assert found["letters"] == "12px"
-    # A click on a name hides its curve wherever it is drawn, and another brings it back.
-    assert int(found["hidden"]) >= 1
-    assert found["back"] == "0"
-    # The pointer shows the time and what each curve has there; dragging zooms all times together.
-    assert int(found["values"]) >= 2
-    assert (found["zoomed"], found["unzoomed"]) == ("true", "true")
-    assert found["verdict"] == "The triangulation covariance is true here, per motion and over distance."
-    # Drawing sets the size of the canvas.
-    assert re.search(r'<canvas[^>]* width="\d+"', shown.stdout)
-    # The page forbids itself to fetch anything: an attempt would be an error here, as any other would.
-    assert "default-src 'none'" in page
-    assert "CONSOLE" not in shown.stderr, shown.stderr

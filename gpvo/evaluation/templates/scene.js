@@ -3,6 +3,7 @@
 document.querySelectorAll("div.scene").forEach(box => {
   const canvas = box.querySelector("canvas"), data = JSON.parse(box.querySelector("script").textContent);
   const views = { turn: [-0.6, 0.6], above: [0, Math.PI / 2], side: [0, 0] };
+  const path = data.true.length ? data.true : data.est;
   let [yaw, pitch] = views.turn, zoom = 1, held = null;
   const rings = data.ellipsoids.flatMap(e => [[0, 1], [1, 2], [2, 0]].map(([a, b]) =>
     Array.from({ length: 33 }, (_, k) => {
@@ -30,7 +31,7 @@ document.querySelectorAll("div.scene").forEach(box => {
       points.forEach((p, k) => { const [a, b] = place(p); if (k) g.lineTo(a, b); else g.moveTo(a, b); });
       g.stroke();
     };
-    const r = data.size, low = Math.min(...data.true.map(p => p[2]));
+    const r = data.size, low = Math.min(...path.map(p => p[2]));
     for (let k = -2; k <= 2; k += 1) {
       line([[k * r / 2, -r, low], [k * r / 2, r, low]], grid, 1);
       line([[-r, k * r / 2, low], [r, k * r / 2, low]], grid, 1);
@@ -38,7 +39,7 @@ document.querySelectorAll("div.scene").forEach(box => {
     rings.forEach(ring => line(ring, "rgba(44, 160, 44, 0.55)", 0.8));
     line(data.true, ink, 1.8);
     line(data.est, "#d62728", 1.4);
-    const [a, b] = place(data.true[0]);
+    const [a, b] = place(path[0]);
     g.fillStyle = ink;
     g.beginPath();
     g.arc(a, b, 4, 0, 2 * Math.PI);
