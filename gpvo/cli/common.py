@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
@@ -35,7 +35,7 @@ class Groups(TyperGroup):
         paths += [a.partition("=")[2] for a in args if a.startswith("--config=")]
         if command is not None and paths:
             at = args.index(str(name)) + 1
-            args = [*args[:at], *options_of_file(Path(paths[-1]), str(name), command.params), *args[at:]]
+            args = [*args[:at], *options_of_file(Path(paths[-1]), str(name), command), *args[at:]]
         return list(super().parse_args(ctx, args))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -79,8 +79,8 @@ def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
 _PLAIN = (str, int, float, bool, list, Path)
 
 
-def options_of_file(path: Path, name: str, parameters: Sequence[Any]) -> list[str]:
-    """Options of the command ``name`` from its table in a TOML file, as words of a command line.
+def options_of_file(path: Path, name: str, command: Any) -> list[str]:
+    """Options of a command and its ``name`` from its table in a TOML file, as words of a command line.
 
     Raises
     ------
@@ -94,8 +94,9 @@ def options_of_file(path: Path, name: str, parameters: Sequence[Any]) -> list[st
     for key, value in found.items():
         if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
             raise GpvoError(f"'{key}' is no table of a command", where=path, cure=f"write options under [{name}]")
-    known = {word.lstrip("-").replace("-", "_"): p for p in parameters for word in p.opts if word.startswith("--")}
+    known = {word.lstrip("-").replace("-", "_"): p for p in command.params for word in p.opts if word.startswith("--")}
     del known["config"]
+    context = command.context_class(command, info_name=name)
     for key, value in found.get(name, {}).items():
         option = known.get(key.replace("-", "_"))
         if option is None:
@@ -106,6 +107,15 @@ def options_of_file(path: Path, name: str, parameters: Sequence[Any]) -> list[st
             raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give true or false")
         if option.is_flag:
             words += [option.opts[0]] if value else option.secondary_opts[:1]
-        else:
-            words += [w for one in (value if isinstance(value, list) else [value]) for w in (option.opts[0], str(one))]
+            continue
+        values = value if isinstance(value, list) else [value]
+        if not all(isinstance(v, (str, int, float)) for v in values):
+            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give a text or a number")
+        texts = [str(v) for v in values]
+        try:
+            for text in texts:
+                option.process_value(context, [text] if option.multiple else text)
+        except typer.BadParameter as problem:
+            raise GpvoError(f"[{name}] {problem.format_message()}", where=path) from None
+        words += [word for text in texts for word in (option.opts[0], text)]
     return words

@@ -45,6 +45,12 @@ def _number(text: str) -> float:
     return value
 
 
+def _whole(text: str) -> int:
+    if len(text) > 20:  # of 64 bits: a longer one overflows where it becomes a float
+        raise ValueError(f"{text[:20]}... is no number of JSON")
+    return int(text)
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Read a document.
 
@@ -56,7 +62,8 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError("is larger than 50 MB", where=path)
-        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_number, parse_float=_number)
+        text = path.read_text(encoding="utf-8")
+        document = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole)
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
     except (ValueError, RecursionError) as error:

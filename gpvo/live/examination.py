@@ -33,7 +33,7 @@ def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]
         if not found or (topic is not None and topic not in found):
             raise SourceError(f"has no poses on '{topic or ''}' (poses on: {', '.join(found) or 'none'})", where=path)
         wanted = found if topic is None else [topic]
-        return {t: examine(Stated.of(m for _, m in messages(reader, [t]))) for t in wanted}
+        return {t: examine(Stated.of((m for _, m in messages(reader, [t])), path)) for t in wanted}
 
 
 def examine_topic(

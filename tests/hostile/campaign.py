@@ -7,7 +7,6 @@ as it has to: read, or refused by one line that names the file, in time and with
 from __future__ import annotations
 
 import json
-import re
 import resource
 import shutil
 import signal
@@ -20,131 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gpvo.types import StereoCamera
+from mutators import ANY_BYTES, Rng, odd_model, odd_table, odd_tracks
 
-EXTREME = tuple(
-    word.encode()
-    for word in (
-        *["1e308", "-1e308", "1e999", "nan", ".inf", "-1", "0", "2147483648", "null", "[]", "{}", "1e-320", "true"],
-        "9" * 400,
-    )
-)
-VALUES = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e160, 0.0, -1.0, 1e-320, 1e12)
 SECONDS, MEGABYTES = 10, 1000
-_NUMBER = re.compile(rb"-?\d+\.?\d*(e[-+]?\d+)?")
-Rng = np.random.Generator
-
-
-# -- bytes --
-
-
-def flip(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    out = bytearray(raw)
-    for at in rng.integers(0, max(len(out), 1), rng.integers(1, 17)):
-        if out:
-            out[at] ^= 1 << int(rng.integers(8))
-    return bytes(out)
-
-
-def truncate(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    return raw[: int(rng.integers(0, max(len(raw), 1)))]
-
-
-def splice(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    at, begin, n = (int(rng.integers(0, max(len(v), 1))) for v in (raw, other, other))
-    return raw[:at] + other[begin : begin + min(n, 4096)] + raw[at + int(rng.integers(0, 4096)) :]
-
-
-def numbers(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    found = list(_NUMBER.finditer(raw))
-    if not found:
-        return flip(raw, rng, other)
-    hit = found[int(rng.integers(len(found)))]
-    return raw[: hit.start()] + EXTREME[int(rng.integers(len(EXTREME)))] + raw[hit.end() :]
-
-
-def swap(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    separator = (b"\n", b",", b" ", b":")[int(rng.integers(4))]
-    fields = raw.split(separator)
-    a, b = (int(k) for k in rng.integers(0, len(fields), 2))
-    fields[a], fields[b] = fields[b], fields[a]
-    return separator.join(fields)
-
-
-def bomb(raw: bytes, rng: Rng, other: bytes) -> bytes:
-    at, n = int(rng.integers(0, max(len(raw), 1))), int(rng.integers(1, 64))
-    return raw[:at] + raw[at : at + n] * int(rng.integers(10, 20_000)) + raw[at:]
-
-
-ANY_BYTES = (flip, truncate, splice, numbers, swap, bomb)
-
-
-# -- arrays: files that are whole, with a content that cannot be --
-
-
-def odd_array(array: np.ndarray, rng: Rng) -> np.ndarray:
-    """Another array: some or all of its values extreme, or of another shape or type."""
-    choice = int(rng.integers(6))
-    if choice == 0:
-        return np.asarray(array[:-1] if array.ndim else [array, array])
-    if choice == 1:
-        return np.asarray(array).astype(("f4", "i8", "U3", "?", "f8", "i4")[int(rng.integers(6))])
-    if choice == 2:
-        return np.atleast_1d(array).reshape(-1, 1)
-    out = np.array(array, dtype=np.float64)
-    value = VALUES[int(rng.integers(len(VALUES)))]
-    if choice == 3 or not out.size:
-        out[...] = value
-    else:
-        out.reshape(-1)[int(rng.integers(out.size))] = value
-    return out
-
-
-def odd_tracks(path: Path, rng: Rng) -> None:
-    with np.load(path) as file:
-        data = {name: file[name] for name in file.files}
-    name = sorted(data)[int(rng.integers(len(data)))]
-    data[name] = odd_array(data[name], rng)
-    np.savez_compressed(path, **data)
-
-
-def odd_model(path: Path, rng: Rng) -> None:
-    from gpvo.errors import ModelError
-    from gpvo.online import modelfile
-
-    arrays, header = modelfile.load(path)
-    arrays, names = dict(arrays), sorted(n for n in arrays if not n.startswith("thesis."))
-    if rng.random() < 0.3:
-        key = sorted(header)[int(rng.integers(len(header)))]
-        header[key] = (None, -1, 0, [], {}, "x", [1.0], [[]], {"x": {}}, 1e300, True)[int(rng.integers(11))]
-    else:
-        name = names[int(rng.integers(len(names)))]
-        arrays[name] = odd_array(arrays[name], rng)
-    try:
-        modelfile.save(path, arrays, header)
-    except ModelError:
-        path.write_bytes(flip(path.read_bytes(), rng, b""))
-
-
-def odd_table(path: Path, rng: Rng) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(path)
-    at = int(rng.integers(table.num_columns))
-    name = table.column_names[at]
-    if rng.random() < 0.2:
-        table = table.remove_column(at)
-    elif rng.random() < 0.2:
-        table = table.set_column(at, name, pa.array(["x"] * table.num_rows))
-    else:
-        values = table[name].to_pylist()
-        if values and isinstance(values[0], (int, float)) and not isinstance(values[0], bool):
-            k = int(rng.integers(len(values)))
-            value = VALUES[int(rng.integers(len(VALUES)))]
-            whole = isinstance(values[0], int)
-            values[k] = int(rng.integers(-(2**62), 2**62)) if whole else value
-            table = table.set_column(at, name, pa.array(values, table[name].type))
-    pq.write_table(table, path)
 
 
 # -- readers --
@@ -173,6 +51,9 @@ def read_run_folder(path: Path) -> None:
     told = list(flying_model().replay(run.log).values())
     assert are_positive_definite(np.array([p.covariance for p in told])).all(), "a covariance that is none"
     assert np.isfinite([p.mean for p in told]).all(), "a mean that is none"
+
+
+CAMERA = StereoCamera(60.0, 60.0, 32.0, 24.0, 0.1, 64, 48)
 
 
 @cache
@@ -223,11 +104,68 @@ def read_image(path: Path) -> None:
 
 def read_bag(path: Path) -> None:
     from gpvo.io.bag_reader import POSE_TYPES, open_bag, read_poses, topics_of
+    from gpvo.live.examination import examine_bag
 
     with open_bag(path) as reader:
         topics = list(topics_of(reader, POSE_TYPES))
     for topic in topics:
-        read_poses(path, topic)
+        if len(read_poses(path, topic)[0]) >= 10:
+            examine_bag(path, topic)
+
+
+def read_seen(path: Path) -> None:
+    """A run with what odometry saw, as ``gpvo twin`` takes it."""
+    from gpvo.twin.estimate import estimate
+
+    structure = estimate(path).structure
+    assert np.isfinite(structure.T_world_cam).all(), "a pose that is none"
+
+
+def read_calibration_state(path: Path) -> None:
+    from gpvo.geometry.covariance import is_positive_definite
+    from gpvo.vo.rig_findings import findings, read_state
+
+    state = read_state(path, CAMERA)
+    assert is_positive_definite(state.covariance), "a covariance that is none"
+    findings(state, CAMERA)
+
+
+def read_gap_or_tolerance(path: Path) -> None:
+    from gpvo.twin.gap import read_gap
+    from gpvo.twin.replicate import read_tolerance
+
+    if path.suffix == ".toml":
+        read_tolerance(str(path))
+    else:
+        assert np.isfinite(read_gap(str(path)).factors(8)).all(), "a factor that is none"
+
+
+def read_options(path: Path) -> None:
+    """The options of a command, as ``--config`` takes them."""
+    from gpvo.cli import app
+    from gpvo.cli.common import options_of_file
+    from typer.main import get_group
+
+    for name, needed in NEEDED.items():
+        command = get_group(app).commands[name]
+        command.make_context(name, [*options_of_file(path, name, command), *needed])
+
+
+NEEDED = {"run": ["x", "-o", "y"], "live": ["--model", "x"], "evaluate": ["x"]}
+
+
+def read_stated_motions(path: Path) -> None:
+    from gpvo.evaluation.score import score_sequence
+
+    score = score_sequence(path / "stated.txt", path / "truth.txt")
+    assert np.isfinite([score.nll_per_dim, score.energy_rotation_rad]).all(), "a score that is none"
+
+
+def read_live_state(path: Path) -> None:
+    from gpvo.live.engine import Engine, EngineSettings
+    from gpvo.live.stages import PoseStage
+
+    Engine(PoseStage("/odom"), flying_model(), [], EngineSettings(state=path))
 
 
 READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Rng], None] | None]] = {
@@ -242,6 +180,12 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Rng], None] | N
     "image": (read_image, None),
     "bag": (read_bag, None),
     "recording": (read_source, None),
+    "seen": (read_seen, odd_table),
+    "calibration state": (read_calibration_state, None),
+    "gap": (read_gap_or_tolerance, None),
+    "options": (read_options, None),
+    "stated": (read_stated_motions, None),
+    "live state": (read_live_state, None),
 }
 
 

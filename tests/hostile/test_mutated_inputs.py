@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,17 +13,25 @@ import cv2
 import numpy as np
 import pytest
 from bag_maker import stereo_bag
-from campaign import READERS
+from campaign import CAMERA, READERS
+from gpvo import runner
 from gpvo.cli import app
+from gpvo.io import open_source
+from gpvo.io.jsonfile import write_json
 from gpvo.io.run import write_run
+from gpvo.io.stated import write_stated
 from gpvo.online.predictor import Predictor
+from gpvo.io.trajectory import write_tum
 from gpvo.sim.points import simulate_points
+from gpvo.types import TruthLog, VoLog
+from gpvo.vo.rig_error import RigState
+from gpvo.vo.rig_findings import document
 from synthetic_runs import make_run
 from typer.testing import CliRunner
 
 CAMPAIGN = Path(__file__).parent / "campaign.py"
 MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
-CAMERA = "  camera_model: pinhole\n  intrinsics: [60.0, 60.0, 32.0, 24.0]\n  distortion_model: radtan\n" \
+LENS = "  camera_model: pinhole\n  intrinsics: [60.0, 60.0, 32.0, 24.0]\n  distortion_model: radtan\n" \
     "  distortion_coeffs: [0.01, 0.0, 0.0, 0.0]\n  resolution: [64, 48]\n"  # fmt: skip
 POSE = "  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]\n"
 
@@ -46,7 +55,7 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ros2 = stereo_bag(ros1=False, n=3).write(root / "recording" / "ros2")
     shutil.copytree(ros2, root / "bag" / "ros2")
     stereo_bag(ros1=True, n=3).write(root / "recording" / "ros1.bag")
-    (root / "calibration" / "camchain.yaml").write_text(f"cam0:\n{CAMERA}cam1:\n{CAMERA}{POSE}")
+    (root / "calibration" / "camchain.yaml").write_text(f"cam0:\n{LENS}cam1:\n{LENS}{POSE}")
     shutil.copy(run / "trajectory.tum", root / "log" / "log.tum")
     shutil.copy(run / "trajectory.tum", root / "plan" / "plan.txt")
     (root / "log" / "log.csv").write_text(
@@ -57,9 +66,29 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     for suffix in ("png", "jpg", "bmp", "tif", "pgm", "webp"):
         cv2.imwrite(str(root / "image" / f"image.{suffix}"), picture)
+    _newer(root, log, truth)
     _euroc(root / "sequence" / "euroc", picture)
     _kitti(root / "sequence" / "kitti", picture)
     return root
+
+
+def _newer(root: Path, log: VoLog, truth: TruthLog) -> None:
+    """What odometry saw, states of a calibration and of a live session, options, and files of the scoreboard."""
+    seen = root / "seen" / "folder"
+    runner.run(open_source(root / "tracks" / "tracks.npz"), seen, keep_tracks=True)
+    write_json(root / "calibration state" / "state.json", document(RigState.prior(CAMERA), CAMERA))
+    (root / "gap" / "gap.json").write_text(json.dumps({"pooled": {"1 s": {"ratio": [2.0] * 6, "spread": [1.5] * 6}}}))
+    (root / "gap" / "mine.toml").write_text("rotation_rad = 0.001\nfocal = 0.002\nbaseline = 0.003\n")
+    (root / "options" / "options.toml").write_text(
+        '[run]\npreset = "thesis"\nsigma = 0.5\nmin_inliers = 10\nkeep_tracks = true\nset = ["max_features=500"]\n'
+        '[live]\ndepth = 20\nstate = "s.json"\n[evaluate]\nsegments = "10,20"\n'
+    )
+    stated = root / "stated" / "folder"
+    stated.mkdir()
+    covariance = np.array([r.covariances.get("pointing_matching", np.full((6, 6), np.nan)) for r in log])
+    write_stated(stated / "stated.txt", log, log.trajectory(), covariance)
+    write_tum(stated / "truth.txt", truth.t_ns, truth.T_world_cam)
+    write_json(root / "live state" / "state.json", {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6)})
 
 
 def _euroc(path: Path, picture: np.ndarray) -> None:
