@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,8 @@ import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io.jsonfile import write_json
-from gpvo.io.run import RunWriter
+from gpvo.io.run import RunWriter, as_stored
+from gpvo.io.snapshot import digest_of
 from gpvo.io.toml import read_toml
 from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo.config import VoConfig, make_config
@@ -58,6 +59,7 @@ def run(
     calibration_state: RigState | None = None,
     amend: Callable[[VoRecord], VoRecord] | None = None,
     meta: Mapping[str, object] | None = None,
+    resume: str | None = None,
 ) -> RunSummary:
     """Run stereo VO over a source and write the run folder ``out``.
 
@@ -65,7 +67,8 @@ def run(
     what odometry saw. ``overwrite``: whether a finished run in ``out`` is replaced, once this one is whole.
     ``calibration_state``: what is known of the calibration's errors. ``amend`` may complete a record before it is
     written; ``meta``: further keys of ``run.json``. An interrupted run leaves a folder that can be read up to its last
-    complete chunk.
+    complete chunk. ``resume``: the options that the source was opened with, in words. A run of the same source, options
+    and settings that broke off in ``out`` is gone on with, to the same bytes but for times; None begins anew.
 
     Raises
     ------
@@ -80,6 +83,9 @@ def run(
     status: Counter[str] = Counter()
     length_m = busy_s = 0.0
     recorder = TrackRecorder() if keep_tracks else None
+    odometry = StereoOdometry(source.camera, config, source.mask, calibration_state)
+    of_model = "" if predictor is None else predictor.digest
+    key = None if resume is None else digest_of(resume, of_model, keep_tracks, odometry, *_content(source))
     with RunWriter(
         out,
         overwrite=overwrite,
@@ -90,12 +96,16 @@ def run(
         config=asdict(config),
         meta=known,
         calibration=source.calibration,
+        resume=key,
     ) as writer:
-        odometry = StereoOdometry(source.camera, config, source.mask, calibration_state)
-        for step in steps(source, config, odometry):
-            record = step.record if amend is None else amend(step.record)
+        done = [] if writer.kept is None else writer.kept.records
+        if writer.kept is not None:
+            odometry, recorder = writer.kept.state
+        for k, step in enumerate(steps(source, config, odometry, done)):
+            record = as_stored(step.record if amend is None else amend(step.record))
             prediction = None if predictor is None else predictor.step(record)
-            writer.append(record, prediction, None if recorder is None else recorder.step(record, step.followed))
+            tracks = None if recorder is None or k < len(done) else recorder.step(record, step.followed)
+            writer.append(record, prediction, tracks, (odometry, recorder))
             status[record.status.value] += 1
             length_m += float(np.linalg.norm(record.T_prev_cur[:3, 3])) if record.is_reference else 0.0
             busy_s += step.seconds
@@ -122,13 +132,28 @@ class Step:
     seconds: float
 
 
-def steps(source: Source, config: VoConfig, odometry: StereoOdometry | None = None) -> Iterator[Step]:
-    """The frames of a source through odometry, one by one."""
+def steps(
+    source: Source, config: VoConfig, odometry: StereoOdometry | None = None, done: Sequence[VoRecord] = ()
+) -> Iterator[Step]:
+    """The frames of a source through odometry, one by one; the records of the first ones may be known already.
+
+    Raises
+    ------
+    SourceError
+        Where these are of other frames.
+    """
     odometry = odometry or StereoOdometry(source.camera, config, source.mask)
     t_last_ns: int | None = None
     for k, frame in enumerate(source):
         if k < _FRAMES_BEFORE_TRUST and isinstance(frame, TrackFrame):
             _refuse_swapped(frame, source.path)
+        if k < len(done):
+            if done[k].t_ns != frame.t_ns:
+                cure = "remove the run folder to begin anew"
+                raise SourceError("is not what the run that broke off was of", where=source.path, cure=cure)
+            t_last_ns = frame.t_ns
+            yield Step(frame, done[k], odometry.last, sum(done[k].stage_ms.values()) * 1e-3)
+            continue
         samples = None if t_last_ns is None else imu_between(source.imu, t_last_ns, frame.t_ns)
         start = time.perf_counter()
         record = odometry.step(frame, samples)
@@ -137,6 +162,15 @@ def steps(source: Source, config: VoConfig, odometry: StereoOdometry | None = No
         yield Step(frame, record, odometry.last, seconds)
     for finding in odometry.pair.findings():
         source.report.note(finding)
+
+
+def _content(source: Source) -> list[object]:
+    """What a source is known by: its files by name, size and time, its IMU and its truth."""
+    path = Path(source.path)
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    stats = ((p, p.stat()) for p in files)
+    known = [(str(p.relative_to(path.parent)), s.st_size, s.st_mtime_ns) for p, s in stats]
+    return [source.format, known, source.imu, source.truth]
 
 
 def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | None:
@@ -167,7 +201,7 @@ def config_of(run: Path) -> VoConfig:
     values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
         return make_config(values.pop("preset"), **values)
-    except (KeyError, TypeError) as problem:
+    except (GpvoError, KeyError, TypeError) as problem:
         raise GpvoError(
             f"the settings of this run cannot be read: {problem}", where=path, cure="run it again"
         ) from None

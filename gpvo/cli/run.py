@@ -137,6 +137,7 @@ def run(
             keep_tracks=keep_tracks,
             overwrite=overwrite,
             calibration_state=known,
+            resume=repr(sorted(options.items())),
         )
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)

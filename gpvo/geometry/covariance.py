@@ -9,6 +9,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array
 
 TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
+_LARGEST = 1e100  # No element of a covariance is larger: products of two or three stay finite.
 
 
 def symmetrise(C: Array) -> Array:
@@ -19,7 +20,9 @@ def symmetrise(C: Array) -> Array:
 def is_positive_definite(C: Array) -> bool:
     """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
     C = np.asarray(C)
-    if not np.isfinite(C).all() or not np.allclose(C, C.T, rtol=1e-8, atol=1e-12 * np.abs(C).max()):
+    largest = np.abs(C).max()
+    # Comparisons with NaN are false.
+    if not largest < _LARGEST or not np.allclose(C, C.T, rtol=1e-8, atol=1e-12 * largest):
         return False
     try:
         np.linalg.cholesky(C)
@@ -35,7 +38,7 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     variance: Array = np.diagonal(C, axis1=1, axis2=2)
     with np.errstate(all="ignore"):
         positive = (variance >= 0) if semi else (variance > 0)
-        good: NDArray[np.bool_] = np.asarray(np.isfinite(C).all(axis=(1, 2)) & positive.all(axis=1))
+        good: NDArray[np.bool_] = np.asarray((np.abs(C) < _LARGEST).all(axis=(1, 2)) & positive.all(axis=1))
         sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
         R = C / sigma[:, :, None] / sigma[:, None, :]
     good &= np.isfinite(R).all(axis=(1, 2))

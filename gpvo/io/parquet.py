@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.parquet_write import KIND_OF
+from gpvo.io.parquet_write import KIND_OF, RowGroup
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -51,6 +51,21 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SourceError(f"is damaged: {reason}", where=path, cure="run the sequence again") from None
+
+
+def placed_columns(path: Path) -> RowGroup:
+    """Where the columns of a written table lie. SourceError where it cannot be read."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        group = pq.read_metadata(path).row_group(0)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise SourceError(f"is damaged: {str(error).splitlines()[0]}", where=path) from None
+    columns = [group.column(i) for i in range(group.num_columns)]
+    place = [(c.data_page_offset, c.total_compressed_size, c.total_uncompressed_size) for c in columns]
+    names = tuple(c.path_in_schema for c in columns)
+    return RowGroup(path, group.num_rows, names, np.array(place, dtype=np.int64).reshape(-1, 3))
 
 
 def _to_numpy(name: str, column: pa.ChunkedArray) -> NDArray[Any]:

@@ -3,14 +3,13 @@
 ``vo_log.parquet`` (columns in :mod:`gpvo.io.run_table`), ``trajectory.tum`` (raw VO, never corrected), ``rig.json``,
 ``truth.parquet``, ``imu.parquet``, ``predictions.parquet``, ``tracks.parquet`` (what odometry saw) where there are
 such, ``config.toml``, ``run.json``. While a run is on, finished chunks of records lie in ``chunks/``; closing it joins
-them. A run that was killed is read from its chunks.
+them. A run that broke off is read from its chunks, and gone on with from the last of them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import shutil
 import time
@@ -28,22 +27,28 @@ from gpvo import __version__
 from gpvo.errors import SourceError
 from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_table
-from gpvo.io.folder_lock import FolderLock
-from gpvo.io.jsonfile import read_json, write_json
+from gpvo.io.jsonfile import write_json
 from gpvo.io.parquet_write import RowGroup, join_tables, write_table
+from gpvo.io.run_folder import FILES, STATE, claim, is_finished, prepare, put_in_place, take_up
 from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
+from gpvo.io.snapshot import save_snapshot
 from gpvo.io.toml import write_toml
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
 
-__all__ = ["Run", "RunWriter", "read_predictions", "read_run", "read_tracks", "write_predictions", "write_run"]
+__all__ = [
+    "Run",
+    "RunWriter",
+    "as_stored",
+    "is_finished",
+    "read_predictions",
+    "read_run",
+    "read_tracks",
+    "write_predictions",
+    "write_run",
+]
 
 SCHEMA = 1
-_FILES = (
-    "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
-    "tracks.parquet",
-)  # fmt: skip
-_OWN = (*_FILES, "config.toml", "run.json", "calibration_state.json")
 
 
 class RunWriter:
@@ -58,6 +63,8 @@ class RunWriter:
     meta : further keys of ``run.json``, such as ``name``, ``source`` and ``source_format``.
     calibration : the raw rig in plain numbers, for ``rig.json``.
     chunk : records per chunk; a killed run loses at most so many.
+    resume : what decides the records beside the source; a run that broke off under the same is gone on with: ``kept``
+        is what it left, and its records are to be appended again, first of all. None begins anew.
 
     Raises
     ------
@@ -79,12 +86,13 @@ class RunWriter:
         meta: Mapping[str, Any] | None = None,
         calibration: Mapping[str, Any] | None = None,
         chunk: int = 100,
+        resume: str | None = None,
     ) -> None:
         self._target = Path(path)
         self._meta = dict(meta or {})
         self._chunk = max(1, chunk)
         self._state = _State()
-        self._lock = _claim(self._target)
+        self._lock = claim(self._target)
         self.path = self._target
         if is_finished(self._target):
             if not overwrite:
@@ -92,12 +100,15 @@ class RunWriter:
                     "holds a finished run", where=path, cure="give --overwrite, or another folder with -o"
                 )
             self.path = self._target.with_name(f".{self._target.name}.new")
-        self._chunks = self.path / "chunks"
+        self._chunks, self._resume = self.path / "chunks", resume
+        self.kept = None if resume is None else take_up(self._chunks, resume)
+        if self.kept is not None:
+            self._state.chunks, self._state.written = len(self.kept.parts["log"]), self.kept.parts
         try:
-            _prepare(self.path)
+            prepare(self.path, keep_chunks=self.kept is not None)
             # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
             self._write_meta(complete=False)
-            self._chunks.mkdir()
+            self._chunks.mkdir(exist_ok=True)
             write_json(self.path / "rig.json", _rig(camera, mounting or Mounting(), calibration))
             if truth is not None:
                 write_truth(self.path / "truth.parquet", truth)
@@ -117,35 +128,45 @@ class RunWriter:
         self.close(complete=error is None)
 
     def append(
-        self, record: VoRecord, prediction: Prediction | None = None, tracks: StereoTracks | None = None
+        self,
+        record: VoRecord,
+        prediction: Prediction | None = None,
+        tracks: StereoTracks | None = None,
+        state: Any = None,
     ) -> None:
         """Add one record, what a model predicted for it, and the observations that came with it.
+
+        ``state``: where all stands after it. It is kept with the chunk that ends here, for going on from it.
 
         Raises
         ------
         ValueError
             Where the stamp does not grow or the record starts from an unknown frame.
         """
-        state = self._state
-        T_prev = state.poses.get(record.t_prev_ns)
-        if state.records_total and record.t_ns <= state.last_t_ns:
-            raise ValueError(f"record at {record.t_ns} ns does not follow {state.last_t_ns} ns")
-        if state.records_total and T_prev is None:
+        now = self._state
+        T_prev = now.poses.get(record.t_prev_ns)
+        if now.records_total and record.t_ns <= now.last_t_ns:
+            raise ValueError(f"record at {record.t_ns} ns does not follow {now.last_t_ns} ns")
+        if now.records_total and T_prev is None:
             raise ValueError(f"record at {record.t_ns} ns starts from {record.t_prev_ns} ns, which is not in the run")
         if T_prev is not None:
             # At rest and in the dark one reference serves for as long as that lasts.
-            state.poses.move_to_end(record.t_prev_ns)
+            now.poses.move_to_end(record.t_prev_ns)
         pose = record.T_prev_cur if T_prev is None else T_prev @ record.T_prev_cur
-        state.remember(record.t_ns, pose)
-        state.records.append(_with_sound_covariances(record))
-        state.lines.append(tum_line(record.t_ns, pose))
-        state.count(record)
+        now.remember(record.t_ns, pose)
+        now.lines.append(tum_line(record.t_ns, pose))
+        now.count(record)
+        if self.kept is not None and now.records_total <= len(self.kept.records):
+            return
+        now.records.append(as_stored(record))
         if prediction is not None:
-            state.predictions.append(prediction)
+            now.predictions.append(prediction)
         if tracks is not None:
-            state.tracks.append(tracks)
-        if len(state.records) >= self._chunk:
+            now.tracks.append(tracks)
+        if len(now.records) >= self._chunk:
             self.flush()
+            if self._resume is not None:
+                save_snapshot(self._chunks / STATE, self._resume, (now.chunks, state))
 
     def note(self, **meta: Any) -> None:
         """Add keys to ``run.json``, written when the run closes."""
@@ -170,33 +191,34 @@ class RunWriter:
         self._state.written.setdefault(kind, []).append(write_table(self._chunks / f"{kind}_{name}", columns))
 
     def close(self, *, complete: bool = True) -> None:
-        """Join the chunks and finish ``run.json``; ``complete=False`` marks a run that broke off."""
+        """Join the chunks and finish ``run.json``; ``complete=False`` leaves a run that broke off in its chunks."""
         replaces = self.path != self._target
         try:
             if complete or not replaces:
                 self._finish(complete)
             if complete and replaces:
-                _put_in_place(self.path, self._target)
+                put_in_place(self.path, self._target)
         finally:
             self._release()
 
     def _release(self) -> None:
-        if self.path != self._target:
+        if self.path != self._target and not (self._chunks / STATE).is_file():
             # Where the new run is not whole, the finished one that it was to replace is worth more.
             shutil.rmtree(self.path, ignore_errors=True)
         self._lock.release()
 
     def _finish(self, complete: bool) -> None:
         self.flush()
-        for kind, parts in self._state.written.items():
-            target = "vo_log.parquet" if kind == "log" else f"{kind}.parquet"
-            join_tables(parts, self.path / target, {"schema": str(SCHEMA)})
-        shutil.rmtree(self._chunks, ignore_errors=True)
+        if complete:
+            for kind, parts in self._state.written.items():
+                target = "vo_log.parquet" if kind == "log" else f"{kind}.parquet"
+                join_tables(parts, self.path / target, {"schema": str(SCHEMA)})
+            shutil.rmtree(self._chunks, ignore_errors=True)
         self._write_meta(complete=complete)
 
     def _digests(self) -> dict[str, str]:
         """SHA-256 of each table of the folder."""
-        files = ((name, self.path / name) for name in _FILES)
+        files = ((name, self.path / name) for name in FILES)
         return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in files if f.is_file()}
 
     def _write_meta(self, *, complete: bool) -> None:
@@ -294,60 +316,10 @@ def _rig(camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[s
     }
 
 
-def _with_sound_covariances(record: VoRecord) -> VoRecord:
-    """The record without covariances that are none: not finite, or not positive definite."""
-    names = list(record.covariances)
-    if not names or not record.usable:
-        return record
-    good = are_positive_definite(np.array([record.covariances[name] for name in names]))
-    if good.all():
-        return record
-    return replace(
-        record, covariances={name: record.covariances[name] for name, is_good in zip(names, good) if is_good}
-    )
-
-
-def is_finished(path: Path) -> bool:
-    """Whether a folder holds a run that was written to its end."""
-    try:
-        return read_json(path / "run.json").get("complete") is True
-    except SourceError:
-        return False
-
-
-def _claim(path: Path) -> FolderLock:
-    """Make the folder, for one writer."""
-    if path.exists() and not path.is_dir():
-        raise SourceError("is a file, not a folder for a run", where=path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        return FolderLock(path)
-    except OSError as error:
-        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
-
-
-def _put_in_place(new: Path, target: Path) -> None:
-    """Exchange a folder for a newer one; at no moment is there neither."""
-    old = target.with_name(f".{target.name}.old")
-    try:
-        shutil.rmtree(old, ignore_errors=True)
-        os.replace(target, old)
-        os.replace(new, target)
-    except OSError as error:
-        raise SourceError(f"cannot be replaced: {error.strerror}; ask for it again", where=target) from None
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _prepare(path: Path) -> None:
-    """Make the folder; clear an older run of exactly the files that a run has."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        unfinished = [p for p in path.iterdir() if p.name.startswith(".") and p.name.endswith(".part")]
-        present = {p.name for p in path.iterdir()} - {p.name for p in unfinished}
-        if present and "run.json" not in present:
-            raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
-        shutil.rmtree(path / "chunks", ignore_errors=True)
-        for file in (*unfinished, *(path / name for name in _OWN)):
-            file.unlink(missing_ok=True)
-    except OSError as error:
-        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
+def as_stored(record: VoRecord) -> VoRecord:
+    """The record as it will be read: covariances by their upper triangles, without those that are none: not finite, or
+    not positive definite."""
+    names, C = list(record.covariances), np.array(list(record.covariances.values())).reshape(-1, 6, 6)
+    C = np.where(np.tri(6, k=-1, dtype=bool), np.swapaxes(C, 1, 2), C)
+    good = are_positive_definite(C) if record.usable else np.ones(len(C), bool)
+    return replace(record, covariances={name: c for name, c, is_good in zip(names, C, good) if is_good})

@@ -18,6 +18,7 @@ from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.run_read import Run
+from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_gp
@@ -144,7 +145,7 @@ def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: T
     """A fold, from ``config.keep`` where a training that was broken off has left it."""
     if config.keep is None:
         return _fold(held_out, train_on, config)
-    sha = hashlib.sha256(repr((versions(), config.settings())).encode())
+    sha = hashlib.sha256(repr((code_digest(), versions(), config.settings())).encode())
     for s in (held_out, *train_on):
         sha.update(repr((s.digest(), s.counts, s.camera)).encode() + s.lost_xi.tobytes() + s.lost_jump.tobytes())
     path = Path(config.keep) / f"{sha.hexdigest()}.json"

@@ -63,7 +63,9 @@ class Stated:
         """From messages of a bag ``where``, in the order of their arrival. GpvoError where there are fewer than ten."""
         kept = list(messages)
         if len(kept) < _ENOUGH:
-            raise GpvoError(f"{len(kept)} messages are too few to judge", where=where, cure=f"record at least {_ENOUGH}")
+            raise GpvoError(
+                f"{len(kept)} messages are too few to judge", where=where, cure=f"record at least {_ENOUGH}"
+            )
         rows = np.array([pose_of(m) for m in kept])
         norm = np.linalg.norm(rows[:, 3:], axis=1)
         good = np.isfinite(rows).all(axis=1) & (norm > 1e-6)

@@ -6,8 +6,6 @@ equal measurements in the reference are the same point. No front end needs to nu
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from gpvo.types import Array, StereoTracks, VoRecord
@@ -19,7 +17,7 @@ class TrackRecorder:
 
     def __init__(self) -> None:
         self._reference: dict[bytes, int] = {}  # measurement in the reference frame: track
-        self._numbers = itertools.count()
+        self._begun = 0  # tracks, by number
 
     def step(self, record: VoRecord, followed: Followed) -> StereoTracks | None:
         """Observations of this frame, and of the reference where a point is matched for the first time.
@@ -31,7 +29,8 @@ class TrackRecorder:
         matches = followed.matches
         before, now = _keys(matches.uvd_prev), _keys(matches.uvd_cur)
         new = np.array([k not in self._reference for k in before], dtype=bool)
-        track = np.array([self._reference.setdefault(k, next(self._numbers)) for k in before], dtype=np.int64)
+        track = np.array([self._reference.setdefault(k, self._begun + i) for i, k in enumerate(before)], dtype=np.int64)
+        self._begun += len(before)
         if record.is_reference:
             self._reference = dict(zip(now, track.tolist(), strict=True))
         if len(track) == 0:

@@ -207,7 +207,12 @@ def test_a_position_beyond_the_earth_is_refused(tmp_path: Path) -> None:
 
 
 def test_json_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
-    for text in ('{"schema": 1e999}', '{"schema": 1%s}' % ("0" * 400), '{"schema": NaN}', json.dumps({"schema": 1})[:-1]):
+    for text in (
+        '{"schema": 1e999}',
+        '{"schema": 1%s}' % ("0" * 400),
+        '{"schema": NaN}',
+        json.dumps({"schema": 1})[:-1],
+    ):
         (tmp_path / "run.json").write_text(text)
         with pytest.raises(SourceError, match=r"run\.json: is damaged"):
             read_json(tmp_path / "run.json")

@@ -20,8 +20,8 @@ from gpvo.io import open_source
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run import write_run
 from gpvo.io.stated import write_stated
-from gpvo.online.predictor import Predictor
 from gpvo.io.trajectory import write_tum
+from gpvo.online.predictor import Predictor
 from gpvo.sim.points import simulate_points
 from gpvo.types import TruthLog, VoLog
 from gpvo.vo.rig_error import RigState
@@ -88,7 +88,9 @@ def _newer(root: Path, log: VoLog, truth: TruthLog) -> None:
     covariance = np.array([r.covariances.get("pointing_matching", np.full((6, 6), np.nan)) for r in log])
     write_stated(stated / "stated.txt", log, log.trajectory(), covariance)
     write_tum(stated / "truth.txt", truth.t_ns, truth.T_world_cam)
-    write_json(root / "live state" / "state.json", {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6)})
+    write_json(
+        root / "live state" / "state.json", {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6)}
+    )
 
 
 def _euroc(path: Path, picture: np.ndarray) -> None:

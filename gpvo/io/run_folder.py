@@ -1,0 +1,105 @@
+"""A run folder while it is written: for one writer, whole in the end, and taken up where a run broke off."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gpvo.errors import SourceError
+from gpvo.io import run_table
+from gpvo.io.folder_lock import FolderLock
+from gpvo.io.jsonfile import read_json
+from gpvo.io.parquet_write import RowGroup
+from gpvo.io.snapshot import load_snapshot
+from gpvo.types import VoRecord
+
+FILES = (
+    "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
+    "tracks.parquet",
+)  # fmt: skip
+_OWN = (*FILES, "config.toml", "run.json", "calibration_state.json")
+KINDS = ("log", "predictions", "tracks")
+"""Tables that are written in chunks, ``KIND_000000.parquet`` and so on."""
+STATE = "state.npz"
+"""In the folder of the chunks: how many there are, and where what made them stood."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a run that broke off left: its records up to the last chunk whose state was kept, the chunks' tables by
+    kind, and that state."""
+
+    records: list[VoRecord]
+    parts: dict[str, list[RowGroup]]
+    state: Any
+
+
+def take_up(chunks: Path, key: str) -> Kept | None:
+    """What was kept under the same key; None where there is nothing of it, or nothing whole. Later chunks go."""
+    found = load_snapshot(chunks / STATE, key)
+    try:
+        count, state = found
+        parts = {kind: sorted(chunks.glob(f"{kind}_*.parquet")) for kind in KINDS}
+        late = [p for paths in parts.values() for p in paths if int(p.stem.rpartition("_")[2]) >= count]
+        kept = {kind: [p for p in paths if p not in late] for kind, paths in parts.items() if paths}
+        from gpvo.io.parquet import placed_columns, read_columns
+
+        records = [r for path in kept["log"] for r in run_table.records_from(read_columns(path)[0])]
+        groups = {kind: [placed_columns(path) for path in paths] for kind, paths in kept.items()}
+        whole = len(kept["log"]) == count and all(len(g) in (0, count) for g in groups.values())
+    # No state, one of other settings or another version, a damaged chunk, or no library that reads it.
+    except (SourceError, ImportError, TypeError, ValueError, KeyError):
+        return None
+    for path in late:
+        path.unlink()
+    return Kept(records, groups, state) if whole else None
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a folder holds a run that was written to its end."""
+    try:
+        return read_json(path / "run.json").get("complete") is True
+    except SourceError:
+        return False
+
+
+def claim(path: Path) -> FolderLock:
+    """Make the folder, for one writer."""
+    if path.exists() and not path.is_dir():
+        raise SourceError("is a file, not a folder for a run", where=path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        return FolderLock(path)
+    except OSError as error:
+        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
+
+
+def put_in_place(new: Path, target: Path) -> None:
+    """Exchange a folder for a newer one; at no moment is there neither."""
+    old = target.with_name(f".{target.name}.old")
+    try:
+        shutil.rmtree(old, ignore_errors=True)
+        os.replace(target, old)
+        os.replace(new, target)
+    except OSError as error:
+        raise SourceError(f"cannot be replaced: {error.strerror}; ask for it again", where=target) from None
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def prepare(path: Path, *, keep_chunks: bool) -> None:
+    """Make the folder; clear an older run of exactly the files that a run has."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        unfinished = [p for p in path.iterdir() if p.name.startswith(".") and p.name.endswith(".part")]
+        present = {p.name for p in path.iterdir()} - {p.name for p in unfinished}
+        if present and "run.json" not in present:
+            raise SourceError("holds something that is not a run", where=path, cure="choose an empty folder with -o")
+        if not keep_chunks:
+            shutil.rmtree(path / "chunks", ignore_errors=True)
+        for file in (*unfinished, *(path / name for name in _OWN)):
+            file.unlink(missing_ok=True)
+    except OSError as error:
+        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None

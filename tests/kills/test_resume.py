@@ -1,0 +1,156 @@
+"""A run that broke off is gone on with from its last chunk: the same bytes as of one that was left in peace."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from gpvo import runner
+from gpvo.errors import SourceError
+from gpvo.io import open_source
+from gpvo.io.run import RunWriter, read_run
+from gpvo.online.predictor import Predictor
+from gpvo.sim.points import simulate_points
+from gpvo.vo.odometry import StereoOdometry
+
+MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
+LENSES = {"pinhole": ([180.0, 180.0, 149.5, 99.5], "radtan"), "fisheye": ([110.0, 110.0, 149.5, 99.5], "equidistant")}
+POSE = "  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.12], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]\n"
+TIMES = ("started", "finished", "wall_s", "stage_ms_mean", "digests", "name")
+
+
+def pictures(folder: Path, kind: str) -> Path:
+    """A folder of image pairs, a dark one and a frozen one among them."""
+    pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+    from gpvo.cameras.models import KannalaBrandt, PinholeRadtan
+    from gpvo.sim.clip import wander
+    from gpvo.sim.render import StereoRenderer
+    from gpvo.sim.worlds import build_world
+
+    numbers, distortion = LENSES[kind]
+    lens = (PinholeRadtan if kind == "pinhole" else KannalaBrandt)(*numbers, 300, 200)
+    T_right_left = np.eye(4)
+    T_right_left[0, 3] = -0.12
+    renderer = StereoRenderer(build_world("room", 0), lens, lens, T_right_left)
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+    for k, T in enumerate(wander(34, seed=2)):
+        pair = renderer.render(T)[:2] if k != 21 else pair  # noqa: F821 (the one before)
+        for side, image in zip(("left", "right"), pair):
+            image = np.asarray(image if k != 12 else 0 * image)
+            grey = np.clip(255 * image if image.max() <= 1 else image, 0, 255).astype(np.uint8)
+            cv2.imwrite(str(folder / side / f"{(k + 1) * 50_000_000:019d}.png"), grey)
+    block = f"  camera_model: pinhole\n  intrinsics: {numbers}\n  distortion_model: {distortion}\n"
+    block += "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  resolution: [300, 200]\n"
+    (folder / "camchain.yaml").write_text(f"cam0:\n{block}cam1:\n{block}{POSE}")
+    return folder
+
+
+def tracks(folder: Path) -> Path:
+    return simulate_points("tunnel-bursts", 3, duration_s=6.0, rate_hz=10.0, dark=(2.0, 2.3)).save(folder / "f.npz")
+
+
+SOURCES: dict[str, Callable[[Path], Path]] = {
+    "tracks": tracks,
+    "pinhole": partial(pictures, kind="pinhole"),
+    "fisheye": partial(pictures, kind="fisheye"),
+}
+
+
+def content(run: Path) -> dict[str, Any]:
+    """All that a run holds but for times."""
+    table = pq.read_table(run / "vo_log.parquet")
+    told = {c: table[c].to_pylist() for c in table.column_names if not c.startswith("stage_")}
+    meta = json.loads((run / "run.json").read_text())
+    meta["summary"].pop("frames_per_s")
+    names = [p.name for p in sorted(run.iterdir()) if p.name not in ("vo_log.parquet", "run.json")]
+    files = {name: (run / name).read_bytes() for name in names}
+    return {**{c: repr(v) for c, v in told.items()}, **files, "meta": {k: meta[k] for k in meta if k not in TIMES}}
+
+
+@pytest.mark.parametrize(("kind", "preset"), [("tracks", "fast"), ("fisheye", "fast"), ("pinhole", "thesis")])
+def test_the_same_bytes_after_breaking_off_twice(
+    kind: str, preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gpvo.vo.config import make_config
+
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
+    path = SOURCES[kind](tmp_path / "source") if kind != "tracks" else tracks(tmp_path)
+    config, steps, begun = make_config(preset), StereoOdometry.step, []
+
+    def fly(out: str, stop: int = 10**6) -> None:
+        begun.clear()
+        left = iter(range(stop))
+
+        def on_frame(step: runner.Step, _: object) -> None:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+
+        predictor = Predictor.load(MODEL)
+        runner.run(
+            open_source(path), tmp_path / out, config, predictor, on_frame, keep_tracks=True, overwrite=False, resume=""
+        )
+
+    def counted(self: StereoOdometry, frame: Any, imu: Any = None) -> Any:
+        begun.append(frame.t_ns)
+        return steps(self, frame, imu)
+
+    monkeypatch.setattr(StereoOdometry, "step", counted)
+    fly("whole")
+    total = len(begun)
+    for stop in (13, 24):
+        with pytest.raises(KeyboardInterrupt):
+            fly("broken", stop)
+        assert len(read_run(tmp_path / "broken").log) >= stop // 5 * 5
+    fly("broken")
+    assert len(begun) == total - 25  # from the fifth chunk on: the 25th record came before it broke off
+    assert content(tmp_path / "broken") == content(tmp_path / "whole")
+
+
+def test_another_source_setting_or_code_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
+    path, seen = tracks(tmp_path), []
+
+    def broken(**known: Any) -> int:
+        """How many frames odometry goes through until the run breaks off at the 23rd."""
+        seen.clear()
+
+        def on_frame(step: runner.Step, _: object) -> None:
+            seen.append(step.frame.t_ns)
+            if len(seen) == 23:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(open_source(path), tmp_path / "run", on_frame=on_frame, **known)
+        return went.count(True)
+
+    went: list[bool] = []
+    step = StereoOdometry.step
+    monkeypatch.setattr(StereoOdometry, "step", lambda *a: (went.append(True), step(*a))[1])
+    made: list[int] = []
+    for known in (
+        {"resume": ""},
+        {"resume": ""},
+        {"resume": "other"},
+        {"resume": "other", "keep_tracks": True},
+        {"resume": "other", "config": runner.VoConfig(sigma_px=2.0)},
+        {},
+    ):
+        went.clear()
+        made.append(broken(**known))
+    assert made == [23, 3, 23, 23, 23, 23]
+
+
+def test_a_source_that_changed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_source(tracks(tmp_path))
+    done = [r.record for _, r in zip(range(3), runner.steps(source, runner.VoConfig()))]
+    shifted = [type(r)(r.t_ns + 1, r.t_prev_ns + 1, r.status, r.T_prev_cur) for r in done]
+    with pytest.raises(SourceError, match="not what the run that broke off was of"):
+        list(runner.steps(source, runner.VoConfig(), done=shifted))
