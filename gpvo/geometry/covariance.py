@@ -20,9 +20,10 @@ def symmetrise(C: Array) -> Array:
 def is_positive_definite(C: Array) -> bool:
     """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
     C = np.asarray(C)
-    largest = np.abs(C).max()
+    size = np.abs(C)
+    largest = size.max()
     # Comparisons with NaN are false.
-    if not largest < _LARGEST or not np.allclose(C, C.T, rtol=1e-8, atol=1e-12 * largest):
+    if not largest < _LARGEST or not (np.abs(C - C.T) <= 1e-8 * size + 1e-12 * largest).all():
         return False
     try:
         np.linalg.cholesky(C)

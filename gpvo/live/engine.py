@@ -95,6 +95,7 @@ class Engine:
         self._steps_s: deque[float] = deque(maxlen=_RECENT)
         self._inside: deque[bool] = deque(maxlen=_RECENT)
         self._reported = (-np.inf, 0)  # seconds and level of the last health
+        self._misfit: list[str] = []
         self._saved_s = -np.inf
         self._resume = _load_state(self.settings.state)
         predictor.require_motions()
@@ -103,22 +104,22 @@ class Engine:
         """Everything that follows from one message; None where nothing came for a while."""
         out: list[Odometry] = []
         now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
-        if arrival is not None:
-            start = time.perf_counter()
-            try:
-                for taken in self.stage.take(arrival):
-                    out.append(self._step(taken))
-                    self._latency_ms.append(1e3 * (time.perf_counter() - start))
-            # A message from outside must not end the process: what follows begins anew, across an unknown motion.
-            except (GpvoError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError) as error:
-                self.counts["failed"] += 1
-                self._warn(f"a message on {arrival.topic} could not be used: {error}", now_s)
-                self.stage.reset()
+        start = time.perf_counter()
+        try:
+            for taken in self.stage.flush() if arrival is None else self.stage.take(arrival):
+                out.append(self._step(taken))
+                self._latency_ms.append(1e3 * (time.perf_counter() - start))
+        # A message from outside must not end the process: what follows begins anew, across an unknown motion.
+        except (GpvoError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError) as error:
+            self.counts["failed"] += 1
+            self._warn(f"a message on {arrival.topic if arrival else 'a topic'} could not be used: {error}", now_s)
+            self.stage.reset()
         self._watch(now_s)
         return out
 
     def close(self) -> None:
-        """Save the state and close the outputs."""
+        """Use what waits, save the state and close the outputs."""
+        self.take(None)
         self._save()
         for output in self.outputs:
             output.close()
@@ -181,11 +182,14 @@ class Engine:
 
     def _watch(self, now_s: float) -> None:
         """Warnings and diagnostics that are due."""
-        problems = self._problems(now_s)
+        due = now_s - self._reported[0] >= _HEALTH_S
+        if due:
+            self._misfit = self._misfits()
+        problems = [*self._silence(now_s), *self._misfit]
         for text in problems:
             self._warn(text, now_s)
         level = 2 if self._is_bad(problems) else 1 if problems or self._is_weak() else 0
-        if now_s - self._reported[0] >= _HEALTH_S or level != self._reported[1]:
+        if due or level != self._reported[1]:
             self._reported = (now_s, level)
             report = self._health(level, problems)
             for output in self.outputs:
@@ -194,10 +198,14 @@ class Engine:
             self._saved_s = now_s
             self._save()
 
-    def _problems(self, now_s: float) -> list[str]:
+    def _silence(self, now_s: float) -> list[str]:
+        if self._seen_ns is None or now_s - self._seen_ns * 1e-9 <= _STALE_S:
+            return []
+        return [f"no usable message for more than {_STALE_S:.0f} s"]
+
+    def _misfits(self) -> list[str]:
+        """What does not fit between source and model, looked at once a second."""
         out = []
-        if self._seen_ns is not None and now_s - self._seen_ns * 1e-9 > _STALE_S:
-            out.append(f"no usable message for more than {_STALE_S:.0f} s")
         if self.stage.camera is not None and self.predictor.camera is None:
             out.append("the model was trained on another odometry's poses, not on pictures")
         out += camera_problems(self.predictor.camera, self.stage.camera)

@@ -8,9 +8,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
+from statistics import median
 from typing import Any
-
-import numpy as np
 
 from gpvo.io.foreign import GAP_STEPS
 from gpvo.online.intake import Doubt
@@ -79,7 +79,7 @@ class StampWatch:
         return Sequence.RESTART
 
     def _advance(self, t_ns: int, step: int) -> Sequence:
-        usual = float(np.median(self._steps)) if len(self._steps) >= 3 else np.inf
+        usual = median(self._steps) if len(self._steps) >= 3 else inf
         self._last = t_ns
         if step > GAP_STEPS * usual:
             return Sequence.GAP

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import threading
 from collections.abc import Callable
 from importlib import import_module
@@ -66,14 +67,18 @@ class Ros2Wire:
 
 
 class Ros1Wire:
-    """A node of rospy, at the master that ROS_MASTER_URI names."""
+    """A node of rospy, at the master that ROS_MASTER_URI names. GpvoError where there is none."""
 
     ros1 = True
 
     def __init__(self) -> None:
-        _require("rospy", "source ROS 1's setup file, or install python3-rospy")
+        _require("rospy", "source ROS 1's setup file, or make rospy visible to this Python")
+        import rosgraph
         import rospy
 
+        if not rosgraph.is_master_online():
+            place = os.environ.get("ROS_MASTER_URI", "")
+            raise GpvoError(f"no ROS master at '{place}'", cure="start roscore, or set ROS_MASTER_URI")
         self.store = get_typestore(Stores.ROS1_NOETIC)
         rospy.init_node("gpvo", anonymous=True, disable_signals=True)
 
@@ -81,7 +86,11 @@ class Ros1Wire:
         """Deliver every message of a topic, whatever type its publisher says it has."""
         import rospy
 
-        rospy.Subscriber(topic, rospy.AnyMsg, lambda m: deliver(topic, m._buff), queue_size=_DEPTH, buff_size=1 << 24)
+        def taken(message: Any) -> None:
+            deliver(topic, message._buff)
+
+        # Without TCP_NODELAY a message waits for the next one, up to 40 ms.
+        rospy.Subscriber(topic, rospy.AnyMsg, taken, queue_size=_DEPTH, buff_size=1 << 24, tcp_nodelay=True)
 
     def advertise(self, topic: str, msgtype: str) -> Send:
         """Announce a topic."""

@@ -29,6 +29,7 @@ from gpvo.vo.odometry import StereoOdometry
 _MAX_M, _MAX_MPS, _MAX_RADPS = 1e7, 300.0, 50.0
 _ENOUGH, _GROWS = 20, 0.95
 _IMU_KEPT = 4000
+_PAIRS_KEPT = 10  # while no CameraInfo has come
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,9 @@ class Stage(Protocol):
 
     def take(self, arrival: Arrival) -> Iterator[Taken]:
         """What a message makes complete."""
+
+    def flush(self) -> Iterator[Taken]:
+        """What waited for a message that did not come."""
 
     def reset(self) -> None:
         """Begin anew with the next message."""
@@ -103,6 +107,10 @@ class PoseStage:
         child = str(getattr(message, "child_frame_id", "")) or "base_link"
         frame = str(message.header.frame_id) or "odom"
         yield Taken(record, begins, arrival.received_ns, T_parent_body, frame, child)
+
+    def flush(self) -> Iterator[Taken]:
+        """Nothing: a pose waits for nothing."""
+        return iter(())
 
     def _record(self, t_ns: int, T_parent_cam: Array, message: Any, seen: Sequence) -> VoRecord:
         before, pose = self._last, self._pose_covariance(message, T_parent_cam)
@@ -160,8 +168,8 @@ def _matrix(holder: Any) -> Array | None:
 class StereoStage:
     """Pairs of pictures through :class:`gpvo.vo.odometry.StereoOdometry`, with an IMU where one is named.
 
-    ``rig``: the calibration; without it CameraInfo beside the image topics is awaited. A pair waits for the first IMU
-    sample after it, or for the next pair.
+    ``rig``: the calibration; without it pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits
+    for the first IMU sample after it, or for the next pair.
     """
 
     method = "pointing_matching"
@@ -186,7 +194,7 @@ class StereoStage:
         self._pairs = PairQueue(self.left, round(PAIR_TOLERANCE_S * 1e9), self._report)
         self._watch = StampWatch()
         self._samples: deque[tuple[int, Array]] = deque(maxlen=_IMU_KEPT)
-        self._waiting: tuple[int, Any, Any, int] | None = None
+        self._waiting: deque[tuple[int, Any, Any, int]] = deque(maxlen=_PAIRS_KEPT)  # with time of arrival
         self._restart()
 
     def take(self, arrival: Arrival) -> Iterator[Taken]:
@@ -199,20 +207,24 @@ class StereoStage:
             pair = self._pairs.push(topic, message)
             self.counts["unpaired"] += self._report.missing - missing
             if pair is not None:
-                yield from self.flush()
-                self._waiting = (*pair, arrival.received_ns)
+                if self._rectifier is not None:
+                    yield from self.flush()
+                elif len(self._waiting) == _PAIRS_KEPT:
+                    self.counts["uncalibrated"] += 1
+                self._waiting.append((*pair, arrival.received_ns))
         elif topic in (info_topic(self.left), info_topic(self.right)):
             self._take_info(topic, message)
         late = self._samples[-1][0] if self._samples else 0
-        if self._waiting is not None and (self.imu is None or late >= self._waiting[0]):
+        is_calibrated = self._rectifier is not None
+        if self._waiting and is_calibrated and (self.imu is None or late >= self._waiting[-1][0]):
             yield from self.flush()
 
     def flush(self) -> Iterator[Taken]:
-        """The pair that waits, with what the IMU has said so far."""
-        waiting, self._waiting = self._waiting, None
-        if waiting is None:
-            return
-        t_ns, left, right, received_ns = waiting
+        """The pairs that wait, with what the IMU has said so far."""
+        while self._waiting:
+            yield from self._step(*self._waiting.popleft())
+
+    def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:
         if self._rectifier is None or self.camera is None:
             self.counts["uncalibrated"] += 1
             return

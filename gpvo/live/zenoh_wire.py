@@ -41,7 +41,7 @@ class ZenohWire:
         require("zenoh")
         import zenoh
 
-        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self.store, self._zenoh = get_typestore(Stores.ROS2_JAZZY), zenoh
         self._domain, self._node, self._ids = domain, node, itertools.count(1)
         config: Any = zenoh.Config()
         is_listening = address is not None and address.startswith("listen:")
@@ -70,7 +70,10 @@ class ZenohWire:
         token = self._announce("MP", topic, msgtype, _QOS_PUBLISHER)
         gid = hashlib.md5(token.encode(), usedforsecurity=False).digest()
         key = f"{self._domain}/{topic.strip('/')}/{dds_name(msgtype)}/{self.store.hash_rihs01(msgtype)}"
-        publisher = self._session.declare_publisher(key, encoding=self._encoding)
+        # Zenoh drops what a busy link does not take at once, unless told to wait.
+        publisher = self._session.declare_publisher(
+            key, encoding=self._encoding, congestion_control=self._zenoh.CongestionControl.BLOCK
+        )
         self._held.append(publisher)
         number = itertools.count(1)
 

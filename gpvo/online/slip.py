@@ -38,11 +38,13 @@ _PATIENCE_S = 1.0
 REASON = "implausible motion"
 
 
-def _bound(history: deque[float], vehicle: float) -> float:
-    """What a vehicle can have, or what odometry's noise makes of it, which is unknown at first; a history of failures
-    raises it fourfold at most."""
+def _is_beyond(value: float, history: deque[float], vehicle: float) -> bool:
+    """Whether it is beyond what a vehicle can have, and what odometry's noise makes of it, which is unknown at first; a
+    history of failures raises the bound fourfold at most."""
+    if value <= vehicle:
+        return False
     noise = _NOISE_MEDIANS * float(np.median(history)) if len(history) >= _ENOUGH else math.inf
-    return min(max(vehicle, noise), _MOST_NOISE * vehicle)
+    return value > min(max(vehicle, noise), _MOST_NOISE * vehicle)
 
 
 def tail_quantile(history: Array, rate: float = FALSE_FLAG_RATE) -> float:
@@ -106,12 +108,12 @@ class SlipDetector:
         acc = record.imu_acc_mean_mps2
         # Whatever the attitude, a camera accelerates by no more than specific force plus gravity.
         felt = 0.0 if acc is None or not np.isfinite(acc).all() else STANDARD_GRAVITY_MPS2 + float(np.linalg.norm(acc))
-        if change[0] > max(_bound(self._linear, MAX_ACCELERATION_MPS2), felt):
+        if change[0] > felt and _is_beyond(change[0], self._linear, MAX_ACCELERATION_MPS2):
             return f"acceleration of {change[0]:.3g} m/s^2"
         if disagreement is not None:
             if disagreement > _GYRO_TRUST_RADPS and disagreement > tail_quantile(np.array(self._gyro)):
                 return f"{disagreement:.3g} rad/s from the gyro"
-        elif change[1] > _bound(self._angular, MAX_TURN_RADPS2):
+        elif _is_beyond(change[1], self._angular, MAX_TURN_RADPS2):
             return f"angular acceleration of {change[1]:.3g} rad/s^2"
         return ""
 

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import signal
-import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,29 +11,7 @@ import numpy as np
 import pytest
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import TOPIC, write_ros1
-
-SYSTEM_PYTHON = "/usr/bin/python3"
-
-
-def _has(module: str) -> bool:
-    if not Path(SYSTEM_PYTHON).exists():
-        return False
-    run = subprocess.run(
-        [SYSTEM_PYTHON, "-c", f"import {module}"], capture_output=True, env=_environment(), check=False
-    )
-    return run.returncode == 0
-
-
-def _environment(**more: str) -> dict[str, str]:
-    keep = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "ROS"))}
-    return {**keep, "ROS_PYTHON_VERSION": "3", "ROS_HOSTNAME": "localhost", "ROS_IP": "127.0.0.1", **more}
-
-
-needs_rosbag = pytest.mark.skipif(not _has("rosbag"), reason="Debian's python3-rosbag is not installed")
-needs_rospy = pytest.mark.skipif(
-    not _has("rospy, netifaces, nav_msgs.msg") or shutil.which("rosmaster") is None,
-    reason="needs Debian's python3-rospy, -rosmaster, -netifaces, -nav-msgs, -geometry-msgs, -actionlib-msgs",
-)
+from ros1_tools import SYSTEM_PYTHON, environment, needs_rosbag, needs_rospy, ros_master
 
 READ = """
 import json, sys, rosbag
@@ -59,7 +32,7 @@ def bag(odometry: list[Odometry], tmp_path_factory: pytest.TempPathFactory) -> P
 @needs_rosbag
 def test_rosbag_info_reads_it(bag: Path, odometry: list[Odometry]) -> None:
     command = [SYSTEM_PYTHON, "-c", "import rosbag; rosbag.rosbagmain()", "info", "-y", str(bag)]
-    run = subprocess.run(command, capture_output=True, text=True, env=_environment(), check=False, timeout=60)
+    run = subprocess.run(command, capture_output=True, text=True, env=environment(), check=False, timeout=60)
     assert run.returncode == 0, run.stderr
     assert "nav_msgs/Odometry" in run.stdout
     assert f"messages: {sum(o.twist_body is not None for o in odometry)}" in run.stdout
@@ -68,7 +41,7 @@ def test_rosbag_info_reads_it(bag: Path, odometry: list[Odometry]) -> None:
 @needs_rosbag
 def test_rosbag_reads_every_number(bag: Path, odometry: list[Odometry]) -> None:
     command = [SYSTEM_PYTHON, "-c", READ, str(bag)]
-    run = subprocess.run(command, capture_output=True, text=True, env=_environment(), check=False, timeout=60)
+    run = subprocess.run(command, capture_output=True, text=True, env=environment(), check=False, timeout=60)
     assert run.returncode == 0, run.stderr
     got = [json.loads(line) for line in run.stdout.splitlines()]
     tracked = [o for o in odometry if o.twist_body is not None]
@@ -112,34 +85,15 @@ rospy.sleep(1.0)
 
 @pytest.fixture
 def master() -> Iterator[str]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    process = subprocess.Popen(
-        ["rosmaster", "--core", "-p", str(port)],
-        env=_environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    for _ in range(100):
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                break
-        time.sleep(0.05)
-    yield f"http://localhost:{port}"
-    process.send_signal(signal.SIGINT)
-    try:
-        process.wait(timeout=10)
-    except subprocess.TimeoutExpired:
-        process.kill()
+    with ros_master() as uri:
+        yield uri
 
 
 @needs_rosbag
 @needs_rospy
 def test_a_live_subscriber_receives_every_message(bag: Path, odometry: list[Odometry], master: str) -> None:
     tracked = [o for o in odometry if o.twist_body is not None]
-    env = _environment(ROS_MASTER_URI=master)
+    env = environment(ROS_MASTER_URI=master)
     listener = subprocess.Popen(
         [SYSTEM_PYTHON, "-c", SUBSCRIBE, TOPIC, str(len(tracked))], env=env, stdout=subprocess.PIPE, text=True
     )
