@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.twin.adjustment import WHITEN, Observations, adjust, without_loose_frames
+from gpvo.twin.adjustment import adjust, without_loose_frames
+from gpvo.twin.normal import REACH, NormalEquations, Pieces, damped
+from gpvo.twin.observations import WHITEN, Chart, Estimate, Observations
 from gpvo.types import StereoCamera
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 CAMERA = StereoCamera(380.0, 385.0, 319.5, 239.5, 0.12, 640, 480)
@@ -85,3 +88,22 @@ def test_a_frame_without_points_lies_between_its_neighbours():
     part = Observations(CAMERA, seen.frame, seen.track, seen.uvd, trusted)
     found = without_loose_frames(adjust(part, start), part, np.arange(7) * 50_000_000)
     assert np.linalg.norm(found.T_world_cam[3, :3, 3] - T[3, :3, 3]) < 0.03
+
+
+@pytest.mark.parametrize(("n_frames", "error"), [(15, 1e-9), (50, 1e-2)], ids=["short tracks", "tracks that are cut"])
+def test_steps_are_those_of_the_dense_equations(n_frames, error):
+    rng = np.random.default_rng(6)
+    T, _, seen = small_problem(rng, n_frames=n_frames, n_tracks=40)
+    chart, pieces = Chart.of(seen), Pieces.of(seen)
+    start = T @ se3.exp(0.01 * rng.standard_normal((n_frames, 6)))
+    now = Estimate(start, chart.begin(seen, start))
+    normal = NormalEquations.of(seen, pieces, now, chart, np.ones(len(seen.frame)))
+    assert (len(pieces.track) > 40) == (n_frames > REACH)
+    C = np.zeros((40, 3, 3))
+    np.add.at(C, pieces.track, normal.C)
+    E = normal.E.toarray()
+    dense = np.block([[block_diag(*damped(normal.B, 1e-4)), E], [E.T, block_diag(*damped(C, 1e-4))]])
+    expected = np.linalg.solve(dense, np.concatenate([normal.pose_gradient.ravel(), normal.point_gradient.ravel()]))
+    found = np.concatenate([step.ravel() for step in normal.solve(1e-4)])
+    off = found - expected
+    assert np.sqrt((off @ dense @ off) / (expected @ dense @ expected)) < error

@@ -1,0 +1,166 @@
+"""The normal equations of a bundle adjustment, with the landmarks eliminated, solved in time linear in the length.
+
+The reduced matrix of the poses couples two frames that see a common landmark. Tracks are short, so it is banded, and
+its Cholesky factor costs no more than its band. A landmark that is seen for longer would widen the band for all: it is
+cut into pieces, each a landmark of its own, which makes a band of :data:`REACH` frames. The factor of that
+preconditions conjugate gradients on the whole equations: one step where no track was cut, a few where some were.
+S. Agarwal et al., "Bundle adjustment in the large" (2010), section 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from gpvo.geometry import se3
+from gpvo.twin.observations import PART, WHITEN, Chart, Estimate, Observations, projection_jacobian, summed
+from gpvo.types import Array
+from gpvo.vo.points import point_jacobian
+
+REACH = 20
+"""Frames of a piece of a track."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Tracks cut into pieces of at most :data:`REACH` frames: ``piece`` (M,) of each observation, ``track`` (P,) of
+    each piece, and ``order`` (M,) of the observations by piece, then frame."""
+
+    piece: NDArray[np.int64]
+    track: NDArray[np.int64]
+    order: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, seen: Observations) -> Pieces:
+        """Where long tracks begin together, their cuts are spread, so that no frame loses all of them."""
+        n = int(seen.track.max(initial=-1)) + 1
+        first, last = np.full(n, np.iinfo(np.int64).max), np.zeros(n, np.int64)
+        np.minimum.at(first, seen.track, seen.frame)
+        np.maximum.at(last, seen.track, seen.frame)
+        shift = np.where(last - first < REACH, 0, np.arange(n) % REACH)
+        number = (seen.frame - first[seen.track] + shift[seen.track]) // REACH
+        keys, piece = np.unique(np.stack([seen.track, number]), axis=1, return_inverse=True)
+        piece = piece.ravel()
+        return cls(piece, keys[0], np.lexsort((seen.frame, piece)))
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """``[[B, E], [E^T, C]]`` of poses and landmarks, with the gradients; ``C`` by pieces of landmarks."""
+
+    B: Array  # (F, 6, 6)
+    C: Array  # (P, 3, 3)
+    E: sparse.bsr_matrix  # (6 F, 3 N), a block for each observation
+    seen: Observations
+    pieces: Pieces
+    pose_gradient: Array  # (F, 6)
+    point_gradient: Array  # (N, 3)
+
+    @classmethod
+    def of(cls, seen: Observations, pieces: Pieces, now: Estimate, chart: Chart, root_weight: Array) -> NormalEquations:
+        """At an estimate; ``root_weight`` (M,) of the observations [1/px]."""
+        n_frames, n_tracks = len(now.T_world_cam), len(now.points_world)
+        B, C = np.zeros((n_frames, 6, 6)), np.zeros((len(pieces.track), 3, 3))
+        by_pose, by_point = np.zeros((n_frames, 6)), np.zeros((n_tracks, 3))
+        blocks = np.empty((len(seen.frame), 6, 3))
+        R = now.T_world_cam[:, :3, :3]
+        lift = R[seen.frame[chart.view]] @ point_jacobian(now.uvd(chart, seen), seen.camera)
+        for rows, part in seen.parts():
+            P, root = now.in_camera(part), root_weight[rows]
+            r = (root[:, None] * ((part.uvd - seen.camera.project(P)) @ WHITEN.T))[:, :, None]
+            slope = root[:, None, None] * (WHITEN @ projection_jacobian(P, seen.camera))
+            A = slope @ np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
+            A[part.frame == 0] = 0.0  # the first pose stays
+            D = slope @ np.swapaxes(R[part.frame], 1, 2) @ lift[part.track]
+            At, Dt = np.swapaxes(A, 1, 2), np.swapaxes(D, 1, 2)
+            by_frame = part.sums(part.frame, n_frames)
+            B += summed(by_frame, At @ A)
+            by_pose += summed(by_frame, (At @ r)[:, :, 0])
+            C += summed(part.sums(pieces.piece[rows], len(C)), Dt @ D)
+            by_point += summed(part.sums(part.track, n_tracks), (Dt @ r)[:, :, 0])
+            blocks[rows] = At @ D
+        starts = np.searchsorted(seen.frame, np.arange(n_frames + 1))
+        E = sparse.bsr_matrix((blocks, seen.track, starts), shape=(6 * n_frames, 3 * n_tracks))
+        return cls(B, C, E, seen, pieces, by_pose, by_point)
+
+    def solve(self, damping: float) -> tuple[Array, Array]:
+        """Steps (F, 6) and (N, 3) of the damped equations."""
+        whole = sparse.csr_matrix((np.ones(len(self.C)), (self.pieces.track, np.arange(len(self.C)))))
+        B = damped(self.B, damping)
+        C_inverse, of_pieces = (
+            np.asarray(np.linalg.inv(damped(C, damping)), np.float64) for C in (summed(whole, self.C), self.C)
+        )
+        E_rows, E_columns = self.E, self.E.T
+        eliminated = (C_inverse @ self.point_gradient[:, :, None])[:, :, 0]
+        right = self.pose_gradient - (E_rows @ eliminated.ravel()).reshape(-1, 6)
+        factor = cholesky_banded(self._band(B, of_pieces), lower=True)
+
+        def reduced(x: Array) -> Array:
+            y = (C_inverse @ (E_columns @ x.ravel()).reshape(-1, 3, 1)).ravel()
+            return (B @ x[:, :, None])[:, :, 0] - (E_rows @ y).reshape(-1, 6)
+
+        def precondition(x: Array) -> Array:
+            return np.asarray(cho_solve_banded((factor, True), x.ravel(), check_finite=False)).reshape(-1, 6)
+
+        pose_step = _conjugate_gradients(reduced, right, precondition)
+        back = self.point_gradient - (E_columns @ pose_step.ravel()).reshape(-1, 3)
+        return pose_step, (C_inverse @ back[:, :, None])[:, :, 0]
+
+    def _band(self, B: Array, C_inverse: Array) -> Array:
+        """``B - E C^-1 E^T`` with the landmarks in pieces, as (6 REACH, 6 F) lower diagonals."""
+        n, order, piece = len(B), self.pieces.order, self.pieces.piece
+        blocks = np.zeros((REACH * n, 6, 6))  # by distance of the two frames, then the earlier frame
+        blocks[:n] = B
+        for i in range(0, len(order), PART):
+            for lag in range(REACH):
+                a, b = order[i : min(i + PART, len(order) - lag)], order[i + lag : i + lag + PART]
+                both = piece[a] == piece[b]
+                if not both.any():
+                    break
+                a, b = a[both], b[both]
+                taken = self.E.data[b] @ C_inverse[piece[a]] @ np.swapaxes(self.E.data[a], 1, 2)
+                near, far = self.seen.frame[a], self.seen.frame[b]
+                places, place = np.unique((far - near) * n + near, return_inverse=True)
+                sums = sparse.csr_matrix((np.ones(len(place)), (place, np.arange(len(place)))))
+                blocks[places] -= summed(sums, taken)
+        band = np.zeros((6 * REACH, 6 * n))
+        by_distance = blocks.reshape(REACH, n, 6, 6)
+        for d in range(REACH):
+            for row in range(6):
+                for column in range(6):
+                    if (diagonal := 6 * d + row - column) >= 0:
+                        band[diagonal, column::6] = by_distance[d, :, row, column]
+        return band
+
+
+def _conjugate_gradients(
+    apply: Callable[[Array], Array], right: Array, precondition: Callable[[Array], Array], tolerance: float = 1e-2
+) -> Array:
+    """Solution (F, 6) of ``apply(x) = right``; at most 300 products."""
+    x, r = np.zeros_like(right), right.copy()
+    z = precondition(r)
+    p, rz = z, float((r * z).sum())
+    goal = tolerance**2 * rz
+    for _ in range(300):
+        if not rz > goal:
+            break
+        Ap = apply(p)
+        alpha = rz / float((p * Ap).sum())
+        x, r = x + alpha * p, r - alpha * Ap
+        z = precondition(r)
+        rz, before = float((r * z).sum()), rz
+        p = z + (rz / before) * p
+    return x
+
+
+def damped(H: Array, damping: float) -> Array:
+    """Blocks with Marquardt's damping; an empty block becomes the identity, so that its step is zero."""
+    diagonal = np.diagonal(H, axis1=1, axis2=2)
+    empty = diagonal.max(axis=1, keepdims=True) <= 0
+    extra = np.where(empty, 1.0, damping * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True))
+    return H + extra[:, :, None] * np.eye(H.shape[1])
