@@ -35,8 +35,8 @@ def reproduce(
     """
     from gpvo.cli.output import print_json, progress
     from gpvo.reproduce.plan import Plan
-    from gpvo.reproduce.result import reproduce as run
-    from gpvo.reproduce.run import Workers
+    from gpvo.reproduce.run import reproduce as run
+    from gpvo.reproduce.stages import Workers
 
     given: dict[str, Any] = {"seeds": seeds, "points_seeds": points_seeds, "data": data}
     if only is not None:
@@ -54,18 +54,19 @@ def _print(result: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from gpvo.reproduce import claims, tables
+    from gpvo.reproduce import tables
 
     console = Console(width=max(Console().width, 190), highlight=False, markup=False)
-    for title, rows in (("", result["rows"]), ("sensitivity", result["sensitivity"]), ("real", result["real"])):
-        if rows:
-            table = Table(*tables.HEADS, title=title)
-            for row in rows:
-                for line in tables.cells(row):
-                    table.add_row(*line)
-                table.add_section()
-            console.print(table)
-    for line in (*claims.lines(result["claims"]), *result["failed"]):
+    for title, rows in tables.sections(result):
+        table = Table(*tables.HEADS, title=title)
+        for row in rows:
+            for line in tables.cells(row):
+                table.add_row(*line)
+            table.add_section()
+        console.print(table)
+    for c in result["claims"]:
+        console.print(f"{c['verdict']}: {c['claim']} ({c['evidence']})")
+    for line in result["failed"]:
         console.print(line)
     asked = [t["met"] for t in result["targets"]]
     console.print(

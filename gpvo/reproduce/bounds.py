@@ -1,4 +1,4 @@
-"""The error of every position of a flight beside what is said of it, by each way of saying it.
+"""The error of every position of a flight beside the bound that a method states of it.
 
 All positions are in the axes of the first camera, whose pose is made equal to the truth.
 """
@@ -8,16 +8,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
 from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.build import TrainingSet, build_run, observe
+from gpvo.evaluation.evaluate import predictions_by_stamp
+from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3
-from gpvo.io.run import Run
-from gpvo.types import Array, MotionError, VoLog
+from gpvo.io.run import Run, read_run
+from gpvo.learning import methods
+from gpvo.online.features import THESIS
+from gpvo.online.position import PositionPredictor
+from gpvo.online.predictor import Predictor
+from gpvo.reproduce.experiments import Experiment, Way, printed
+from gpvo.reproduce.models import ModelJob, sets_of
+from gpvo.reproduce.stages import Store, digest_of, write_arrays
+from gpvo.types import Array, MotionError, Status, VoLog
+from gpvo.vo.config import pair_method
 
 _FIELDS = ("t_s", "path_m", "error_m", "mean_m", "covariance_m2")
 
@@ -25,7 +36,7 @@ _FIELDS = ("t_s", "path_m", "error_m", "mean_m", "covariance_m2")
 @dataclass(frozen=True)
 class Bounds:
     """One flight, N frames with truth. ``t_s``, ``path_m`` (N,): time and length of the true path so far; ``error_m``
-    (N, 3) estimate minus truth; ``mean_m`` (N, 3) and ``covariance_m2`` (N, 3, 3): what is said of that error."""
+    (N, 3) estimate minus truth; ``mean_m`` (N, 3) and ``covariance_m2`` (N, 3, 3): what is stated of that error."""
 
     name: str
     t_s: Array
@@ -46,7 +57,7 @@ class Bounds:
 
 
 def bounds_of(run: Run, mean_m: Array, covariance_m2: Array) -> Bounds:
-    """The frames with truth, of what is said (N, 3), (N, 3, 3) of every frame of a run."""
+    """The frames with truth, of what is stated (N, 3), (N, 3, 3) of every frame of a run."""
     assert run.truth is not None
     T_true, known = interpolate_truth(run.truth, run.log.t_ns)
     T_est, first = run.log.trajectory(), int(np.argmax(known))
@@ -102,3 +113,129 @@ def load_bounds(path: Path) -> list[Bounds]:
     with np.load(path, allow_pickle=False) as data:
         names = [str(n) for n in data["names"]]
         return [Bounds(n, **{name: data[f"{k}.{name}"] for name in _FIELDS}) for k, n in enumerate(names)]
+
+
+@dataclass(frozen=True)
+class BoundMethod:
+    """How the error of a position is stated: ``v_t`` summed (thesis), ``joint`` compounded, GP of the ``position``
+    (thesis) or of each ``motion``, or the ``learned`` model. ``name``: of the covariance in the log, for the
+    first two."""
+
+    kind: Literal["v_t", "joint", "position", "motion", "learned"]
+    name: str = ""
+
+    @property
+    def preset(self) -> str:
+        """Of the odometry."""
+        return "thesis" if self.kind in ("v_t", "position") else "fast"
+
+    @property
+    def learns(self) -> bool:
+        """Whether it needs training flights."""
+        return self.kind in ("position", "motion", "learned")
+
+
+def method_of(e: Experiment, way: Way) -> BoundMethod:
+    """The method that a way of an experiment comes to."""
+    if way == "full":
+        return BoundMethod("learned")
+    if e.method == "gp":
+        return BoundMethod("position" if way == "recipe" else "motion")
+    if e.method == "triangulation":
+        return BoundMethod("v_t" if way == "recipe" else "joint", e.method)
+    if way == "recipe":
+        return BoundMethod("v_t", pair_method(*printed(e.sigma_px)))
+    return BoundMethod("joint", pair_method(*e.sigma_px))
+
+
+@dataclass(frozen=True)
+class BoundsJob:
+    """The bounds of a set of flights by one method. ``training``: runs that the thesis' GP of motions learns from."""
+
+    name: str
+    method: BoundMethod
+    runs: tuple[Path, ...]
+    training: tuple[Path, ...] = ()
+    model: ModelJob | None = None
+
+    def path(self, store: Store) -> Path:
+        """Where the bounds lie."""
+        made_from = [p.name for p in (*self.runs, *self.training)], self.model.path(store).name if self.model else ""
+        key = digest_of(self.method.kind, self.method.name, made_from)
+        return store.folder("bounds") / f"{self.name}-{self.method.kind}-{key}.npz"
+
+    def make(self, path: Path, store: Store) -> None:
+        """State the bounds of every flight and save them."""
+        runs = [read_run(p) for p in self.runs]
+        kind, name = self.method.kind, self.method.name
+        if kind == "v_t":
+            found = [bounds_of(r, np.zeros((len(r.log), 3)), summed_v_t(r.log, name)) for r in runs]
+        elif kind == "joint":
+            found = [_joint(r, name) for r in runs]
+        elif kind == "motion":
+            gp = methods.thesis_gp(sets_of(self.training))
+            found = [_motion(r, gp) for r in runs]
+        else:
+            assert self.model is not None
+            model = self.model.path(store)
+            if kind == "position":
+                positions = PositionPredictor.load(model)
+                found = [_position(r, positions) for r in runs]
+            else:
+                found = [_learned(r, Predictor.load(model)) for r in runs]
+        write_arrays(path, as_arrays(found))
+
+
+def job_of(
+    name: str, e: Experiment, way: Way, runs: tuple[Path, ...], training: tuple[Path, ...], trained_on: str
+) -> BoundsJob | None:
+    """A way of an experiment over ``runs``, learnt from ``training`` runs; None where it needs some and has none."""
+    method = method_of(e, way)
+    if not runs or (method.learns and not training):
+        return None
+    model = None
+    if method.kind == "learned":
+        model = ModelJob(trained_on, "learned", training)
+    elif method.kind == "position":
+        model = ModelJob(f"{trained_on}-position", "position", training)
+    return BoundsJob(name, method, runs, training if method.kind == "motion" else (), model)
+
+
+def _joint(run: Run, method: str) -> Bounds:
+    # Of all that the records state, this method alone is wanted.
+    log = VoLog(
+        [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in run.log]
+    )
+    errors = next(s.errors for s in statements(log) if s.method == method)
+    assert errors is not None
+    return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, errors))
+
+
+def _position(run: Run, predictor: PositionPredictor) -> Bounds:
+    _, X = observe(run.log, predictor.features, "position")
+    mean, sigma = predictor.predict(X)
+    return bounds_of(run, mean, sigma[:, :, None] ** 2 * np.eye(3))
+
+
+def _motion(run: Run, gp: methods.Statement) -> Bounds:
+    """A GP speaks of measured motions; a lost one is taken to be like the one before."""
+    s: TrainingSet = build_run(run, columns=THESIS)
+    stated = gp(s)
+    assert stated is not None
+    at = {int(t): k for k, t in enumerate(s.t_ns)}
+    mean, errors, last = np.zeros((len(run.log), 6)), [], 1e-12 * np.eye(6)
+    for k, record in enumerate(run.log):
+        row = at.get(record.t_ns)
+        if row is not None:
+            mean[k], last = stated[0][row], stated[1][row]
+        errors.append(MotionError.independent(last))
+    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, errors))
+
+
+def _learned(run: Run, predictor: Predictor) -> Bounds:
+    predictions = predictions_by_stamp(run, predictor)
+    bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
+    learned = next(s for s in statements(bare, predictions) if s.method == "learned")
+    assert learned.errors is not None
+    mean: Array = np.where([[r.status is Status.LOST] for r in run.log], 0.0, learned.mean)
+    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, learned.errors))

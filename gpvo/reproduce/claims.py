@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from gpvo.reproduce.bounds import Bounds, load_bounds
+from gpvo.reproduce.bounds import BoundMethod, Bounds, BoundsJob, load_bounds
 from gpvo.reproduce.experiments import WAYS, Way
+from gpvo.reproduce.flights import Flights
 from gpvo.reproduce.plan import Mode
-from gpvo.reproduce.run import Cell, Flights, Workers
-from gpvo.reproduce.sayings import Saying, SayingJob, say
-from gpvo.reproduce.scores import Pooled, pooled
-from gpvo.reproduce.store import Store
-from gpvo.reproduce.studies import OTHER, SAME, Studies, gain
+from gpvo.reproduce.rows import Cell
+from gpvo.reproduce.scores import Interval, pooled, squared_ends
+from gpvo.reproduce.stages import Store, Workers
+from gpvo.reproduce.studies import OTHER, SAME, Studies
 from gpvo.reproduce.tables import MODES, number, with_interval
+from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.types import Array
 
 _REST_S = 2.9
 _FLAT, _HARDLY, _OWN = 0.1, 1.25, 0.5
 HOLDS, FAILS, OPEN = "holds", "does not hold", "open"
+
+Evidence = Callable[[str, Way], list[Bounds]]
+"""The flights of a row by its key and a way."""
 
 
 @dataclass(frozen=True)
@@ -34,42 +37,34 @@ class Claim:
     evidence: str
 
 
-class Evidence:
-    """Bounds by experiment and way, of the mode with more flights."""
-
-    def __init__(self, cells: Sequence[Cell], store: Store, mode: Mode) -> None:
-        self.mode = mode
-        self._paths: dict[tuple[str, Way], Path] = {
-            (c.experiment.key, c.way): c.job.path(store) for c in cells if c.mode == mode
-        }
-
-    def __call__(self, key: str, way: Way) -> list[Bounds]:
-        """The flights of a row."""
-        return load_bounds(self._paths[key, way])
-
-    def has(self, *keys: str) -> bool:
-        """Whether all these rows were flown, all ways."""
-        return all((key, way) in self._paths for key in keys for way in WAYS)
-
-
 def claims(
     cells: Sequence[Cell], flights: Flights, studies: Studies | None, store: Store, workers: Workers
 ) -> list[dict[str, Any]]:
-    """Every claim with its verdict; one that cannot be judged is open, and says why."""
-    modes: list[Mode] = list(dict.fromkeys(c.mode for c in cells))
+    """Every claim with its verdict, by the mode with more flights; one that cannot be judged is open, and says why."""
+    modes = {c.mode for c in cells}
     mode: Mode = "points" if "points" in modes or not modes else "images"
-    found = Evidence(cells, store, mode)
-    out = [judge(found) if found.has(*keys) else _unknown(text) for text, keys, judge in _JUDGES]
-    out.insert(2, _noisy_pairs(flights, mode, store, workers))
-    out += [_more_data(studies), _target_world(studies), *_inputs(studies)]
-    return [{**c.__dict__, "mode": MODES[mode]} for c in out]
+    flown = {(c.experiment.key, c.way): c for c in cells if c.mode == mode}
+
+    def found(key: str, way: Way) -> list[Bounds]:
+        return flown[key, way].load(store)
+
+    out = []
+    for claim, keys, judge in _ROWS:
+        known = all((key, way) in flown for key in keys for way in WAYS)
+        out.append(Claim(claim, *(judge(found) if known else _UNKNOWN)))
+    out.insert(2, Claim("noisy pairs hardly matter on the moon", *_noisy_pairs(flights, mode, store, workers)))
+    out.append(Claim("more training data help", *_more_data(studies)))
+    out.append(Claim("training in the environment of the target helps", *_target_world(studies)))
+    for what, lacking in (("the IMU", "without IMU"), ("the geometric covariance", "without geometric covariance")):
+        judged = _UNKNOWN if studies is None else _gain("a model without", studies.ablation, "all inputs", lacking)
+        out.append(Claim(f"{what} as an input helps", *judged))
+    return [{**asdict(c), "mode": MODES[mode]} for c in out]
 
 
-def _unknown(claim: str, why: str = "no flights of this kind") -> Claim:
-    return Claim(claim, OPEN, why)
+_UNKNOWN = OPEN, "no flights of this kind"
 
 
-def _flat(found: Evidence) -> Claim:
+def _flat(found: Evidence) -> tuple[str, str]:
     shares = {}
     for way in WAYS:
         flights = found("4.2-clean", way)
@@ -79,50 +74,49 @@ def _flat(found: Evidence) -> Claim:
     held = [way for way, share in shares.items() if share < _FLAT]
     text = ", ".join(f"{way} {100 * share:.2g} %" for way, share in shares.items())
     verdict = HOLDS if len(held) == len(WAYS) else f"holds for {', '.join(held)} alone" if held else FAILS
-    return Claim(_JUDGES[0][0], verdict, f"bound at the end of the rest, as a share of the last one: {text}")
+    return verdict, f"bound at the end of the rest, as a share of the last one: {text}"
 
 
-def _noise(found: Evidence) -> Claim:
-    pairs = {way: (found("4.1-clean", way), found("4.1-noisy", way)) for way in WAYS}
+def _noise(found: Evidence) -> tuple[str, str]:
     text, verdicts = [], {}
-    for way, (clean, noisy) in pairs.items():
-        n = min(len(clean), len(noisy))
-        said, real = (_quotient(noisy[:n], clean[:n], of) for of in (_predicted, _final))
-        twice = _double_ratio(noisy[:n], clean[:n])
-        text.append(f"{way}: stated x{number(said)}, error x{number(real)}")
-        verdicts[way] = _above(twice, 1.0)
-    return Claim(_JUDGES[1][0], verdicts["recipe"], "; ".join(text) + " (verdict of the recipe)")
+    for way in WAYS:
+        noisy, clean = _paired(found("4.1-noisy", way), found("4.1-clean", way))
+        real, stated = (pooled(a, b)[0] for a, b in zip(noisy, clean, strict=True))
+        text.append(f"{way}: stated x{number(stated)}, error x{number(real)}")
+        verdicts[way] = _above(_double_ratio(noisy, clean), 1.0)
+    return verdicts["recipe"], "; ".join(text) + " (verdict of the recipe)"
 
 
-def _tighter(found: Evidence) -> Claim:
+def _tighter(found: Evidence) -> tuple[str, str]:
     pm, tri = found("4.2-noisy", "recipe"), found("4.1-noisy", "recipe")
-    narrower = pooled(_predicted(pm), _predicted(tri))
+    value, interval = pooled(squared_ends(pm)[1], squared_ends(tri)[1])
     inside = [float(np.mean([(np.abs(b.error_m) <= 3 * b.sigma_m + 1e-9).mean() for b in way])) for way in (pm, tri)]
-    verdict = _above(Pooled(1 / narrower.value, _inverse(narrower.high), _inverse(narrower.low)), 1.0)
-    evidence = (
-        f"last bound over that of triangulation: {_with(narrower)}; inside 3 sigma: {100 * inside[0]:.0f} % against "
-        f"{100 * inside[1]:.0f} % (99.7 % is right): tighter is not better by itself"
+    # Tighter: the quotient lies below one.
+    verdict = {HOLDS: FAILS, FAILS: HOLDS, OPEN: OPEN}[_above(interval, 1.0)]
+    return verdict, (
+        f"last bound over that of triangulation: {with_interval(value, interval)}; inside 3 sigma: "
+        f"{100 * inside[0]:.0f} % against {100 * inside[1]:.0f} % (99.7 % is right): tighter is not better by itself"
     )
-    return Claim(_JUDGES[2][0], verdict, evidence)
 
 
-def _own_bound(found: Evidence) -> Claim:
+def _own_bound(found: Evidence) -> tuple[str, str]:
     text, smaller = [], []
     for key in ("4.3", "4.6"):
         flights = found(key, "recipe")
         at = [int(np.searchsorted(b.t_s, b.t_s[-1] / 4)) for b in flights]
-        said = np.sqrt(np.mean([np.trace(b.covariance_m2[-1]) for b in flights]) / np.mean(
-            [np.trace(b.covariance_m2[k]) for b, k in zip(flights, at, strict=True)]
-        ))  # fmt: skip
-        real = np.sqrt(_final(flights).mean() / np.mean([(b.error_m[k] ** 2).sum() for b, k in zip(flights, at)]))
-        text.append(
-            f"{key}: error grows x{number(real)} from a quarter of the flight to its end, the bound x{number(said)}"
+        early, late = (
+            np.array([((b.error_m[k] ** 2).sum(), np.trace(b.covariance_m2[k])) for b, k in zip(flights, ends)])
+            for ends in (at, [-1] * len(flights))
         )
-        smaller.append(said < _OWN * real)
-    return Claim(_JUDGES[3][0], HOLDS if all(smaller) else FAILS if not any(smaller) else OPEN, "; ".join(text))
+        real, stated = np.sqrt(late.mean(axis=0) / early.mean(axis=0))
+        text.append(
+            f"{key}: error grows x{number(real)} from a quarter of the flight to its end, the bound x{number(stated)}"
+        )
+        smaller.append(stated < _OWN * real)
+    return HOLDS if all(smaller) else FAILS if not any(smaller) else OPEN, "; ".join(text)
 
 
-_JUDGES: list[tuple[str, tuple[str, ...], Callable[[Evidence], Claim]]] = [
+_ROWS: list[tuple[str, tuple[str, ...], Callable[[Evidence], tuple[str, str]]]] = [
     ("bounds are flat before take-off", ("4.2-clean",), _flat),
     ("noise raises the stated sigma more than the error", ("4.1-clean", "4.1-noisy"), _noise),
     ("sigma_p and sigma_m give tighter bounds in noise", ("4.1-noisy", "4.2-noisy"), _tighter),
@@ -130,99 +124,66 @@ _JUDGES: list[tuple[str, tuple[str, ...], Callable[[Evidence], Claim]]] = [
 ]
 
 
-def _noisy_pairs(flights: Flights, mode: Mode, store: Store, workers: Workers) -> Claim:
-    claim = "noisy pairs hardly matter on the moon"
+def _noisy_pairs(flights: Flights, mode: Mode, store: Store, workers: Workers) -> tuple[str, str]:
     runs = [flights.runs(name, mode, "fast") for name in ("moon", "moon-clean")]
     if not all(runs):
-        return _unknown(claim)
-    jobs = [SayingJob(f"pairs-{mode}", Saying("joint", "pointing_matching"), r) for r in runs]
-    noisy, clean = (load_bounds(p) for p in workers.map("bounds", say, [(j, store) for j in jobs]))
-    n = min(len(noisy), len(clean))
-    error, said = (pooled(of(noisy[:n]), of(clean[:n])) for of in (_final, _predicted))
+        return _UNKNOWN
+    jobs = [BoundsJob(f"pairs-{mode}", BoundMethod("joint", "pointing_matching"), r) for r in runs]
+    workers.keep("bounds", jobs, store)
+    noisy, clean = _paired(*(load_bounds(job.path(store)) for job in jobs))
+    error, stated = (pooled(a, b) for a, b in zip(noisy, clean, strict=True))
     # Holds where the error surely grows by less than a quarter.
-    verdict = {HOLDS: FAILS, FAILS: HOLDS, OPEN: OPEN}[_above(error, _HARDLY)]
-    return Claim(
-        claim, verdict, f"final error with noisy pairs over that without: {_with(error)}; bound: {_with(said)}"
+    verdict = {HOLDS: FAILS, FAILS: HOLDS, OPEN: OPEN}[_above(error[1], _HARDLY)]
+    return verdict, (
+        f"final error with noisy pairs over that without: {with_interval(*error)}; bound: {with_interval(*stated)}"
     )
 
 
-def _more_data(studies: Studies | None) -> Claim:
-    claim = "more training data help"
+def _more_data(studies: Studies | None) -> tuple[str, str]:
     if studies is None or min(len(c) for c in studies.curve.values()) < 2:
-        return _unknown(claim, "too few training flights for a curve")
+        return OPEN, "too few training flights for a curve"
     text, verdicts = [], []
     for kind, by_count in studies.curve.items():
         few, many = min(by_count), max(by_count)
-        found = gain(by_count[many], by_count[few])
-        text.append(f"{kind}: {few} to {many} flights, gain in NLL per axis {found}")
-        verdicts.append(_above(Pooled(found.mean, found.low, found.high), 0.0))
-    return Claim(claim, verdicts[0] if len(set(verdicts)) == 1 else OPEN, "; ".join(text))
+        verdict, found = _gain("", by_count, many, few)
+        text.append(f"{kind}: {few} to {many} flights, {found}")
+        verdicts.append(verdict)
+    return verdicts[0] if len(set(verdicts)) == 1 else OPEN, "; ".join(text)
 
 
-def _target_world(studies: Studies | None) -> Claim:
-    claim = "training in the environment of the target helps"
+def _target_world(studies: Studies | None) -> tuple[str, str]:
     if studies is None or not studies.curve[SAME]:
-        return _unknown(claim)
+        return _UNKNOWN
     n = max(studies.curve[SAME])
-    found = gain(studies.curve[SAME][n], studies.curve[OTHER][n])
-    verdict = _above(Pooled(found.mean, found.low, found.high), 0.0)
-    return Claim(claim, verdict, f"gain in NLL per axis over other worlds, {n} flights each: {found}")
+    return _gain(f"other worlds, {n} flights each", {k: c[n] for k, c in studies.curve.items()}, SAME, OTHER)
 
 
-def _inputs(studies: Studies | None) -> list[Claim]:
-    out = []
-    for what, without in (("the IMU", "without IMU"), ("the geometric covariance", "without geometric covariance")):
-        claim = f"{what} as an input helps"
-        if studies is None:
-            out.append(_unknown(claim))
-            continue
-        found = gain(studies.ablation["all inputs"], studies.ablation[without])
-        verdict = _above(Pooled(found.mean, found.low, found.high), 0.0)
-        out.append(Claim(claim, verdict, f"gain in NLL per axis over a model without: {found}"))
-    return out
+def _gain(over: str, nll: Mapping[Any, Array], better: Any, worse: Any) -> tuple[str, str]:
+    """Whether one likelihood per axis is better than another, over flights, by a bootstrap in pairs."""
+    found = sequence_bootstrap(nll[worse] - nll[better])
+    what = f"gain in NLL per axis over {over}:" if over else "gain in NLL per axis"
+    return _above((found.low, found.high), 0.0), f"{what} {found}"
 
 
-def _above(p: Pooled, level: float) -> str:
-    if p.low is None or p.high is None or not np.isfinite(p.low):
+def _above(interval: Interval | None, level: float) -> str:
+    """Whether a quantity with this interval lies above a level."""
+    if interval is None or not np.isfinite(interval[0]):
         return OPEN
-    return HOLDS if p.low > level else FAILS if p.high < level else OPEN
+    return HOLDS if interval[0] > level else FAILS if interval[1] < level else OPEN
 
 
-def _inverse(value: float | None) -> float | None:
-    return None if value is None else 1.0 / max(value, 1e-300)
+def _paired(a: Sequence[Bounds], b: Sequence[Bounds]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Squared last errors and bounds of two sets of flights, as many of each."""
+    n = min(len(a), len(b))
+    return squared_ends(a[:n]), squared_ends(b[:n])
 
 
-def _with(p: Pooled) -> str:
-    return with_interval(p.value, None if p.low is None or p.high is None else (p.low, p.high))
-
-
-def _final(flights: Sequence[Bounds]) -> Array:
-    return np.array([(b.error_m[-1] ** 2).sum() for b in flights])
-
-
-def _predicted(flights: Sequence[Bounds]) -> Array:
-    return np.array([b.predicted_m[-1] ** 2 for b in flights])
-
-
-def _quotient(a: Sequence[Bounds], b: Sequence[Bounds], of: Callable[[Sequence[Bounds]], Array]) -> float:
-    return float(np.sqrt(of(a).mean() / of(b).mean()))
-
-
-def _double_ratio(noisy: Sequence[Bounds], clean: Sequence[Bounds], draws: int = 4000) -> Pooled:
-    """Growth of what is stated over growth of the error, with an interval over seeds."""
-    parts = [_predicted(noisy), _predicted(clean), _final(noisy), _final(clean)]
-
-    def ratio(means: Sequence[Any]) -> Any:
-        return np.sqrt(means[0] / means[1] * means[3] / means[2])
-
-    value = float(ratio([p.mean() for p in parts]))
-    if len(noisy) < 3:
-        return Pooled(value, None, None)
-    pick = np.random.default_rng(0).integers(0, len(noisy), (draws, len(noisy)))
-    low, high = np.quantile(ratio([p[pick].mean(1) for p in parts]), [0.025, 0.975])
-    return Pooled(value, float(low), float(high))
-
-
-def lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """One line per claim, for a terminal."""
-    return [f"{c['verdict']}: {c['claim']} ({c['evidence']})" for c in found]
+def _double_ratio(noisy: tuple[Array, Array], clean: tuple[Array, Array], draws: int = 4000) -> Interval | None:
+    """Interval over seeds of the growth of what is stated over the growth of the error."""
+    n = len(noisy[0])
+    if n < 3:
+        return None
+    pick = np.random.default_rng(0).integers(0, n, (draws, n))
+    (error, stated), (clean_error, clean_stated) = ([v[pick].mean(1) for v in pair] for pair in (noisy, clean))
+    low, high = np.quantile(np.sqrt(stated / clean_stated * clean_error / error), [0.025, 0.975])
+    return float(low), float(high)

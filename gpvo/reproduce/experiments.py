@@ -42,6 +42,17 @@ class Published:
     predicted_m: float
     residual_m: float | None = None
 
+    def document(self) -> dict[str, float | None]:
+        """The figures and their ratios, as scripts read them."""
+        return {
+            "rmse_m": self.rmse_m,
+            "final_error_m": self.final_m,
+            "predicted_final_error_m": self.predicted_m,
+            "ratio": self.predicted_m / self.final_m,
+            "residual_m": self.residual_m,
+            "residual_over_rmse": None if self.residual_m is None else self.residual_m / self.rmse_m,
+        }
+
 
 @dataclass(frozen=True)
 class FlightSet:

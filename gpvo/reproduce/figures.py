@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +10,53 @@ from matplotlib.figure import Figure
 
 from gpvo.io.atomic import replacing
 from gpvo.reproduce.bounds import Bounds
+from gpvo.reproduce.rows import Cell
+from gpvo.reproduce.stages import Store
+from gpvo.reproduce.studies import Studies
+from gpvo.reproduce.tables import MODES
+from gpvo.types import Array
 
 _AXES = ("x: right", "y: down", "z: forward")
 _GREEN = "#2ca02c"
+
+
+def draw(cells: Sequence[Cell], studied: Studies | None, store: Store, out: Path) -> list[dict[str, str]]:
+    """Every figure as a file in ``out``, and what it shows: of each row the first flight."""
+    drawn: list[dict[str, str]] = []
+
+    def keep(name: str, title: str, figure: Figure) -> None:
+        path = out / "figures" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})
+        drawn.append({"file": f"figures/{name}.png", "title": title})
+
+    simulated: dict[tuple[str, str], list[Cell]] = {}
+    real: dict[str, list[Cell]] = {}
+    for c in cells:
+        if c.mode == "real":
+            real.setdefault(c.experiment.key, []).append(c)
+        elif c.experiment.table == "sensitivity":
+            # The last figure shows the pairs of sigmas side by side.
+            if c.experiment.flights == "tunnel" and c.way == "recipe":
+                simulated.setdefault((c.mode, "4.9"), []).append(c)
+        elif c.experiment.figure:
+            simulated.setdefault((c.mode, c.experiment.figure), []).append(c)
+    for (mode, number), group in sorted(simulated.items(), key=lambda item: item[0]):
+        what = "tunnel, clean: sensitivity to sigma_p, sigma_m" if number == "4.9" else group[0].experiment.title
+        title = f"Figure {number}, {what} ({MODES[mode]}, first seed)"
+        keep(f"{number}-{mode}", title, bounds_figure(title, {_column(c): c.load(store)[0] for c in group}))
+    for key, group in real.items():
+        title = f"Real: {group[0].experiment.title} (first sequence)"
+        keep(key, title, bounds_figure(title, {c.way: c.load(store)[0] for c in group}))
+    if studied is not None and len(next(iter(studied.curve.values()))) > 1:
+        keep("learning-curve", f"Learning curve ({MODES[studied.mode]})", curve_figure(studied.curve))
+    return drawn
+
+
+def _column(c: Cell) -> str:
+    p, m = c.experiment.sigma_px
+    return f"recipe, sigma_p {p}, sigma_m {m}" if c.experiment.table == "sensitivity" else c.way
 
 
 def bounds_figure(title: str, columns: Mapping[str, Bounds]) -> Figure:
@@ -53,25 +97,20 @@ def _limit(bounds: list[Bounds], axis: int) -> float:
     return max(1.15 * min(max(error, reach), 4 * error), 1e-6)
 
 
-def curve_figure(curves: Mapping[str, tuple[list[int], list[float], list[float], list[float]]]) -> Figure:
-    """Learning curves: number of flights, mean NLL per axis, low, high."""
+def curve_figure(curves: Mapping[str, Mapping[int, Array]]) -> Figure:
+    """Learning curves: NLL per axis of every flight (n,), by kind of training and number of flights."""
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     ax = figure.subplots()
-    for (name, (n, mean, low, high)), colour in zip(curves.items(), ("#1f77b4", "#d62728", _GREEN), strict=False):
-        ax.plot(n, mean, marker="o", color=colour, label=name)
-        ax.fill_between(n, low, high, color=colour, alpha=0.15, lw=0)
+    for (name, by_count), colour in zip(curves.items(), ("#1f77b4", "#d62728", _GREEN), strict=False):
+        mean = np.array([v.mean() for v in by_count.values()])
+        reach = np.array([1.96 * v.std(ddof=1) / np.sqrt(len(v)) if len(v) > 1 else 0.0 for v in by_count.values()])
+        ax.plot(list(by_count), mean, marker="o", color=colour, label=name)
+        ax.fill_between(list(by_count), mean - reach, mean + reach, color=colour, alpha=0.15, lw=0)
     ax.set_xscale("log", base=2)
-    ticks = sorted({k for n, *_ in curves.values() for k in n})
+    ticks = sorted({n for by_count in curves.values() for n in by_count})
     ax.set_xticks(ticks, [str(k) for k in ticks])
     ax.minorticks_off()
     ax.set(xlabel="training flights", ylabel="NLL per axis [nats], lower is better", title="Learning curve")
     ax.legend(frameon=False)
     ax.grid(alpha=0.3)
     return figure
-
-
-def save(figure: Figure, path: Path) -> None:
-    """As PNG, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})

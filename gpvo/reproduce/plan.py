@@ -1,4 +1,4 @@
-"""How much is flown: seeds, durations, and every flight that follows from them."""
+"""How much is flown: seeds, durations, experiments."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from gpvo import __version__
 from gpvo.errors import GpvoError
-from gpvo.reproduce.experiments import EXPERIMENTS, FLIGHTS, SENSITIVITY, Experiment, FlightSet
-from gpvo.reproduce.store import Store, digest_of, digest_of_file
-from gpvo.sim.scenario import Scenario, load_scenario
+from gpvo.reproduce.experiments import EXPERIMENTS, FLIGHTS, SENSITIVITY, Experiment
 
 Mode = Literal["images", "points"]
 MODES: tuple[Mode, ...] = ("images", "points")
@@ -83,51 +80,3 @@ class Plan:
             return []
         files = sorted(p for p in (self.data / _RECORDINGS).glob("*") if p.suffix in (".txt", ".csv", ".tum"))
         return files[0::2] if half == "training" else files[1::2]
-
-
-@dataclass(frozen=True)
-class Flight:
-    """One flight to simulate. ``key``: digest of everything that decides it."""
-
-    set_name: str
-    mode: Mode
-    seed: int
-    scenario: Scenario
-    key: str
-    presets: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """Short, and unique within one folder."""
-        return f"{self.set_name}-{self.mode}-{self.seed}-{self.key}"
-
-
-def flights_of(plan: Plan, name: str, mode: Mode, store: Store) -> list[Flight]:
-    """The flights of a set, in order; cuts pieces of recordings where it flies them."""
-    chosen = FLIGHTS[name]
-    if chosen.points_only and mode != "points":
-        return []
-    first, count = chosen.first_seed, plan.training[mode]
-    seeds = range(first, first + count) if chosen.is_training else plan.test_seeds(mode)
-    return [_flight(plan, chosen, mode, seed, k, store) for k, seed in enumerate(seeds)]
-
-
-def _flight(plan: Plan, chosen: FlightSet, mode: Mode, seed: int, k: int, store: Store) -> Flight:
-    duration = plan.duration_s * (chosen.longer if plan.stretch else 1.0)
-    overrides: dict[str, Any] = {**chosen.overrides, "duration_s": duration, "rate_hz": plan.rate_hz}
-    recordings = plan.recordings(chosen.recorded) if chosen.recorded else []
-    content = ""
-    if recordings:
-        from gpvo.reproduce.recordings import cut
-
-        piece = cut(recordings[seed % len(recordings)], seed, duration, store)
-        overrides["trajectory"], content = str(piece.resolve()), digest_of_file(piece)
-    elif chosen.recorded:
-        # Without recordings there is no path for a vehicle of that name: a quadrotor wanders.
-        overrides["vehicle"] = "quadrotor"
-    if mode == "images":
-        overrides = {k: v for k, v in overrides.items() if not k.startswith("points.")}
-    scenario = load_scenario(chosen.scenarios[k % len(chosen.scenarios)], overrides)
-    decided = scenario.model_dump(mode="json") | {"trajectory": content}
-    key = digest_of(decided, seed, mode, __version__)
-    return Flight(chosen.name, mode, seed, scenario, key, ("fast", "thesis") if chosen.thesis_preset else ("fast",))

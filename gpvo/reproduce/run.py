@@ -1,118 +1,111 @@
-"""The whole reproduction: simulate -> odometry -> models -> bounds -> tables, each stage kept in the folder."""
+"""The whole reproduction: simulate, run odometry, train, state bounds, score; and the folder that a person opens."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gpvo.learning.parallel import map_jobs
-from gpvo.reproduce.experiments import WAYS, Experiment, Way
-from gpvo.reproduce.flights import Flown, fly
-from gpvo.reproduce.learn import ModelJob, fit
-from gpvo.reproduce.plan import Flight, Mode, Plan, flights_of
-from gpvo.reproduce.sayings import Saying, SayingJob, model_job, say, saying_of
-from gpvo.reproduce.store import Store
-
-Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Where jobs run, and who is told of progress."""
-
-    jobs: int = 1
-    backend: str = "local"
-    scheduler: str | None = None
-    progress: Progress = lambda what, total: nullcontext(lambda: None)
-
-    def map(self, what: str, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
-        """The function over all arguments, in order."""
-        listed = list(arguments)
-        with self.progress(what, len(listed)) as done:
-            return map_jobs(
-                function, listed, jobs=self.jobs, backend=self.backend, scheduler=self.scheduler, on_done=done
-            )
+from gpvo import __version__
+from gpvo.io.jsonfile import plain, write_json
+from gpvo.reproduce import figures, rows, scores, studies, tables
+from gpvo.reproduce.claims import claims
+from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS
+from gpvo.reproduce.flights import fly_all
+from gpvo.reproduce.plan import Plan
+from gpvo.reproduce.stages import Store, Workers, only_user, write_text
 
 
-@dataclass(frozen=True)
-class Flights:
-    """All flights that were made. ``failed``: one line per flight that could not be flown."""
+def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str, Any]:
+    """Every experiment of the list; stages that ``out`` holds are not done again.
 
-    flown: dict[tuple[str, Mode], list[Flown]] = field(default_factory=dict)
+    Writes ``results.json`` (the returned document, schema 1), ``tables.md``, ``tables.csv``, ``figures/*.png`` and
+    ``report.html`` into ``out``.
 
-    def runs(self, name: str, mode: Mode, preset: str) -> tuple[Path, ...]:
-        """Run folders of a set, in the order of its seeds."""
-        return tuple(f.runs[preset] for f in self.flown.get((name, mode), []) if preset in f.runs)
+    Raises
+    ------
+    GpvoError
+        Where the folder cannot be written, or the folder of data is missing.
+    """
+    with only_user(out):
+        result = _computed(plan, out, workers or Workers())
+        document = plain(result)
+        write_json(out / "results.json", document)
+        write_text(out / "tables.md", tables.as_markdown(document))
+        every_row = [*document["rows"], *document["sensitivity"], *document["real"]]
+        write_text(out / "tables.csv", tables.as_csv(every_row))
+        write_text(out / "report.html", tables.as_page(document, out))
+    return result
 
-    @property
-    def failed(self) -> list[str]:
-        """What could not be flown, and why."""
-        return [f"{f.flight.name}: {f.error}" for group in self.flown.values() for f in group if f.error]
 
-
-def fly_all(plan: Plan, store: Store, workers: Workers) -> Flights:
-    """Stages one and two, for every set of flights in every mode."""
-    wanted: dict[tuple[str, Mode], list[Flight]] = {
-        (name, mode): flights_of(plan, name, mode, store) for mode in plan.modes for name in plan.flight_sets
+def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
+    """Every stage, then the document and its figures."""
+    store = Store(out)
+    flights = fly_all(plan, store, workers)
+    real: list[rows.Cell] = []
+    refused: list[str] = []
+    if plan.data is not None and not plan.only:
+        real, refused = rows.real_cells(plan.data, plan.real_frames, store, workers)
+    simulated = rows.simulated_cells(plan, flights)
+    rows.compute([*simulated, *real], store, workers)
+    studied = studies.run_studies(plan, flights, store, workers)
+    claimed = [] if plan.only else claims(simulated, flights, studied, store, workers)
+    main = scores.rows([c for c in simulated if c.experiment.table != "sensitivity"], store)
+    if not (plan.recordings("test") and plan.recordings("training")):
+        for row in main:
+            row["title"] += ", NO RECORDED PATHS: random ones" if row["table"] in ("4.5", "4.6") else ""
+    return {
+        "schema": 1,
+        "gpvo": __version__,
+        "plan": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(plan).items()},
+        "ways": WAYS,
+        "notes": _notes(plan),
+        "rows": main,
+        "sensitivity": scores.rows([c for c in simulated if c.experiment.table == "sensitivity"], store),
+        "real": scores.rows(real, store),
+        "targets": scores.targets(main),
+        "claims": claimed,
+        "studies": studies.document(studied),
+        "errata": list(ERRATA),
+        "out_of_scope": list(OUT_OF_SCOPE),
+        "failed": [*flights.failed, *refused],
+        "figures": figures.draw([*simulated, *real], studied, store, out),
     }
-    listed = [f for group in wanted.values() for f in group]
-    # The long ones first, so that no core waits for a last long one.
-    listed.sort(key=lambda f: (f.mode != "images", -f.scenario.duration_s))
-    flown = workers.map("flights", fly, [(f, store) for f in listed])
-    by_key = {f.flight.name: f for f in flown}
-    return Flights({where: [by_key[f.name] for f in group] for where, group in wanted.items()})
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One way of one experiment in one mode, and the job that says it."""
-
-    experiment: Experiment
-    way: Way
-    mode: Mode
-    job: SayingJob
-    model: ModelJob | None
-
-
-def cells(plan: Plan, flights: Flights, store: Store) -> list[Cell]:
-    """Every cell of the tables for which there are flights."""
-    out = []
-    for mode in plan.modes:
-        for e in plan.experiments:
-            for way in WAYS:
-                if e.table == "sensitivity" and way == "full":
-                    continue
-                cell = _cell(e, way, mode, flights, store)
-                if cell is not None:
-                    out.append(cell)
-    return out
-
-
-def _cell(e: Experiment, way: Way, mode: Mode, flights: Flights, store: Store) -> Cell | None:
-    saying = saying_of(e, way)
-    runs = flights.runs(e.flights, mode, saying.preset)
-    training = flights.runs(e.training, mode, saying.preset)
-    needs_training = saying.kind in ("position", "motion", "learned")
-    if not runs or (needs_training and not training):
-        return None
-    model = model_job(f"{e.training}-{mode}", saying, training)
-    path = None if model is None else model.path(store)
-    own = training if saying.kind == "motion" else ()
-    return Cell(e, way, mode, _job(e, mode, saying, runs, own, path), model)
-
-
-def _job(
-    e: Experiment, mode: Mode, saying: Saying, runs: tuple[Path, ...], training: tuple[Path, ...], model: Path | None
-) -> SayingJob:
-    return SayingJob(f"{e.flights}-{mode}", saying, runs, training, model)
-
-
-def compute(table: Sequence[Cell], store: Store, workers: Workers) -> None:
-    """Stages three and four: every model that a cell needs, then every cell's bounds."""
-    models = dict.fromkeys(c.model for c in table if c.model is not None)
-    workers.map("models", fit, [(m, store) for m in models])
-    jobs = {c.job.path(store): c.job for c in table}
-    workers.map("bounds", say, [(j, store) for j in jobs.values()])
+def _notes(plan: Plan) -> list[str]:
+    """What stands for what, in plain words."""
+    length = f"{plan.duration_s:g} s" + (", the long straight twice as long" if plan.stretch else "")
+    notes = [
+        "The thesis' flights are not available; ours stand in for them. Compare ratios, not metres.",
+        f"Flights of {length}, {plan.rate_hz:g} Hz. Seeds with images: {plan.seeds}; further seeds in "
+        f"points-only mode: {plan.points_seeds} (landmark tracks without pictures), in rows of their own. "
+        f"Each trains apart: on {plan.training['images']} flights with images, on {plan.training['points']} without.",
+        "RMSE, final and predicted final error are roots of mean squares over the seeds; brackets are 95 % intervals "
+        "of a bootstrap by seed. Predicted: root of the expected squared error, 1 sigma.",
+        "Tables 4.1, 4.2: a drawn mine tunnel for the thesis' simulated one; models learned in other tunnels, clean "
+        "and noisy. Table 4.3: the same tunnel as in training. Table 4.4: a rover on a drawn moon.",
+    ]
+    half = plan.recordings("test"), plan.recordings("training")
+    if all(half):
+        names = [", ".join(p.stem for p in files) for files in half]
+        notes.append(
+            "Tables 4.5, 4.6: no T265 flight under motion capture is at hand. Pictures of a T265-like fisheye pair are "
+            f"drawn along recorded paths, the calibration off by a draw from the datasheet's tolerance in every "
+            f"flight; test paths: {names[0]}; training paths and draws are others: {names[1]}. Points-only rows see "
+            "such paths through a rectified pair of the T265's baseline, without a lens."
+        )
+    else:
+        notes.append(
+            "Tables 4.5, 4.6: NO RECORDED PATHS at hand (--data FOLDER with flown_paths/): smooth random paths stand "
+            "in for them, the calibration off by a draw from the datasheet's tolerance in every flight."
+        )
+    if plan.data is None:
+        notes.append("Real data: none at hand (--data FOLDER, or the variable GPVO_DATA).")
+    else:
+        cut = "" if plan.real_frames is None else f", of logs the first {plan.real_frames} frames"
+        notes.append(
+            "Real data: stereo tracks of cars and logs of another odometry stand for real flights; every sequence is "
+            f"judged by models of the others{cut}."
+        )
+    return notes

@@ -1,69 +1,83 @@
-"""Flights of one row, pooled over seeds."""
+"""The scores of a row: flights pooled over seeds, beside what the thesis prints and what is asked of the full model.
+
+What could not be computed is None.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from gpvo.reproduce.bounds import Bounds
+from gpvo.reproduce.bounds import Bounds, BoundsJob
+from gpvo.reproduce.experiments import Experiment
+from gpvo.reproduce.rows import Cell
+from gpvo.reproduce.stages import Store
 from gpvo.types import Array
 
+RATIO = (0.7, 1.5)
+MAGNITUDE_BELOW, VECTOR_UP_TO = 0.7, 1.0
+_RESIDUAL_TABLES = ("4.3", "4.6")
 _DRAWS = 4000
 
-
-@dataclass(frozen=True)
-class Pooled:
-    """The root of a mean of squares, or a ratio of two, over seeds, with the 95 % interval of a bootstrap by seed.
-
-    ``low`` and ``high`` are None with fewer than three seeds: nothing can be said.
-    """
-
-    value: float
-    low: float | None
-    high: float | None
+Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Scores:
-    """One way of one row [m]. ``ratio``: predicted over actual final error. ``vector``: position error after the
-    predicted mean is taken off; ``magnitude``: |error| minus its predicted expectation, the thesis' residual; both as
-    root mean squares, and over the RMSE. ``coverage``: share of position errors inside 3 sigma, per axis."""
+    """One way of one row [m]; the names are those of ``results.json``.
 
-    flights: int
-    rmse_m: Pooled
-    final_m: Pooled
-    predicted_m: Pooled
-    ratio: Pooled
-    vector_m: Pooled
-    magnitude_m: Pooled
-    vector_over_rmse: Pooled
-    magnitude_over_rmse: Pooled
-    coverage: float
+    Roots of mean squares over the flights, ``*_interval``: 95 % of a bootstrap by flight, None with fewer than three.
+    ``ratio``: predicted over actual final error. ``vector``: position error after the predicted mean is taken off;
+    ``magnitude``: |error| minus its predicted expectation, the thesis' residual. ``coverage_3_sigma``: share of
+    position errors inside, per axis.
+    """
+
+    seeds: int
+    rmse_m: float
+    rmse_interval_m: Interval | None
+    final_error_m: float
+    final_error_interval_m: Interval | None
+    predicted_final_error_m: float
+    ratio: float
+    ratio_interval: Interval | None
+    vector_residual_m: float
+    vector_over_rmse: float
+    vector_over_rmse_interval: Interval | None
+    magnitude_residual_m: float
+    magnitude_over_rmse: float
+    magnitude_over_rmse_interval: Interval | None
+    coverage_3_sigma: float
 
 
 def score(flights: Sequence[Bounds]) -> Scores:
     """Scores over flights; each flight counts alike."""
     squared_error = np.array([(b.error_m**2).sum(1).mean() for b in flights])
-    final = np.array([(b.error_m[-1] ** 2).sum() for b in flights])
-    predicted = np.array([b.predicted_m[-1] ** 2 for b in flights])
+    final, predicted = squared_ends(flights)
     vector = np.array([((b.error_m - b.mean_m) ** 2).sum(1).mean() for b in flights])
     magnitude = np.array([(magnitude_residual(b) ** 2).mean() for b in flights])
     inside = [(np.abs(b.error_m - b.mean_m) <= 3 * b.sigma_m + 1e-9).mean() for b in flights]
     one = np.ones(len(flights))
     return Scores(
-        flights=len(flights),
-        rmse_m=pooled(squared_error, one),
-        final_m=pooled(final, one),
-        predicted_m=pooled(predicted, one),
-        ratio=pooled(predicted, final),
-        vector_m=pooled(vector, one),
-        magnitude_m=pooled(magnitude, one),
-        vector_over_rmse=pooled(vector, squared_error),
-        magnitude_over_rmse=pooled(magnitude, squared_error),
-        coverage=float(np.mean(inside)),
+        len(flights),
+        *pooled(squared_error, one),
+        *pooled(final, one),
+        pooled(predicted, one)[0],
+        *pooled(predicted, final),
+        pooled(vector, one)[0],
+        *pooled(vector, squared_error),
+        pooled(magnitude, one)[0],
+        *pooled(magnitude, squared_error),
+        float(np.mean(inside)),
     )
+
+
+def squared_ends(flights: Sequence[Bounds]) -> tuple[Array, Array]:
+    """(n,) squared error of the last position of every flight, and what is expected of it [m^2]."""
+    final = np.array([(b.error_m[-1] ** 2).sum() for b in flights])
+    return final, np.array([b.predicted_m[-1] ** 2 for b in flights])
 
 
 def magnitude_residual(b: Bounds) -> Array:
@@ -90,16 +104,67 @@ def expected_length(mean: Array, covariance: Array) -> Array:
     return np.sqrt(scale) * (-np.expm1(log_laplace) / np.sqrt(t)).sum(1) * (u[1] - u[0]) / np.sqrt(4 * np.pi)
 
 
-def pooled(above: Array, below: Array, draws: int = _DRAWS) -> Pooled:
+def pooled(above: Array, below: Array) -> tuple[float, Interval | None]:
     """``sqrt(mean(above) / mean(below))`` of squares (n,), with an interval over seeds, drawn in pairs."""
+
+    def root_ratio(above: Array, below: Array) -> Array:
+        return np.sqrt(np.asarray(above) / np.maximum(below, 1e-300))
+
+    value = float(root_ratio(above.mean(), below.mean()))
     n = len(above)
-    value = _root_ratio(above.mean(), below.mean())
     if n < 3:
-        return Pooled(float(value), None, None)
-    pick = np.random.default_rng(0).integers(0, n, (draws, n))
-    low, high = np.quantile(_root_ratio(above[pick].mean(1), below[pick].mean(1)), [0.025, 0.975])
-    return Pooled(float(value), float(low), float(high))
+        return value, None
+    pick = np.random.default_rng(0).integers(0, n, (_DRAWS, n))
+    low, high = np.quantile(root_ratio(above[pick].mean(1), below[pick].mean(1)), [0.025, 0.975])
+    return value, (float(low), float(high))
 
 
-def _root_ratio(above: Array, below: Array) -> Array:
-    return np.sqrt(np.asarray(above) / np.maximum(below, 1e-300))
+def rows(cells: Sequence[Cell], store: Store) -> list[dict[str, Any]]:
+    """One entry per experiment and mode, in the order of the cells, as scripts read it."""
+    made: dict[tuple[BoundsJob, ...], Scores] = {}
+    out: dict[tuple[str, str], dict[str, Any]] = {}
+    for cell in cells:
+        # Cells of several tables share their bounds, and the work.
+        found = made.get(cell.jobs) or made.setdefault(cell.jobs, score(cell.load(store)))
+        key = (cell.experiment.key, cell.mode)
+        row = out.setdefault(key, {**_head(cell.experiment), "mode": cell.mode, "seeds": found.seeds, "ways": {}})
+        row["ways"][cell.way] = asdict(found)
+    return list(out.values())
+
+
+def _head(e: Experiment) -> dict[str, Any]:
+    """What a row says of itself."""
+    return {
+        "key": e.key,
+        "table": e.table,
+        "title": e.title,
+        "method": e.method,
+        "sigma_px": list(e.sigma_px) if e.method == "pointing_matching" else None,
+        "warning": e.warning,
+        "stands_in": e.stands_in,
+        "thesis": None if e.published is None else e.published.document(),
+    }
+
+
+def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What is asked of the full model, row by row, and whether it is met; None where too few seeds tell."""
+    out = []
+    for row in rows:
+        found = row["ways"].get("full")
+        if found is None or row["warning"]:
+            continue
+        low_high = found["ratio_interval"]
+        inside = RATIO[0] <= found["ratio"] <= RATIO[1]
+        contains = None if low_high is None else low_high[0] <= 1.0 <= low_high[1]
+        out.append(_target(row, f"predicted over actual in [{RATIO[0]}, {RATIO[1]}]", found["ratio"], inside))
+        out.append(_target(row, "its interval contains 1", found["ratio"], contains))
+        if row["table"] in _RESIDUAL_TABLES:
+            m, v = found["magnitude_over_rmse"], found["vector_over_rmse"]
+            out.append(_target(row, f"magnitude residual below {MAGNITUDE_BELOW} of RMSE", m, m < MAGNITUDE_BELOW))
+            # A model without a mean leaves the error as it is: rounding must not fail it.
+            out.append(_target(row, "vector residual not above RMSE", v, v <= VECTOR_UP_TO + 1e-9))
+    return out
+
+
+def _target(row: Mapping[str, Any], what: str, value: float, met: bool | None) -> dict[str, Any]:
+    return {"key": row["key"], "mode": row["mode"], "target": what, "value": value, "met": met}

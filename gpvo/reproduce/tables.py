@@ -1,10 +1,12 @@
-"""The tables as text: CSV for spreadsheets, Markdown for people."""
+"""The result for people: tables as CSV and Markdown, and one self-contained page with the same numbers."""
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 MODES = {"images": "images", "points": "points only", "real": "real"}
@@ -42,17 +44,28 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return stream.getvalue()
 
 
+def sections(document: Mapping[str, Any]) -> list[tuple[str, Sequence[Mapping[str, Any]]]]:
+    """Titles and rows of the tables that have any."""
+    titles = {
+        "rows": "Tables 4.1 to 4.6",
+        "sensitivity": "Sensitivity to sigma_p and sigma_m",
+        "real": "Real data",
+    }
+    return [(title, document[key]) for key, title in titles.items() if document[key]]
+
+
+def lists(document: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
+    """Titles and lines of the remarks that there are."""
+    titles = {"errata": "Errata", "out_of_scope": "Out of scope", "failed": "Not flown"}
+    return [(title, document[key]) for key, title in titles.items() if document[key]]
+
+
 def as_markdown(document: Mapping[str, Any]) -> str:
     """All tables of the document."""
     parts = ["# The thesis' experiments, reproduced", ""]
     parts += [f"* {line}" for line in document["notes"]]
-    for title, rows in (
-        ("Tables 4.1 to 4.6", document["rows"]),
-        ("Sensitivity to sigma_p and sigma_m", document["sensitivity"]),
-        ("Real data", document["real"]),
-    ):
-        if rows:
-            parts += ["", f"## {title}", "", *_table(rows)]
+    for title, rows in sections(document):
+        parts += ["", f"## {title}", "", *_grid(HEADS, [line for row in rows for line in cells(row)])]
     parts += ["", "## What is asked of the full model", ""]
     parts += _grid(
         ("row", "flights", "target", "value", "met"),
@@ -63,10 +76,32 @@ def as_markdown(document: Mapping[str, Any]) -> str:
         parts += _grid(
             ("claim", "verdict", "evidence"), [(c["claim"], c["verdict"], c["evidence"]) for c in document["claims"]]
         )
-    for title, key in (("Errata", "errata"), ("Out of scope", "out_of_scope"), ("Not flown", "failed")):
-        if document[key]:
-            parts += ["", f"## {title}", "", *(f"* {line}" for line in document[key])]
+    for title, lines in lists(document):
+        parts += ["", f"## {title}", "", *(f"* {line}" for line in lines)]
     return "\n".join(parts) + "\n"
+
+
+def as_page(document: Mapping[str, Any], folder: Path) -> str:
+    """All tables and figures of the document as HTML; pictures are read from ``folder``."""
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, select_autoescape
+
+    # The style sheet is that of the other pages.
+    loader = ChoiceLoader([PackageLoader("gpvo.reproduce"), PackageLoader("gpvo.evaluation")])
+    environment = Environment(loader=loader, autoescape=select_autoescape(default=True), trim_blocks=True)
+    environment.filters["number"] = number
+
+    def embedded(file: str) -> str:
+        return "data:image/png;base64," + base64.b64encode((folder / file).read_bytes()).decode("ascii")
+
+    return environment.get_template("reproduce.html").render(
+        result=document,
+        groups=[(title, [line for row in rows for line in cells(row)]) for title, rows in sections(document)],
+        heads=HEADS,
+        modes=MODES,
+        verdict=verdict,
+        pictures=[{**f, "data": embedded(f["file"])} for f in document["figures"]],
+        lists=lists(document),
+    )
 
 
 def verdict(met: bool | None) -> str:
@@ -98,10 +133,6 @@ def cells(row: Mapping[str, Any]) -> list[tuple[str, ...]]:
             )
         )  # fmt: skip
     return out
-
-
-def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    return _grid(HEADS, [line for row in rows for line in cells(row)])
 
 
 def _grid(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:

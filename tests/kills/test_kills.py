@@ -33,7 +33,7 @@ REPRODUCE = """
 import sys
 from pathlib import Path
 from gpvo.reproduce.plan import Plan
-from gpvo.reproduce.result import reproduce
+from gpvo.reproduce.run import reproduce
 training = {"images": 0, "points": 2}
 reproduce(Plan(seeds=0, points_seeds=2, training=training, duration_s=5.0, only=("4.3",)), Path(sys.argv[1]))
 """

@@ -1,7 +1,7 @@
 """The declared list: the thesis' figures as printed, every row with flights and models."""
 
 import pytest
-from gpvo.reproduce import document
+from gpvo.reproduce.bounds import method_of
 from gpvo.reproduce.experiments import (
     EXPERIMENTS,
     FLIGHTS,
@@ -11,7 +11,6 @@ from gpvo.reproduce.experiments import (
     printed,
     sigma_pairs,
 )
-from gpvo.reproduce.sayings import saying_of
 
 # Table, RMSE, final and predicted final error [m], residual of the GP.
 PRINTED = [
@@ -37,10 +36,10 @@ def test_every_row_of_the_thesis_is_there():
 
 
 def test_the_ratios_of_the_thesis_are_as_the_thesis_has_them():
-    ratios = [document.published(e.published)["ratio"] for e in EXPERIMENTS if e.published]
+    ratios = [e.published.document()["ratio"] for e in EXPERIMENTS if e.published]
     assert min(ratios) == pytest.approx(1.3, abs=0.06)
     assert max(ratios) == pytest.approx(2.4, abs=0.05)
-    gp = [document.published(e.published)["residual_over_rmse"] for e in EXPERIMENTS if e.published]
+    gp = [e.published.document()["residual_over_rmse"] for e in EXPERIMENTS if e.published]
     assert all(r > 1.0 for r in gp if r is not None)
 
 
@@ -61,12 +60,12 @@ def test_what_is_printed_without_a_square_is_kept_in_the_recipe_alone():
     assert printed((0.1, 0.5))[0] ** 2 == pytest.approx(0.1)
     assert printed((0.1, 0.5)) in sigma_pairs(row.flights, "thesis")
     assert row.sigma_px in sigma_pairs(row.flights, "fast")
-    assert saying_of(row, "recipe").kind == "v_t"
-    assert saying_of(row, "recipe").method != saying_of(row, "corrected").method
-    assert saying_of(row, "recipe").preset == "thesis"
+    assert method_of(row, "recipe").kind == "v_t"
+    assert method_of(row, "recipe").name != method_of(row, "corrected").name
+    assert method_of(row, "recipe").preset == "thesis"
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_ways_of_a_gp_row(way):
     row = next(e for e in EXPERIMENTS if e.key == "4.3")
-    assert saying_of(row, way).kind == {"recipe": "position", "corrected": "motion", "full": "learned"}[way]
+    assert method_of(row, way).kind == {"recipe": "position", "corrected": "motion", "full": "learned"}[way]

@@ -15,10 +15,10 @@ import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.reproduce import tables
-from gpvo.reproduce.flights import fly
-from gpvo.reproduce.plan import Plan, flights_of
-from gpvo.reproduce.result import reproduce
-from gpvo.reproduce.store import Store, only_user
+from gpvo.reproduce.flights import flights_of, fly
+from gpvo.reproduce.plan import Plan
+from gpvo.reproduce.run import reproduce
+from gpvo.reproduce.stages import Store, only_user
 from typer.testing import CliRunner
 
 SMALL = {"seeds": 0, "points_seeds": 2, "training": {"images": 0, "points": 2}, "duration_s": 5.0, "only": ("4.3",)}
@@ -26,7 +26,7 @@ SCRIPT = f"""
 import sys
 from pathlib import Path
 from gpvo.reproduce.plan import Plan
-from gpvo.reproduce.result import reproduce
+from gpvo.reproduce.run import reproduce
 reproduce(Plan(**{SMALL!r}), Path(sys.argv[1]))
 """
 

@@ -1,14 +1,14 @@
-"""What is kept between runs: files named by the digest of what they were made from, each whole or not at all."""
+"""Work kept between runs, in files named by the digest of what they were made from, each whole or not at all."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.io import atomic
 from gpvo.io.folder_lock import FolderLock
 from gpvo.io.jsonfile import plain
+from gpvo.learning.parallel import map_jobs
 
+Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 _LENGTH = 12
 
 
@@ -34,7 +36,8 @@ def digest_of_file(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Store:
-    """A folder of stages: ``paths``, ``flights`` (on their way to odometry), ``runs``, ``models``, ``bounds``."""
+    """A folder of stages: ``paths``, ``flights`` (on their way to odometry), ``runs``, ``models``, ``bounds`` and
+    ``likelihoods``."""
 
     root: Path
 
@@ -46,6 +49,46 @@ class Store:
         except OSError as error:
             raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
         return path
+
+
+class Stage(Protocol):
+    """Something to make once: a file whose name says what it is made from."""
+
+    def path(self, store: Store) -> Path:
+        """Where it lies. Names of runs and models hold the digests of what they were made from in turn."""
+
+    def make(self, path: Path, store: Store) -> None:
+        """Compute it and write it there, whole or not at all."""
+
+
+def keep(stage: Stage, store: Store) -> Path:
+    """Make a stage, unless it is there."""
+    path = stage.path(store)
+    if not path.is_file():
+        stage.make(path, store)
+    return path
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where jobs run, and who is told of progress."""
+
+    jobs: int = 1
+    backend: str = "local"
+    scheduler: str | None = None
+    progress: Progress = lambda what, total: nullcontext(lambda: None)
+
+    def map(self, what: str, function: Callable[..., Any], jobs: Iterable[Any], store: Store) -> list[Any]:
+        """``function(job, store)`` of every job, in order."""
+        listed = [(job, store) for job in jobs]
+        with self.progress(what, len(listed)) as done:
+            return map_jobs(
+                function, listed, jobs=self.jobs, backend=self.backend, scheduler=self.scheduler, on_done=done
+            )
+
+    def keep(self, what: str, stages: Iterable[Stage], store: Store) -> None:
+        """Make every stage, each once."""
+        self.map(what, keep, dict.fromkeys(stages), store)
 
 
 @contextmanager
