@@ -35,7 +35,7 @@ def forecast(
     """
     from gpvo.cli.output import print_json
     from gpvo.evaluation.forecast import forecast as run_forecast
-    from gpvo.evaluation.plan import read_plan
+    from gpvo.evaluation.forecast import read_plan
     from gpvo.online.predictor import Predictor
 
     if out is not None and out.suffix not in (".parquet", ".csv"):
@@ -122,8 +122,8 @@ def _print(f: Forecast, path: Path, frame: str) -> None:
 
 def _write(out: Path, f: Forecast) -> None:
     """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
-    from gpvo.io.csvfile import write_csv
     from gpvo.io.parquet_write import write_table
+    from gpvo.io.tables import write_csv
 
     position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
     columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}
@@ -138,11 +138,11 @@ def _write(out: Path, f: Forecast) -> None:
 
 
 def _draw(plot: Path, f: Forecast, title: str) -> None:
-    from gpvo.evaluation.forecast_figure import draw
+    from gpvo.evaluation import plots
     from gpvo.io.atomic import replacing
 
     with replacing(plot) as temporary:
-        draw(f, title).savefig(temporary, dpi=110, format="png")
+        plots.forecast(f, title).savefig(temporary, dpi=110, format="png")
 
 
 def register(app: typer.Typer) -> None:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from gpvo.accumulation import PoseError
 from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation.statements import Statement
-from gpvo.evaluation.trajectory import path_length_m
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import Interval, block_bootstrap
 from gpvo.stats.consistency import (
@@ -115,7 +114,7 @@ def consistency(
     covered = [float(c) for c in coverage(e, sigma)]
     quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
-    progress = path_length_m(T_true), (log.t_ns - log.t_ns[0]) * 1e-9
+    progress = se3.path_length_m(T_true[:, :3, 3]), (log.t_ns - log.t_ns[0]) * 1e-9
     return Consistency(
         method=statement.method,
         count=int(stated.sum()),

@@ -18,7 +18,7 @@ from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m
 from gpvo.errors import GpvoError, SourceError
-from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon, consistency
+from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.poses import PoseConsistency, pose_consistency, pose_document
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
@@ -28,6 +28,7 @@ from gpvo.online.predictor import Predictor
 from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Prediction, Status, TruthLog, VoLog
 
+_UNITS = ("translation_m", "rotation_rad")
 METHODS = (
     "constant",
     "triangulation",
@@ -267,16 +268,13 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "truth_sigma_axes": e.truth_sigma.tolist(),
         "truth_sigma_stated": _by_kind(e.truth_sigma_stated),
         "truth_tells_from_m": e.tells_from_m,
-        "fixed_rotation": None if e.turned is None else _plain(e.turned),
-        "rpe": {
-            name: {"translation_m": _plain(getattr(t, key).translation_m), "rotation_rad": _plain(getattr(t,
-            key).rotation_rad)} for name, key in (("frame", "rpe_frame"), ("1s", "rpe_second"), ("10m", "rpe_10m"))
-        },
-        "segments": [_plain(s) for s in t.segments],
+        "fixed_rotation": None if e.turned is None else asdict(e.turned),
+        "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},
+        "segments": [asdict(s) for s in t.segments],
         "poses": pose_document(e.poses),
         "verdict": asdict(verdict(e)),
         "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
-    }  # fmt: skip
+    }
 
 
 def _by_kind(sigma: Array) -> dict[str, float]:
@@ -288,45 +286,37 @@ def _methods_of(e: Evaluation) -> list[str]:
     return [*METHODS, *(m for m in e.consistency if m not in METHODS)]
 
 
-def _plain(value: Any) -> dict[str, Any]:
-    return {name: getattr(value, name) for name in value.__dataclass_fields__}
-
-
 def _horizon(h: Horizon | None) -> dict[str, Any]:
     keys = ("nees_dof", "nees_dof_truth_noise", "z2_truth_noise")
     return {k: getattr(h, k, None) for k in keys} | {"count": 0 if h is None else h.count}
 
 
 def _method_document(c: Consistency | None) -> dict[str, Any]:
-    blocks = ("translation", "rotation", "joint")
-    if c is None:
-        none = dict.fromkeys(blocks)
-        return {
-            "nees_dof": none, "nees_dof_interval": none, "nees_dof_median": none, "nees_dof_truth_noise": none,
-            "coverage": dict.fromkeys("123"), "nll_per_dim": None,
-            "nll_stated_per_dim": None, "nees_dof_median_stated": None,
-            "crps": {"translation_m": None, "rotation_rad": None},
-            "energy": {"translation_m": None, "rotation_rad": None}, "correlation_gain_nats": None,
-            "by_difficulty": {"nees_dof": None, "coverage": None}, "predicted_final_error_m": None,
-            "predicted_final_error_independent_m": None, "one_second": _horizon(None),
-            "horizons": [{"length_m": m, **_horizon(None)} for m in HORIZONS_M],
-        }  # fmt: skip
-    intervals = c.nees_dof
+    """Scores of one method; of one that says nothing the same entries, all None."""
+
+    def of(name: str) -> Any:
+        return getattr(c, name, None)
+
+    def by_block(name: str) -> dict[str, Any]:
+        return of(name) or dict.fromkeys(BLOCKS)
+
     return {
-        "nees_dof": {b: i.mean if (i := intervals[b]) else None for b in blocks},
-        "nees_dof_interval": {b: [i.low, i.high] if (i := intervals[b]) else None for b in blocks},
-        "nees_dof_median": c.nees_dof_median,
-        "nees_dof_truth_noise": c.nees_dof_truth_noise,
-        "coverage": dict(zip("123", c.coverage, strict=True)),
-        "nll_per_dim": c.nll_per_dim,
-        "nll_stated_per_dim": c.nll_stated_per_dim,
-        "nees_dof_median_stated": c.nees_dof_median_stated,
-        "crps": {"translation_m": c.crps_translation_m, "rotation_rad": c.crps_rotation_rad},
-        "energy": {"translation_m": c.energy_translation_m, "rotation_rad": c.energy_rotation_rad},
-        "correlation_gain_nats": c.correlation_gain_nats,
-        "by_difficulty": {"nees_dof": c.nees_dof_by_difficulty, "coverage": c.coverage_by_difficulty},
-        "predicted_final_error_m": c.predicted_final_error_m,
-        "predicted_final_error_independent_m": c.predicted_final_error_independent_m,
-        "one_second": _horizon(c.one_second),
-        "horizons": [{"length_m": m, **_horizon(h)} for m, h in itertools.zip_longest(HORIZONS_M, c.horizons)],
+        "nees_dof": {b: i and i.mean for b, i in by_block("nees_dof").items()},
+        "nees_dof_interval": {b: i and [i.low, i.high] for b, i in by_block("nees_dof").items()},
+        "nees_dof_median": by_block("nees_dof_median"),
+        "nees_dof_truth_noise": by_block("nees_dof_truth_noise"),
+        "coverage": dict(zip("123", of("coverage") or [None] * 3, strict=True)),
+        "nll_per_dim": of("nll_per_dim"),
+        "nll_stated_per_dim": of("nll_stated_per_dim"),
+        "nees_dof_median_stated": of("nees_dof_median_stated"),
+        "crps": {unit: of(f"crps_{unit}") for unit in _UNITS},
+        "energy": {unit: of(f"energy_{unit}") for unit in _UNITS},
+        "correlation_gain_nats": of("correlation_gain_nats"),
+        "by_difficulty": {name: of(f"{name}_by_difficulty") for name in ("nees_dof", "coverage")},
+        "predicted_final_error_m": of("predicted_final_error_m"),
+        "predicted_final_error_independent_m": of("predicted_final_error_independent_m"),
+        "one_second": _horizon(of("one_second")),
+        "horizons": [
+            {"length_m": m, **_horizon(h)} for m, h in itertools.zip_longest(HORIZONS_M, of("horizons") or ())
+        ],
     }

@@ -8,32 +8,32 @@ much VO's error rose; writes the same as Markdown, JSON and a figure. Flights th
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gpvo.dataset.build import build_run
-from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
-from gpvo.evaluation.fusion_figure import plot_experiment
 from gpvo.evaluation.fusion_flights import (
     FIRST_TEST_SEED,
     Campaign,
     Rise,
-    refuse_training_seeds,
+    check_numbers,
+    experiment_parser,
     rise,
     training_runs,
     unseen_runs,
     with_accidents,
 )
+from gpvo.evaluation.fusion_plot import experiment_figure, save
 from gpvo.evaluation.fusion_report import document
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
 from gpvo.filters.study import Study, fit_scalars, make_policies, study
+from gpvo.io.atomic import write_text
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run import Run
+from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets
@@ -101,14 +101,14 @@ def markdown(outcome: Outcome) -> str:
     result = outcome.study
     names = list(result.scores)
     parts = [f"# {outcome.title}", "", f"{len(result.runs)} flights that no model and no constant has seen.", ""]
-    parts += _table(["policy", *(c[0] for c in _COLUMNS), "diverged"], [_mean_row(result, n) for n in names])
+    parts += markdown_table(["policy", *(c[0] for c in _COLUMNS), "diverged"], [_mean_row(result, n) for n in names])
     parts += ["", f"VO in the episodes: {outcome.rise}.", ""]
     parts += [f"* {result.compare(LEARNED, other)}" for other in names if other != LEARNED]
     if result.constants:
         parts += ["", f"Factors on the constant's variances (translation, rotation): best {result.constants.best}, "]
         parts[-1] += f"hindsight {result.constants.hindsight}."
     parts += ["", "## Every run: ATE [m], and the learned policy's NEES per degree of freedom", ""]
-    return "\n".join(parts + _table(["run", *names, "position", "attitude"], _run_rows(result))) + "\n"
+    return "\n".join(parts + markdown_table(["run", *names, "position", "attitude"], _run_rows(result))) + "\n"
 
 
 def _mean_row(result: Study, name: str) -> list[str]:
@@ -124,20 +124,13 @@ def _run_rows(result: Study) -> list[list[str]]:
     ]
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    cells = [head, ["---"] * len(head), *rows]
-    return [f"| {' | '.join(row)} |" for row in cells]
-
-
 def write(outcome: Outcome, stem: Path) -> None:
     """``stem.md``, ``stem.json`` and ``stem.png``."""
-    text = stem.with_suffix(".md.part")
-    text.write_text(markdown(outcome), encoding="utf-8")
-    text.replace(stem.with_suffix(".md"))
+    write_text(stem.with_suffix(".md"), markdown(outcome))
     risen = outcome.rise
     extra = {"share": risen.share, "standard_deviation": risen.standard_deviation, "median": risen.median}
     write_json(stem.with_suffix(".json"), {**document(outcome.report), "title": outcome.title, "rise": extra})
-    plot_experiment(outcome.study, outcome.title, stem.with_suffix(".png"))
+    save(experiment_figure(outcome.study, outcome.title), stem.with_suffix(".png"))
 
 
 def trained(training: Sequence[Run], path: Path) -> Path:
@@ -148,20 +141,13 @@ def trained(training: Sequence[Run], path: Path) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of the experiment."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = experiment_parser(__doc__, 12, 50, FIRST_TEST_SEED, "experiment")
     parser.add_argument("scenario", help="such as tunnel-bursts, tunnel-clean, tunnel-noise")
-    parser.add_argument("--train", type=int, default=12, help="training flights")
-    parser.add_argument("--test", type=int, default=50, help="test flights")
-    parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="of the first test flight")
     parser.add_argument("--pictures", action="store_true", help="draw the pictures: real VO, a hundred times slower")
     parser.add_argument("--duration", type=float, help=f"s; default {_POINTS_S:g}, with pictures {_PICTURES_S:g}")
     parser.add_argument("--model", type=Path, help="use this model, such as one trained on points, in place of a new")
-    parser.add_argument("-o", "--out", type=Path, default=Path("experiment"), help="folder for runs and results")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes that fly")
     given = parser.parse_args(arguments)
-    if given.train < 2 or given.test < 2:
-        raise GpvoError("too few flights to learn or to judge", cure="--train and --test of 2 at least")
-    refuse_training_seeds(given.train, given.test, given.test_seed)
+    check_numbers(given)
     duration = given.duration or (_PICTURES_S if given.pictures else _POINTS_S)
     campaign = Campaign(given.scenario, given.out, duration, given.pictures)
     training = training_runs(campaign, given.train, given.jobs)

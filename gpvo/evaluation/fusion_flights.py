@@ -5,6 +5,8 @@ Every fourth test flight has accidents: two seconds of darkness, frozen pictures
 
 from __future__ import annotations
 
+import argparse
+import os
 import shutil
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -50,10 +52,24 @@ class Campaign:
         return self.folder / f"{self.scenario}-{kind}-{seed:04d}{_ACCIDENTS if accidents else ''}"
 
 
-def refuse_training_seeds(train: int, test: int, first_test_seed: int) -> None:
-    """Raise GpvoError where one of so many test flights is a training flight."""
-    if first_test_seed < FIRST_TRAIN_SEED + train and first_test_seed + test > FIRST_TRAIN_SEED:
-        raise GpvoError("test flights are among the training flights", cure=f"--test-seed {FIRST_TRAIN_SEED + train}")
+def experiment_parser(about: str | None, train: int, test: int, test_seed: int, out: str) -> argparse.ArgumentParser:
+    """The command line that experiments share, with these defaults."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train", type=int, default=train, help="training flights of each scenario")
+    parser.add_argument("--test", type=int, default=test, help="test flights of each scenario")
+    parser.add_argument("--test-seed", type=int, default=test_seed, help="seed of the first test flight")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes that fly")
+    parser.add_argument("-o", "--out", type=Path, default=Path(out), help="folder for runs and results")
+    return parser
+
+
+def check_numbers(given: argparse.Namespace) -> None:
+    """Raise GpvoError for too few flights, and where a test flight is a training flight."""
+    if given.train < 2 or given.test < 2:
+        raise GpvoError("too few flights to learn or to judge", cure="--train and --test of 2 at least")
+    after = FIRST_TRAIN_SEED + given.train
+    if given.test_seed < after and given.test_seed + given.test > FIRST_TRAIN_SEED:
+        raise GpvoError("test flights are among the training flights", cure=f"--test-seed {after}")
 
 
 def training_runs(campaign: Campaign, count: int, jobs: int = 1) -> list[Run]:

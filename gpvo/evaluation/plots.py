@@ -1,4 +1,4 @@
-"""Pictures of one run: data in, matplotlib ``Figure`` out."""
+"""Pictures of one run, and of a forecast: data in, matplotlib ``Figure`` out."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.patches import Ellipse
 
 from gpvo.evaluation import curves
 from gpvo.evaluation.evaluate import Evaluation
+from gpvo.evaluation.forecast import Forecast
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.atomic import replacing
 from gpvo.stats.series import allan_deviation, autocorrelation
@@ -64,12 +65,46 @@ def trajectory(e: Evaluation) -> Figure:
 
 
 def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
-    """Axes to draw in. Truth in a camera's world (y down, as KITTI's) is turned so that the third axis points up."""
-    first = e.T_true[e.covered][0] if e.covered.any() else e.T_est[0]
-    down = first[:3, :3] @ np.array([0.0, 1.0, 0.0])
+    """Axes to draw in, so that the third points up."""
+    return _level_of(e.T_true[e.covered][0] if e.covered.any() else e.T_est[0])
+
+
+def _level_of(T_world_cam: Array) -> tuple[Array, tuple[str, str, str]]:
+    """By the first pose. A camera's world (y down, as KITTI's) is turned."""
+    down = T_world_cam[:3, :3] @ np.array([0.0, 1.0, 0.0])
     if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
         return R_FLU_OPTICAL, ("forward z", "left -x", "up -y")
     return np.eye(3), ("x", "y", "z")
+
+
+def forecast(f: Forecast, title: str) -> Figure:
+    """Of a planned path: top view with 3-sigma ellipses and sigma over the distance, one above the other."""
+    figure = Figure(figsize=(8, 8), layout="constrained")
+    top, below = figure.subplots(2, 1, height_ratios=(2, 1))
+    to_plane, names = _level_of(f.plan.T_world_cam[0])
+    p = f.plan.T_world_cam[:, :3, 3] @ to_plane.T
+    C = to_plane @ f.position_covariance @ to_plane.T
+    top.plot(p[:, 0], p[:, 1], color="black", lw=1.2, label="plan")
+    far = np.concatenate([[False], f.in_domain < 0.5])
+    if far.any():
+        top.plot(p[far, 0], p[far, 1], ".", color="#d62728", ms=3, label="outside the training domain")
+    for k in np.unique(np.linspace(1, len(p) - 1, 12).astype(int)):
+        # As an artist the ellipse does not stretch the axes: a vast bound must not hide the path.
+        top.add_artist(_ellipse(p[k, :2], C[k, :2, :2]))
+    top.plot([], [], color=colour("learned"), lw=0.8, label="3-sigma bound of the position")
+    top.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", title=title)
+    top.set_aspect("equal", adjustable="datalim")
+    top.margins(0.15)
+    _legend(top)
+    distance = f.plan.distance_m
+    for j, axis in enumerate("xyz"):
+        below.plot(distance, f.position_sigma_m[:, j], lw=1, label=axis)
+    below.plot(distance, f.sigma_m, color="black", lw=1.4, label="all three")
+    below.set(xlabel="distance [m]", ylabel="sigma of the position [m]")
+    _legend(below, columns=4)
+    for ax in (top, below):
+        ax.grid(alpha=0.3)
+    return figure
 
 
 def _ellipse(centre: Array, C: Array) -> Ellipse:

@@ -10,7 +10,6 @@ and interval, as its calibration is one draw. Flights that the folder holds are 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,10 +24,11 @@ from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
 from gpvo.evaluation.evaluate import judged, predictions_by_stamp
-from gpvo.evaluation.fusion_flights import Campaign, flights, refuse_training_seeds, training_runs
+from gpvo.evaluation.fusion_flights import Campaign, check_numbers, experiment_parser, flights, training_runs
 from gpvo.evaluation.statements import statements
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run import Run, read_run
+from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
@@ -143,13 +143,13 @@ def markdown(results: Mapping[str, Mapping[str, MethodScores]]) -> str:
     """One row per scenario and method: NEES per degree of freedom with 95 % intervals over flights, median, NLL,
     predicted over actual final error."""
     head = ["scenario", "method", "flights", *(f"NEES, {c}" for c in NEES_COLUMNS), "median", "NLL", "final"]
-    rows = [head, ["---"] * len(head)]
+    rows = []
     for scenario, methods in results.items():
         for method, s in methods.items():
             cells = [_cell(s, i) for i in range(len(NEES_COLUMNS))]
             ends = [f"{s.median.mean():.2f}", f"{s.nll.mean():.3f}", f"{s.final_ratio:.2f}"]
             rows.append([scenario, method, str(len(s.nll)), *cells, *ends])
-    return "\n".join(f"| {' | '.join(r)} |" for r in rows)
+    return "\n".join(markdown_table(head, rows))
 
 
 def _cell(scores: MethodScores, column: int) -> str:
@@ -176,21 +176,15 @@ def document(results: Mapping[str, Mapping[str, MethodScores]]) -> dict[str, Any
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of the experiment."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = experiment_parser(__doc__, 10, 12, FIRST_TEST_SEED, "scenarios")
     parser.add_argument("scenarios", nargs="*", default=list(DURATIONS_S), help="default: all")
-    parser.add_argument("--train", type=int, default=10, help="training flights of each scenario")
-    parser.add_argument("--test", type=int, default=12, help="test flights of each scenario")
-    parser.add_argument("--test-seed", type=int, default=FIRST_TEST_SEED, help="seed of the first test flight")
     parser.add_argument("--duration", type=float, help="of a flight [s]; default: far enough for 100 m")
     parser.add_argument("--together", action="store_true", help="also one model of all scenarios of equal rate")
     parser.add_argument("--twins", type=int, default=0, help="also a model of so many twins of each test flight")
-    parser.add_argument("--jobs", type=int, default=1, help="processes that fly")
-    parser.add_argument("-o", "--out", type=Path, default=Path("scenarios"), help="folder for runs and results")
     given = parser.parse_args(arguments)
-    unknown = [s for s in given.scenarios if s not in DURATIONS_S]
-    if unknown or given.train < 2 or given.test < 2:
-        raise GpvoError(f"cannot judge {unknown or 'so few flights'}", cure="names of --help; two flights at least")
-    refuse_training_seeds(given.train, given.test, given.test_seed)
+    if unknown := [s for s in given.scenarios if s not in DURATIONS_S]:
+        raise GpvoError(f"cannot judge {unknown}", cure=f"one of {', '.join(DURATIONS_S)}")
+    check_numbers(given)
     results: dict[str, dict[str, MethodScores]] = {}
     flown = []
     for name in given.scenarios:

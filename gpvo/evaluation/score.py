@@ -16,11 +16,11 @@ import numpy as np
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run
 from gpvo.geometry import se3
-from gpvo.io.csvfile import write_csv
 from gpvo.io.foreign import read_foreign, to_records
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run_read import Run
 from gpvo.io.stated import read_stated, write_stated
+from gpvo.io.tables import write_csv
 from gpvo.io.trajectory import read_tum, write_tum
 from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpvo.evaluation.evaluate import Evaluation, document
 from gpvo.io.atomic import write_text
-from gpvo.io.csvfile import write_csv
+from gpvo.io.tables import write_csv
 from gpvo.io.trajectory import write_tum
 from gpvo.online.features import AXES
 

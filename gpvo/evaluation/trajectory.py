@@ -83,12 +83,6 @@ class TrajectoryErrors:
     segments: tuple[Segment, ...]
 
 
-def path_length_m(T: Array) -> Array:
-    """(N,) length of the path up to each pose."""
-    steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def relative_errors(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
     """``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,): (M, 4, 4)."""
     d_est = se3.inverse(T_est[start]) @ T_est[end]
@@ -118,7 +112,7 @@ def segments(T_est: Array, T_true: Array, lengths_m: Sequence[float], every: int
 
     NaN, and a count of 0, for a length that the path does not reach.
     """
-    arc = path_length_m(T_true)
+    arc = se3.path_length_m(T_true[:, :3, 3])
     out = []
     for length in lengths_m:
         start, end = pairs_ahead(arc, length, every)
@@ -147,7 +141,7 @@ def trajectory_errors(
     and of a second are not taken across such a gap.
     """
     frame = np.arange(len(t_ns)) if frame is None else frame
-    arc = path_length_m(T_true)
+    arc = se3.path_length_m(T_true[:, :3, 3])
     lengths = lengths_m or (LONG_M if arc[-1] > _LONG_PATH_M else SHORT_M)
     from_start = se3.inverse(T_true[0]) @ T_true
     drift = (T_est[0] @ from_start)[:, :3, 3] - T_est[:, :3, 3]

@@ -238,3 +238,9 @@ def orthonormalise(T: Array) -> Array:
     sign = np.linalg.det(U @ Vt)
     U = U * np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)[..., None, :]
     return from_rt(U @ Vt, T[..., :3, 3])
+
+
+def path_length_m(position_m: Array) -> Array:
+    """(N,) length of a path of straight lines up to each of its points (N, d)."""
+    steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -63,11 +63,10 @@ def bounds_of(run: Run, mean_m: Array, covariance_m2: Array) -> Bounds:
     T_est, first = run.log.trajectory(), int(np.argmax(known))
     T_first_world = T_est[first] @ se3.inverse(T_true[first])
     true_m = (T_first_world @ T_true)[known, :3, 3]
-    steps = np.linalg.norm(np.diff(true_m, axis=0), axis=1)
     return Bounds(
         name=run.name,
         t_s=(run.log.t_ns[known] - run.log.t_ns[0]) * 1e-9,
-        path_m=np.concatenate([[0.0], np.cumsum(steps)]),
+        path_m=se3.path_length_m(true_m),
         error_m=T_est[known, :3, 3] - true_m,
         mean_m=mean_m[known],
         covariance_m2=covariance_m2[known],

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gpvo.io.tables import markdown_table
+
 MODES = {"images": "images", "points": "points only", "real": "real"}
 _THESIS = ("rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "residual_m", "residual_over_rmse")
 _OURS = (
@@ -65,15 +67,15 @@ def as_markdown(document: Mapping[str, Any]) -> str:
     parts = ["# The thesis' experiments, reproduced", ""]
     parts += [f"* {line}" for line in document["notes"]]
     for title, rows in sections(document):
-        parts += ["", f"## {title}", "", *_grid(HEADS, [line for row in rows for line in cells(row)])]
+        parts += ["", f"## {title}", "", *markdown_table(HEADS, [line for row in rows for line in cells(row)])]
     parts += ["", "## What is asked of the full model", ""]
-    parts += _grid(
+    parts += markdown_table(
         ("row", "flights", "target", "value", "met"),
         [(t["key"], MODES[t["mode"]], t["target"], number(t["value"]), verdict(t["met"])) for t in document["targets"]],
     )
     if document["claims"]:
         parts += ["", "## The thesis' claims", ""]
-        parts += _grid(
+        parts += markdown_table(
             ("claim", "verdict", "evidence"), [(c["claim"], c["verdict"], c["evidence"]) for c in document["claims"]]
         )
     for title, lines in lists(document):
@@ -133,10 +135,3 @@ def cells(row: Mapping[str, Any]) -> list[tuple[str, ...]]:
             )
         )  # fmt: skip
     return out
-
-
-def _grid(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
-    def line(values: Sequence[str]) -> str:
-        return "| " + " | ".join(v.replace("|", "\\|") for v in values) + " |"
-
-    return [line(heads), line(["---"] * len(heads)), *(line(values) for values in lines)]

@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.geometry.se3 import path_length_m
 from gpvo.sim.imu import Motion
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array
 
@@ -57,7 +58,7 @@ def along_curve(
     The speed varies by a third around ``speed_mps``. ``agility`` multiplies how quickly it sways, turns and changes
     speed. Where the curve ends before the time does, the flight slows and hovers there.
     """
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    arc = path_length_m(centre)
     curve = make_interp_spline(arc, gaussian_filter1d(centre, 3.0, axis=0, mode="nearest"), k=5)
     t = knots(duration_s)
     pace = smooth_start(t, rest_s)
@@ -137,12 +138,12 @@ def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float 
         For fewer than two points, or two equal ones in a row.
     """
     corners = np.asarray(points, float).reshape(-1, 3)
-    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    chord = path_length_m(corners)
     if len(corners) < 2 or (np.diff(chord) < 1e-3).any():
         raise GpvoError("waypoints need at least two places, none twice in a row", cure="waypoints = [[x, y, z], ...]")
     curve = make_interp_spline(chord, corners, k=min(3, len(corners) - 1))
     fine = np.linspace(0.0, chord[-1], max(2000, int(50 * chord[-1])))
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
+    along = path_length_m(curve(fine))
     at_arc = CubicSpline(along, fine)
     t = knots(duration_s)
     u = at_arc(soft_end(speed_mps * smooth_start(t, rest_s), along[-1], 0.5 * speed_mps))

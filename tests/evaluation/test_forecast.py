@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from gpvo import cli
 from gpvo.errors import ModelError
-from gpvo.evaluation.forecast import forecast
-from gpvo.evaluation.plan import Plan, resample
+from gpvo.evaluation.forecast import Plan, forecast, resample
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.trajectory import Trajectory, write_tum

@@ -85,7 +85,7 @@ def read_log(path: Path) -> None:
 
 
 def read_planned_path(path: Path) -> None:
-    from gpvo.evaluation.plan import read_plan
+    from gpvo.evaluation.forecast import read_plan
 
     assert np.isfinite(read_plan(path, 0.1).motions).all(), "a motion that is none"
 

@@ -1,4 +1,4 @@
-"""Tables for people: CSV."""
+"""Tables for people: CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -19,3 +19,9 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     plain = (c.tolist() if hasattr(c, "tolist") else c for c in columns.values())
     writer.writerows([None if v != v else v for v in row] for row in zip(*plain, strict=True))
     write_text(path, stream.getvalue())
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table in Markdown."""
+    cells = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(v.replace("|", "\\|") for v in row) + " |" for row in cells]
