@@ -17,7 +17,6 @@ from rich.console import Console
 
 from gpvo import __version__
 from gpvo.cli import (
-    calibration,
     common,
     evaluate,
     files,
@@ -58,25 +57,29 @@ def _root(
     """Options that stand before the command."""
 
 
-for group in (
-    simulate,
-    run,
-    calibration,
-    files,
-    twin,
-    learn,
-    evaluate,
-    score,
-    forecast,
-    fuse,
-    live,
-    reproduce,
-    selftest,
+for command in (
+    simulate.simulate,
+    run.run,
+    run.calibration,
+    files.info,
+    files.import_,
+    twin.twin,
+    learn.train,
+    learn.predict,
+    learn.check,
+    learn.export,
+    evaluate.evaluate,
+    evaluate.report,
+    score.score,
+    forecast.forecast,
+    fuse.fuse,
+    fuse.publish,
+    live.live,
+    live.doctor,
+    reproduce.reproduce,
+    selftest.selftest,
 ):
-    group.register(app)
-for registered in app.registered_commands:
-    assert registered.callback is not None
-    registered.callback = common.with_common_options(registered.callback)
+    app.command(command.__name__.rstrip("_"))(common.with_common_options(command))
 
 
 _ANY_CLICK_ERROR: Any = typer.BadParameter.__mro__[1]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.output import Json
 from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, settings_of
 from gpvo.errors import GpvoError
 
@@ -53,7 +54,7 @@ def evaluate(
     tolerance: ToleranceOption = "none",
     gap: GapOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the twins.")] = 0,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Score the trajectory and every stated covariance.
 
@@ -70,22 +71,8 @@ def evaluate(
     else:
         found = _evaluate(runs, model, truth, options)
         documents = document(found)["runs"]
-    names = distinct([e.run.name for e in found])
-    if stated is not None:
-        from gpvo.evaluation.score import write_statements
-
-        for evaluation, name in zip(found, names, strict=True):
-            write_statements(evaluation, stated, name)
-    if tables is not None:
-        from gpvo.evaluation.tables import write_tables
-
-        for evaluation, name in zip(found, names, strict=True):
-            write_tables(evaluation, tables, name)
-    if plots is not None:
-        from gpvo.evaluation.plots import save_all
-
-        for evaluation, name in zip(found, names, strict=True):
-            save_all(evaluation, plots, name)
+    for evaluation, name in zip(found, distinct([e.run.name for e in found]), strict=True):
+        _write_files(evaluation, name, stated=stated, tables=tables, plots=plots)
     if json_:
         print_json({"schema": 1, "runs": documents})
     else:
@@ -94,6 +81,22 @@ def evaluate(
         if len(documents) > 1:
             _print_pooled(document(found)["pooled"], len(found))
     _tell_misfits(model, found)
+
+
+def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path | None, plots: Path | None) -> None:
+    """Whatever folder is given."""
+    if stated is not None:
+        from gpvo.evaluation.score import write_statements
+
+        write_statements(e, stated, name)
+    if tables is not None:
+        from gpvo.evaluation.tables import write_tables
+
+        write_tables(e, tables, name)
+    if plots is not None:
+        from gpvo.evaluation.plots import save_all
+
+        save_all(e, plots, name)
 
 
 def report(
@@ -123,42 +126,32 @@ def report(
 
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
+    from gpvo.cli.output import numbers
     from gpvo.evaluation.matches import match_pictures
     from gpvo.io import open_source
     from gpvo.runner import config_of
 
     if sequence is None or len(runs) != 1:
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
-    return match_pictures(open_source(sequence), config_of(runs[0]), [int(f) for f in _numbers("--frames", frames)])
+    wanted = [int(f) for f in numbers("--frames", frames, "give numbers, separated by commas")]
+    return match_pictures(open_source(sequence), config_of(runs[0]), wanted)
 
 
 def options_of(segments: str | None, truth_sigma: str | None, align: str, time_offset: str) -> EvaluateOptions:
     """The flags, parsed."""
+    from gpvo.cli.output import numbers
     from gpvo.evaluation.evaluate import EvaluateOptions
 
-    lengths = None if segments is None else tuple(_numbers("--segments", segments))
-    if lengths is not None and min(lengths) <= 0:
-        raise GpvoError(f"--segments is '{segments}'", cure="give lengths above 0 in metres")
-    sigma = None
+    lengths, sigma, offset_s = None, None, None
+    if segments is not None:
+        lengths = tuple(numbers("--segments", segments, "give lengths above 0 in metres", least=1e-9))
     if truth_sigma is not None:
-        given = _numbers("--truth-sigma", truth_sigma)
-        if len(given) > 2 or min(given) < 0:
-            raise GpvoError(f"--truth-sigma is '{truth_sigma}'", cure="give metres, or metres,radians")
+        cure = "give metres, or metres,radians"
+        given = numbers("--truth-sigma", truth_sigma, cure, counts=(1, 2), least=0.0)
         sigma = (given[0], given[1] if len(given) == 2 else 0.0)
-    offsets = None if time_offset == "auto" else _numbers("--time-offset", time_offset)
-    if offsets is not None and len(offsets) != 1:
-        raise GpvoError(f"--time-offset is '{time_offset}'", cure="give seconds, or auto")
-    return EvaluateOptions(lengths, sigma, align, None if offsets is None else offsets[0])
-
-
-def _numbers(option: str, text: str) -> list[float]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(map(math.isfinite, numbers)):
-        raise GpvoError(f"{option} is '{text}'", cure="give numbers, separated by commas")
-    return numbers
+    if time_offset != "auto":
+        (offset_s,) = numbers("--time-offset", time_offset, "give seconds, or auto", counts=(1,))
+    return EvaluateOptions(lengths, sigma, align, offset_s)
 
 
 def _loaded(runs: list[Path], model: Path | None, truth: Path | None) -> tuple[list[Run], Predictor | None]:
@@ -317,9 +310,3 @@ def _text(value: float | None, digits: int = 3) -> str:
     if value is None or not math.isfinite(value):
         return "-"
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.{digits}g}"
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(evaluate)
-    app.command()(report)

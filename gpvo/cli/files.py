@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli import source_options as options
-from gpvo.cli.output import one_of
+from gpvo.cli.output import Json, one_of
 from gpvo.errors import GpvoError
 
 
@@ -19,7 +19,7 @@ def info(
     pair_tolerance: options.PairTolerance = None,
     left_topic: options.LeftTopic = None,
     right_topic: options.RightTopic = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the document as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Say what a file or folder is.
 
@@ -67,15 +67,22 @@ def import_(
     ] = "pose",
     covariance_axes: Annotated[str, typer.Option(help="Axes of the covariances in a CSV: world or body.")] = "world",
     overwrite: options.Overwrite = False,
-    json_: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Turn another odometry's log into a run folder.
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
     from gpvo.cli.importing import ImportSettings, import_log
-    from gpvo.cli.output import print_json
+    from gpvo.cli.output import numbers, print_json
 
+    offset, sigma = None, None
+    if time_offset != "auto":
+        (offset,) = numbers("--time-offset", time_offset, "give seconds, such as -0.02, or auto", counts=(1,))
+    if truth_sigma is not None:
+        cure = "give metres,radians, such as 0.003,0.0002"
+        translation, rotation = numbers("--truth-sigma", truth_sigma, cure, counts=(2,), least=0.0)
+        sigma = (translation, rotation)
     summary = import_log(
         ImportSettings(
             log=log,
@@ -90,8 +97,8 @@ def import_(
             rate_hz=rate_hz,
             frame=one_of("--frame", frame, ("cam", "body")),
             align=one_of("--align", align, ("none", "rotation", "transform")),
-            time_offset_s=None if time_offset == "auto" else _number("--time-offset", time_offset),
-            truth_sigma=None if truth_sigma is None else _sigma(truth_sigma),
+            time_offset_s=offset,
+            truth_sigma=sigma,
             covariance_of=one_of("--covariance-of", covariance_of, ("pose", "motion")),
             covariance_axes=one_of("--covariance-axes", covariance_axes, ("world", "body")),
         ),
@@ -112,30 +119,3 @@ def _mapping(option: str, texts: list[str]) -> dict[str, str]:
             raise GpvoError(f"{option} is '{text}'", cure="give COLUMN=NAME, such as var_x=cov_00")
         out[column.strip()] = name.strip()
     return out
-
-
-def _number(option: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) < 1e10:
-        raise GpvoError(f"{option} is '{text}'", cure="give seconds, such as -0.02, or auto")
-    return value
-
-
-def _sigma(text: str) -> tuple[float, float]:
-    parts = text.split(",")
-    try:
-        translation, rotation = (float(p) for p in parts)
-    except ValueError:
-        translation = rotation = -1.0
-    if not (translation >= 0 and rotation >= 0):
-        raise GpvoError(f"--truth-sigma is '{text}'", cure="give metres,radians, such as 0.003,0.0002")
-    return translation, rotation
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(info)
-    app.command("import")(import_)

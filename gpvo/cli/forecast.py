@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.output import Json
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def forecast(
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over the distance.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Every pose, as .parquet or .csv.")] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Predict the covariance along a planned path.
 
@@ -143,8 +144,3 @@ def _draw(plot: Path, f: Forecast, title: str) -> None:
 
     with replacing(plot) as temporary:
         plots.forecast(f, title).savefig(temporary, dpi=110, format="png")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's command to the application."""
-    app.command()(forecast)

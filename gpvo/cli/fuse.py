@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from gpvo.errors import GpvoError
+from gpvo.cli.output import Json
 
 if TYPE_CHECKING:
     from gpvo.filters.study import Comparison
@@ -33,13 +33,13 @@ def fuse(
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Filter VO with an IMU under each covariance.
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
-    from gpvo.cli.output import print_json
+    from gpvo.cli.output import one_of, print_json
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
@@ -47,12 +47,9 @@ def fuse(
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
-    if init not in ("truth", "static"):
-        raise GpvoError(f"--init is '{init}'", cure="choose truth or static")
-    if gate not in ("discard", "inflate"):
-        raise GpvoError(f"--gate is '{gate}'", cure="choose discard or inflate")
-    if mean not in get_args(MeanUse):
-        raise GpvoError(f"--mean is '{mean}'", cure=f"choose one of: {', '.join(get_args(MeanUse))}")
+    one_of("--init", init, ("truth", "static"))
+    one_of("--gate", gate, ("discard", "inflate"))
+    one_of("--mean", mean, get_args(MeanUse))
     if plot is not None:
         from gpvo.evaluation.fusion_plot import plot_fusion, require_picture
 
@@ -115,7 +112,7 @@ def publish(
             "--check", help="Report what the consumer will do with the messages; writes a file only with --to or -o."
         ),
     ] = False,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Write what robot_localization, PX4 and ArduPilot consume.
 
@@ -157,9 +154,3 @@ def _teller() -> Callable[[str], None] | None:
     if not sys.stderr.isatty():
         return None
     return lambda what: print(f"\r\033[K{what}", end="\r", file=sys.stderr, flush=True)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(fuse)
-    app.command()(publish)

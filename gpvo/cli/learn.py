@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.output import Json
 from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
 from gpvo.errors import GpvoError
 
@@ -19,7 +20,6 @@ _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth, or one file of training rows.")]
 Model = Annotated[Path, typer.Argument(help="Model file.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 def train(
@@ -355,9 +355,3 @@ def export(
     target = out or model.with_name(name + SUFFIXES[chosen])
     export_model(model, target, chosen, for_filter=for_filter, prefix=prefix)
     print(f"{target}: {target.stat().st_size} bytes")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    for command in (train, predict, check, export):
-        app.command()(command)

@@ -131,9 +131,3 @@ def _one_wire(**given: bool) -> str | None:
     if len(chosen) > 1:
         raise GpvoError(f"--{' and --'.join(chosen)} exclude each other", cure="choose one")
     return chosen[0] if chosen else None
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(live)
-    app.command()(doctor)

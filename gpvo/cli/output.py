@@ -8,9 +8,11 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from gpvo.errors import GpvoError
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+_MOST = 1e10  # of any number on a command line: metres, seconds
 _loud = {"quiet": False, "verbose": False}
 
 
@@ -103,6 +107,23 @@ def one_of(option: str, value: str, choices: Iterable[str]) -> str:
     if value not in choices:
         raise GpvoError(f"{option} is '{value}'", cure=f"choose {' or '.join(choices)}")
     return value
+
+
+def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), least: float = -math.inf) -> list[float]:
+    """The numbers of an option, separated by commas: finite, at least ``least``, of one of the ``counts`` if given.
+
+    Raises
+    ------
+    GpvoError
+        With the ``cure``, where the text is something else.
+    """
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = [math.nan]
+    if not all(abs(x) < _MOST and x >= least for x in found) or (counts and len(found) not in counts):
+        raise GpvoError(f"{option} is '{text}'", cure=cure)
+    return found
 
 
 @contextmanager

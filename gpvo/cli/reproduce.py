@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from gpvo.cli.output import Json
+
 
 def reproduce(
     out: Annotated[
@@ -27,7 +29,7 @@ def reproduce(
     jobs: Annotated[int, typer.Option(help="Processes; -1: one per core.")] = -1,
     backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Reproduce every experiment of the thesis.
 
@@ -73,8 +75,3 @@ def _print(result: dict[str, Any], out: Path) -> None:
         f"targets of the full model: {asked.count(True)} met, {asked.count(False)} not, {asked.count(None)} open"
     )
     console.print(str(out / "report.html"))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(reproduce)

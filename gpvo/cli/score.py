@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gpvo.cli.output import Json
 from gpvo.errors import GpvoError
 
 
@@ -21,7 +22,7 @@ def score(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Of a folder of methods: write METHOD.json and board.csv here.")
     ] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Score anybody's stated covariances from files alone.
 
@@ -91,8 +92,3 @@ def _print(found: dict[str, Any]) -> None:
         if i["low"] is not None:
             told = f"[{factor * i['low']:.4g}, {factor * i['high']:.4g}] (95 %, by whole sequences)"
         console.print(f"{name}: {factor * i['mean']:.4g} {unit} {told}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(score)

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import typer
-
 from gpvo.errors import EXTRA_OF, GpvoError
 
 _FLIGHTS = 3
@@ -153,8 +151,3 @@ def _messages(bench: _Bench) -> str:
     predictor.reset(run.log.camera)
     messages = [builder.step(record, predictor.step(record)) for record in run.log]
     return f"{len(messages)} odometry messages"
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(selftest)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.output import Json
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def simulate(
         list[str] | None,
         typer.Option("--set", help="Setting of the scenario as key=value, with dots for tables. Repeatable."),
     ] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Simulate stereo sequences with IMU and exact truth.
 
@@ -134,10 +135,7 @@ def _show_list(json_: bool) -> None:
 
 def _assignment(text: str) -> tuple[str, Any]:
     """``key=value`` with a TOML value; what is no TOML is text."""
-    try:
-        import tomllib
-    except ModuleNotFoundError:  # Python 3.10
-        import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
+    from gpvo.io.toml import tomllib
 
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
@@ -161,8 +159,3 @@ def _seeds(text: str) -> list[int]:
     except ValueError:
         raise GpvoError(f"--seeds '{text}' is no list of seeds", cure="such as 0..9 or 1,4,7") from None
     return list(dict.fromkeys(out))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(simulate)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gpvo.cli.output import Json
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def twin(
     gap: GapOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Twins to make in parallel; -1 for one per core.")] = 1,
-    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    json_: Json = False,
 ) -> None:
     """Simulate runs again, so that their errors are known.
 
@@ -128,8 +129,3 @@ def in_place_of_runs_without_truth(paths: list[Path], settings: TwinSettings, jo
     without = [p for p in paths if read_run(p).truth is None]
     with TemporaryDirectory(prefix="gpvo-twins-") as folder:
         yield [p for p in paths if p not in without] + make_all(without, Path(folder), settings, jobs)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this file's commands to the application."""
-    app.command()(twin)
