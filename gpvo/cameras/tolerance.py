@@ -18,6 +18,7 @@ class Tolerance:
     baseline: float = 0.0  # fraction
     focal: float = 0.0  # fraction
     rotation_rad: float = 0.0  # between the cameras, per axis
+    distortion: float = 0.0  # absolute, of the first coefficient; a rectified pair has none
 
 
 TOLERANCES: dict[str, Tolerance] = {

@@ -9,7 +9,8 @@ import numpy as np
 from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation.evaluate import Evaluation, judged, predictions_by_stamp
 from gpvo.evaluation.statements import statements
-from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors, path_length_m
+from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors
+from gpvo.geometry import se3
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
 
@@ -29,7 +30,7 @@ def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
     T_est, noiseless = run.log.trajectory(), np.zeros(6)
     none = np.zeros((0, 4, 4))
     of_none = RelativeError(Statistics.of(np.zeros(0)), Statistics.of(np.zeros(0)))
-    length = float(path_length_m(T_est)[-1])
+    length = float(se3.path_length_m(T_est[:, :3, 3])[-1])
     return Evaluation(
         run=run,
         errors=MotionErrors(np.zeros(0, np.int64), np.zeros((0, 6)), none, none, np.zeros(0)),

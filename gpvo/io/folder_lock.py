@@ -1,4 +1,4 @@
-"""One writer of a folder at a time."""
+"""One writer of a folder or file at a time."""
 
 from __future__ import annotations
 
@@ -16,23 +16,25 @@ except ImportError:  # Windows: two writers there are not told of one another.
 class FolderLock:
     """Held from its making to :meth:`release`, or to the end of the process, however that comes.
 
+    ``path``: the folder, or with ``create`` a file that stands for ``where``.
+
     Raises
     ------
     SourceError
         Where another process, or another writer of this one, holds it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, create: bool = False, where: Path | None = None) -> None:
         self._handle = -1
         if fcntl is None:
             return
-        self._handle = os.open(path, os.O_RDONLY)
+        self._handle = os.open(path, os.O_RDWR | os.O_CREAT if create else os.O_RDONLY)
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self.release()
             cure = "wait for it, or choose another folder with -o"
-            raise SourceError("is being written by somebody else", where=path, cure=cure) from None
+            raise SourceError("is being written by somebody else", where=where or path, cure=cure) from None
 
     def release(self) -> None:
         """Let others write; a second time does nothing."""

@@ -11,6 +11,7 @@ import numpy as np
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.tolerance import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
@@ -20,17 +21,6 @@ from gpvo.types import Array
 T_BODY_LEFT = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
 # Where it sits on a vehicle, in body axes [m]: a rover carries it on a mast.
 PLACE_M = {"quadrotor": (0.12, 0.0, 0.02), "path": (0.12, 0.0, 0.02), "rover": (0.35, 0.0, 0.75)}
-
-
-@dataclass(frozen=True)
-class RigTolerance:
-    """Standard deviations of the calibration's error, drawn once per flight: fractions of baseline and focal length,
-    turn of the right camera per axis [rad], absolute change of the first distortion coefficient."""
-
-    baseline: float = 0.0
-    focal: float = 0.0
-    rotation_rad: float = 0.0
-    distortion: float = 0.0
 
 
 def _pinhole() -> StereoRig:
@@ -87,9 +77,9 @@ class RigError:
     distortion: tuple[float, float]
 
     @classmethod
-    def draw(cls, tolerance: RigTolerance, rng: np.random.Generator, offset: RigTolerance | None = None) -> RigError:
+    def draw(cls, tolerance: Tolerance, rng: np.random.Generator, offset: Tolerance | None = None) -> RigError:
         """Normal within the tolerance, about a fixed ``offset``, whose turn is about the vertical axis of the image."""
-        e, fixed = rng.standard_normal(7), offset or RigTolerance()
+        e, fixed = rng.standard_normal(7), offset or Tolerance()
         turn = tolerance.rotation_rad * e[1:4] + [0.0, fixed.rotation_rad, 0.0]
         bend = fixed.distortion + tolerance.distortion * e[5:]
         return cls(

@@ -11,10 +11,11 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from gpvo.cameras.tolerance import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.io.toml import read_toml
-from gpvo.sim.points import SCENARIOS, PointsScenario, Tolerance
-from gpvo.sim.rig import CAMERAS, RigTolerance, camera_rig
+from gpvo.sim.points import SCENARIOS, PointsScenario
+from gpvo.sim.rig import CAMERAS, camera_rig
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
@@ -79,14 +80,14 @@ class Scenario(BaseModel):
     points: dict[str, Any] = {}
 
     @property
-    def tolerance(self) -> RigTolerance:
+    def tolerance(self) -> Tolerance:
         """Standard deviations of the calibration's error."""
-        return RigTolerance(**self.calibration)
+        return Tolerance(**self.calibration)
 
     @property
-    def offset(self) -> RigTolerance:
+    def offset(self) -> Tolerance:
         """Fixed part of the calibration's error."""
-        return RigTolerance(**self.calibration_offset)
+        return Tolerance(**self.calibration_offset)
 
 
 def names() -> tuple[str, ...]:
@@ -143,15 +144,10 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
         "bursts": scenario.episodes_share > 0,
         "causes": scenario.causes,
         "dark": scenario.dark,
-        "tolerance": _pinhole_part(scenario.calibration),
-        "offset": _pinhole_part(scenario.calibration_offset),
+        "tolerance": scenario.tolerance,
+        "offset": scenario.offset,
     }
     return replace(base, **{**values, **scenario.points})
-
-
-def _pinhole_part(errors: Mapping[CalibrationKey, float]) -> Tolerance:
-    """Errors that a rectified pair without distortion can have."""
-    return Tolerance(errors.get("baseline", 0.0), errors.get("focal", 0.0), errors.get("rotation_rad", 0.0))
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:

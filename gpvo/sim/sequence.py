@@ -17,23 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
+from gpvo.io.folder_lock import FolderLock
 from gpvo.io.jsonfile import write_json
 from gpvo.io.toml import to_toml
 from gpvo.sim import imu, routes, sequence_files, sequence_plan, vehicles
 from gpvo.sim.episodes import Episode
-from gpvo.sim.eye import Eye
-from gpvo.sim.flow import optical_flow
+from gpvo.sim.eye import Eye, optical_flow
 from gpvo.sim.imu import Motion
 from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
 from gpvo.sim.scenario import Scenario
 from gpvo.sim.sequence_plan import FramePlan
 from gpvo.sim.worlds import build_world
 from gpvo.types import Array
-
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 # Stamps of 19 digits, as real recordings have them.
 START_NS = 1_600_000_000_000_000_000
@@ -101,24 +96,17 @@ def simulate(
 @contextmanager
 def _only_writer(target: Path) -> Iterator[None]:
     """Hold a lock beside the folder, so that two processes never fill one; it falls when the process dies."""
-    lock = target.with_name(target.name + ".lock")
+    file = target.with_name(target.name + ".lock")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(lock, os.O_CREAT | os.O_RDWR)
+        lock = FolderLock(file, create=True, where=target)
     except OSError as error:
         raise GpvoError(f"cannot be written: {error.strerror}", where=target) from None
     try:
-        if fcntl is not None:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise GpvoError("is being written by another process", where=target) from None
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
+        yield
     finally:
-        os.close(handle)
+        file.unlink(missing_ok=True)
+        lock.release()
 
 
 def _is_finished(target: Path, resolved: str) -> bool:

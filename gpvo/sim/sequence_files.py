@@ -1,20 +1,23 @@
-"""The files of a sequence in EuRoC's layout, with Kalibr's calibration beside them."""
+"""The files of a sequence in EuRoC's layout, with Kalibr's calibration; and a contact sheet of its pictures."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rig import StereoRig
+from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.sim.imu import Motion
 from gpvo.types import Array, ImuLog, ImuNoise
 
+_WIDTH_PX = 320  # of a picture on the contact sheet
 _CAMERA_HEAD = "#timestamp [ns],filename"
 _IMU_HEAD = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -121,3 +124,29 @@ def _csv(path: Path, head: str, t_ns: NDArray[np.int64], rows: Array) -> None:
         file.write(head + "\n")
         for t, row in zip(t_ns.tolist(), rows.tolist()):
             file.write(f"{t}," + ",".join(f"{v:.12g}" for v in row) + "\n")
+
+
+def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns: int = 2) -> Path:
+    """Write ``rows * columns`` pairs, left and right side by side and spread evenly over the sequence, as a PNG."""
+    mav = Path(sequence) / "mav0"
+    files = [sorted((mav / camera / "data").glob("*.png")) for camera in ("cam0", "cam1")]
+    if not files[0]:
+        raise GpvoError("holds no pictures", where=sequence)
+    tiles = []
+    for k in np.linspace(0, len(files[0]) - 1, rows * columns).astype(int):
+        pair = [_read(side[k]) for side in files]
+        small = [cv2.resize(p, (_WIDTH_PX, round(p.shape[0] * _WIDTH_PX / p.shape[1]))) for p in pair]
+        tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
+    sheet = np.vstack([np.hstack(tiles[r * columns : (r + 1) * columns]) for r in range(rows)])
+    target = Path(out)
+    data = cv2.imencode(".png", sheet)[1].tobytes()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_bytes(data)
+    return target
+
+
+def _read(file: Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise GpvoError("is no picture", where=file)
+    return np.asarray(image, np.uint8)

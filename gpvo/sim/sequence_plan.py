@@ -53,9 +53,9 @@ def move(scenario: Scenario, path: Path3, world: World) -> Motion:
     if scenario.vehicle == "quadrotor":
         return vehicles.fly(path)
     if scenario.vehicle == "rover":
-        if not world.heights:
+        if world.ground is None:
             raise GpvoError(f"the world '{scenario.world}' has no ground to drive on", cure="vehicle = quadrotor")
-        return rover.drive(path, world.heights[0])
+        return rover.drive(path, world.ground)
     return path.motion(vehicles.RATE_HZ)
 
 

@@ -178,7 +178,7 @@ def read_tolerance(text: str) -> tuple[str, Tolerance]:
     if text in TOLERANCES:
         return text, TOLERANCES[text]
     path = Path(text)
-    known = {f.name for f in fields(Tolerance)}
+    known = {f.name for f in fields(Tolerance)} - {"distortion"}
     cure = f"give one of {', '.join(TOLERANCES)}, or a TOML file with {', '.join(sorted(known))}"
     if not path.is_file():
         raise GpvoError(f"there is no tolerance '{text}'", cure=cure)

@@ -19,7 +19,6 @@ def quick(monkeypatch):
         clearance=lambda p: np.minimum(5.0 - np.abs(p[:, 0]), 5.0 - np.abs(p[:, 1])),
         start_pose=se3.from_rt(np.eye(3), np.array([-3.0, 0.0, 1.5])),
         centreline=np.stack([np.linspace(-4, 4, 40), np.zeros(40), np.full(40, 1.5)], 1),
-        heights=(),
     )
     monkeypatch.setattr(sequence, "build_world", lambda kind, seed, **params: world)
 

@@ -74,7 +74,7 @@ def test_command(tmp_path):
 
     app = typer.Typer()
     app.callback()(lambda: None)
-    command.register(app)
+    app.command()(command.simulate)
     run = CliRunner().invoke
     listed = run(app, ["simulate", "--list"])
     assert "lunar-straight" in listed.output

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from gpvo.sim.flow import optical_flow
+from gpvo.sim.eye import optical_flow
 from gpvo.sim.scenario import load_scenario
 from gpvo.sim.sequence import simulate
 

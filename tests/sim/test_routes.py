@@ -21,7 +21,6 @@ def pipe(length_m: float = 80.0, radius_m: float = RADIUS_M):
         clearance=lambda p: radius_m - np.hypot(p[:, 1], p[:, 2]),
         centreline=np.stack([x, 0 * x, 0 * x], 1),
         start_pose=se3.from_rt(np.eye(3), np.array([2.0, 0.0, 0.0])),
-        heights=(),
     )
 
 

@@ -9,12 +9,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from gpvo.cameras.tolerance import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.sim import sequence, sequence_plan
 from gpvo.sim.eye import without_texture
-from gpvo.sim.rig import RigError, RigTolerance, camera_rig, true_rig
+from gpvo.sim.rig import RigError, camera_rig, true_rig
 from gpvo.sim.scenario import load_scenario, stated_seed
 from gpvo.types import STANDARD_GRAVITY_MPS2
 
@@ -103,7 +104,7 @@ def test_resolved_scenario_flies_the_same_again(quick, tmp_path):
 def test_one_writer_at_a_time(quick, tmp_path):
     with (
         sequence._only_writer(tmp_path / "seq"),
-        pytest.raises(GpvoError, match="written by another process"),
+        pytest.raises(GpvoError, match="seq: is being written by somebody else"),
     ):
         sequence.simulate(quick(), 1, tmp_path / "seq")
     assert sequence.simulate(quick(), 1, tmp_path / "seq").redone
@@ -165,15 +166,15 @@ def test_a_recorded_path_must_be_given(quick, tmp_path):
 @pytest.mark.parametrize("camera", ["pinhole", "euroc", "t265"])
 def test_drawn_rig(camera):
     written = camera_rig(camera)
-    same = true_rig(written, RigError.draw(RigTolerance(), np.random.default_rng(0)))
+    same = true_rig(written, RigError.draw(Tolerance(), np.random.default_rng(0)))
     assert np.allclose(same.T_right_left, written.T_right_left, atol=1e-15)
     assert same.left == written.left
-    errors = [RigError.draw(RigTolerance(0.01, 0.003, 5e-4, 1e-3), np.random.default_rng(s)) for s in range(200)]
+    errors = [RigError.draw(Tolerance(0.01, 0.003, 5e-4, 1e-3), np.random.default_rng(s)) for s in range(200)]
     drawn = [true_rig(written, e) for e in errors]
     ratio = np.array([d.baseline_m / written.baseline_m for d in drawn])
     assert ratio.std() == pytest.approx(0.01, rel=0.2)
     assert all(d.left.fx_px != written.left.fx_px for d in drawn)
-    fixed = true_rig(written, RigError.draw(RigTolerance(), np.random.default_rng(0), RigTolerance(baseline=0.01)))
+    fixed = true_rig(written, RigError.draw(Tolerance(), np.random.default_rng(0), Tolerance(baseline=0.01)))
     assert fixed.baseline_m / written.baseline_m == pytest.approx(1.01, abs=1e-12)
 
 

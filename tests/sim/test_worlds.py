@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.sim.worlds import build_world, cache, tunnel
-from gpvo.sim.worlds.distance import TriangleDistance
 from gpvo.sim.worlds.shapes import grid_faces, icosphere, rectangle, vertex_normals
+from gpvo.sim.worlds.world import TriangleDistance, World
 
 SMALL = {
     "tunnel": {"length": 30.0, "step": 0.25, "curve": "curved", "smooth_stretches": 1},
@@ -28,6 +28,17 @@ def _small_and_own_cache(tmp_path_factory: pytest.TempPathFactory):
         yield
 
 
+def on_surfaces(world: World, n: int, seed: int) -> np.ndarray:
+    """``n`` points (n, 3) spread evenly over the surfaces of a world."""
+    rng = np.random.default_rng(seed)
+    corners = world.mesh.vertices[world.mesh.faces].astype(np.float64)
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(edge1, edge2), axis=1)
+    face = rng.choice(len(area), size=n, p=area / area.sum())
+    a, b = np.sqrt(rng.random(n)), rng.random(n)
+    return corners[face, 0] + (a * (1 - b))[:, None] * edge1[face] + (a * b)[:, None] * edge2[face]
+
+
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_a_world_offers_what_paths_need(kind: str) -> None:
     world = build_world(kind, 4, **SMALL[kind])
@@ -39,10 +50,9 @@ def test_a_world_offers_what_paths_need(kind: str) -> None:
     assert np.linalg.det(R) == pytest.approx(1)
     assert (world.centreline >= world.bounds[0]).all()
     assert (world.centreline <= world.bounds[1]).all()
-    marks = world.landmarks(200, 1)
+    marks = on_surfaces(world, 200, 1)
     within = ((marks >= world.bounds[0] - 0.5) & (marks <= world.bounds[1] + 0.5)).all(axis=1)
     assert np.abs(world.clearance(marks[within])).max(initial=0) < 2e-3
-    np.testing.assert_array_equal(marks, world.landmarks(200, 1))
     mesh = world.mesh
     assert np.isfinite(mesh.vertices).all()
     assert mesh.light.min() >= 0
@@ -92,18 +102,18 @@ def test_branches_open_into_the_main_tunnel() -> None:
 
 def test_height_is_that_of_the_ground() -> None:
     world = build_world("lunar", 8, **SMALL["lunar"])
-    grid = world.heights[0]
+    grid = world.ground
+    assert grid is not None
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 20, 300), rng.uniform(-1.2, 1.2, 300)
-    on = np.stack([x, y, world.height(x, y)], axis=1)
+    on = np.stack([x, y, grid(x, y)], axis=1)
     assert np.abs(world.clearance(on)).max() < 1e-4
     assert (world.clearance(on + [0, 0, 0.2]) > 0.1).all()
     assert (world.clearance(on - [0, 0, 0.2]) < -0.1).all()
     assert grid.cell <= 0.25
     with pytest.raises(GpvoError, match="outside"):
-        world.height(np.array([1e4]), np.array([0.0]))
-    with pytest.raises(GpvoError, match="no terrain"):
-        build_world("room", 5, **SMALL["room"]).height(np.zeros(1), np.zeros(1))
+        grid(np.array([1e4]), np.array([0.0]))
+    assert build_world("room", 5, **SMALL["room"]).ground is None
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,6 @@ def save_world(world: World, path: Path) -> None:
     """
     arrays: dict[str, np.ndarray] = {f"mesh_{f.name}": getattr(world.mesh, f.name) for f in fields(Mesh)}
     arrays |= {f"texture_{k}": texture for k, texture in enumerate(world.textures)}
-    arrays |= {f"height_{k}": grid.z for k, grid in enumerate(world.heights)}
     arrays |= {"centreline": world.centreline, "start_pose": world.start_pose, "bounds": world.bounds}
     header: dict[str, object] = {
         "kind": world.kind,
@@ -68,9 +67,12 @@ def save_world(world: World, path: Path) -> None:
         "params": dict(world.params),
         "lighting": asdict(world.lighting),
         "textures": len(world.textures),
-        "heights": [(grid.x0, grid.y0, grid.cell) for grid in world.heights],
+        "ground": None,
         "light_map": None,
     }
+    if world.ground is not None:
+        arrays["ground"] = world.ground.z
+        header["ground"] = (world.ground.x0, world.ground.y0, world.ground.cell)
     if world.light_map is not None:
         arrays["light_map"] = world.light_map.image
         header["light_map"] = (world.light_map.origin, world.light_map.texel, world.light_map.material)
@@ -107,6 +109,6 @@ def load_world(path: Path) -> World:
             centreline=data["centreline"],
             start_pose=data["start_pose"],
             bounds=data["bounds"],
-            heights=tuple(HeightGrid(data[f"height_{k}"], *g) for k, g in enumerate(header["heights"])),
+            ground=HeightGrid(data["ground"], *header["ground"]) if header["ground"] is not None else None,
             light_map=light_map,
         )

@@ -2,43 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from gpvo.sim.worlds.noise import F32, fractal
-from gpvo.sim.worlds.shapes import Faces, grid_faces, icosphere
+from gpvo.sim.worlds.shapes import Parts, add_stone, grid_faces, icosphere
 from gpvo.sim.worlds.tubes import Tube
 from gpvo.types import Array
 
 _GLOW = 12.0  # irradiance that makes a lamp's glass white
 _BOX = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_FAN = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)  # of a rectangle whose corners are in order
 _BOX_SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-
-
-@dataclass
-class Parts:
-    """Pieces of one mesh: vertices (V, 3), texture coordinates (V, 2), faces, material, and their own glow (V,)."""
-
-    vertices: list[Array] = field(default_factory=list)
-    uv: list[Array] = field(default_factory=list)
-    faces: list[Faces] = field(default_factory=list)
-    material: list[NDArray[np.uint8]] = field(default_factory=list)
-    glow: list[Array] = field(default_factory=list)
-    count: int = 0
-
-    def add(
-        self, vertices: Array, uv: Array, faces: Faces, material: int | NDArray[np.uint8], glow: float = 0.0
-    ) -> None:
-        """One piece; faces count from its own first vertex."""
-        self.vertices.append(vertices)
-        self.uv.append(uv)
-        self.faces.append((faces + self.count).astype(np.int32))
-        self.material.append(np.broadcast_to(np.asarray(material, np.uint8), len(faces)))
-        self.glow.append(np.full(len(vertices), glow))
-        self.count += len(vertices)
 
 
 def _box(
@@ -49,12 +25,7 @@ def _box(
         local = _BOX[list(side)] * size
         a, b = local[1] - local[0], local[3] - local[0]
         uv = np.stack([(local - local[0]) @ e / max(np.linalg.norm(e), 1e-9) for e in (a, b)], axis=1) / tile_m
-        parts.add(centre + local @ axes, uv + centre[:2] / tile_m, grid_fan(), material, glow)
-
-
-def grid_fan() -> Faces:
-    """Two triangles of a rectangle whose corners are in order."""
-    return np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+        parts.add(centre + local @ axes, uv + centre[:2] / tile_m, _FAN, material, glow)
 
 
 def lamps(parts: Parts, positions: Array, tube: Tube, material: int) -> None:
@@ -127,15 +98,3 @@ def rubble(
         stone = stone @ turn
         place = tube.vertices[row, column] + 0.35 * radius * line.up[row]
         add_stone(parts, stone, faces, place, material, tile_m)
-
-
-def add_stone(parts: Parts, stone: Array, faces: Faces, place: Array, material: int, tile_m: float) -> None:
-    """A stone with sharp edges: every face has its own corners, and the texture plane that it faces most."""
-    corners = stone[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    axis = np.abs(normal).argmax(axis=1)
-    first = np.where(axis == 0, 1, 0)
-    second = np.where(axis == 2, 1, 2)
-    plane = np.stack([np.take_along_axis(corners, k[:, None, None], axis=2)[..., 0] for k in (first, second)], axis=2)
-    uv = plane.reshape(-1, 2) / tile_m + place[:2] / tile_m
-    parts.add(corners.reshape(-1, 3) + place, uv, np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3), material)

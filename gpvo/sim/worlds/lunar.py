@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from gpvo.errors import GpvoError
 from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.fittings import Parts, add_stone
 from gpvo.sim.worlds.noise import fractal, lattice, spectral
-from gpvo.sim.worlds.shapes import grid_faces, icosphere, vertex_normals
-from gpvo.sim.worlds.soil import regolith
-from gpvo.sim.worlds.stone import rock
-from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
+from gpvo.sim.worlds.shapes import Parts, add_stone, grid_faces, icosphere, vertex_normals
+from gpvo.sim.worlds.stone import regolith, rock
+from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World, check_ranges
 from gpvo.types import Array
 
 _TILE_M = 2.5
@@ -49,12 +46,10 @@ def build(
     GpvoError
         For values out of range.
     """
-    for name, value, low, high in (
-        ("length", length, 20, 1000), ("boulders", boulders, 0, 20000), ("craters", craters, 0, 20000),
-        ("sun_elevation_deg", sun_elevation_deg, 3, 90), ("sun_azimuth_deg", sun_azimuth_deg, -360, 360),
-    ):  # fmt: skip
-        if not low <= value <= high:
-            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
+    check_ranges(
+        length=(length, 20, 1000), boulders=(boulders, 0, 20000), craters=(craters, 0, 20000),
+        sun_elevation_deg=(sun_elevation_deg, 3, 90), sun_azimuth_deg=(sun_azimuth_deg, -360, 360),
+    )  # fmt: skip
     rng = np.random.default_rng([seed, 2])
     x = _spaced(-_BEHIND_M, length + _BEHIND_M, 20.0, _EDGE_M)
     y = _spaced(-_LANE_M, _LANE_M, _EDGE_M, _EDGE_M)
@@ -85,7 +80,7 @@ def build(
         bounds=np.array(
             [[-_BEHIND_M + 1, -_LANE_M + 0.5, deepest], [length + _BEHIND_M - 1, _LANE_M - 0.5, highest + 6]]
         ),
-        heights=(grid,),
+        ground=grid,
         light_map=light_map,
     )
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpvo.errors import GpvoError
 from gpvo.sim.worlds import textures
 from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.shapes import Faces, rectangle, vertex_normals
-from gpvo.sim.worlds.world import Lighting, Mesh, World
+from gpvo.sim.worlds.shapes import Parts, rectangle, vertex_normals
+from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
 
 _TEXTURE_PX = 1024
@@ -16,39 +15,23 @@ _PLASTER, _BLOCKS, _PLANKS, _CARDBOARD, _POSTER = 0, 1, 2, 3, 4
 _POSTERS = 5
 
 
-class _Parts:
-    """Rectangles put together to one mesh."""
+def _panel(
+    parts: Parts, material: int, tile_m: float, corner: Array, u: Array, v: Array, edge: float, turn: float = 0
+) -> None:
+    """A rectangle, its texture starting at (``turn``, ``turn``) tiles."""
+    vertices, uv, faces = rectangle(corner, u, v, edge)
+    parts.add(vertices, uv / tile_m + turn, faces, material)
 
-    def __init__(self) -> None:
-        self.vertices: list[Array] = []
-        self.uv: list[Array] = []
-        self.faces: list[Faces] = []
-        self.material: list[np.ndarray] = []
-        self._count = 0
 
-    def add(
-        self, material: int, tile_m: float, corner: Array, u: Array, v: Array, edge: float, turn: float = 0
-    ) -> None:
-        """One rectangle, its texture starting at (``turn``, ``turn``) tiles."""
-        vertices, uv, faces = rectangle(corner, u, v, edge)
-        self.vertices.append(vertices)
-        self.uv.append(uv / tile_m + turn)
-        self.faces.append(faces + self._count)
-        self.material.append(np.full(len(faces), material, np.uint8))
-        self._count += len(vertices)
-
-    def box(self, material: int, centre: Array, size: Array, heading: float, turn: float) -> None:
-        """A closed box standing on z = ``centre[2]``, seen from outside."""
-        c, s = np.cos(heading), np.sin(heading)
-        axes = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) * np.asarray(size)[:, None]
-        corner = np.asarray(centre) - 0.5 * axes[0] - 0.5 * axes[1]
-        x, y, z = axes
-        tile = 1.2
-        self.add(material, tile, corner, x, z, 0.2, turn)
-        self.add(material, tile, corner + x, y, z, 0.2, turn + 0.3)
-        self.add(material, tile, corner + x + y, -x, z, 0.2, turn + 0.6)
-        self.add(material, tile, corner + y, -y, z, 0.2, turn + 0.8)
-        self.add(material, tile, corner + z, x, y, 0.2, turn + 0.5)
+def _box(parts: Parts, material: int, centre: Array, size: Array, heading: float, turn: float) -> None:
+    """A closed box standing on z = ``centre[2]``, seen from outside."""
+    c, s = np.cos(heading), np.sin(heading)
+    axes = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) * np.asarray(size)[:, None]
+    corner = np.asarray(centre) - 0.5 * axes[0] - 0.5 * axes[1]
+    x, y, z = axes
+    sides = ((corner, x, z, 0.0), (corner + x, y, z, 0.3), (corner + x + y, -x, z, 0.6), (corner + y, -y, z, 0.8))
+    for at, u, v, further in (*sides, (corner + z, x, y, 0.5)):
+        _panel(parts, material, 1.2, at, u, v, 0.2, turn + further)
 
 
 def build(
@@ -71,15 +54,13 @@ def build(
     GpvoError
         For values out of range.
     """
-    for name, value, low, high in (
-        ("width", width, 6, 60), ("depth", depth, 6, 60), ("height", height, 2.5, 15),
-        ("boxes", boxes, 0, 200), ("posters", posters, 0, 100), ("blank_walls", blank_walls, 0, 4),
-    ):  # fmt: skip
-        if not low <= value <= high:
-            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
+    check_ranges(
+        width=(width, 6, 60), depth=(depth, 6, 60), height=(height, 2.5, 15),
+        boxes=(boxes, 0, 200), posters=(posters, 0, 100), blank_walls=(blank_walls, 0, 4),
+    )  # fmt: skip
     rng = np.random.default_rng([seed, 3])
     size = np.array([width, depth, height])
-    parts = _Parts()
+    parts = Parts()
     _shell(parts, size, blank_walls, rng)
     _furnish(parts, size, boxes, posters, rng)
     angle = np.linspace(0, 2 * np.pi, 200)
@@ -110,24 +91,23 @@ def _walls(size: Array) -> list[tuple[Array, Array]]:
     return [(corners[k], corners[(k + 1) % 4] - corners[k]) for k in range(4)]
 
 
-def _shell(parts: _Parts, size: Array, blank_walls: int, rng: np.random.Generator) -> None:
+def _shell(parts: Parts, size: Array, blank_walls: int, rng: np.random.Generator) -> None:
     x, y, z = size
     up = np.array([0, 0, z])
-    parts.add(_PLANKS, 3.0, np.array([-x / 2, -y / 2, 0]), np.array([x, 0, 0]), np.array([0, y, 0]), 0.25)
-    parts.add(_PLASTER, 3.0, np.array([-x / 2, y / 2, z]), np.array([x, 0, 0]), np.array([0, -y, 0]), 0.25)
+    _panel(parts, _PLANKS, 3.0, np.array([-x / 2, -y / 2, 0]), np.array([x, 0, 0]), np.array([0, y, 0]), 0.25)
+    _panel(parts, _PLASTER, 3.0, np.array([-x / 2, y / 2, z]), np.array([x, 0, 0]), np.array([0, -y, 0]), 0.25)
     for k in range(int(x // 1.5)):  # beams under the ceiling
-        parts.box(
-            _BLOCKS, np.array([-x / 2 + 0.75 + 1.5 * k, 0, z - 0.3]), np.array([0.12, y - 0.02, 0.2]), 0.0, 0.1 * k
-        )
+        middle, extent = np.array([-x / 2 + 0.75 + 1.5 * k, 0, z - 0.3]), np.array([0.12, y - 0.02, 0.2])
+        _box(parts, _BLOCKS, middle, extent, 0.0, 0.1 * k)
     order = rng.permutation(4)
     for wall, (corner, along) in enumerate(_walls(size)):
         blank = order[wall] < blank_walls
-        parts.add(_PLASTER if blank else _BLOCKS, 2.0, corner, along, up, 0.25)
+        _panel(parts, _PLASTER if blank else _BLOCKS, 2.0, corner, along, up, 0.25)
         foot = corner + 0.01 * np.cross(along, up) / np.linalg.norm(np.cross(along, up))
-        parts.add(_CARDBOARD, 4.0, foot, along, np.array([0, 0, 0.12]), 0.25)
+        _panel(parts, _CARDBOARD, 4.0, foot, along, np.array([0, 0, 0.12]), 0.25)
 
 
-def _furnish(parts: _Parts, size: Array, boxes: int, posters: int, rng: np.random.Generator) -> None:
+def _furnish(parts: Parts, size: Array, boxes: int, posters: int, rng: np.random.Generator) -> None:
     walls = _walls(size)
     for k in range(boxes):
         corner, along = walls[k % 4]
@@ -135,9 +115,10 @@ def _furnish(parts: _Parts, size: Array, boxes: int, posters: int, rng: np.rando
         inward /= -np.linalg.norm(inward)
         extent = rng.uniform([0.4, 0.35, 0.3], [1.1, 0.7, 1.3])
         at = corner + rng.uniform(0.12, 0.88) * along + rng.uniform(0.5, 1.0) * inward
-        parts.box(_CARDBOARD, at, extent, rng.uniform(0, np.pi), rng.uniform(0, 1))
+        _box(parts, _CARDBOARD, at, extent, rng.uniform(0, np.pi), rng.uniform(0, 1))
         if rng.random() < 0.4:
-            parts.box(_CARDBOARD, at + [0, 0, extent[2]], extent * [0.6, 0.6, 0.5], rng.uniform(0, np.pi), rng.random())
+            on_top, smaller = at + [0, 0, extent[2]], extent * [0.6, 0.6, 0.5]
+            _box(parts, _CARDBOARD, on_top, smaller, rng.uniform(0, np.pi), rng.random())
     for k in range(posters):
         corner, along = walls[k % 4]
         direction = along / np.linalg.norm(along)
@@ -147,11 +128,11 @@ def _furnish(parts: _Parts, size: Array, boxes: int, posters: int, rng: np.rando
         share = (k // 4 + rng.uniform(0.15, 0.6)) / slots
         at = corner + share * (np.linalg.norm(along) - wide) * direction + 0.015 * inward
         at = at + [0, 0, rng.uniform(0.9, max(1.0, size[2] - 2.6))]
-        parts.add(_POSTER + k % _POSTERS, wide, at, wide * direction, np.array([0, 0, wide]), 0.2)
+        _panel(parts, _POSTER + k % _POSTERS, wide, at, wide * direction, np.array([0, 0, wide]), 0.2)
 
 
-def _lit(parts: _Parts, size: Array, rng: np.random.Generator) -> Mesh:
-    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces).astype(np.int32)
+def _lit(parts: Parts, size: Array, rng: np.random.Generator) -> Mesh:
+    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces)
     N = vertex_normals(V, F)
     baker = Baker(V, N, F)
     grid = np.stack(np.meshgrid([-0.3, 0.0, 0.3], [-0.3, 0.0, 0.3], [0.0]), axis=-1).reshape(-1, 3)

@@ -1,8 +1,9 @@
-"""Pieces of meshes."""
+"""Pieces of meshes, and how they are put together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -11,6 +12,29 @@ from numpy.typing import NDArray
 from gpvo.types import Array
 
 Faces = NDArray[np.int32]
+
+
+@dataclass
+class Parts:
+    """Pieces of one mesh: vertices (V, 3), texture coordinates (V, 2), faces, material, and their own glow (V,)."""
+
+    vertices: list[Array] = field(default_factory=list)
+    uv: list[Array] = field(default_factory=list)
+    faces: list[Faces] = field(default_factory=list)
+    material: list[NDArray[np.uint8]] = field(default_factory=list)
+    glow: list[Array] = field(default_factory=list)
+    count: int = 0
+
+    def add(
+        self, vertices: Array, uv: Array, faces: Faces, material: int | NDArray[np.uint8], glow: float = 0.0
+    ) -> None:
+        """One piece; faces count from its own first vertex."""
+        self.vertices.append(vertices)
+        self.uv.append(uv)
+        self.faces.append((faces + self.count).astype(np.int32))
+        self.material.append(np.broadcast_to(np.asarray(material, np.uint8), len(faces)))
+        self.glow.append(np.full(len(vertices), glow))
+        self.count += len(vertices)
 
 
 def grid_faces(rows: int, columns: int) -> Faces:
@@ -71,3 +95,15 @@ def rectangle(
     s, t = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, nu), np.linspace(0, 1, nv)))
     vertices = np.asarray(corner, float) + s[:, None] * np.asarray(u, float) + t[:, None] * np.asarray(v, float)
     return vertices, np.stack([s * lengths[0], t * lengths[1]], axis=1), grid_faces(nv, nu)
+
+
+def add_stone(parts: Parts, stone: Array, faces: Faces, place: Array, material: int, tile_m: float) -> None:
+    """A stone with sharp edges: every face has its own corners, and the texture plane that it faces most."""
+    corners = stone[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.abs(normal).argmax(axis=1)
+    first = np.where(axis == 0, 1, 0)
+    second = np.where(axis == 2, 1, 2)
+    plane = np.stack([np.take_along_axis(corners, k[:, None, None], axis=2)[..., 0] for k in (first, second)], axis=2)
+    uv = plane.reshape(-1, 2) / tile_m + place[:2] / tile_m
+    parts.add(corners.reshape(-1, 3) + place, uv, np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3), material)

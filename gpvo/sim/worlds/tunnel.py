@@ -11,11 +11,11 @@ from gpvo.errors import GpvoError
 from gpvo.sim.worlds import fittings
 from gpvo.sim.worlds.baking import Baker
 from gpvo.sim.worlds.noise import fractal, lattice
-from gpvo.sim.worlds.shapes import vertex_normals
+from gpvo.sim.worlds.shapes import Parts, vertex_normals
 from gpvo.sim.worlds.stone import gravel, rock
 from gpvo.sim.worlds.textures import duct, shotcrete
 from gpvo.sim.worlds.tubes import Line, Tube, rough_tube
-from gpvo.sim.worlds.world import Lighting, Mesh, World
+from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
 
 _RADIUS_M = 2.6
@@ -48,10 +48,10 @@ def build(
     """
     if curve not in _CURVES:
         raise GpvoError(f"unknown curve '{curve}' of a tunnel", cure=f"choose from {', '.join(_CURVES)}")
-    limits = (("length", length, 20, 2000), ("roughness", roughness, 0, 0.6), ("lamps", lamps, 0, 1000))
-    for name, value, low, high in (*limits, ("step", step, 0.05, 0.25), ("smooth_stretches", smooth_stretches, 0, 50)):
-        if not low <= value <= high:
-            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
+    check_ranges(
+        length=(length, 20, 2000), roughness=(roughness, 0, 0.6), lamps=(lamps, 0, 1000),
+        step=(step, 0.05, 0.25), smooth_stretches=(smooth_stretches, 0, 50),
+    )  # fmt: skip
     rng = np.random.default_rng([seed, 1])
     values = lattice(rng)
     line = _line(length, step, _CURVES[curve], rng)
@@ -133,7 +133,7 @@ def _branch(
 
 
 def _mesh(tubes: list[Tube], bare: Array, lamps: float, values: np.ndarray, rng: np.random.Generator) -> Mesh:
-    parts = fittings.Parts()
+    parts = Parts()
     for k, tube in enumerate(tubes):
         points, f = tube.vertices.reshape(-1, 3), tube.faces
         inside = np.zeros(len(points), bool)
@@ -161,9 +161,7 @@ def _within(s: Array, intervals: Array) -> NDArray[np.bool_]:
     return np.any((s[:, None] >= intervals[:, 0]) & (s[:, None] <= intervals[:, 1]), axis=1)
 
 
-def _furnish(
-    parts: fittings.Parts, tube: Tube, bare: Array, lamps: Array, values: np.ndarray, rng: np.random.Generator
-) -> None:
+def _furnish(parts: Parts, tube: Tube, bare: Array, lamps: Array, values: np.ndarray, rng: np.random.Generator) -> None:
     """Lamps, duct, cables, bolts and rubble, none of them where the walls are bare."""
     s = tube.line.s
     rows = np.flatnonzero((s > 2.0) & (s < s[-1] - 2.0))

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds.distance import TriangleDistance
 from gpvo.types import Array
 
 F32 = NDArray[np.float32]
+_NEIGHBOURS = 16
+_CHUNK = 4096
+
+
+def check_ranges(**given: tuple[float, float, float]) -> None:
+    """Refuse parameters, given as (value, least, most), that are out of range. Raises GpvoError."""
+    for name, (value, low, high) in given.items():
+        if not low <= value <= high:
+            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
 
 
 @dataclass(frozen=True)
@@ -91,7 +100,8 @@ class World:
 
     ``textures``: one (n, n) uint8 image per material, tileable, n a power of two; grey 255 is albedo 1 after squaring.
     ``centreline`` (N, 3): a line one can fly or drive along. ``start_pose`` (4, 4): body (FLU) at its beginning.
-    ``bounds`` (2, 3): corners of the box in which paths may run. ``heights``: terrain grids, empty where there is none.
+    ``bounds`` (2, 3): corners of the box in which paths may run. ``ground``: heights of the terrain without boulders,
+    None where there is none.
     """
 
     kind: str
@@ -103,13 +113,8 @@ class World:
     centreline: Array
     start_pose: Array
     bounds: Array
-    heights: tuple[HeightGrid, ...] = field(default=())
+    ground: HeightGrid | None = None
     light_map: LightMap | None = None
-
-    @property
-    def texture(self) -> NDArray[np.uint8]:
-        """The first material's texture."""
-        return self.textures[0]
 
     @cached_property
     def _distance(self) -> TriangleDistance:
@@ -118,35 +123,6 @@ class World:
     def clearance(self, points: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the nearest surface, negative inside rock, ground or a wall."""
         return self._distance.signed(np.asarray(points, dtype=np.float64).reshape(-1, 3))
-
-    def landmarks(self, n: int, seed: int) -> Array:
-        """``n`` points (n, 3) spread evenly over the surfaces."""
-        rng = np.random.default_rng(seed)
-        corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        area = np.linalg.norm(np.cross(edge1, edge2), axis=1)
-        face = rng.choice(len(area), size=n, p=area / area.sum())
-        a, b = np.sqrt(rng.random(n)), rng.random(n)
-        return corners[face, 0] + (a * (1 - b))[:, None] * edge1[face] + (a * b)[:, None] * edge2[face]
-
-    def height(self, x: Array, y: Array) -> Array:
-        """Height of the ground [m] at (x, y), without boulders; worlds with terrain only.
-
-        Raises
-        ------
-        GpvoError
-            In a world without terrain, or outside of it.
-        """
-        if not self.heights:
-            raise GpvoError(f"the world '{self.kind}' has no terrain")
-        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-        out = np.full(x.shape, np.nan)
-        for grid in self.heights:
-            inside = np.isnan(out) & grid.contains(x, y)
-            out[inside] = grid(x[inside], y[inside])
-        if np.isnan(out).any():
-            raise GpvoError("a height was asked for outside the terrain", cure="keep the path within World.bounds")
-        return out
 
 
 @dataclass(frozen=True)
@@ -158,16 +134,18 @@ class HeightGrid:
     y0: float
     cell: float
 
-    def contains(self, x: Array, y: Array) -> NDArray[np.bool_]:
-        """Whether (x, y) lies on the grid."""
-        rows, columns = self.z.shape
-        u, v = (x - self.x0) / self.cell, (y - self.y0) / self.cell
-        return (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
-
     def __call__(self, x: Array, y: Array) -> Array:
-        """Height on the two triangles of each cell, split from (0, 1) to (1, 0) as the mesh is."""
+        """Height on the two triangles of each cell, split from (0, 1) to (1, 0) as the mesh is.
+
+        Raises
+        ------
+        GpvoError
+            Outside the grid.
+        """
         rows, columns = self.z.shape
-        u, v = (x - self.x0) / self.cell, (y - self.y0) / self.cell
+        u, v = (np.asarray(x) - self.x0) / self.cell, (np.asarray(y) - self.y0) / self.cell
+        if not ((u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)).all():
+            raise GpvoError("a height was asked for outside the terrain", cure="keep the path within World.bounds")
         j = np.clip(u.astype(int), 0, columns - 2)
         i = np.clip(v.astype(int), 0, rows - 2)
         u, v = u - j, v - i
@@ -176,3 +154,74 @@ class HeightGrid:
         lower = z00 + u * (z10 - z00) + v * (z01 - z00)
         upper = z11 + (1 - u) * (z01 - z11) + (1 - v) * (z10 - z11)
         return np.where(u + v <= 1, lower, upper)
+
+
+class TriangleDistance:
+    """Distance to the nearest of a mesh's triangles, found among those whose centres are near.
+
+    Triangles of each class of size are searched apart, lest many small ones hide a large one.
+    ``vertices`` (V, 3), ``faces`` (F, 3), visible from the side of positive distance.
+    """
+
+    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+        self._corners = vertices[faces].astype(np.float64)
+        centre = self._corners.mean(axis=1)
+        size = np.linalg.norm(self._corners - centre[:, None], axis=2).max(axis=1)
+        size_class = np.floor(np.log2(np.maximum(size, 1e-6)) / 1.5)
+        self._members = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
+        self._trees = [cKDTree(centre[members]) for members in self._members]
+
+    def signed(self, points: Array) -> Array:
+        """(N, 3) to (N,) [m], positive on the visible side."""
+        parts = [self._signed(points[k : k + _CHUNK]) for k in range(0, len(points), _CHUNK)]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def _signed(self, points: Array) -> Array:
+        found = []
+        for tree, members in zip(self._trees, self._members):
+            count = min(_NEIGHBOURS, len(members))
+            found.append(members[tree.query(points, k=count)[1].reshape(len(points), count)])
+        index = np.concatenate(found, axis=1)
+        a, b, c = np.moveaxis(self._corners[index], 2, 0)
+        nearest = closest_on_triangles(points[:, None], a, b, c)
+        offset = points[:, None] - nearest
+        distance = np.linalg.norm(offset, axis=-1)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+        # Several triangles share an edge or a corner: the one seen most squarely says which side it is.
+        side = (offset * normal).sum(axis=-1)
+        best = distance.min(axis=1, keepdims=True)
+        side = np.where(distance <= best + 1e-9 + 1e-6 * best, side, 0.0)
+        winner = np.abs(side).argmax(axis=1)
+        sign = np.where(side[np.arange(len(points)), winner] < 0, -1.0, 1.0)
+        return sign * best[:, 0]
+
+
+def closest_on_triangles(p: Array, a: Array, b: Array, c: Array) -> Array:
+    """Nearest point of triangles ``a b c`` to ``p``, all (..., 3).
+
+    Christer Ericson, Real-Time Collision Detection (2005), section 5.1.5.
+    """
+    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
+    d1, d2 = (ab * ap).sum(-1), (ac * ap).sum(-1)
+    d3, d4 = (ab * bp).sum(-1), (ac * bp).sum(-1)
+    d5, d6 = (ab * cp).sum(-1), (ac * cp).sum(-1)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+
+    def ratio(x: Array, y: Array) -> Array:
+        return x / np.where(np.abs(y) > 1e-300, y, 1e-300)
+
+    total = ratio(np.ones_like(va), va + vb + vc)
+    v, w = vb * total, vc * total
+    rules = (
+        ((va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0), 1 - ratio(d4 - d3, d4 - d3 + d5 - d6), None),
+        ((vb <= 0) & (d2 >= 0) & (d6 <= 0), 0.0, ratio(d2, d2 - d6)),
+        ((d6 >= 0) & (d5 <= d6), 0.0, 1.0),
+        ((vc <= 0) & (d1 >= 0) & (d3 <= 0), ratio(d1, d1 - d3), 0.0),
+        ((d3 >= 0) & (d4 <= d3), 1.0, 0.0),
+        ((d1 <= 0) & (d2 <= 0), 0.0, 0.0),
+    )
+    for where, new_v, new_w in rules:
+        v = np.where(where, new_v, v)
+        w = np.where(where, 1 - v if new_w is None else new_w, w)
+    return a + v[..., None] * ab + w[..., None] * ac
