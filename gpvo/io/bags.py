@@ -11,23 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.camera_info import CameraInfo, rig_from_camera_info
 from gpvo.cameras.kalibr import camchain_topics
+from gpvo.cameras.projections import CameraInfo, rig_from_camera_info
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
 from gpvo.cameras.yamlfile import read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.bag_images import decode_message, pair_streams
-from gpvo.io.bag_imu import imu_topics, read_imu
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
     ODOMETRY_TYPE,
     POSE_TYPES,
+    imu_topics,
     is_bag,
     messages,
     open_bag,
+    read_imu,
     read_poses,
     stamp_ns,
     topics_of,

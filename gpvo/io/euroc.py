@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.euroc_yaml import read_sensor_pair, read_sensor_pose
-from gpvo.cameras.kalibr import read_imu_noise
+from gpvo.cameras.kalibr import read_imu_noise, read_sensor_pair, read_sensor_pose
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
 from gpvo.cameras.yamlfile import calibration_text, read_yaml
@@ -16,9 +15,8 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.images import FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
-from gpvo.io.lines import text_lines
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest
+from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, text_lines
 from gpvo.io.trajectory import read_euroc_csv
 from gpvo.io.truth import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog

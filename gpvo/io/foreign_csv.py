@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.lines import text_lines
 from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
-from gpvo.io.stamps import UNITS_NS, check_interval, text_to_ns
+from gpvo.io.stamps import UNITS_NS, check_interval, text_lines, text_to_ns
 from gpvo.types import Array
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.cameras.imagesize import image_size, is_decodable
-from gpvo.cameras.masks import read_mask
-from gpvo.cameras.rectify import Rectifier
+from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.order import OrderCheck

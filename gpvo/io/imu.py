@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import SourceError
-from gpvo.io.lines import text_lines
-from gpvo.io.stamps import integer_ns
+from gpvo.io.stamps import integer_ns, text_lines
 from gpvo.types import ImuLog, ImuNoise
 
 

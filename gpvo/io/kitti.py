@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gpvo.cameras.kitti_calib import left_camera_offset, read_kitti_calib
+from gpvo.cameras.projections import left_camera_offset, read_kitti_calib
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, read_grey8
 from gpvo.io.source import SourceReport

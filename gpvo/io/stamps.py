@@ -1,10 +1,11 @@
-"""Stamps: nanoseconds from text without rounding, matching of two cameras, and order in a running sequence."""
+"""Stamps: nanoseconds from text without rounding, matching of two cameras, order in a sequence; lines of text files."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
 from decimal import Decimal, InvalidOperation
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -16,10 +17,35 @@ from gpvo.io.source import SourceReport
 GAP_FACTOR = 1.75
 PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
 _WINDOW = 51
+_MAX_BYTES = 2_000_000_000
+_MAX_CHARACTERS = 1_000_000
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 # Usual intervals of any odometry [ns]; beyond them the stamps are in another unit.
 _SHORTEST_NS, _LONGEST_NS = 1e5, 1e12
+
+
+def text_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Numbers from 1 and text of the lines of a file, without blanks around them; empty ones are left out.
+
+    Raises
+    ------
+    SourceError
+        Where the file cannot be read, is larger than 2 GB, or has a line of more than a million characters.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise SourceError("is larger than 2 GB: no log", where=path)
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            number = 0
+            while line := file.readline(_MAX_CHARACTERS + 1):
+                number += 1
+                if len(line) > _MAX_CHARACTERS:
+                    raise SourceError(f"line {number} is longer than a million characters", where=path)
+                if text := line.strip().removeprefix("\ufeff"):
+                    yield number, text
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
 
 
 def seconds_text_to_ns(text: str) -> int:

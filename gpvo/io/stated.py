@@ -17,8 +17,7 @@ from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.atomic import write_text
-from gpvo.io.lines import text_lines
-from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns
+from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
 from gpvo.types import IMPORTED, Array, Status, VoLog, VoRecord
 

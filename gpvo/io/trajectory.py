@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.atomic import replacing
-from gpvo.io.lines import text_lines
-from gpvo.io.stamps import integer_ns, ns_to_seconds_text, seconds_text_to_ns
+from gpvo.io.stamps import integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.types import Array
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gpvo.cameras.camera_info import CameraInfo, rig_from_camera_info
+from gpvo.cameras.projections import CameraInfo, rig_from_camera_info
 from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
 from gpvo.geometry import se3

@@ -5,15 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from gpvo.cameras.camera_info import CameraInfo, rig_from_camera_info
-from gpvo.cameras.euroc_yaml import read_sensor_pair
-from gpvo.cameras.kalibr import camchain_topics, read_camchain, read_imu_noise
-from gpvo.cameras.kitti_calib import left_camera_offset, read_kitti_calib
-from gpvo.cameras.masks import read_mask
+from gpvo.cameras.kalibr import camchain_topics, read_camchain, read_imu_noise, read_sensor_pair
 from gpvo.cameras.models import KannalaBrandt, PinholeRadtan
-from gpvo.cameras.opencv_yaml import read_opencv_stereo, rig_from_librealsense
-from gpvo.cameras.readers import find_calibration, read_stereo_yaml
-from gpvo.cameras.rectify import Rectifier
+from gpvo.cameras.projections import CameraInfo, left_camera_offset, read_kitti_calib, rig_from_camera_info
+from gpvo.cameras.readers import find_calibration, read_opencv_stereo, read_stereo_yaml
+from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
@@ -266,14 +262,6 @@ def test_opencv_file_written_by_opencv(tmp_path):
     rig = read_stereo_yaml(path)
     np.testing.assert_allclose(rig.T_right_left, T_RIGHT_LEFT, atol=1e-12)
     assert (rig.left.width, rig.left.height) == (640, 480)
-
-
-def test_librealsense_rotation_is_column_major():
-    c = {"fx": 286.0, "fy": 286.0, "ppx": 420.0, "ppy": 398.0, "coeffs": [-0.003, 0.04, -0.037, 0.006, 0.0]}
-    rotation = T_RIGHT_LEFT[:3, :3].ravel(order="F").tolist()
-    rig = rig_from_librealsense(c, c, rotation, T_RIGHT_LEFT[:3, 3].tolist())
-    np.testing.assert_allclose(rig.T_right_left, T_RIGHT_LEFT, atol=1e-12)
-    assert (rig.left.width, rig.left.height) == (848, 800)
 
 
 @pytest.mark.parametrize("white_is_usable", [True, False])

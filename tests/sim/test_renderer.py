@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("numba")
 
-from gpvo.sim.render import Effects, StereoRenderer
+from gpvo.sim.render import StereoRenderer
 from small_world import FISHEYE, PINHOLE, RADTAN, pose, right_of, small_world
 
 
@@ -51,11 +51,3 @@ def test_motion_blur_is_the_mean_of_its_poses_and_depth_that_of_the_frame():
     np.testing.assert_allclose(left, np.mean([s[0] for s in single], axis=0), rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(right, np.mean([s[1] for s in single], axis=0), rtol=1e-5, atol=1e-7)
     np.testing.assert_array_equal(depth, single[1][2])
-
-
-def test_darkness_and_dust():
-    renderer = StereoRenderer(small_world(), PINHOLE, PINHOLE, right_of(0.1), threads=1)
-    clear = renderer.render(pose())[0]
-    assert not renderer.render(pose(), effects=Effects(lamps=0, head_lamp=0))[0].any()
-    dusty = renderer.render(pose(), effects=Effects(dust_per_m=2.0))[0]
-    assert dusty.std() < 0.3 * clear.std()

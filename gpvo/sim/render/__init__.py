@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from gpvo.sim.render.stereo import Effects, StereoRenderer
+from gpvo.sim.render.stereo import StereoRenderer
 
-__all__ = ["Effects", "StereoRenderer"]
+__all__ = ["StereoRenderer"]

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from gpvo.sim.render import raster, shade
 from gpvo.sim.render.groups import COLUMNS, SCRATCH, TAPS
 from gpvo.sim.render.lanes import LANES
-from gpvo.sim.render.rays import RayTable
-from gpvo.sim.render.scene import Scene
+from gpvo.sim.render.scene import RayTable, Scene
 from gpvo.types import Array
 
 _MOST_TAPS = 3
@@ -52,7 +51,7 @@ class Drawer:
     def draw(self, band: int, lights: Array) -> None:
         """Fill the rows of a band of ``radiance`` and ``depth``.
 
-        ``lights``: ambient, factor on baked light, head lamp, extinction of dust [1/m], its airlight.
+        ``lights``: ambient, head lamp.
         """
         s, t, memory = self._scene, self._table, self._memory[band]
         y0, y1 = self.bands[band]
@@ -77,8 +76,6 @@ class Drawer:
             shade.cast_shadows(
                 self._frame, memory.corner, s.vertices, memory.table, self._light_map, self.radiance, y0, y1
             )
-        if lights[3] > 0:
-            shade.veil(self._frame, np.float32(lights[3]), np.float32(lights[4]), self.radiance, y0, y1)
 
 
 class _Memory:

@@ -11,7 +11,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from gpvo.sim.render.rays import LANES
+from gpvo.sim.render.scene import LANES
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 FLOATS, INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)

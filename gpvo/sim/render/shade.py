@@ -38,7 +38,7 @@ def _vertex_light(v, vertices, P, axis, lights):
     forward = -(axis[0] * x + axis[1] * y + axis[2] * z) * inverse
     beam = min(max((forward - 0.30) / 0.65, 0.0), 1.0)
     beam = beam * beam * (3.0 - 2.0 * beam)
-    return vertices[v, 9] * (lights[0] + lights[1] * vertices[v, 8] + lights[2] * beam * facing / (0.15 + square))
+    return vertices[v, 9] * (lights[0] + vertices[v, 8] + lights[1] * beam * facing / (0.15 + square))
 
 
 @njit(**OPTIONS)
@@ -155,7 +155,7 @@ def shade(
 ):  # fmt: skip
     """Radiance and depth of the rows ``y_first`` to ``y_last`` (exclusive) from the visibility buffer.
 
-    ``lights``: ambient, factor on baked light, head lamp. ``table`` (T, 16) float32, ``integers`` the same memory as
+    ``lights``: ambient, head lamp. ``table`` (T, 16) float32, ``integers`` the same memory as
     int32; a row whose TAPS are 0 is not filled yet.
     """
     pixels, out_radiance, out_depth = (
@@ -204,16 +204,3 @@ def cast_shadows(frame, corner, vertices, table, light_map, radiance, y_first, y
             u = vertices[i, 6] + (table[t, U] * rx + table[t, U + 1] * ry + table[t, U + 2] * rz) * distance
             v = vertices[i, 7] + (table[t, V] * rx + table[t, V + 1] * ry + table[t, V + 2] * rz) * distance
             radiance[y, x] *= _shadow(image, u, v, origin_u, origin_v, scale)
-
-
-@njit(**OPTIONS)
-def veil(frame, extinction, airlight, radiance, y_first, y_last):
-    """Dust between camera and surface: takes light away and adds its own (Koschmieder, 1924)."""
-    for y in range(y_first, y_last):
-        for x in range(radiance.shape[1]):
-            inverse = frame[y, x >> 3, INVERSE, x & 7]
-            if inverse == 0:
-                radiance[y, x] = airlight
-            else:
-                clear = f4(math.exp(-extinction / inverse))
-                radiance[y, x] = radiance[y, x] * clear + airlight * (f4(1) - clear)

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.cameras.models import CameraModel
 from gpvo.errors import MissingExtraError
-from gpvo.sim.render.rays import RayTable
-from gpvo.sim.render.scene import Scene
+from gpvo.sim.render.scene import RayTable, Scene
 from gpvo.sim.worlds.world import World
 from gpvo.types import Array
 
 Image = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Effects:
-    """What may happen to the light of one frame.
-
-    ``lamps`` and ``head_lamp`` scale the world's fixed light and the lamp at the camera (0: switched off).
-    ``dust_per_m``: extinction of the air [1/m]; its haze glows with the world's ``dust_airlight``.
-    """
-
-    lamps: float = 1.0
-    head_lamp: float = 1.0
-    dust_per_m: float = 0.0
 
 
 class StereoRenderer:
@@ -75,8 +60,8 @@ class StereoRenderer:
         except ImportError as error:
             raise MissingExtraError("numba", "sim") from error
         scene = Scene.of(world)
-        self._lighting = scene.lighting
-        self._head_lamp = scene.lighting.head_lamp if head_lamp is None else head_lamp
+        lamp = scene.lighting.head_lamp if head_lamp is None else head_lamp
+        self._lights = np.array([scene.lighting.ambient, lamp])
         tables = [RayTable.of(model, max_angle_rad) for model in (left, right)]
         bands = max(1, (threads + 1) // 2)
         self._left, self._right = (Drawer(scene, table, far_m, bands) for table in tables)
@@ -85,7 +70,7 @@ class StereoRenderer:
         self.mask_left, self.mask_right = (table.valid for table in tables)
 
     def render(
-        self, T_world_left: Array, *, motion: Array | Sequence[Array] | None = None, effects: Effects | None = None
+        self, T_world_left: Array, *, motion: Array | Sequence[Array] | None = None
     ) -> tuple[Image, Image, Image]:
         """Linear radiance of both cameras and the depth of the left one, (H, W) float32 each, yours to keep.
 
@@ -93,18 +78,17 @@ class StereoRenderer:
         always that of ``T_world_left``. Depth runs along the optical axis [m], NaN where there is nothing; that of the
         right camera is kept in ``depth_right`` until the next call.
         """
-        effects = effects or Effects()
         pose = np.asarray(T_world_left, dtype=np.float64)
         left = right = None
         if motion is not None and len(motion) > 1:
             left, right = np.zeros_like(self._left.radiance), np.zeros_like(self._right.radiance)
             for T in motion:
-                self._draw(np.asarray(T, dtype=np.float64), effects)
+                self._draw(np.asarray(T, dtype=np.float64))
                 left += self._left.radiance
                 right += self._right.radiance
             left /= np.float32(len(motion))
             right /= np.float32(len(motion))
-        self._draw(pose, effects)
+        self._draw(pose)
         if left is None or right is None:
             left, right = self._left.radiance.copy(), self._right.radiance.copy()
         return left, right, self._left.depth.copy()
@@ -114,21 +98,10 @@ class StereoRenderer:
         """Depth of the right camera at the last pose (H, W) [m], NaN where there is nothing."""
         return self._right.depth.copy()
 
-    def _draw(self, T_world_left: Array, effects: Effects) -> None:
-        base = self._lighting
-        brightest = max(effects.lamps, effects.head_lamp)
-        lights = np.array(
-            [
-                base.ambient * effects.lamps,
-                effects.lamps,
-                self._head_lamp * effects.head_lamp,
-                effects.dust_per_m,
-                base.dust_airlight * brightest,
-            ]
-        )
+    def _draw(self, T_world_left: Array) -> None:
         views = ((self._left, T_world_left), (self._right, T_world_left @ self._T_left_right))
         aims = [(drawer.aim, (pose,)) for drawer, pose in views]
-        draws = [(drawer.draw, (band, lights)) for drawer, _ in views for band in range(len(drawer.bands))]
+        draws = [(drawer.draw, (band, self._lights)) for drawer, _ in views for band in range(len(drawer.bands))]
         for jobs in (aims, draws):
             if self._pool is None:
                 for function, arguments in jobs:

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds import fittings
 from gpvo.sim.worlds.baking import Baker
 from gpvo.sim.worlds.noise import fractal, lattice
 from gpvo.sim.worlds.shapes import Parts, vertex_normals
 from gpvo.sim.worlds.stone import gravel, rock
 from gpvo.sim.worlds.textures import duct, shotcrete
-from gpvo.sim.worlds.tubes import Line, Tube, rough_tube
+from gpvo.sim.worlds.tubes import Line, Tube, bolts, lamp_fixtures, pipe, rough_tube, rubble
 from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
 
@@ -166,16 +165,16 @@ def _furnish(parts: Parts, tube: Tube, bare: Array, lamps: Array, values: np.nda
     s = tube.line.s
     rows = np.flatnonzero((s > 2.0) & (s < s[-1] - 2.0))
     free = rows[~_within(s[rows], bare + [-0.5, 0.5])]
-    fittings.lamps(parts, lamps, tube, _SHOTCRETE)
+    lamp_fixtures(parts, lamps, tube, _SHOTCRETE)
     for run in np.split(free, np.flatnonzero(np.diff(free) > 1) + 1):
         third = run[:: max(round(0.25 / (s[1] - s[0])), 1)]
-        fittings.pipe(parts, tube, third, np.deg2rad(52), 0.42, 0.27, 14, 0.02, _DUCT, 1.5)
+        pipe(parts, tube, third, np.deg2rad(52), 0.42, 0.27, 14, 0.02, _DUCT, 1.5)
         for angle in (148, 153, 160):
-            fittings.pipe(parts, tube, third, np.deg2rad(angle), 0.12, 0.025, 6, 0.07, _DUCT, 1.5)
-    fittings.bolts(parts, tube, free[:: max(round(1.5 / (s[1] - s[0])), 1)], _DUCT, rng)
-    fittings.rubble(parts, tube, free, 0.5, 0.28, int(4 * s[-1]), values, _ROCK, _TILE_M, rng)
+            pipe(parts, tube, third, np.deg2rad(angle), 0.12, 0.025, 6, 0.07, _DUCT, 1.5)
+    bolts(parts, tube, free[:: max(round(1.5 / (s[1] - s[0])), 1)], _DUCT, rng)
+    rubble(parts, tube, free, 0.5, 0.28, int(4 * s[-1]), values, _ROCK, _TILE_M, rng)
     for end in (rows[s[rows] < 3.5], rows[s[rows] > s[-1] - 3.5]):
-        fittings.rubble(parts, tube, end, 1.0, 0.7, 60, values, _ROCK, _TILE_M, rng)
+        rubble(parts, tube, end, 1.0, 0.7, 60, values, _ROCK, _TILE_M, rng)
 
 
 def _seamless(normals: Array, tubes: list[Tube]) -> Array:

@@ -73,12 +73,10 @@ class Mesh:
 @dataclass(frozen=True)
 class Lighting:
     """Light that is not baked. ``ambient``: irradiance from everywhere. ``head_lamp``: radiant intensity of a lamp at
-    the camera, 0 for none. ``dust_airlight``: radiance of a thick cloud of dust in this light.
-    """
+    the camera, 0 for none."""
 
     ambient: float = 0.01
     head_lamp: float = 0.0
-    dust_airlight: float = 0.1
 
 
 @dataclass(frozen=True)
