@@ -144,8 +144,9 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
         "bursts": scenario.episodes_share > 0,
         "causes": scenario.causes,
         "dark": scenario.dark,
-        "tolerance": scenario.tolerance,
-        "offset": scenario.offset,
+        # A rectified pair has no distortion to be wrong.
+        "tolerance": replace(scenario.tolerance, distortion=0.0),
+        "offset": replace(scenario.offset, distortion=0.0),
     }
     return replace(base, **{**values, **scenario.points})
 
