@@ -11,9 +11,9 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
-from gpvo.filters.synthetic import synthetic_flight
 from gpvo.publish.odometry import OdometryBuilder
 from gpvo.types import MotionError
+from tests.filters.synthetic_flights import synthetic_flight
 
 
 def _microseconds(call: Callable[[], object], number: int, repeats: int = 7) -> float:

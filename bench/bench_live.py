@@ -30,8 +30,8 @@ from gpvo.geometry import se3
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online import modelfile
-from gpvo.sim.clip import pinhole, render_clip, wander
 from gpvo.types import Status, TruthLog, VoLog, VoRecord
+from tests.vo.rendered_clip import pinhole, render_clip, wander
 
 from bench.live_peers import LEFT, POSES, RIGHT, pose
 

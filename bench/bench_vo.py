@@ -8,7 +8,6 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 from gpvo.geometry import se3
-from gpvo.sim.clip import pinhole, render_clip, wander
 from gpvo.types import Array, StereoCamera, StereoFrame, VoLog
 from gpvo.vo import opencv
 from gpvo.vo.config import make_config
@@ -16,6 +15,7 @@ from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.motion import transfer
 from gpvo.vo.odometry import StereoOdometry
 from numpy.typing import NDArray
+from tests.vo.rendered_clip import pinhole, render_clip, wander
 
 SIZES = ((640, 480), (752, 480), (848, 800))
 FRAMES = 80

@@ -12,9 +12,9 @@ from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy
 from gpvo.filters.run import FuseOptions, fuse_flight
 from gpvo.filters.side_by_side import fuse_side_by_side
 from gpvo.filters.study import Constants, Study, fit_scalars, has_noise, make_policies, study, table
-from gpvo.filters.synthetic import ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
 from gpvo.types import Status, VoRecord
+from synthetic_flights import ErrorLaw, synthetic_flight, with_geometric
 
 
 def test_ate_agrees_with_evo() -> None:

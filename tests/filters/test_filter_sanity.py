@@ -11,8 +11,8 @@ from gpvo.errors import GpvoError
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight, require_sane
-from gpvo.filters.synthetic import synthetic_flight, with_geometric
 from gpvo.types import ImuLog
+from synthetic_flights import synthetic_flight, with_geometric
 
 
 @pytest.fixture(scope="module")

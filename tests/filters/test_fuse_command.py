@@ -14,11 +14,11 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionSettings, fuse_runs
 from gpvo.filters.policies import POLICIES
 from gpvo.filters.run import FuseOptions
-from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.run import read_run, write_run
 from gpvo.types import ImuLog, Mounting, Status, TruthLog, VoLog, VoRecord
+from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
 from typer.testing import CliRunner
 
 MOUNTING = Mounting(se3.from_rt(R_FLU_OPTICAL, np.array([0.3, 0.0, 0.1])), FORWARD_CAMERA)

@@ -11,10 +11,10 @@ from gpvo.filters import measurement as me
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import CORE, TH, Nominal, P, constant_velocity_step, imu_step
 from gpvo.filters.run import FuseOptions, begin, make_filter
-from gpvo.filters.synthetic import FORWARD_CAMERA, ErrorLaw, synthetic_flight
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import MotionError
+from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-5, 5e-3, 0.5, 1.5])

@@ -13,10 +13,10 @@ from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
 from gpvo.filters.run import FuseOptions, begin, fuse_flight
 from gpvo.filters.start import StartSigmas, StaticTest, from_rest, from_truth, heading
-from gpvo.filters.synthetic import synthetic_flight
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.types import ImuLog, TruthLog, VoLog
+from synthetic_flights import synthetic_flight
 
 
 def _rest(rng: np.random.Generator, R: np.ndarray, bias: np.ndarray, n: int = 100) -> ImuLog:

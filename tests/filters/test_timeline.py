@@ -12,12 +12,12 @@ from gpvo.filters.measurement import BIAS, JOINT
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
-from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, ErrorLaw, Events, synthetic_flight
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import ImuLog, Status, VoRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic_flights import FORWARD_CAMERA, MEMS, ErrorLaw, Events, synthetic_flight
 
 from motion_errors import prediction
 

@@ -13,8 +13,8 @@ from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
 from gpvo.filters.sanity import check_flight
 from gpvo.filters.start import StartSigmas
-from gpvo.filters.synthetic import synthetic_flight
 from gpvo.types import ImuLog, Status, VoRecord
+from synthetic_flights import synthetic_flight
 
 AT_S = 3.0
 Fault = Callable[[np.ndarray, np.ndarray, np.ndarray, int], None]

@@ -15,11 +15,11 @@ import psutil
 import pytest
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import FuseOptions, begin, make_filter
-from gpvo.filters.synthetic import synthetic_flight
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry.covariance import are_positive_definite
 from gpvo.online.predictor import Predictor
 from gpvo.types import VoRecord
+from synthetic_flights import synthetic_flight
 from synthetic_runs import make_run
 
 STEPS = int(os.environ.get("GPVO_LONG_STEPS", "40000"))

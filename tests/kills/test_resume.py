@@ -30,9 +30,9 @@ def pictures(folder: Path, kind: str) -> Path:
     """A folder of image pairs, a dark one and a frozen one among them."""
     pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
     from gpvo.cameras.models import KannalaBrandt, PinholeRadtan
-    from gpvo.sim.clip import wander
     from gpvo.sim.render import StereoRenderer
     from gpvo.sim.worlds import build_world
+    from rendered_clip import wander
 
     numbers, distortion = LENSES[kind]
     lens = (PinholeRadtan if kind == "pinhole" else KannalaBrandt)(*numbers, 300, 200)

@@ -13,12 +13,12 @@ from gpvo.filters.policies import ConstantPolicy
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V, imu_step
 from gpvo.filters.run import Flight, FuseOptions, fuse_flight
 from gpvo.filters.start import StartSigmas
-from gpvo.filters.synthetic import FORWARD_CAMERA, MEMS, smooth_path
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import ImuLog, MotionError, Status, VoRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic_flights import FORWARD_CAMERA, MEMS, smooth_path
 
 ACCEPT = Gate(on_fail="accept")
 GRAVITY = np.array([0.0, 0.0, -9.80665])

@@ -12,9 +12,9 @@ from gpvo.cameras.rig import StereoRig
 from gpvo.geometry import se3
 from gpvo.online.predictor import Predictor
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
-from gpvo.sim.clip import pinhole, render_clip, wander
 from gpvo.types import StereoFrame, VoLog
 from gpvo.vo.odometry import StereoOdometry
+from rendered_clip import pinhole, render_clip, wander
 from test_wires import WIRES, check
 from wire_peers import ROOT, ends_in_a_second, live, place, reader, running
 

@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.filters.synthetic import ErrorLaw, synthetic_flight
 from gpvo.publish import consumers
 from gpvo.publish.mavlink import upper_triangle
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
+from synthetic_flights import ErrorLaw, synthetic_flight
 
 
 @pytest.fixture(scope="module")

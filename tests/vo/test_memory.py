@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
-from gpvo.sim.clip import pinhole, render_clip, wander
+from rendered_clip import pinhole, render_clip, wander
 
 FRAMES = 10_000
 # In a process of its own: the renderer's memory is none of the odometry's.

@@ -15,7 +15,7 @@ from gpvo.vo.config import make_config, read_settings
 from gpvo.vo.odometry import StereoOdometry
 
 pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
-from gpvo.sim.clip import Clip, pinhole, render_clip, wander
+from rendered_clip import Clip, pinhole, render_clip, wander
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from stereo_points import CAMERA, scene
 
 pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
 import stress
-from gpvo.sim.clip import pinhole, render_clip, wander
+from rendered_clip import pinhole, render_clip, wander
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL

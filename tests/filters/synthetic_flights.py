@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
-
 from gpvo.filters.run import Flight
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, ImuNoise, Prediction, Status, VoRecord
+from numpy.typing import NDArray
 
 FORWARD_CAMERA = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0.02], [0, -1, 0, -0.03], [0, 0, 0, 1]])
 MEMS = ImuNoise(2e-4, 2e-3, 2e-5, 5e-4)
