@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Mapping
+from datetime import datetime, timezone
 from typing import Any
 
 from gpvo.online.features import AXES
@@ -14,8 +17,9 @@ def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -
         return "\n\n".join([_position(header, name), _sequences(header), _domain(header)]) + "\n"
     sections = [
         _intro(header, name),
+        _unfit(header, table),
         _data(header),
-        _scores(table),
+        _scores(table, name),
         _calibration(header),
         _domain(header),
         _limits(header),
@@ -34,12 +38,48 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             "",
             "Predicts the error of stereo visual odometry, with covariance, in the rectified left camera's frame.",
             "",
+            f"* trained on {_today()} with gpvo {h['versions']['gpvo']}",
             f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}): {inputs}",
             f"* mean that a filter takes off: {_steady(choices)}",
         ]
     )
+
+
+def _today() -> str:
+    """The date, or that of the environment's SOURCE_DATE_EPOCH, by which builds are made reproducible."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    now = datetime.fromtimestamp(int(epoch), timezone.utc) if epoch.isdecimal() else datetime.now(timezone.utc)
+    return now.date().isoformat()
+
+
+def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
+    """Where the model must not be used, by example."""
+    camera, domain = h["camera"], h["training_domain"]
+    lines = [f"* At a rate other than {h['rate_hz']:.3g} frames/s."]
+    if camera is not None:
+        lines.insert(0, f"* With a camera other than its own (focal length {_camera(camera)}).")
+    speeds = [domain[c] for c in ("v_x_mps", "v_y_mps", "v_z_mps") if c in domain]
+    if speeds:
+        top = max(abs(v) for reach in speeds for v in reach)
+        lines.append(f"* Faster than {top:.2g} m/s along any axis of the camera; no training motion was.")
+    if "n_inliers" in domain:
+        lines.append(
+            f"* Where odometry keeps fewer than {math.ceil(domain['n_inliers'][0])} inliers; no training motion did."
+        )
+    for fold in table.get("folds", ()):
+        found, inside = fold["methods"]["learned"]["nees_dof"]["joint"], fold.get("in_domain", 1.0)
+        if found is not None and not 0.5 <= found <= 2.0:
+            wrong = "overconfident" if found > 1 else "too cautious"
+            lines.append(
+                f"* On flights like `{fold['held_out']}`: left out of training, it was {wrong} (NEES/dof {found:.3g})."
+            )
+        elif inside < 0.9:
+            lines.append(f"* On flights like `{fold['held_out']}`: left out, {100 * inside:.0f} % of it was in domain.")
+    if h.get("simulated_truth"):
+        lines.append("* As proof that a vehicle is safe: its truth was simulated.")
+    return "\n".join(["## Where not to use it", "", *lines, "", "`gpvo check MODEL RUN` tells before a flight."])
 
 
 def _steady(choices: Mapping[str, Any]) -> str:
@@ -76,10 +116,7 @@ def _sequences(h: Mapping[str, Any]) -> str:
     ]
     camera = h["camera"]
     seen = (
-        "no camera known"
-        if camera is None
-        else f"focal length {camera['fx_px']:.1f} px, baseline {camera['baseline_m']:.4f} m, "
-        f"{camera['width']}x{camera['height']}"
+        "no camera known" if camera is None else f"focal length {_camera(camera)}, {camera['width']}x{camera['height']}"
     )
     head = [
         "## Training data",
@@ -92,6 +129,10 @@ def _sequences(h: Mapping[str, Any]) -> str:
     return "\n".join([*head, *rows])
 
 
+def _camera(camera: Mapping[str, Any]) -> str:
+    return f"{camera['fx_px']:.1f} px, baseline {camera['baseline_m']:.4f} m"
+
+
 def _number(value: float | None, digits: str = ".3g") -> str:
     return "-" if value is None else format(value, digits)
 
@@ -102,7 +143,7 @@ _HEAD = (
 )
 
 
-def _scores(table: Mapping[str, Any]) -> str:
+def _scores(table: Mapping[str, Any], name: str) -> str:
     if not table.get("folds"):
         return "## Scores\n\nOne short sequence: nothing could be left out, so nothing is known about another one."
     blocks = table.get("folds_are") == "time blocks"
@@ -127,6 +168,14 @@ def _scores(table: Mapping[str, Any]) -> str:
     ]
     for fold in table["folds"]:
         lines += _row(fold["held_out"], fold["methods"]["learned"])
+    if any(fold.get("stated_and_actual") for fold in table["folds"]):
+        lines += [
+            "",
+            f"![Stated against actual error]({name}.svg)",
+            "",
+            "Stated against actual error of an axis, for tenths of the motions by what was stated. On the diagonal",
+            "sigma is right; above it sigma is too small. In the green band it is right within a factor of 1.4.",
+        ]
     return "\n".join(lines)
 
 

@@ -50,6 +50,18 @@ def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) ->
     }
 
 
+def stated_and_actual(error: Array, mean: Array, covariance: Array) -> dict[str, list[tuple[float, float]]]:
+    """By kind of axis, over tenths of the motions by rising stated variance: the root mean stated variance and the root
+    mean squared error of an axis [m or rad]. Arguments as in :func:`score`, (n, 6) and (n, 6, 6)."""
+    variance, square = np.diagonal(covariance, axis1=1, axis2=2), (error - mean) ** 2
+    out = {}
+    for kind, block in (("translation_m", slice(0, 3)), ("rotation_rad", slice(3, 6))):
+        order = np.argsort(variance[:, block].sum(1), kind="stable")
+        tenths = [rows for rows in np.array_split(order, 10) if len(rows)]
+        out[kind] = [tuple(float(np.sqrt(v[rows, block].mean())) for v in (variance, square)) for rows in tenths]
+    return out  # type: ignore[return-value]
+
+
 def empty() -> dict[str, Any]:
     """The same document where nothing could be computed."""
     return {

@@ -10,6 +10,7 @@ from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import ModelError
 from gpvo.io.atomic import write_text
 from gpvo.learning.card import model_card
+from gpvo.learning.cardplot import stated_against_actual
 from gpvo.learning.train import TrainedModel, TrainingSet, training_digest
 from gpvo.online import modelfile
 
@@ -17,6 +18,11 @@ from gpvo.online import modelfile
 def card_path(model: Path) -> Path:
     """Of the model card."""
     return model.with_name(model.name + ".md")
+
+
+def picture_path(model: Path) -> Path:
+    """Of the card's picture."""
+    return model.with_name(model.name + ".svg")
 
 
 def rows_path(model: Path) -> Path:
@@ -36,12 +42,17 @@ def check_writable(path: Path) -> None:
 
 
 def save_model(trained: TrainedModel, path: str | Path) -> None:
-    """``path``, ``path.md`` and ``path.rows.parquet``; each replaced whole or not at all. Kept folds are done with."""
+    """``path``, ``path.md`` with its picture ``path.svg``, and ``path.rows.parquet``; each whole or not at all. Kept
+    folds are done with."""
     path = Path(path)
     check_writable(path)
     write_sets(rows_path(path), trained.sets)
-    text = model_card(trained.header, trained.table, path.name)
-    write_text(card_path(path), text)
+    picture = stated_against_actual(trained.table.get("folds", ()))
+    if picture is None:
+        picture_path(path).unlink(missing_ok=True)
+    else:
+        write_text(picture_path(path), picture)
+    write_text(card_path(path), model_card(trained.header, trained.table, path.name))
     modelfile.save(path, trained.arrays, trained.header)
     shutil.rmtree(folds_path(path), ignore_errors=True)
 

@@ -25,7 +25,7 @@ from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_sta
 from gpvo.learning.parallel import map_jobs
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
-from gpvo.learning.scores import average, empty, score
+from gpvo.learning.scores import average, empty, score, stated_and_actual
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import units
 from gpvo.online.predictor import Predictor
@@ -173,6 +173,7 @@ def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainC
         "truth_moves_at_rest": held_out.counts.get("truth_moves_at_rest", 0),
         "methods": methods,
         "in_domain": float(np.mean(estimate.in_domain > 0.5)),
+        "stated_and_actual": stated_and_actual(held_out.Y, estimate.mean, estimate.covariance),
         "slips": _slips(held_out, estimate, learned, arrays["method.constant"]),
         "choices": learned.choices,
     }

@@ -146,10 +146,9 @@ def test_trainings(flights: Path, tmp_path: Path) -> None:
 
     killed(0.1, command, look, takes_s)
     assert model.read_bytes() == wanted
-    assert {p.name for p in tmp_path.iterdir()} <= {model.name, f"{model.name}.md", f"{model.name}.rows.parquet"} | {
-        p.name
-        for p in tmp_path.glob(".m.gpvo*")  # of a model being written when it was killed
-    }
+    being_written = {p.name for p in tmp_path.glob(".m.gpvo*")}  # when it was killed
+    whole = {model.name, *(f"{model.name}.{suffix}" for suffix in ("md", "svg", "rows.parquet"))}
+    assert {p.name for p in tmp_path.iterdir()} <= whole | being_written
 
 
 @pytest.mark.slow

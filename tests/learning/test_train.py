@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
 from gpvo.learning.steadymean import significantly_positive
-from gpvo.learning.store import card_path, folds_path, rows_path, save_model
+from gpvo.learning.store import card_path, folds_path, picture_path, rows_path, save_model
 from gpvo.learning.train import _slips, train_sets
 from gpvo.learning.update import config_of, update
 from gpvo.learning.velocities import rate_changes
@@ -210,6 +212,16 @@ def test_table_has_every_row_and_every_key(tmp_path):
     card = card_path(tmp_path / "m.gpvo").read_text()
     assert "pointing_matching_scaled" in card
     assert "training data" in card.lower()
+    assert "## Where not to use it" in card
+    assert re.search(r"trained on \d{4}-\d\d-\d\d with gpvo", card)
+    # The picture: in each of two panels a curve per sequence, near the diagonal on errors as stated.
+    assert "(m.gpvo.svg)" in card
+    root = ElementTree.fromstring(picture_path(tmp_path / "m.gpvo").read_text())
+    assert len([e for e in root.iter() if e.tag.endswith("polyline")]) == 2 * len(sets)
+    for fold in folds:
+        for pairs in fold["stated_and_actual"].values():
+            stated, actual = np.array(pairs).T
+            assert 0.7 < np.sqrt((actual**2).mean() / (stated**2).mean()) < 1.4
 
 
 def test_the_row_base_is_the_model_with_its_gp_at_the_mean_function(tmp_path):
