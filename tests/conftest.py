@@ -14,8 +14,8 @@ settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None)
 settings.load_profile("same")
 
-# Helper modules lie beside the tests that use them.
-for folder in {p.parent for p in Path(__file__).parent.rglob("*.py")}:
+# Helper modules lie beside the tests that use them; `bench` at the root.
+for folder in {Path(__file__).parents[1], *(p.parent for p in Path(__file__).parent.rglob("*.py"))}:
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
 

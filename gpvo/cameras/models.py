@@ -6,9 +6,10 @@ frame (x right, y down, z forward).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,33 +19,36 @@ from gpvo.types import Array
 _NEWTON_STEPS = 60
 
 
-class CameraModel(Protocol):
-    """What every lens model offers. ``width, height`` [px]; ``fx_px, fy_px, cx_px, cy_px`` [px]."""
+@dataclass(frozen=True)
+class CameraModel(ABC):
+    """A lens: ``fx_px, fy_px, cx_px, cy_px`` [px], ``width, height`` [px], and the coefficients of its distortion."""
 
     kind: ClassVar[str]
 
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def fx_px(self) -> float: ...
-    @property
-    def fy_px(self) -> float: ...
-    @property
-    def cx_px(self) -> float: ...
-    @property
-    def cy_px(self) -> float: ...
-    @property
-    def distortion(self) -> tuple[float, ...]: ...
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
 
+    @property
+    def intrinsics_px(self) -> list[float]:
+        """fx, fy, cx, cy."""
+        return [float(v) for v in (self.fx_px, self.fy_px, self.cx_px, self.cy_px)]
+
+    @abstractmethod
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) points to (N, 2) pixels and (N,) whether the lens can see the point (also outside the image)."""
-        ...
 
+    @abstractmethod
     def unproject(self, uv: Array) -> Array:
         """(N, 2) pixels to (N, 3) unit rays; NaN where no ray maps to the pixel."""
-        ...
+
+    def _normalised(self, uv: Array) -> Array:
+        """(N, 2) pixels to the plane of unit focal length."""
+        return (np.asarray(uv, dtype=np.float64).reshape(-1, 2) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
 
 
 def _smallest_positive_root(coefficients_ascending: tuple[float, ...], default: float) -> float:
@@ -87,21 +91,15 @@ def _invert_monotone(
 
 
 @dataclass(frozen=True)
-class PinholeRadtan:
+class PinholeRadtan(CameraModel):
     """Pinhole with radial-tangential distortion ``(k1, k2, p1, p2[, k3])`` (D. Brown, 1966; OpenCV's order).
 
-    ``fx_px, fy_px, cx_px, cy_px`` [px], ``width, height`` [px]. Points at or behind the lens plane, and those beyond
+    Points at or behind the lens plane, and those beyond
     the radius where the radial polynomial folds back, are not valid.
     """
 
     kind: ClassVar[str] = "pinhole-radtan"
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    width: int
-    height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     @property
@@ -148,10 +146,7 @@ class PinholeRadtan:
 
     def unproject(self, uv: Array) -> Array:
         """(N, 2) pixels to (N, 3) unit rays, by Newton's method in two dimensions; NaN where there is none."""
-        distorted = (np.asarray(uv, dtype=np.float64).reshape(-1, 2) - (self.cx_px, self.cy_px)) / (
-            self.fx_px,
-            self.fy_px,
-        )
+        distorted = self._normalised(uv)
         xy = self._undistort_radially(distorted)
         for _ in range(20):
             residual = self._distort(xy) - distorted
@@ -191,21 +186,15 @@ class PinholeRadtan:
 
 
 @dataclass(frozen=True)
-class KannalaBrandt:
+class KannalaBrandt(CameraModel):
     """Fisheye ``r = f theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)``, also beyond 90 degrees.
 
     J. Kannala, S. Brandt, "A generic camera model and calibration method" (2006), equation 6, in the four-coefficient
-    form of Kalibr's ``equidistant`` and ``cv2.fisheye``. ``fx_px, fy_px, cx_px, cy_px`` [px], ``width, height`` [px].
+    form of Kalibr's ``equidistant`` and ``cv2.fisheye``.
     """
 
     kind: ClassVar[str] = "kannala-brandt"
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    width: int
-    height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
     @property
@@ -238,7 +227,7 @@ class KannalaBrandt:
 
     def unproject(self, uv: Array) -> Array:
         """(N, 2) pixels to (N, 3) unit rays; NaN beyond the largest angle."""
-        m = (np.asarray(uv, dtype=np.float64).reshape(-1, 2) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
+        m = self._normalised(uv)
         r = np.linalg.norm(m, axis=1)
         theta = _invert_monotone(self._radius, self._slope, r, self.max_angle_rad)
         direction = m / np.where(r > 0, r, 1.0)[:, None]

@@ -58,7 +58,7 @@ class StereoRig:
             and isinstance(b, PinholeRadtan)
             and not any(a.distortion)
             and not any(b.distortion)
-            and bool(np.allclose(_intrinsics(a), _intrinsics(b), atol=1e-6))
+            and bool(np.allclose(a.intrinsics_px, b.intrinsics_px, atol=1e-6))
             and bool(np.allclose(self.T_right_left[:3, :3], np.eye(3), atol=1e-9))
             and bool(np.allclose(self.T_right_left[1:3, 3], 0.0, atol=1e-9))
         )
@@ -73,7 +73,7 @@ class StereoRig:
         def lens(model: CameraModel) -> dict[str, object]:
             return {
                 "model": model.kind,
-                "intrinsics_px": _intrinsics(model),
+                "intrinsics_px": model.intrinsics_px,
                 "distortion": [float(k) for k in model.distortion],
                 "resolution_px": [model.width, model.height],
             }
@@ -86,10 +86,6 @@ class StereoRig:
             "T_body_left": None if self.T_body_left is None else self.T_body_left.tolist(),
             "timeshift_cam_imu_s": self.timeshift_cam_imu_s,
         }
-
-
-def _intrinsics(model: CameraModel) -> list[float]:
-    return [float(v) for v in (model.fx_px, model.fy_px, model.cx_px, model.cy_px)]
 
 
 def check_pose(T: object, name: str, where: object = None) -> Array:
@@ -144,7 +140,7 @@ def check_rig(rig: StereoRig) -> None:
 
 
 def _check_lens(lens: CameraModel, name: str, where: str | None) -> None:
-    numbers = np.array([*_intrinsics(lens), *lens.distortion], dtype=np.float64)
+    numbers = np.array([*lens.intrinsics_px, *lens.distortion], dtype=np.float64)
     if not np.abs(numbers).max() < _LARGEST:
         told = "that is not finite, or beyond a million"
         raise CalibrationError(f"the {name} camera has an intrinsic {told}", where=where)

@@ -26,12 +26,13 @@ def info(
     Example: gpvo info MH_01_easy/
     """
     from gpvo.cli.describe import as_lines, describe
-    from gpvo.cli.output import jsonable, print_json
+    from gpvo.cli.output import print_json
+    from gpvo.io.jsonfile import plain
 
     given = options.source_options(
         calibration=calibration, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic
     )
-    document = jsonable(describe(path, kind, given))
+    document = plain(describe(path, kind, given))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:

@@ -84,22 +84,11 @@ def new_table(*columns: str) -> Table:
     return table
 
 
-def jsonable(value: Any) -> Any:
-    """The same document with plain Python values; what is not finite becomes None."""
-    if isinstance(value, dict):
-        return {str(k): jsonable(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(v) for v in value]
-    if hasattr(value, "tolist"):
-        return jsonable(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def print_json(document: dict[str, Any]) -> None:
     """Print a document in the form scripts read."""
-    print(json.dumps(jsonable(document), indent=2))
+    from gpvo.io.jsonfile import plain
+
+    print(json.dumps(plain(document), indent=2))
 
 
 def one_of(option: str, value: str, choices: Iterable[str]) -> str:

@@ -169,7 +169,7 @@ def calibration(
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
-    from gpvo.cli.output import jsonable, print_json
+    from gpvo.cli.output import print_json
     from gpvo.errors import SourceError
     from gpvo.io.atomic import write_text
     from gpvo.io.jsonfile import read_json
@@ -185,7 +185,7 @@ def calibration(
         write_text(out, camchain(rig))
     found = document(state, camera)
     if json_:
-        print_json({"run": str(run), **jsonable(found)})
+        print_json({"run": str(run), **found})
         return
     print("\n".join(found["findings"] or ["nothing found wrong between the cameras"]))
     if out is not None:

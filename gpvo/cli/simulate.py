@@ -89,15 +89,12 @@ def simulate(
 
 def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -> Flight:
     from gpvo.cli.output import progress
-    from gpvo.sim.campaign import Flight, fly_points
+    from gpvo.sim.campaign import fly
 
     if points:
-        return fly_points(scenario, seed, out if out.suffix == ".npz" else out.with_name(out.name + ".npz"))
-    from gpvo.sim.sequence import simulate as simulate_images
-
+        return fly(scenario, seed, out if out.suffix == ".npz" else out.with_name(out.name + ".npz"), points)
     with progress("frames", int(scenario.duration_s * scenario.rate_hz) + 1) as advance:
-        info = simulate_images(scenario, seed, out, threads=threads, on_frame=advance)
-    return Flight(seed, out, info.frames, info.distance_m, info.redone)
+        return fly(scenario, seed, out, threads=threads, on_frame=advance)
 
 
 def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from gpvo.filters.gate import chi2_quantile
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import LEARNED
 from gpvo.filters.run import FusedRun
-from gpvo.filters.study import Constants, Study
+from gpvo.filters.study import Study
 from gpvo.io.atomic import write_text
 from gpvo.types import Array
 
@@ -53,7 +54,7 @@ def document(report: FusionReport) -> dict[str, Any]:
         "runs": runs,
         "mean": {name: _mean(result, name, report.traces) for name in names},
         "comparisons": [_comparison(result, LEARNED, other) for other in others],
-        "constants": _constants_document(result.constants),
+        "constants": None if result.constants is None else asdict(result.constants),
         "warnings": list(report.warnings),
     }
 
@@ -94,17 +95,6 @@ def _comparison(result: Study, policy: str, against: str) -> dict[str, Any] | No
         "gain_percent": compared.gain_percent,
         "ate_difference_m": d.mean,
         "interval_m": [d.low, d.high],
-    }
-
-
-def _constants_document(constants: Constants | None) -> dict[str, Any] | None:
-    if constants is None:
-        return None
-    return {
-        "mean_squares": constants.mean_squares,
-        "dt_s": constants.dt_s,
-        "best": constants.best,
-        "hindsight": constants.hindsight,
     }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gpvo.cameras.kalibr import read_imu_noise
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, read_grey8
+from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns
@@ -55,8 +55,8 @@ class FolderSource(FileSource):
             )
         known = SourceReport()
         pairs = _list_pairs(path, rate_hz, tolerance_s, known)
-        first = read_grey8(pairs[0].left) if pairs else None
-        rig = read_stereo_yaml(chain, size=None if first is None else (first.shape[1], first.shape[0]))
+        first = first_size(pairs, "left")
+        rig = read_stereo_yaml(chain, size=None if first is None else first[1])
         super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         if (path / "imu.csv").is_file():
             noise = path / "imu.yaml"

@@ -261,6 +261,12 @@ def _size_of(path: Path) -> tuple[int, int] | None:
         return None
 
 
+def first_size(pairs: Sequence[PairFiles], side: str) -> tuple[Path, tuple[int, int]] | None:
+    """File and (width, height) of the first readable image of a camera, ``left`` or ``right``."""
+    sizes = ((path, _size_of(path)) for path in (getattr(pair, side) for pair in pairs))
+    return next(((path, size) for path, size in sizes if size is not None), None)
+
+
 def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
     """Refuse a calibration for another resolution, judged by the first readable image of each camera.
 
@@ -270,17 +276,11 @@ def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
         Naming both resolutions.
     """
     for side, lens in (("left", rig.left), ("right", rig.right)):
-        for pair in pairs[:20]:
-            path: Path = getattr(pair, side)
-            size = _size_of(path)
-            if size is None:
-                continue
-            width, height = size
-            if (width, height) != (lens.width, lens.height):
-                raise CalibrationError(
-                    f"the image is {width}x{height}, its calibration is for {lens.width}x{lens.height}"
-                    + (f" ({rig.where})" if rig.where else ""),
-                    where=path,
-                    cure="use the calibration of this resolution, or scale its intrinsics",
-                )
-            break
+        path, (width, height) = first_size(pairs, side) or (None, (lens.width, lens.height))
+        if (width, height) != (lens.width, lens.height):
+            raise CalibrationError(
+                f"the image is {width}x{height}, its calibration is for {lens.width}x{lens.height}"
+                + (f" ({rig.where})" if rig.where else ""),
+                where=path,
+                cure="use the calibration of this resolution, or scale its intrinsics",
+            )

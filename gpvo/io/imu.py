@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import SourceError
-from gpvo.io.stamps import integer_ns, text_lines
+from gpvo.io.stamps import growing, integer_ns, text_lines
 from gpvo.types import ImuLog, ImuNoise
 
 
@@ -56,8 +56,7 @@ def make_imu(
     remark: Callable[[str], None] | None = None,
 ) -> ImuLog:
     """An :class:`ImuLog` of samples (N, 6), gyro first; those that repeat or go back in time are dropped."""
-    latest = np.maximum.accumulate(t_ns)
-    keep = np.concatenate([[True], t_ns[1:] > latest[:-1]])
+    keep = growing(t_ns)
     if remark is not None and not keep.all():
         remark(f"{int((~keep).sum())} of {len(t_ns)} IMU samples repeat or go back in time: dropped")
     t = t_ns[keep] - round(shift_s * 1e9)

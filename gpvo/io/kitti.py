@@ -7,8 +7,9 @@ from typing import Any
 
 from gpvo.cameras.projections import left_camera_offset, read_kitti_calib
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, read_grey8
+from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
+from gpvo.io.stamps import growing
 from gpvo.io.trajectory import Trajectory, read_kitti_poses, read_times
 from gpvo.io.truth import GPS_INS, TruthNoise, carry
 from gpvo.types import TruthLog
@@ -38,8 +39,10 @@ class KittiSource(FileSource):
         left, right = self._cameras(path, colour)
         known = SourceReport()
         pairs = self._list_pairs(path, left, right, known)
-        size = _first_size(pairs, path)
-        rig = read_kitti_calib(calib, left=left, right=right, size=size)
+        first = first_size(pairs, "left")  # the calibration does not say it
+        if first is None:
+            raise SourceError("not one readable left image", where=path)
+        rig = read_kitti_calib(calib, left=left, right=right, size=first[1])
         super().__init__(path, path.name, rig, pairs, known, **options)
         self.truth = self._read_truth(path, calib, left, truth_noise)
 
@@ -102,23 +105,5 @@ class KittiSource(FileSource):
                 where=file,
                 cure="KITTI poses have no stamps: both files must have one line per frame",
             )
-        grows = _strictly_growing(stamps)
+        grows = growing(stamps)
         return carry(Trajectory(stamps[grows], T_world_cam0[grows]), left_camera_offset(calib, left), noise)
-
-
-def _strictly_growing(stamps: Any) -> list[int]:
-    """Indices of the stamps that are later than all before them."""
-    kept: list[int] = []
-    for i, t in enumerate(stamps):
-        if not kept or t > stamps[kept[-1]]:
-            kept.append(i)
-    return kept
-
-
-def _first_size(pairs: list[PairFiles], path: Path) -> tuple[int, int]:
-    """(width, height) of the first readable left image; KITTI's calibration does not say it."""
-    for pair in pairs:
-        image = read_grey8(pair.left)
-        if image is not None:
-            return image.shape[1], image.shape[0]
-    raise SourceError("not one readable left image", where=path)

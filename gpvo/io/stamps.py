@@ -150,6 +150,11 @@ class _GapWatch:
         self._last = t_ns
 
 
+def growing(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) whether each stamp is later than all before it."""
+    return np.concatenate([[True], t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]])
+
+
 def usual_interval(t_ns: Iterable[int]) -> float | None:
     """Median interval of stamps [ns], whatever their order; None for fewer than three."""
     stamps = np.unique(np.fromiter(t_ns, dtype=np.int64))

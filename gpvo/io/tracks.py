@@ -27,7 +27,7 @@ from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import in_order
+from gpvo.io.stamps import growing, in_order
 from gpvo.io.truth import GPS_INS, TruthNoise
 from gpvo.types import Array, ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
 
@@ -138,7 +138,7 @@ class TracksSource:
         acc = np.full((n, 3), np.nan)
         if "acc_body_mps2" in self._data:
             acc = _shaped(self._data, "acc_body_mps2", (n, 3), self.path)
-        keep = _growing(self._t_ns)
+        keep = growing(self._t_ns)
         return ImuLog(self._t_ns[keep], gyro[keep], acc[keep])
 
     def _full_imu(self) -> ImuLog:
@@ -151,14 +151,14 @@ class TracksSource:
             raise SourceError(f"has 'imu_t_ns' but not {', '.join(absent)}", where=self.path)
         gyro, acc = (_shaped(self._data, a, (k, 3), self.path) for a in ("imu_gyro_radps", "imu_acc_mps2"))
         noise = ImuNoise(*_shaped(self._data, "imu_noise", (4,), self.path)) if "imu_noise" in self._data else None
-        keep = _growing(t_ns)
+        keep = growing(t_ns)
         return ImuLog(t_ns[keep].astype(np.int64), gyro[keep], acc[keep], noise)
 
     def _make_truth(self, noise: TruthNoise | None) -> TruthLog | None:
         if "T_world_cam" not in self._data:
             return None
         T = _shaped(self._data, "T_world_cam", (len(self._t_ns), 4, 4), self.path, finite=False)
-        keep = _growing(self._t_ns) & ~np.isnan(T[:, :3]).all(axis=(1, 2))
+        keep = growing(self._t_ns) & ~np.isnan(T[:, :3]).all(axis=(1, 2))
         if not keep.any():
             raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="leave it out: no truth")
         poses = [check_pose(T[k], f"'T_world_cam' row {k}", self.path) for k in np.flatnonzero(keep)]
@@ -237,8 +237,3 @@ def _shaped(
     if (np.abs(out) > most).any():
         raise SourceError(f"'{key}' holds {np.nanmax(np.abs(out)):.3g}, and {most:.3g} is the most", where=path)
     return out
-
-
-def _growing(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(N,) whether each stamp is later than all before it."""
-    return np.concatenate([[True], t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]])

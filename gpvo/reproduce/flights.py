@@ -17,6 +17,7 @@ from gpvo.io.trajectory import read_euroc_csv, read_tum, tum_line
 from gpvo.reproduce.experiments import FLIGHTS, FlightSet, sigma_pairs
 from gpvo.reproduce.plan import Mode, Plan
 from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file, write_text
+from gpvo.sim.campaign import fly as simulate
 from gpvo.sim.scenario import Scenario, load_scenario
 from gpvo.vo.config import make_config
 
@@ -98,7 +99,7 @@ def fly(flight: Flight, store: Store) -> Flown:
     sequence = store.folder("flights") / (flight.name + (".npz" if flight.mode == "points" else ""))
     try:
         if missing:
-            _simulate(flight, sequence)
+            simulate(flight.scenario, flight.seed, sequence, points=flight.mode == "points")
         for preset, path in missing.items():
             runner.run(open_source(sequence), path, make_config(preset, sigma_pairs_px=pairs[preset]))
     except GpvoError as error:
@@ -113,18 +114,6 @@ def fly(flight: Flight, store: Store) -> Flown:
 def is_complete(run: Path) -> bool:
     """Whether a run folder holds a run that was finished."""
     return (run / "run.json").is_file() and bool(read_json(run / "run.json").get("complete"))
-
-
-def _simulate(flight: Flight, sequence: Path) -> None:
-    if flight.mode == "points":
-        from gpvo.sim.campaign import fly_points
-
-        if not sequence.is_file():
-            fly_points(flight.scenario, flight.seed, sequence)
-        return
-    from gpvo.sim.sequence import simulate
-
-    simulate(flight.scenario, flight.seed, sequence, threads=1)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,17 +60,25 @@ def fly_campaign(
         return list(client.gather([client.submit(fly_one, *task, pure=False) for task in tasks]))
 
 
-def fly_one(scenario: Scenario, seed: int, out: Path, points: bool = False, threads: int = 1) -> Flight:
+def fly_one(scenario: Scenario, seed: int, out: Path, points: bool = False) -> Flight:
     """One flight; what goes wrong with it comes back as its ``error``."""
     try:
-        if points:
-            return fly_points(scenario, seed, out)
-        from gpvo.sim.sequence import simulate
-
-        info = simulate(scenario, seed, out, threads=threads)
-        return Flight(seed, out, info.frames, info.distance_m, info.redone)
+        return fly(scenario, seed, out, points)
     except GpvoError as error:
         return Flight(seed, out, error=str(error))
+
+
+def fly(
+    scenario: Scenario, seed: int, out: Path, points: bool = False, threads: int = 1,
+    on_frame: Callable[[], None] | None = None,
+) -> Flight:  # fmt: skip
+    """One flight with images, a folder, or without, an ``.npz``. Raises GpvoError where it goes wrong."""
+    if points:
+        return fly_points(scenario, seed, out)
+    from gpvo.sim.sequence import simulate
+
+    info = simulate(scenario, seed, out, threads=threads, on_frame=on_frame)
+    return Flight(seed, out, info.frames, info.distance_m, info.redone)
 
 
 def fly_points(scenario: Scenario, seed: int, out: Path) -> Flight:

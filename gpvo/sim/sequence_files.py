@@ -96,7 +96,7 @@ def _lens(lens: CameraModel, distortion_key: str) -> dict[str, Any]:
     fisheye = lens.kind == "kannala-brandt"
     return {
         "camera_model": "pinhole",
-        "intrinsics": [float(v) for v in (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)],
+        "intrinsics": lens.intrinsics_px,
         "distortion_model": "equidistant" if fisheye else "radial-tangential",
         distortion_key: [float(k) for k in lens.distortion[:4]],
         "resolution": [lens.width, lens.height],

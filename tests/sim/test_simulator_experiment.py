@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
 pytest.importorskip("mujoco", reason="flights need the extra gpvo[sim]")
-from gpvo.evaluation import simulator_experiment as experiment
+from bench import simulator_experiment as experiment
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Is the simulator exact, and do its errors come from where they should? Flights with pictures, run through odometry.
 
-``python -m gpvo.evaluation.simulator_experiment -o DIR [--seeds 10] [--only clean,baseline,bursts,lunar]``
+``python -m bench.simulator_experiment -o DIR [--seeds 10] [--only clean,baseline,bursts,lunar]``
 
 ``clean``: perfect calibration, no image noise: the mean error of a motion, in percent of the motion, over seeds.
 ``baseline``: the same with a rig whose baseline is 1 % longer than its calibration says: the scale error.
@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from gpvo import runner
 from gpvo.dataset.errors import MotionErrors, motion_errors
 from gpvo.io import open_source
