@@ -93,8 +93,10 @@ def print_json(document: dict[str, Any]) -> None:
 
 def one_of(option: str, value: str, choices: Iterable[str]) -> str:
     """The value of an option. Raises GpvoError where it is none of the choices."""
-    if value not in choices:
-        raise GpvoError(f"{option} is '{value}'", cure=f"choose {' or '.join(choices)}")
+    known = list(choices)
+    if value not in known:
+        cure = f"choose {known[0]} or {known[1]}" if len(known) == 2 else f"choose one of: {', '.join(known)}"
+        raise GpvoError(f"{option} is '{value}'", cure=cure)
     return value
 
 
