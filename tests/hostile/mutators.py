@@ -127,6 +127,7 @@ def odd_table(path: Path, rng: Rng) -> None:
             k = int(rng.integers(len(values)))
             value = VALUES[int(rng.integers(len(VALUES)))]
             whole = isinstance(values[0], int)
-            values[k] = int(rng.integers(-(2**62), 2**62)) if whole else value
+            most = 2 ** (table[name].type.bit_width - 2)
+            values[k] = int(rng.integers(-most, most)) if whole else value
             table = table.set_column(at, name, pa.array(values, table[name].type))
     pq.write_table(table, path)
