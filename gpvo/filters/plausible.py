@@ -1,4 +1,4 @@
-"""Which IMU samples can be: those in the range of a sensor, in step with the ones before, and on one clock.
+"""Which IMU samples can be: those in the range of a sensor, in step with the ones before, noisy, and on one clock.
 
 What cannot be is missing, not wrong: the filter bridges it and is less sure (see ``Timeline``).
 """
@@ -17,6 +17,7 @@ LONGEST_GAP_S = 1.0
 """A sample that comes later is believed when the next one confirms its clock."""
 _LIMITS = np.repeat([MOST_RADPS, MOST_MPS2], 3)
 _LEAST_STEP = np.repeat([3.0, 30.0], 3)  # [rad/s, m/s^2] that two samples may always differ by
+_STUCK = 8  # samples with the very same reading: a sensor has noise, and held ones repeat two or four times
 _TIMES_USUAL = 20.0  # the usual step that they may differ by, where that is more
 _FORGET = 0.02
 
@@ -29,6 +30,7 @@ class ImuGuard:
         self._t_ns: int | None = None
         self._sample = np.zeros(6)
         self._usual = np.zeros(6)
+        self._reading, self._repeats = np.zeros(6), 0
         self._doubt: Doubt[tuple[int, Array]] = Doubt()
 
     def judge(self, t_ns: int, sample: Array) -> str:
@@ -37,6 +39,8 @@ class ImuGuard:
             return "imu_not_finite"
         if (np.abs(sample) > _LIMITS).any():
             return "imu_out_of_range"
+        if self._is_stuck(sample):
+            return "imu_stuck"
         if self._t_ns is not None:
             problem = self._beside(t_ns, sample, self._t_ns, self._sample)
             if problem == "imu_repeated" or (problem and not self._doubt.is_settled_by((t_ns, sample), self._agree)):
@@ -46,6 +50,12 @@ class ImuGuard:
         self._t_ns, self._sample = t_ns, sample
         self._doubt.clear()
         return ""
+
+    def _is_stuck(self, sample: Array) -> bool:
+        """Whether a sensor that had noise says the same again and again."""
+        self._repeats = self._repeats + 1 if (sample == self._reading).all() else 0
+        self._reading = sample
+        return self._repeats >= _STUCK and bool(self._usual.any())
 
     def _agree(self, before: tuple[int, Array], now: tuple[int, Array]) -> bool:
         return not self._beside(*now, *before)

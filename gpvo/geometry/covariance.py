@@ -9,7 +9,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array
 
 TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
-_LARGEST = 1e100  # No element of a covariance is larger: products of two or three stay finite.
+_LARGEST = 1e100  # No element of a covariance is larger, no variance as small as its inverse: squares stay finite.
 
 
 def symmetrise(C: Array) -> Array:
@@ -38,7 +38,7 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     C = np.asarray(C, dtype=np.float64)
     variance: Array = np.diagonal(C, axis1=1, axis2=2)
     with np.errstate(all="ignore"):
-        positive = (variance >= 0) if semi else (variance > 0)
+        positive = (variance >= 0) if semi else (variance > 1 / _LARGEST)
         good: NDArray[np.bool_] = np.asarray((np.abs(C) < _LARGEST).all(axis=(1, 2)) & positive.all(axis=1))
         sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
         R = C / sigma[:, :, None] / sigma[:, None, :]

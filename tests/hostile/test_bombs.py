@@ -15,9 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import CalibrationError, GpvoError, SourceError
+from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
@@ -216,3 +218,24 @@ def test_json_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
         (tmp_path / "run.json").write_text(text)
         with pytest.raises(SourceError, match=r"run\.json: is damaged"):
             read_json(tmp_path / "run.json")
+
+
+def test_lengths_that_are_none_in_an_mcap_are_refused(tmp_path: Path) -> None:
+    """Of each record in turn, and of what a chunk unpacks to."""
+    path = next(stereo_bag(ros1=False, n=2).write(tmp_path / "bag", mcap=True).glob("*.mcap"))
+    raw, at, refusals = path.read_bytes(), 8, []
+    before = _peak_mb()
+    while at + 9 < len(raw):
+        (length,) = struct.unpack_from("<Q", raw, at + 1)
+        for place in (at + 1, at + 9 + 16) if length >= 24 else (at + 1,):
+            bad = bytearray(raw)
+            bad[place : place + 8] = struct.pack("<Q", 2**62)
+            path.write_bytes(bad)
+            try:
+                list(open_source(path))
+            except GpvoError as refusal:
+                refusals.append(str(refusal))
+        at += 9 + length
+    assert len(refusals) > 5
+    assert all(path.name in told and "\n" not in told for told in refusals)
+    assert _peak_mb() - before < 500

@@ -28,6 +28,15 @@ def _set(gyro: float, acc: float, samples: int = 1, *, add: bool = False) -> Fau
     return fault
 
 
+def _stuck(samples: int) -> Fault:
+    """The same reading again and again."""
+
+    def fault(t: np.ndarray, w: np.ndarray, f: np.ndarray, k: int) -> None:
+        w[k : k + samples], f[k : k + samples] = w[k - 1], f[k - 1]
+
+    return fault
+
+
 def _stamp(seconds: float) -> Fault:
     def fault(t: np.ndarray, w: np.ndarray, f: np.ndarray, k: int) -> None:
         t[k] += round(seconds * 1e9)
@@ -44,6 +53,16 @@ FAULTS: dict[str, Fault] = {
     "one sample of 1e10": _set(1e10, 1e10),
     "one sample of 1e300": _set(1e300, -1e300),
     "not a number for half a second": _set(np.nan, np.nan, 100),
+    "one reading for half a second": _stuck(100),
+}
+LONG_FAULTS: dict[str, Fault] = {
+    f"{name} for {s} s": fault
+    for s in (2, 5)
+    for name, fault in (
+        ("saturation", _set(35.0, 160.0, 200 * s)),
+        ("not a number", _set(np.nan, np.nan, 200 * s)),
+        ("one reading", _stuck(200 * s)),
+    )
 }
 
 
@@ -94,6 +113,16 @@ def test_the_filter_stays_consistent_after_a_fault(fault: str) -> None:
         flight = faulty(seed, FAULTS[fault], 10.0)
         nees.append(nees_after(flight, fused(flight)))
     position, attitude = np.mean(nees, axis=0)
+    assert 0.5 <= position <= 2.0
+    assert 0.5 <= attitude <= 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", LONG_FAULTS)
+def test_the_filter_stays_consistent_after_a_long_fault(fault: str) -> None:
+    """Twelve flights each."""
+    flights = [faulty(seed, LONG_FAULTS[fault], 14.0) for seed in range(12)]
+    position, attitude = np.mean([nees_after(flight, fused(flight)) for flight in flights], axis=0)
     assert 0.5 <= position <= 2.0
     assert 0.5 <= attitude <= 2.0
 
