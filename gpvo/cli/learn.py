@@ -166,7 +166,7 @@ def _refuse_twice(paths: list[Path]) -> None:
 
 
 def _train_file(paths: list[Path], config: TrainConfig, update: Path | None) -> TrainedModel:
-    from gpvo.learning.stream import train_stored
+    from gpvo.learning.update import train_stored
 
     if len(paths) > 1 or update is not None:
         raise GpvoError("a file of training rows stands alone", where=paths[0], cure="give that file, or run folders")
@@ -186,7 +186,7 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
 
     from gpvo.dataset.table import write_sets
     from gpvo.io.run import read_run
-    from gpvo.learning.stream import train_stored
+    from gpvo.learning.update import train_stored
 
     with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
         rows = Path(folder) / "rows.parquet"

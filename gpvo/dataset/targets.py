@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.align import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.online.window import Window
+from gpvo.online.observer import Window
 from gpvo.types import Array, TruthLog, VoRecord
 
 

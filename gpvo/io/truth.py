@@ -29,7 +29,6 @@ MOTION_CAPTURE = TruthNoise(1e-4, 8e-4)
 # Smoothed by a batch estimator with an IMU (EuRoC: below 0.01 mm and 0.1 mrad): its white part is nothing, what
 # remains is slow.
 BATCH_ESTIMATE = TruthNoise(0.0, 0.0)
-SIMULATION = TruthNoise(0.0, 0.0)
 UNKNOWN = TruthNoise(0.0, 0.0)
 
 

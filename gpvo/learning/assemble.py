@@ -20,7 +20,7 @@ from gpvo.learning.calibrate import (
 from gpvo.learning.logvariance import basis_of, log_ratio
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
-from gpvo.learning.patterns import LASTING_S, Patterns, learn_patterns
+from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
 from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
 from gpvo.learning.rows import Rows
 from gpvo.learning.selection import significant_gain
@@ -137,7 +137,7 @@ class _Sums:
         """The same as the model has it, without the geometry's correlation."""
         lasting = self.patterns is not None and {
             "calibration_patterns": self.patterns.usual,
-            "calibration_tau_s": np.full(6, LASTING_S),
+            "calibration_tau_s": np.full(6, PERSISTENT_S),
         }
         return Division(
             share=self.parts.share,

@@ -17,10 +17,9 @@ from gpvo.dataset.build import TrainingSet
 from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_base
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
-from gpvo.learning.folds import group_folds
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
 from gpvo.learning.rows import Rows
-from gpvo.learning.selection import significant_gain, simplest_sufficient
+from gpvo.learning.selection import group_folds, significant_gain, simplest_sufficient
 from gpvo.learning.steadymean import steady_mean
 from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.basis import ProjectedGP

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.learning.folds import group_folds
 from gpvo.learning.rows import Rows
+from gpvo.learning.selection import group_folds
 from gpvo.learning.spans import cut
 from gpvo.online.base import TWIST_COLUMNS
 from gpvo.types import Array
 
-LASTING_S = 3600.0
+PERSISTENT_S = 3600.0
 """How long a calibration stays the same: longer than the flights to learn from, which do not show it."""
 _WINDOW = 100
 _LEAST_FLIGHTS, _MOST_FOLDS = 4, 5

@@ -1,4 +1,5 @@
-"""The one rule by which training leaves a simpler model for another: held-out gain above its standard error."""
+"""Which groups are left out together, and the one rule by which training leaves a simpler model for another: held-out
+gain above its standard error."""
 
 from __future__ import annotations
 
@@ -6,7 +7,8 @@ from collections.abc import Hashable, Mapping
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as t_distribution
 
 from gpvo.types import Array
 
@@ -27,3 +29,30 @@ def simplest_sufficient(loss_by_group: Mapping[Candidate, Array]) -> Candidate:
     simplest first."""
     best = min(loss_by_group.values(), key=np.mean)
     return next(name for name, loss in loss_by_group.items() if not significant_gain(loss - best))
+
+
+def significantly_positive(gain: Array, risk: float = 0.05) -> NDArray[np.bool_]:
+    """(D,) whether the mean over groups of gain (G, D) is positive: one-sided t-test, risk shared among the D axes."""
+    groups, axes = gain.shape
+    if groups < 2:
+        return np.zeros(axes, dtype=bool)
+    statistic = gain.mean(axis=0) / np.maximum(gain.std(axis=0, ddof=1) / np.sqrt(groups), 1e-300)
+    return np.asarray(statistic > t_distribution.ppf(1.0 - risk / axes, groups - 1))
+
+
+def group_folds(groups: NDArray, max_folds: int) -> NDArray[np.int64]:
+    """(n,) fold of each row: no group is split, and folds are of similar size (largest group first, to the smallest
+    fold).
+
+    With one group alone: ``max_folds`` blocks of consecutive rows.
+    """
+    _, label, count = np.unique(np.asarray(groups), return_inverse=True, return_counts=True)
+    n = len(label)
+    if len(count) < 2:
+        return np.minimum(np.arange(n) * max_folds // max(n, 1), max_folds - 1).astype(np.int64)
+    n_folds = min(max_folds, len(count))
+    load, fold_of = np.zeros(n_folds), np.zeros(len(count), dtype=np.int64)
+    for group in np.argsort(-count, kind="stable"):
+        fold_of[group] = np.argmin(load)
+        load[fold_of[group]] += count[group]
+    return fold_of[label]

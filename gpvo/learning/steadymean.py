@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import t as t_distribution
 
 from gpvo.geometry.covariance import turn_first_root
 from gpvo.learning.rows import Rows
+from gpvo.learning.selection import significantly_positive
 from gpvo.online.estimate import ErrorModel
 from gpvo.types import Array
 
@@ -32,12 +31,3 @@ def steady_mean(rows: Rows, model: ErrorModel, variance: Array) -> Array:
     same_way = np.sign(right.sum(axis=0) - right) * right / left
     # The mean may lean either way, so that half of the risk is that of each.
     return np.where(significantly_positive(same_way, risk=0.025), right.sum(axis=0) / left.sum(axis=0), 0.0)
-
-
-def significantly_positive(gain: Array, risk: float = 0.05) -> NDArray[np.bool_]:
-    """(D,) whether the mean over groups of gain (G, D) is positive: one-sided t-test, risk shared among the D axes."""
-    groups, axes = gain.shape
-    if groups < 2:
-        return np.zeros(axes, dtype=bool)
-    statistic = gain.mean(axis=0) / np.maximum(gain.std(axis=0, ddof=1) / np.sqrt(groups), 1e-300)
-    return np.asarray(statistic > t_distribution.ppf(1.0 - risk / axes, groups - 1))

@@ -160,12 +160,12 @@ def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainC
     """All methods fitted without one sequence and scored on it."""
     arrays = method_arrays(train_on)
     statements = {**simple_statements(arrays), "gp_thesis": thesis_gp(train_on, seed=config.seed)}
-    said: dict[str, tuple[Any, ...] | None] = {name: state(held_out) for name, state in statements.items()}
+    stated: dict[str, tuple[Any, ...] | None] = {name: state(held_out) for name, state in statements.items()}
     learned = fit_model(train_on, config)
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
-    said["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
-    said["base"] = (of_base.mean, of_base.covariance, of_base.nu)
-    methods = {name: empty() if (s := said[name]) is None else score(held_out.Y, *s) for name in METHODS}
+    stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
+    stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)
+    methods = {name: empty() if (s := stated[name]) is None else score(held_out.Y, *s) for name in METHODS}
     return {
         "held_out": held_out.name,
         "rows": len(held_out),

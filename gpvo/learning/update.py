@@ -1,4 +1,4 @@
-"""Adding one's own flights to a model: old and new rows together, everything fitted and judged anew."""
+"""Training from rows that were kept: those of a model with one's own flights added, and sets larger than memory."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
+from gpvo.dataset.stored import CHUNK_ROWS, StoredSets
 from gpvo.errors import ModelError
 from gpvo.io.run_read import Run
 from gpvo.learning.config import TrainConfig
@@ -37,3 +38,17 @@ def update(
     for gone in (s.name for s in old if s.name in names):
         tell(f"sequence '{gone}' of {path} is replaced by the run of that name")
     return train_sets([*(s for s in old if s.name not in names), *new], config, judge=judge)
+
+
+def train_stored(
+    path: str | Path, config: TrainConfig, *, judge: bool = True, chunk_rows: int = CHUNK_ROWS
+) -> TrainedModel:
+    """Train from a file of training sets; in memory are never more than ``config.max_rows`` rows and a chunk.
+
+    Of more rows, blocks of consecutive ones are kept, equally many of each sequence.
+    """
+    stored = StoredSets(path)
+    sets = stored.thinned(config.max_rows, chunk_rows)
+    trained = train_sets(sets, config, judge=judge)
+    trained.header["rows"] = {"given": len(stored), "in_memory": sum(len(s) for s in sets)}
+    return trained

@@ -6,8 +6,7 @@ import numpy as np
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.rows import Rows
-from gpvo.online.base import TWIST_COLUMNS
-from gpvo.online.velocity import COASTED, Velocities
+from gpvo.online.base import COASTED, TWIST_COLUMNS, Velocities
 from gpvo.types import Array
 
 _LEAST = 1e-6

@@ -13,7 +13,7 @@ from statistics import median
 from typing import Any
 
 from gpvo.io.foreign import GAP_STEPS
-from gpvo.online.intake import Doubt
+from gpvo.online.observer import Doubt
 
 BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""

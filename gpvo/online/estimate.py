@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import turn_first_root
-from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, feature_noise, motion_noise, positions
+from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, Velocities, feature_noise, motion_noise, positions
 from gpvo.online.basis import SharedBasis
 from gpvo.online.division import Division
 from gpvo.online.guard import Domain, DomainCheck, growth
 from gpvo.online.validation import LARGEST, check_arrays, check_related
-from gpvo.online.velocity import Velocities
 from gpvo.types import Array, MotionError, Prediction
 
 LN_LARGEST = 60.0
@@ -206,18 +205,18 @@ class ErrorModel:
         duration, columns = self._duration(X, dt_s), self._base_columns(X)
         base, plain = (np.maximum(v, LEAST_VAR) for v in self.base.both(columns, duration))
         place = self._locate(X, base, duration)
-        said = self.basis.predict(place.inside[:, self.inputs])
+        predicted = self.basis.predict(place.inside[:, self.inputs])
         outside = (1.0 - place.in_domain)[:, None]
         # A bias of noise goes with the noise; what VO is wrong by on average of its motion, with the motion's duration.
         unit = np.sqrt(base) if self.mean_in_sigma[0] else np.repeat((duration / self.dt_s)[:, None], 6, axis=1)
-        usual = said.mean * unit
-        log_noise = np.maximum(np.minimum(said.log_noise_var, LN_LARGEST), -LN_LARGEST)
-        known = log_noise - 0.5 * said.log_noise_spread
+        usual = predicted.mean * unit
+        log_noise = np.maximum(np.minimum(predicted.log_noise_var, LN_LARGEST), -LN_LARGEST)
+        known = log_noise - 0.5 * predicted.log_noise_spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = log_noise + outside * np.maximum(self.high - log_noise, 0.0)
         grown = growth(place.distance, self.outside_power)[:, None]
         mean = usual * place.in_domain[:, None]
-        mean_var = (said.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
+        mean_var = (predicted.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
         # What odometry says of itself means what it meant in training only where the surroundings are alike.
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
         limit = self.velocities.largest_error_var(columns[:, :6], duration)

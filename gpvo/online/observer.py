@@ -1,14 +1,49 @@
-"""From records to features: the one path that flight and training share."""
+"""From records to features: the one path that flight and training share.
+
+What cannot be is ``lost``, by name, and leaves no trace in what is remembered. Motions over a window are
+joined to records: features and targets then need no second definition.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Generic, TypeVar
 
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.geometry import covariance as transport
 from gpvo.online.features import FeatureStream
-from gpvo.online.intake import Intake
 from gpvo.online.slip import SlipDetector
-from gpvo.online.window import Window
-from gpvo.types import Array, StereoCamera, VoRecord
+from gpvo.types import Array, Status, StereoCamera, VoRecord
+
+LONGEST_STEP_S = 60.0
+"""A record that comes later than this after the one before is believed when the next one confirms its clock."""
+_LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
+_FARTHEST_M = 1e5  # No motion between two frames is longer.
+_NOT_RIGID = 1e-3  # Deviation of R^T R from the identity.
+_EYE = np.eye(4)
+_EYE.setflags(write=False)
+T = TypeVar("T")
+_MEANS = (
+    "reproj_rms_px",
+    "disparity_p10_px",
+    "disparity_p50_px",
+    "disparity_p90_px",
+    "spread_u",
+    "spread_v",
+    "log10_condition",
+    "brightness",
+    "contrast",
+    "sharpness",
+    "noise_level",
+)
+_COUNTS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
+_IMU = ("imu_gyro_mean_radps", "imu_gyro_std_radps", "imu_acc_mean_mps2", "imu_acc_std_mps2")
+_PATTERN = re.compile(r"(window|length):([0-9]*\.?[0-9]+)(s|m)")
 
 
 class Observer:
@@ -29,3 +64,145 @@ class Observer:
         if self._window is not None:
             judged = self._window.step(judged) if judged is not None else None
         return None if judged is None else (judged, self._stream.step(judged))
+
+
+class Doubt(Generic[T]):
+    """Holds what looks odd beside all before, a jump of a clock or of a reading, until ``enough`` in a row agree."""
+
+    def __init__(self, enough: int = 2) -> None:
+        self._enough, self._count = enough, 0
+        self._last: T | None = None
+
+    def is_settled_by(self, odd: T, agrees: Callable[[T, T], bool]) -> bool:
+        """Whether the next odd one is to be believed; ``agrees`` says whether it goes with the odd one before it."""
+        self._count = self._count + 1 if self._last is not None and agrees(self._last, odd) else 1
+        self._last = odd
+        if self._count < self._enough:
+            return False
+        self.clear()
+        return True
+
+    def clear(self) -> None:
+        """What came now is not odd."""
+        self._count, self._last = 0, None
+
+
+class Intake:
+    """Judges the stamps and the motion of one record after the other, in the order of their arrival.
+
+    A record whose stamp repeats, goes back or jumps ahead is ``lost``, and the next one is judged by the record before
+    it; where that next one follows the odd one, the clock itself was set, and is believed. A motion that is not finite
+    and rigid is replaced by none.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._doubt: Doubt[int] = Doubt()
+
+    def step(self, record: VoRecord) -> VoRecord:
+        """The record, ``lost`` with the reason where it cannot be. Call once per record."""
+        problem = self._clock(record)
+        if not _is_motion(record.T_prev_cur):
+            record = replace(record, T_prev_cur=_EYE)
+            problem = problem or "the motion is not finite and rigid"
+        return record.with_status(Status.LOST, problem) if problem else record
+
+    def _clock(self, record: VoRecord) -> str:
+        t_ns, last_ns = record.t_ns, self._last_ns
+        if (
+            last_ns is not None
+            and record.status is not Status.START
+            and not (follows(last_ns, t_ns) or self._doubt.is_settled_by(t_ns, follows))
+        ):
+            step_s = (t_ns - last_ns) * 1e-9
+            return "the stamp repeats" if step_s == 0 else f"the stamp jumps by {step_s:+.3g} s"
+        self._last_ns = t_ns
+        self._doubt.clear()
+        if record.usable and record.t_prev_ns >= t_ns:
+            return "the motion ends no later than it begins"
+        return ""
+
+
+def follows(before_ns: int, t_ns: int) -> bool:
+    """Whether a stamp comes after the one before, and not too long after."""
+    return 0 < t_ns - before_ns <= _LONGEST_STEP_NS
+
+
+def _is_motion(T: Array) -> bool:
+    """Whether T is a rigid transform (4, 4) of a credible length."""
+    # Comparisons with NaN are false.
+    if T.shape != (4, 4) or not np.abs(T).max() < _FARTHEST_M:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R.T @ R - _EYE[:3, :3]).max() < _NOT_RIGID)
+
+
+class Window:
+    """Joins the latest motions into one that spans ``size`` seconds or metres, frame by frame and causally.
+
+    ``kind`` is "window" (seconds) or "length" (metres of path).
+    """
+
+    def __init__(self, kind: str, size: float) -> None:
+        self.kind, self.size = kind, size
+        self._motions: deque[VoRecord] = deque()
+
+    @classmethod
+    def of(cls, target: str) -> Window | None:
+        """The window of a target such as ``window:1s`` or ``length:1m``; None for ``frame`` and ``position``."""
+        if target in ("frame", "position"):
+            return None
+        match = _PATTERN.fullmatch(target)
+        if match is None or (match[1] == "window") != (match[3] == "s") or float(match[2]) <= 0:
+            raise GpvoError(f"there is no target '{target}'", cure="frame, window:1s, length:1m or position")
+        return cls(match[1], float(match[2]))
+
+    def step(self, record: VoRecord) -> VoRecord | None:
+        """The motion over the window that ends with this record; None until it is full. A lost frame empties it."""
+        if not record.usable:
+            self._motions.clear()
+            return None
+        if self._motions and self._motions[-1].t_ns != record.t_prev_ns:
+            # The reference is an older frame: drop the motions that came after it.
+            while self._motions and self._motions[-1].t_ns != record.t_prev_ns:
+                self._motions.pop()
+        self._motions.append(record)
+        while len(self._motions) > 1 and self._extent() - self._measure(self._motions[0]) >= self.size * (1 - 1e-9):
+            self._motions.popleft()
+        return joined(list(self._motions)) if self._extent() >= self.size * (1 - 1e-9) else None
+
+    def _measure(self, record: VoRecord) -> float:
+        return record.dt_s if self.kind == "window" else float(np.linalg.norm(record.T_prev_cur[:3, 3]))
+
+    def _extent(self) -> float:
+        return sum(self._measure(r) for r in self._motions)
+
+
+def joined(motions: list[VoRecord]) -> VoRecord:
+    """One record for consecutive motions: compounded motion and covariances, means of what describes the images."""
+    last = motions[-1]
+    T = np.eye(4)
+    covariances: dict[str, Array] = dict.fromkeys(last.covariances, np.zeros((6, 6)))
+    for r in motions:
+        T = T @ r.T_prev_cur
+        covariances = {
+            m: transport.symmetrise(transport.compound(r.T_prev_cur, C, r.covariances[m]))
+            for m, C in covariances.items()
+            if m in r.covariances
+        }
+    status = max((r.status for r in motions), key=lambda s: s.severity)
+    known: dict[str, Any] = {name: float(np.mean([getattr(r, name) for r in motions])) for name in _MEANS}
+    known |= {name: int(np.mean([getattr(r, name) for r in motions])) for name in _COUNTS}
+    known |= {
+        n: None if any(getattr(r, n) is None for r in motions) else np.mean([getattr(r, n) for r in motions], axis=0)
+        for n in _IMU
+    }
+    return replace(
+        last,
+        t_prev_ns=motions[0].t_prev_ns,
+        T_prev_cur=T,
+        status=Status(status),
+        covariances=covariances,
+        v_t={},
+        **known,
+    )

@@ -232,42 +232,42 @@ class Predictor:
             for i in order
         ]
 
-    def _publish(self, record: VoRecord, said: Prediction) -> Prediction:
+    def _publish(self, record: VoRecord, prediction: Prediction) -> Prediction:
         """The prediction for a record in flight: the adapted scale, the record's status, and what is lost."""
-        t_ns, status, confidence, scale = record.t_ns, record.status, float(said.confidence), self._adaptive.scale
+        t_ns, status, confidence, scale = record.t_ns, record.status, float(prediction.confidence), self._adaptive.scale
         if status is Status.LOST:
-            return self._publish_lost(record, said)
-        if said.in_domain < DEGRADED_BELOW and status is Status.OK:
+            return self._publish_lost(record, prediction)
+        if prediction.in_domain < DEGRADED_BELOW and status is Status.OK:
             status = Status.DEGRADED
         if status is Status.DEGRADED:
             confidence *= 0.5
         squared = scale[:, None] * scale
-        variance = np.diagonal(said.covariance) * scale**2
+        variance = np.diagonal(prediction.covariance) * scale**2
         if record.dt_s > 0:
             self._rate_var = variance / record.dt_s**2
-        self._remember(t_ns, (said.mean, np.sqrt(variance)))
+        self._remember(t_ns, (prediction.mean, np.sqrt(variance)))
         return Prediction(
-            mean=said.mean,
-            jitter=said.jitter * squared,
-            white=said.white * squared,
-            persistent_root=said.persistent_root * scale[:, None],
-            persistent_tau_s=said.persistent_tau_s,
+            mean=prediction.mean,
+            jitter=prediction.jitter * squared,
+            white=prediction.white * squared,
+            persistent_root=prediction.persistent_root * scale[:, None],
+            persistent_tau_s=prediction.persistent_tau_s,
             dt_s=record.dt_s,
-            nu=said.nu,
+            nu=prediction.nu,
             status=status,
             t_ns=t_ns,
-            epistemic=np.minimum(said.epistemic * scale**2, variance),
+            epistemic=np.minimum(prediction.epistemic * scale**2, variance),
             confidence=confidence,
-            in_domain=float(said.in_domain),
+            in_domain=float(prediction.in_domain),
         )
 
-    def _publish_lost(self, record: VoRecord, said: Prediction) -> Prediction:
+    def _publish_lost(self, record: VoRecord, prediction: Prediction) -> Prediction:
         """What was learnt of measured motions does not apply to one that was not."""
         variance = self._lost_variance(record)
         # Truth of it says nothing of the scale of what was.
         self._remember(record.t_ns, None)
-        p = self._unmeasured(record, np.diag(variance), 0.0, float(said.in_domain))
-        return replace(p, epistemic=np.minimum(said.epistemic * self._adaptive.scale**2, variance))
+        p = self._unmeasured(record, np.diag(variance), 0.0, float(prediction.in_domain))
+        return replace(p, epistemic=np.minimum(prediction.epistemic * self._adaptive.scale**2, variance))
 
     def _remember(self, t_ns: int, stated: tuple[Array, Array] | None) -> None:
         self._stated[t_ns] = stated

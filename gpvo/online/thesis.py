@@ -39,9 +39,9 @@ class ThesisModel:
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Mean (n, D) and covariance (n, D, D), diagonal, of rows X (n, d); a missing value counts as zero."""
         U = (np.nan_to_num(np.asarray(X, dtype=np.float64), nan=0.0) - self.centre) / self.spread
-        said = [basis.predict(U) for basis in self.axes]
-        mean = np.hstack([s.mean for s in said]) * self.scale
-        variance = np.hstack([s.epistemic_var + np.exp(s.log_noise_var) for s in said]) * self.scale**2
+        predictions = [basis.predict(U) for basis in self.axes]
+        mean = np.hstack([s.mean for s in predictions]) * self.scale
+        variance = np.hstack([s.epistemic_var + np.exp(s.log_noise_var) for s in predictions]) * self.scale**2
         return mean, variance[:, :, None] * np.eye(len(self.axes))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:

@@ -15,14 +15,13 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry.covariance import turn_first_root
 from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
-from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, base_columns
+from gpvo.online.base import COASTED, RESIDUAL_COLUMN, BaseVariance, Velocities, base_columns
 from gpvo.online.basis import ProjectedGP, SharedBasis
 from gpvo.online.division import PARTS, Division
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.for_filter import FOR_FILTER
 from gpvo.online.guard import Domain
 from gpvo.online.predictor import Predictor
-from gpvo.online.velocity import COASTED, Velocities
 from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner

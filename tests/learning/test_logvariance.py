@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.learning.folds import group_folds
 from gpvo.learning.logvariance import basis_of, fit_log_variance, log_ratio
+from gpvo.learning.selection import group_folds
 
 
 def drawn(n_groups: int, seed: int, *, nu: float = np.inf, level: float = 0.5):

@@ -11,8 +11,8 @@ from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, SourceError
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
-from gpvo.learning.stream import train_stored
 from gpvo.learning.train import train_sets
+from gpvo.learning.update import train_stored
 from small_model import training_sets
 
 QUICK = TrainConfig(features="velocity,n_inliers")

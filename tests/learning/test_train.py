@@ -24,15 +24,14 @@ from gpvo.learning.methods import METHODS, best_scale
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
-from gpvo.learning.steadymean import significantly_positive
+from gpvo.learning.selection import significantly_positive
 from gpvo.learning.store import card_path, folds_path, picture_path, rows_path, save_model
 from gpvo.learning.train import _slips, train_sets
 from gpvo.learning.update import config_of, update
 from gpvo.learning.velocities import rate_changes
-from gpvo.online.base import TWIST_COLUMNS
+from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.predictor import Predictor
-from gpvo.online.velocity import COASTED
 from gpvo.stats.consistency import nees
 from gpvo.types import VoLog
 from small_model import small_model, training_sets
