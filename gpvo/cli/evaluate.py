@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
 from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, settings_of
 from gpvo.errors import GpvoError
 
@@ -60,7 +60,6 @@ def evaluate(
 
     Example: gpvo evaluate runs/mh01 --plots pictures
     """
-    from gpvo.cli.output import print_json
     from gpvo.evaluation.evaluate import distinct, document
 
     options = options_of(segments, truth_sigma, align, time_offset)
@@ -126,7 +125,6 @@ def report(
 
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
-    from gpvo.cli.output import numbers
     from gpvo.evaluation.matches import match_pictures
     from gpvo.io import open_source
     from gpvo.runner import config_of
@@ -139,7 +137,6 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
 
 def options_of(segments: str | None, truth_sigma: str | None, align: str, time_offset: str) -> EvaluateOptions:
     """The flags, parsed."""
-    from gpvo.cli.output import numbers
     from gpvo.evaluation.evaluate import EvaluateOptions
 
     lengths, sigma, offset_s = None, None, None
@@ -228,7 +225,6 @@ def _with_twins(
 
 
 def _print(d: dict[str, Any]) -> None:
-    from gpvo.cli.output import say
 
     if about := d.get("simulated_truth"):
         say(
@@ -246,7 +242,7 @@ def _print(d: dict[str, Any]) -> None:
     if d["truth_moves_at_rest"]:
         say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands there, and the truth moves")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
-    relative = (f"{name} {_text(m)} m, {_text(math.degrees(rad))} deg" for name, m, rad in errors)
+    relative = (f"{name} {cell(m)} m, {cell(math.degrees(rad))} deg" for name, m, rad in errors)
     say(f"  relative error (rms) over a {'; '.join(relative)}")
     for s in (s for s in d["segments"] if s["count"]):
         say(
@@ -261,7 +257,6 @@ def _print(d: dict[str, Any]) -> None:
 
 
 def _print_methods(d: dict[str, Any]) -> None:
-    from gpvo.cli.output import console, new_table, say
 
     sigma = d["truth_sigma"]
     noisy = bool(sigma["translation_m"] or sigma["rotation_rad"])
@@ -279,11 +274,11 @@ def _print_methods(d: dict[str, Any]) -> None:
             m["nll_per_dim"],
             m["nll_stated_per_dim"],
         )
-        cells = [c if isinstance(c, str) else _text(c) for c in rest[0 if noisy else 1 :]]
-        table.add_row(method, _text(m["nees_dof"][block]), f"{_text(low, 2)}-{_text(high, 2)}", *cells)
+        cells = [cell(c) for c in rest[0 if noisy else 1 :]]
+        table.add_row(method, cell(m["nees_dof"][block]), f"{cell(low, 2)}-{cell(high, 2)}", *cells)
     if not table.row_count:
         return
-    console().print(table)
+    show(table)
     say("NEES: per degree of freedom of one motion; 1 is right. _vt: of the translation alone.")
     say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
     say("NLL: nats per axis of a Gaussian; stated: of the stated density, where it has heavier tails.")
@@ -293,20 +288,13 @@ def _print_methods(d: dict[str, Any]) -> None:
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
-    from gpvo.cli.output import console, new_table, say
 
     table = new_table("method", "NLL", "interval", "NEES", "interval")
     for method, scores in pooled.items():
         cells = []
         for s in (scores["nll_per_dim"], scores["nees_dof"]):
-            cells += [_text(s["mean"]), "-" if s["low"] is None else f"{_text(s['low'])} to {_text(s['high'])}"]
+            cells += [cell(s["mean"]), "-" if s["low"] is None else f"{cell(s['low'])} to {cell(s['high'])}"]
         table.add_row(method, *cells)
     if table.row_count:
         say(f"mean of the {runs} runs" + ("" if runs > 2 else ": too few for an interval"))
-        console().print(table)
-
-
-def _text(value: float | None, digits: int = 3) -> str:
-    if value is None or not math.isfinite(value):
-        return "-"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.{digits}g}"
+        show(table)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli import source_options as options
-from gpvo.cli.output import Json, one_of
+from gpvo.cli.output import Json, numbers, one_of, print_json
 from gpvo.errors import GpvoError
 
 
@@ -26,7 +26,6 @@ def info(
     Example: gpvo info MH_01_easy/
     """
     from gpvo.cli.describe import as_lines, describe
-    from gpvo.cli.output import print_json
     from gpvo.io.jsonfile import plain
 
     given = options.source_options(
@@ -75,7 +74,6 @@ def import_(
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
     from gpvo.cli.importing import ImportSettings, import_log
-    from gpvo.cli.output import numbers, print_json
 
     offset, sigma = None, None
     if time_offset != "auto":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, new_table, print_json, show
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ def forecast(
 
     Example: gpvo forecast errors.gpvo --path plan.tum --plot plan.png
     """
-    from gpvo.cli.output import print_json
     from gpvo.evaluation.forecast import forecast as run_forecast
     from gpvo.evaluation.forecast import read_plan
     from gpvo.online.predictor import Predictor
@@ -94,19 +93,16 @@ def _row(f: Forecast, k: int) -> dict[str, float]:
 
 
 def _print(f: Forecast, path: Path, frame: str) -> None:
-    from gpvo.cli.output import console as new_console
-    from gpvo.cli.output import new_table
 
     p = f.plan
-    console = new_console()
-    console.print(
+    show(
         f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m of the {frame}, {len(p.t_s) - 1} motions at"
         f" {1 / p.step_s:.3g} Hz"
     )
-    console.print(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
+    show(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
     for o in f.outside:
         a, b = o.planned, o.trained
-        console.print(
+        show(
             f"  {o.feature}: {a[0]:.3g} to {a[1]:.3g}, the training knows {b[0]:.3g} to {b[1]:.3g}"
             f" ({100 * o.share:.0f} % beyond)"
         )
@@ -114,11 +110,11 @@ def _print(f: Forecast, path: Path, frame: str) -> None:
     for k in _stops(len(p.t_s)):
         row = _row(f, k)
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
-    console.print(table)
-    console.print("1 sigma of the position since the first pose, in the axes of the plan's world")
+    show(table)
+    show("1 sigma of the position since the first pose, in the axes of the plan's world")
     if f.mean[-1].any():
         x, y, z = f.mean_error_m[-1]
-        console.print(f"and an error to be expected at the end of {x:.3g}, {y:.3g}, {z:.3g} m")
+        show(f"and an error to be expected at the end of {x:.3g}, {y:.3g}, {z:.3g} m")
 
 
 def _write(out: Path, f: Forecast) -> None:

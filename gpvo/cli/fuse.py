@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, one_of, print_json
 
 if TYPE_CHECKING:
     from gpvo.filters.study import Comparison
@@ -39,7 +39,6 @@ def fuse(
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
-    from gpvo.cli.output import one_of, print_json
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
@@ -118,7 +117,6 @@ def publish(
 
     Example: gpvo publish runs/flight7 --to mavlink -o flight7.tlog --consumer px4 --check
     """
-    from gpvo.cli.output import print_json
     from gpvo.publish.job import PublishSettings, publish_run
 
     settings = PublishSettings(

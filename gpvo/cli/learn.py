@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, cell, new_table, note, print_json, show
 from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
 from gpvo.errors import GpvoError
 
@@ -68,7 +68,6 @@ def train(
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
-    from gpvo.cli.output import print_json
     from gpvo.learning.store import check_writable, folds_path, save_model
 
     check_writable(out)
@@ -128,7 +127,6 @@ def _is_given(ctx: typer.Context, option: str) -> bool:
 
 
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> TrainedModel:
-    from gpvo.cli.output import note
     from gpvo.io.run import read_run
     from gpvo.learning.config import TrainConfig
 
@@ -195,8 +193,6 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
 
 
 def _print_table(document: dict[str, Any]) -> None:
-    from gpvo.cli.output import console as new_console
-    from gpvo.cli.output import new_table
 
     if not document["folds"]:
         print("one short run alone: nothing could be left out, so there is no table")
@@ -211,18 +207,17 @@ def _print_table(document: dict[str, Any]) -> None:
         if not few and (known := [v for v in per_fold if v is not None]):
             per_fold = [min(known), max(known)]
         if any(v is not None for v in (*per_fold, *rest)):
-            table.add_row(method, *(_text(v) for v in (*per_fold, *rest)))
-    console = new_console()
+            table.add_row(method, *(cell(v) for v in (*per_fold, *rest)))
     what = (
         "run" if document.get("folds_are") != "time blocks" else "part of the one run (nothing is said of another one)"
     )
-    console.print(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
-    console.print(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
-    console.print(table)
+    show(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
+    show(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
+    show(table)
     resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
     if resting:
         told = ", ".join(f"{n} of {name}" for name, n in resting.items())
-        console.print(f"left out, as the vehicle stands there and the truth moves: {told}  (--stationary keep)")
+        show(f"left out, as the vehicle stands there and the truth moves: {told}  (--stationary keep)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
@@ -230,16 +225,14 @@ def _print_table(document: dict[str, Any]) -> None:
             f"{method} {sum(s['nees_dof_with_slips'][method] for s in slips) / len(slips):.3g}"
             for method in ("learned", "constant")
         )
-        console.print(
+        show(
             f"slips: {total['caught']} caught, {total['missed']} missed, {total['falsely_flagged']} falsely flagged;"
             f" NEES with the flagged counted in: {', '.join(counted_in)}"
         )
     c = document["comparison"]
     if c is not None:
-        console.print(
-            f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {_interval(c, 'nll_per_dim_difference')}"
-        )
-        console.print(f"learned minus base (what the Gaussian process adds): {_interval(c, 'learned_less_base')}")
+        show(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {_interval(c, 'nll_per_dim_difference')}")
+        show(f"learned minus base (what the Gaussian process adds): {_interval(c, 'learned_less_base')}")
 
 
 def _interval(comparison: dict[str, Any], name: str) -> str:
@@ -252,10 +245,6 @@ def _nees(block: dict[str, float | None]) -> float | None:
     return block["joint"] if block["joint"] is not None else block["translation"]
 
 
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
 def predict(
     model: Model,
     runs: Annotated[list[Path], typer.Argument(help="Run folders.")],
@@ -266,7 +255,6 @@ def predict(
 
     Example: gpvo predict errors.gpvo runs/flight -o predictions.parquet
     """
-    from gpvo.cli.output import print_json
     from gpvo.evaluation.evaluate import distinct
     from gpvo.io.run import read_run, write_predictions
     from gpvo.online.predictor import Predictor
@@ -311,7 +299,6 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
     """
     from dataclasses import asdict
 
-    from gpvo.cli.output import print_json
     from gpvo.io.run import read_run
     from gpvo.learning.check import check as check_model
     from gpvo.online.predictor import Predictor

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gpvo.cli.output import one_of
+from gpvo.cli.output import one_of, print_json
 from gpvo.errors import GpvoError, printable
 
 
@@ -56,7 +56,6 @@ def live(
 
     Example: gpvo live --odometry /vins_estimator/odometry --model vins.gpvo --zenoh
     """
-    from gpvo.cli.output import print_json
     from gpvo.live.engine import EngineSettings
     from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings, run_live
 
@@ -106,7 +105,6 @@ def doctor(
 
     Example: gpvo doctor flight.mcap
     """
-    from gpvo.cli.output import print_json
     from gpvo.live.examination import examine_bag, examine_topic
     from gpvo.live.job import POSE_TYPE_NAMES
 

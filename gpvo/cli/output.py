@@ -17,7 +17,6 @@ import typer
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -67,11 +66,11 @@ def say(text: str) -> None:
     print(text if len(text) <= width else textwrap.fill(text, int(width), subsequent_indent=indent))
 
 
-def console() -> Console:
-    """Where tables are printed: as wide as the terminal, 80 columns in a pipe."""
+def show(what: str | Table) -> None:
+    """Print a table or a line, as wide as the terminal, 80 columns in a pipe."""
     from rich.console import Console
 
-    return Console(highlight=False, markup=False)
+    Console(highlight=False, markup=False).print(what)
 
 
 def new_table(*columns: str) -> Table:
@@ -115,6 +114,15 @@ def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), le
     if not all(abs(x) < _MOST and x >= least for x in found) or (counts and len(found) not in counts):
         raise GpvoError(f"{option} is '{text}'", cure=cure)
     return found
+
+
+def cell(value: float | str | None, digits: int = 3) -> str:
+    """A number as tables show it, a dash for what is not known; text as it is."""
+    if isinstance(value, str):
+        return value
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.{digits}g}"
 
 
 @contextmanager

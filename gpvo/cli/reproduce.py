@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, print_json, progress
 
 
 def reproduce(
@@ -35,7 +35,6 @@ def reproduce(
 
     Example: gpvo reproduce -o out/thesis --quick
     """
-    from gpvo.cli.output import print_json, progress
     from gpvo.reproduce.plan import Plan
     from gpvo.reproduce.run import reproduce as run
     from gpvo.reproduce.stages import Workers

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gpvo.cli import source_options as flags
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, print_json, progress
 
 if TYPE_CHECKING:
     from gpvo.types import Prediction
@@ -72,7 +72,6 @@ def run(
     """
     from gpvo import runner
     from gpvo.cli import output
-    from gpvo.cli.output import print_json, progress
     from gpvo.io import open_source
     from gpvo.learning.check import ENOUGH_INSIDE
     from gpvo.vo.config import make_config, read_settings
@@ -169,7 +168,6 @@ def calibration(
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
-    from gpvo.cli.output import print_json
     from gpvo.errors import SourceError
     from gpvo.io.atomic import write_text
     from gpvo.io.jsonfile import read_json

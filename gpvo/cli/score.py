@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, cell, new_table, print_json, show
 from gpvo.errors import GpvoError
 
 
@@ -33,7 +33,6 @@ def score(
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
     from gpvo.cli.evaluate import options_of
-    from gpvo.cli.output import print_json
     from gpvo.evaluation.score import board, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
 
@@ -58,29 +57,24 @@ def score(
 
 
 def _print_board(columns: dict[str, list[Any]]) -> None:
-    from gpvo.cli.output import console, new_table
 
     table = new_table("method", "E [mm]", "E [mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     for row in zip(*columns.values()):
-        table.add_row(*(x if isinstance(x, str) else "-" if x is None else f"{x:.3g}" for x in row))
-    console().print(table)
+        table.add_row(*map(cell, row))
+    show(table)
     print("E: energy score. NEES per motion, then over a second and lengths of path; 1 is right.")
     print("easy, hard: share within 1 sigma (0.68 is right) in the calmest and the worst quarter.")
 
 
 def _print(found: dict[str, Any]) -> None:
-    from gpvo.cli.output import console as new_console
-    from gpvo.cli.output import new_table
 
     table = new_table("sequence", "motions", "lost", "energy [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
         over = (s["nees_dof_over"][name] for name in ("1s", "10m", "100m"))
         numbers = (*energy, s["nll_per_dim"], s["nees_dof"], *over)
-        cells = ("-" if x is None else f"{x:.3g}" for x in numbers)
-        table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *cells)
-    console = new_console()
-    console.print(table)
+        table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers))
+    show(table)
     pooled = found["pooled"]
     for name, unit, factor in (
         ("energy_translation_m", "mm", 1e3),
@@ -91,4 +85,4 @@ def _print(found: dict[str, Any]) -> None:
         told = "too few sequences for an interval"
         if i["low"] is not None:
             told = f"[{factor * i['low']:.4g}, {factor * i['high']:.4g}] (95 %, by whole sequences)"
-        console.print(f"{name}: {factor * i['mean']:.4g} {unit} {told}")
+        show(f"{name}: {factor * i['mean']:.4g} {unit} {told}")

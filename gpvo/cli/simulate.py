@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, print_json, progress
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -88,7 +88,6 @@ def simulate(
 
 
 def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -> Flight:
-    from gpvo.cli.output import progress
     from gpvo.sim.campaign import fly
 
     if points:
@@ -104,8 +103,6 @@ def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path 
 
         contact_sheet(good[0].path, preview)
     if json_:
-        from gpvo.cli.output import print_json
-
         print_json(
             {"schema": 1, "scenario": scenario.name, "flights": [f.__dict__ | {"path": str(f.path)} for f in flights]}
         )
@@ -122,8 +119,6 @@ def _show_list(json_: bool) -> None:
 
     known = {name: load_scenario(name).about for name in names()}
     if json_:
-        from gpvo.cli.output import print_json
-
         print_json({"schema": 1, "scenarios": known})
         return
     for name, about in known.items():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpvo.cli.output import Json
+from gpvo.cli.output import Json, new_table, print_json, progress, show
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ def twin(
 
     Example: gpvo twin runs/mine -o twins --tolerance d455
     """
-    from gpvo.cli.output import print_json
 
     settings = settings_of(replicates, tolerance, seed, gap)
     if out is None and not against:
@@ -74,7 +73,6 @@ def twin(
 def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: bool) -> None:
     import numpy as np
 
-    from gpvo.cli.output import console, new_table, print_json
     from gpvo.evaluation.by_twins import SPANS, ratios
     from gpvo.io.run import read_run
     from gpvo.online.features import AXES
@@ -94,7 +92,7 @@ def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: 
             table.add_row(name, span, *(f"{v:.2f}" for v in row))
     for span, m, d in zip(SPANS, mean, spread):
         table.add_row("all, times or over", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
-    console().print(table)
+    show(table)
     print("real over predicted error, root mean square; the truth's own noise is counted in")
 
 
@@ -109,7 +107,6 @@ def settings_of(replicates: int, tolerance: str, seed: int, gap: str | None = No
 
 def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int = 1) -> list[Path]:
     """Twins of all runs, with a progress bar; names of runs that are alike are told apart."""
-    from gpvo.cli.output import progress
     from gpvo.evaluation.evaluate import distinct
     from gpvo.twin.replicate import make_twins
 

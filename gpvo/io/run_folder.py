@@ -10,7 +10,7 @@ from typing import Any
 
 from gpvo.errors import SourceError
 from gpvo.io import run_table
-from gpvo.io.folder_lock import FolderLock
+from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import read_json
 from gpvo.io.parquet_write import RowGroup
 from gpvo.io.snapshot import load_snapshot

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io import atomic
-from gpvo.io.folder_lock import FolderLock
+from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import plain
 from gpvo.learning.parallel import map_jobs
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.io.folder_lock import FolderLock
+from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import write_json
 from gpvo.io.toml import to_toml
 from gpvo.sim import imu, routes, sequence_files, sequence_plan, vehicles
