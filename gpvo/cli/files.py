@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -73,7 +73,8 @@ def import_(
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
-    from gpvo.cli.importing import ImportSettings, import_log
+    from gpvo.cli.importing import import_log
+    from gpvo.io.foreign import read_foreign
 
     offset, sigma = None, None
     if time_offset != "auto":
@@ -82,26 +83,25 @@ def import_(
         cure = "give metres,radians, such as 0.003,0.0002"
         translation, rotation = numbers("--truth-sigma", truth_sigma, cure, counts=(2,), least=0.0)
         sigma = (translation, rotation)
+    stamps: dict[str, Any] = {"times": times, "rate_hz": rate_hz}
+    covariances: dict[str, Any] = {
+        "covariance_of": one_of("--covariance-of", covariance_of, ("pose", "motion")),
+        "covariance_axes": one_of("--covariance-axes", covariance_axes, ("world", "body")),
+    }
+    chosen: dict[str, Any] = {
+        "frame": one_of("--frame", frame, ("cam", "body")),
+        "align": one_of("--align", align, ("none", "rotation", "transform")),
+    }
+    mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])
     summary = import_log(
-        ImportSettings(
-            log=log,
-            truth=truth,
-            kind=format_,
-            truth_kind=truth_format,
-            mapping=_mapping("--map", map_ or []),
-            truth_mapping=_mapping("--truth-map", truth_map or []),
-            topic=topic,
-            truth_topic=truth_topic,
-            times=times,
-            rate_hz=rate_hz,
-            frame=one_of("--frame", frame, ("cam", "body")),
-            align=one_of("--align", align, ("none", "rotation", "transform")),
-            time_offset_s=offset,
-            truth_sigma=sigma,
-            covariance_of=one_of("--covariance-of", covariance_of, ("pose", "motion")),
-            covariance_axes=one_of("--covariance-axes", covariance_axes, ("world", "body")),
-        ),
+        read_foreign(log, format_, mapping=mapping, topic=topic, **stamps, **covariances),
+        None
+        if truth is None
+        else read_foreign(truth, truth_format, mapping=truth_mapping, topic=truth_topic, complete=True, **stamps),
         out,
+        **chosen,
+        time_offset_s=offset,
+        truth_sigma=sigma,
         overwrite=overwrite,
     )
     if json_:
