@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gpvo.cli import source_options as flags
-from gpvo.cli.output import Json, print_json, progress
+from gpvo.cli.output import Json, note, print_json, progress
 
 if TYPE_CHECKING:
+    from gpvo.runner import RunSummary
     from gpvo.types import Prediction
 
 _MOST_NOTES = 5
@@ -71,10 +73,11 @@ def run(
     Example: gpvo run MH_01_easy/ -o runs/mh01
     """
     from gpvo import runner
-    from gpvo.cli import output
     from gpvo.io import open_source
     from gpvo.learning.check import ENOUGH_INSIDE
+    from gpvo.online.predictor import Predictor
     from gpvo.vo.config import make_config, read_settings
+    from gpvo.vo.rig_findings import read_state
 
     shorthand = {
         "methods": methods,
@@ -88,37 +91,19 @@ def run(
         shorthand["self_calibration"] = self_calibration
     config = make_config(preset, **read_settings([*(f"{k}={v}" for k, v in shorthand.items()), *(settings or ())]))
     options = flags.source_options(
-        size,
-        calibration=calibration,
-        hfov_deg=hfov_deg,
-        mask_left=mask_left,
-        mask_right=mask_right,
-        bits=bits,
-        rate_hz=rate_hz,
-        tolerance_s=pair_tolerance,
-        left_topic=left_topic,
-        right_topic=right_topic,
-        imu_topic=imu_topic,
-        truth_topic=truth_topic,
-        truth_frame=truth_frame,
-    )
+        size, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right, bits=bits,
+        rate_hz=rate_hz, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic,
+        imu_topic=imu_topic, truth_topic=truth_topic, truth_frame=truth_frame,
+    )  # fmt: skip
     sequence = open_source(source, kind=kind, **options)
-    known = None
-    if calibration_state is not None:
-        from gpvo.vo.rig_findings import read_state
-
-        known = read_state(calibration_state, sequence.camera)
-    predictor = None
-    if model is not None:
-        from gpvo.online.predictor import Predictor
-
-        predictor = Predictor.load(model)
-    inside: list[bool] = []
+    state = None if calibration_state is None else read_state(calibration_state, sequence.camera)
+    predictor = None if model is None else Predictor.load(model)
     show = None
     if view or record_view is not None:
         from gpvo.evaluation.live_view import LiveView
 
         show = LiveView(sequence.camera, str(sequence.name), record_view).show
+    inside: list[bool] = []
     with progress("frames", len(sequence)) as advance:
 
         def on_frame(step: runner.Step, prediction: Prediction | None) -> None:
@@ -129,24 +114,21 @@ def run(
                 show(step, prediction)
 
         summary = runner.run(
-            sequence,
-            out,
-            config,
-            predictor,
-            on_frame,
-            keep_tracks=keep_tracks,
-            overwrite=overwrite,
-            calibration_state=known,
-            resume=repr(sorted(options.items())),
-        )
+            sequence, out, config, predictor, on_frame, keep_tracks=keep_tracks, overwrite=overwrite,
+            calibration_state=state,
+        )  # fmt: skip
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)
         told = f"{model.name} does not fit: only {share:.0f} % of the frames lie inside the training domain"
         print(f"gpvo: {told} (gpvo check says more)", file=sys.stderr)
-    notes = sequence.report.notes
+    _tell(out, summary, sequence.report.notes, json_)
+
+
+def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> None:
+    """The summary, and a few of the notes that the source made."""
     more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
-    for note in (*notes[:_MOST_NOTES], *more):
-        output.note(f"source: {note}")
+    for line in (*notes[:_MOST_NOTES], *more):
+        note(f"source: {line}")
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:
