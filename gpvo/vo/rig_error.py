@@ -13,13 +13,15 @@ without a prior, and dy from the rows, which need no motion. What cannot be told
 
 Two things keep it honest. Errors of neighbouring frames are alike (a feature's place is off in the same way for as
 long as it is followed): blocks of frames are compared with their expected scatter, and all information is divided by
-the ratio. And rigs are of several kinds, exact, good, usual and bad ones: the estimate is the mean over the kinds by
-their probability (J. Dickey, "The weighted likelihood ratio", 1971), so that an exact rig keeps its exact geometry.
+the ratio. And rigs are of several kinds, exact or not, with a mounting and with lenses that are good, usual or bad: the
+estimate is the mean over the kinds by their probability (J. Dickey, "The weighted likelihood ratio", 1971), so that an
+exact rig keeps its exact geometry, and a camera knocked out of its place the lens that it had.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,8 @@ _DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
 _DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
 _ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
 _TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
-_KINDS = (0.3, 1.0, 4.0)  # of rigs beside exact ones, equally likely: their prior of dx is so many times as wide
+# Rigs that are not exact: their mounting, and apart from it their lenses, are so many times as wrong, equally likely.
+_KINDS = (0.3, 1.0, 4.0)
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: the limit of disparity selects far ones
@@ -48,17 +51,20 @@ def terms(x: Array, y: Array) -> Array:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def prior_covariance(camera: StereoCamera) -> Array:
-    """(12, 12) of the coefficients of dx, then of dy, each in the order of :data:`TERMS`."""
+def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0) -> Array:
+    """(12, 12) of the coefficients of dx, then of dy, each in the order of :data:`TERMS`.
+
+    Of rigs whose right camera stands ``mounting`` times, and whose lenses bend ``lens`` times as wrong as usual.
+    """
     reach = (0.5 * camera.width / camera.fx_px) ** ORDER
     vertical, optical = np.zeros((2, 2 * N_TERMS))
     vertical[[0, 3]] = 1.0
     optical[2], optical[N_TERMS + 1] = -1.0, 1.0
     rows_px = np.where(ORDER == 0, *_ROW_PX)
-    disparity_px = np.where(ORDER == 0, *_DISPARITY_PX)
+    disparity_px = np.where(ORDER == 0, mounting * _DISPARITY_PX[0], lens * _DISPARITY_PX[1])
     free = np.concatenate([disparity_px / camera.fx_px / reach, rows_px / camera.fy_px / reach])
     turns = np.outer(vertical, vertical) + np.outer(optical, optical)
-    return np.diag(free**2) + _TURN_RAD**2 * turns
+    return np.diag(free**2) + (mounting * _TURN_RAD) ** 2 * turns
 
 
 def principal_errors(state: RigState, camera: StereoCamera) -> Array:
@@ -113,8 +119,9 @@ class RigError:
             return
         precision = np.asarray(np.linalg.inv(self._start.covariance), np.float64)
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
-        kinds = _KINDS if self._may_be_exact else (1.0,)
-        self._priors = [_Prior.of(self._start, factor) for factor in kinds]
+        kinds = product(_KINDS, _KINDS) if self._may_be_exact else ()
+        covariances = [prior_covariance(camera, *kind) for kind in kinds] or [self._start.covariance]
+        self._priors = [_Prior.of(self._start.mean, covariance) for covariance in covariances]
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
     def correct(self, uvd: Array) -> Array:
@@ -188,12 +195,12 @@ class RigError:
             covariance = np.asarray(np.linalg.inv(prior.precision + information), np.float64)
             mean = covariance @ (prior.score + score)
             fits.append((mean, covariance))
-            # Savage-Dickey: against a rig whose disparities are exact.
+            # Savage-Dickey: against a rig whose disparities are exact, which is as likely as all kinds of others.
             P, m = covariance[_DX, _DX], mean[_DX]
             log_odds.append(0.5 * (m @ np.linalg.solve(P, m) + np.linalg.slogdet(P)[1] - prior.log_det_dx))
         if len(fits) == 1:
             return RigState(*fits[0], 1.0)
-        weight = np.exp(np.array([0.0, *log_odds]) - max(0.0, *log_odds))
+        weight = np.exp(np.array([np.log(len(fits)), *log_odds]) - max(0.0, *log_odds))
         weight /= weight.sum()
         mean, best = np.zeros(2 * N_TERMS), int(np.argmax(weight[1:]))
         covariance = np.zeros_like(fits[0][1])
@@ -230,12 +237,10 @@ class _Prior:
     log_det_dx: float
 
     @classmethod
-    def of(cls, start: RigState, factor: float) -> _Prior:
-        """With coefficients of dx that are ``factor`` times as large."""
-        scale = np.where(np.arange(2 * N_TERMS) < N_TERMS, factor, 1.0)
-        covariance = start.covariance * np.outer(scale, scale)
+    def of(cls, mean: Array, covariance: Array) -> _Prior:
+        """Of a Gaussian of this mean (12,) and covariance (12, 12)."""
         precision = np.asarray(np.linalg.inv(covariance), np.float64)
-        return cls(precision, precision @ start.mean, float(np.linalg.slogdet(covariance[_DX, _DX])[1]))
+        return cls(precision, precision @ mean, float(np.linalg.slogdet(covariance[_DX, _DX])[1]))
 
 
 class _Blocks:
