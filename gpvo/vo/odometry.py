@@ -211,8 +211,8 @@ class StereoOdometry:
         state, config = self._state, self.config
         record = VoRecord(t_ns, state.t_ref_ns, verdict.status, guess, reason=verdict.reason)
         if motion is not None:
-            G = transfer(motion.T_prev_cur, motion.uvd_prev, self.camera).G
-            moments = ResidualMoments.of(motion.residuals, G)
+            moved = transfer(motion.T_prev_cur, motion.uvd_prev, self.camera)
+            moments = ResidualMoments.of(motion.residuals, moved.G)
             record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
             C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, state.twist)
@@ -223,8 +223,10 @@ class StereoOdometry:
                 v_t=dict.fromkeys(config.stated, C[:3, :3]),
             )
         if self.config.persistent_noise:
-            self._persistent.update(motion.residuals, G)
+            self._persistent.update(motion.residuals, moved.G)
         self._sigmas.update(moments)
+        if self._sigmas.estimates:
+            self._sigmas.design.update(motion, moved, self.camera)
         sigma_p_px, sigma_m_px = self._sigmas.values
         by_method = covariances_by_method(
             config.methods,

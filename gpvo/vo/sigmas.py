@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpvo.types import Array
-from gpvo.vo.motion import apply_whitener, persistent_direction, residual_covariance, whitener
+from gpvo.types import Array, StereoCamera
+from gpvo.vo.motion import Motion, Transfer, apply_whitener, persistent_direction, residual_covariance, whitener
 from gpvo.vo.points import triangulation_pixel_covariance
 
 _MEMORY = 0.97  # of the running mean: about thirty frames
+_PARTS = 4, 2  # columns and rows of the picture: finer ones see less of what neighbours share, coarser ones the same
 _S_UNIT = triangulation_pixel_covariance(1.0)
 # Of squares with one degree of freedom, cut off at four; of means of two, at 6.6 medians.
 _CUT_ALONG, _LEFT_ALONG = 4.0, 0.9195
@@ -67,22 +68,62 @@ class SigmaEstimator:
     def __init__(self, sigma_p_px: float | None, sigma_m_px: float | None) -> None:
         self._fixed = (sigma_p_px, sigma_m_px)
         self._running = _START
+        self.design = DesignEffect()
 
     def update(self, moments: ResidualMoments) -> None:
         """Take in one motion's residuals."""
         self._running = self._running.plus(moments, _MEMORY)
 
     @property
+    def estimates(self) -> bool:
+        """Whether any sigma is not given."""
+        return None in self._fixed
+
+    @property
     def values(self) -> tuple[float, float]:
         """(sigma_p, sigma_m) [px] to use now.
 
-        Estimated ones are those of the second moment: the predictive of a motion is a Student-t with the degrees of
-        freedom of the residuals, whose variance is ``nu / (nu - 2)`` times as large.
+        Estimated ones are those of independent points that tell a motion as well as the points do: the residuals' own,
+        by the design effect. They are those of the second moment: the predictive of a motion is a Student-t with the
+        degrees of freedom of the residuals, whose variance is ``nu / (nu - 2)`` times as large.
         """
         nu = self._running.freedom
-        running = np.array(self._running.sigmas) * np.sqrt(nu / (nu - 2.0))
+        running = np.array(self._running.sigmas) * np.sqrt(nu / (nu - 2.0) * self.design.ratio)
         p, m = (float(r) if f is None else f for f, r in zip(self._fixed, running, strict=True))
         return p, m
+
+
+class DesignEffect:
+    """How many times the variance of a motion is that of one from independent points.
+
+    L. Kish, "Survey sampling", 1965; clusters of a regression: K.-Y. Liang, S. Zeger, 1986. Points near each other are
+    wrong alike: on one surface, or moving thing. The motion's score, summed over each of :data:`_PARTS` parts of the
+    picture, then scatters more than its information says.
+    """
+
+    def __init__(self) -> None:
+        self._scatter = self._expected = 1.0
+
+    def update(self, motion: Motion, moved: Transfer, camera: StereoCamera) -> None:
+        """Take in a motion; ``moved``: the transfer of its smoothed points."""
+        W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT, motion.persistent))
+        z, A = apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H)
+        share = motion.uvd_prev[:, :2] / [camera.width, camera.height]
+        column, row = np.clip((share * _PARTS).astype(np.int64), 0, np.array(_PARTS) - 1).T
+        part = row * _PARTS[0] + column == np.arange(_PARTS[0] * _PARTS[1])[:, None]
+        scores = part @ np.einsum("ikn,in->nk", A, z)
+        information = np.stack([np.einsum("ikn,iln->kl", B, B) for B in (A[..., p] for p in part)])
+        covariance = np.linalg.inv(information.sum(axis=0))
+        told = information @ covariance  # by each part; the motion takes the square of it off
+        variance = max(float((z**2).sum()) / max(z.size - 6.0, 1.0), 1e-12)
+        expected = float(np.trace(told, axis1=1, axis2=2).sum() - (told * told.transpose(0, 2, 1)).sum())
+        self._scatter = _MEMORY * self._scatter + float(((scores @ covariance) * scores).sum()) / variance
+        self._expected = _MEMORY * self._expected + expected
+
+    @property
+    def ratio(self) -> float:
+        """1 for independent points."""
+        return self._scatter / self._expected
 
 
 class PersistentNoise:

@@ -8,7 +8,7 @@ from gpvo.geometry import se3
 from gpvo.vo.covariance import motion_covariance
 from gpvo.vo.motion import refine, transfer
 from gpvo.vo.points import pointing_matching_pixel_covariance
-from gpvo.vo.sigmas import PersistentNoise, ResidualMoments, SigmaEstimator
+from gpvo.vo.sigmas import DesignEffect, PersistentNoise, ResidualMoments, SigmaEstimator
 from stereo_points import CAMERA, noisy, scene
 
 
@@ -51,3 +51,26 @@ def test_sigmas_of_few_points(count: int) -> None:
             scores.append(e @ np.linalg.solve(C, e) / 6)
     assert 0.4 < np.median(scores) < 2.5
     assert np.mean(scores) < 10
+
+
+@pytest.mark.parametrize(("shared_px", "least", "most"), [(0.0, 0.85, 1.15), (0.15, 2.5, 8.0)])
+def test_points_that_err_alike_count_as_fewer(shared_px: float, least: float, most: float) -> None:
+    """Noise of 0.15 px by point, and noise common to each eighth of the picture; NEES/dof stays near one by it."""
+    rng = np.random.default_rng(0)
+    design, sigmas, scores = DesignEffect(), SigmaEstimator(None, None), []
+    for k in range(120):
+        T, before, after = scene(rng, 150, (8.0, 60.0))
+        part = (before[:, 0] // 160 + 4 * (before[:, 1] // 240)).astype(int)
+        before, after = noisy(rng, before, 0.15), noisy(rng, after, 0.15)
+        after += shared_px * rng.standard_normal((8, 3))[part]
+        motion = refine(T, before, after, CAMERA)
+        assert motion is not None
+        moved = transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA)
+        design.update(motion, moved, CAMERA)
+        sigmas.update(ResidualMoments.of(motion.residuals, moved.G))
+        if k >= 20:
+            S = pointing_matching_pixel_covariance(*np.multiply(sigmas.values, design.ratio**0.5))
+            e = se3.log(se3.inverse(T) @ motion.T_prev_cur)
+            scores.append(e @ np.linalg.solve(motion_covariance(motion.T_prev_cur, motion.uvd_prev, CAMERA, S).full, e))
+    assert least < design.ratio < most
+    assert 0.7 < np.mean(scores) / 6 < 1.5
