@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
-from gpvo.types import Status
+from gpvo.dataset.align import interpolate_truth
+from gpvo.io.source import open_source
+from gpvo.types import Status, StereoFrame
 from gpvo.vo.config import make_config
 from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.image import Light, in_light_of
@@ -126,3 +131,18 @@ def test_the_stress_list() -> None:
     silent = {fault: stress.run(change(whole)).silent for fault, change in stress.FAULTS.items()}
     print(silent)
     assert sum(len(frames) for fault, frames in silent.items() if not ("patch" in fault or "late" in fault)) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
+def test_the_stress_list_on_a_drive() -> None:
+    """Sixty frames of KITTI raw 0001, about 10 m/s: no fault is silent."""
+    source = open_source(Path(os.environ["GPVO_DATA"]) / "kitti_2011_09_26_0001")
+    frames = [f for f in source if isinstance(f, StereoFrame)][:60]
+    assert source.truth is not None
+    T_world_cam, known = interpolate_truth(source.truth, np.array([f.t_ns for f in frames]))
+    assert known.all()
+    assert source.camera is not None
+    whole = stress.Footage(source.camera, frames, T_world_cam)
+    silent = {fault: stress.run(change(whole)).silent for fault, change in stress.FAULTS.items()}
+    assert sum(map(len, silent.values())) == 0, silent
