@@ -53,6 +53,19 @@ def test_the_readme_names_commands() -> None:
     assert any(line.startswith("gpvo train") for line in commands())
 
 
+def test_it_is_read_in_a_minute() -> None:
+    """At most 700 words of prose and one table of at most six rows; every figure of the table stands in the results."""
+    text = README.read_text()
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert 2 < len(rows) <= 2 + 6
+    prose = re.sub(r"```[^`]*```|^ {4}.*$|^\|.*$|^!\[.*$", "", text, flags=re.MULTILINE)
+    assert len(re.sub(r"\]\([^)]*\)", "]", prose).split()) <= 700
+    pages = "\n".join((ROOT / "docs" / name).read_text() for name in ("results.rst", "concepts/twins.rst"))
+    stated = {f.rstrip("0") for f in re.findall(r"-?\d+\.\d+", pages)}
+    for figure in re.findall(r"-?\d+\.\d+", "\n".join(rows)):
+        assert figure.rstrip("0") in stated, figure
+
+
 @pytest.mark.slow
 def test_every_command_runs(tmp_path: Path) -> None:
     stand_in = prepare(tmp_path)
