@@ -49,7 +49,7 @@ def test_its_command_is_there(title: str) -> None:
     if words[0] == "gpvo":
         told = CliRunner().invoke(cli.app, [words[1], "--help"]).output
         assert all(option in told for option in words if option.startswith("--"))
-    elif words[0] == "pytest":
+    elif "pytest" in words[:2]:
         assert (ROOT / words[-1]).is_file()
     else:
         assert words[:2] == ["python", "-m"]
