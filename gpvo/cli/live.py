@@ -23,6 +23,10 @@ def live(
     odometry_type: Annotated[
         str, typer.Option(help="Type of that topic: odometry, or pose (PoseWithCovarianceStamped).")
     ] = ("odometry"),
+    truth: Annotated[
+        str | None, typer.Option(help="Topic of truth that comes late (mocap, tags): adapts the covariance.")
+    ] = None,
+    truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
     replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False,
@@ -68,6 +72,8 @@ def live(
             imu=imu,
             odometry=odometry,
             pose_type=POSE_TYPE_NAMES[odometry_type],
+            truth=truth,
+            truth_type=POSE_TYPE_NAMES[one_of("--truth-type", truth_type, POSE_TYPE_NAMES)],
             calibration=calibration,
             replay=replay,
             fast=fast,

@@ -7,16 +7,17 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import rotate_covariance
-from gpvo.io.jsonfile import read_json, write_json
 from gpvo.learning.check import rate_problems
 from gpvo.live.intake import Arrival
+from gpvo.live.kept_state import State, load_state, save_state
+from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
@@ -58,7 +59,8 @@ class Output(Protocol):
 class EngineSettings:
     """``increment``: the pose's covariance is that of its last motion, not accumulated since the start.
 
-    ``state``: file that holds where the odometry stood; taken up at the start, written every 10 s and at the end.
+    ``state``: file that holds where the odometry stood and what late truth taught; taken up at the start, written every
+    10 s and at the end.
     """
 
     correct_twist: bool = False
@@ -70,8 +72,8 @@ class Engine:
     """Steps stage, predictor and message builder, and hands the results to the outputs.
 
     The pose that is published never jumps: where the source starts again, or was away, an unknown motion stands
-    between, with the covariance of what may have happened. ``tell``: called with each warning, at once and then every
-    10 s while it holds.
+    between, with the covariance of what may have happened. ``truth`` adapts the predictor's scale.
+    ``tell``: called with each warning, at once and then every 10 s while it holds.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class Engine:
         outputs: Iterable[Output],
         settings: EngineSettings | None = None,
         tell: Callable[[str], None] = print,
+        truth: LateTruth | None = None,
     ) -> None:
         self.stage, self.predictor, self.outputs = stage, predictor, list(outputs)
         self.settings = settings or EngineSettings()
@@ -88,6 +91,7 @@ class Engine:
         self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
         self.last: Odometry | None = None
         self.tell = tell
+        self._truth = truth
         self._told_s: dict[str, float] = {}
         self._builder: OdometryBuilder | None = None
         self._seen_ns: int | None = None  # arrival of the last message that was used
@@ -97,7 +101,8 @@ class Engine:
         self._reported = (-np.inf, 0)  # seconds and level of the last health
         self._misfit: list[str] = []
         self._saved_s = -np.inf
-        self._resume = _load_state(self.settings.state)
+        self._resume = load_state(self.settings.state)
+        self._scale = np.ones(6) if self._resume is None else self._resume.scale
         predictor.require_motions()
 
     def take(self, arrival: Arrival | None) -> list[Odometry]:
@@ -106,6 +111,8 @@ class Engine:
         now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
         start = time.perf_counter()
         try:
+            if self._truth is not None and arrival is not None and arrival.topic == self._truth.topic:
+                self._adapt(self._truth, arrival.message)
             for taken in self.stage.flush() if arrival is None else self.stage.take(arrival):
                 out.append(self._step(taken))
                 self._latency_ms.append(1e3 * (time.perf_counter() - start))
@@ -127,13 +134,17 @@ class Engine:
     def _step(self, taken: Taken) -> Odometry:
         builder = self._builder
         if taken.begins:
-            self.predictor.reset(self.stage.camera)
+            self.predictor.reset(self.stage.camera, self._scale)
+            if self._truth is not None:
+                self._truth.forget()
         if builder is None:
             builder = self._builder = self._first_builder(taken)
         if taken.begins and self._seen_ns is not None:
             self._bridge(builder, taken)
         record = taken.record
         prediction = self.predictor.step(record)
+        if self._truth is not None:
+            self._truth.predicted(record, prediction)
         message = builder.step(record, prediction)
         if self.settings.increment:
             message = self._of_increment(message, record, prediction)
@@ -147,16 +158,22 @@ class Engine:
             output.odometry(message)
         return message
 
+    def _adapt(self, truth: LateTruth, message: Any) -> None:
+        for t_ns, xi in truth.take(message, self.stage.T_body_cam):
+            self.predictor.observe(xi, t_ns)
+            self.counts["truth"] += 1
+        self._scale = self.predictor.scale
+
     def _first_builder(self, taken: Taken) -> OdometryBuilder:
         """Starts where the source says, or where the saved state stopped."""
         resume, start = self._resume, np.eye(4) if taken.T_parent_body is None else taken.T_parent_body
-        T_odom_body = start if resume is None else resume[0]
+        T_odom_body = start if resume is None else resume.T_odom_body
         builder = OdometryBuilder(
             self.stage.T_body_cam, T_odom_body, self.stage.method, correct_twist=self.settings.correct_twist
         )
         if resume is not None:
             A = se3.adjoint(se3.inverse(self.stage.T_body_cam))
-            in_body = rotate_covariance(resume[0][:3, :3].T, resume[1])
+            in_body = rotate_covariance(T_odom_body[:3, :3].T, resume.pose_covariance)
             away = _unknown(1.0, np.zeros(6))
             builder.step(lost(taken.record, 1.0, A @ in_body @ A.T + away, self.stage.method))
         return builder
@@ -257,29 +274,10 @@ class Engine:
     def _save(self) -> None:
         if self.settings.state is None or self.last is None:
             return
-        document = {
-            "schema": 1,
-            "T_odom_body": self.last.T_odom_body,
-            "pose_covariance": self.last.pose_covariance,
-        }
-        write_json(self.settings.state, document)
+        save_state(self.settings.state, State(self.last.T_odom_body, self.last.pose_covariance, self._scale))
 
 
 def _unknown(away_s: float, twist: Array) -> Array:
     """(6, 6) covariance of what may have happened while nothing was heard, or the source began elsewhere."""
     start = np.diag([_POSITION_SIGMA_M**2] * 3 + [_ATTITUDE_SIGMA_RAD**2] * 3)
     return lost_covariance(min(away_s, 1e3), twist) + start
-
-
-def _load_state(path: Path | None) -> tuple[Array, Array] | None:
-    """Pose (4, 4) and its covariance (6, 6) in ``odom`` of a state file; None where there is none yet."""
-    if path is None or not path.exists():
-        return None
-    try:
-        document = read_json(path)
-        T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
-        if T.shape != (4, 4) or C.shape != (6, 6) or not (np.isfinite(T).all() and np.isfinite(C).all()):
-            raise ValueError("it holds no pose")
-    except (GpvoError, ValueError, KeyError, TypeError) as error:
-        raise GpvoError(f"is no state of gpvo live: {error}", where=path, cure="remove it to begin anew") from None
-    return T, C

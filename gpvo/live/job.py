@@ -17,6 +17,7 @@ from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, open_bag
 from gpvo.io.bags import info_topic
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival, Mailbox, arrivals
+from gpvo.live.late_truth import LateTruth
 from gpvo.live.outputs import ODOMETRY, POSE, FileOutput, MavlinkOutput, Wire, WireOutput, decode
 from gpvo.live.replay import odometry_topic, replay
 from gpvo.live.stages import PoseStage, Stage, StereoStage
@@ -35,6 +36,8 @@ class LiveSettings:
     imu: str | None = None
     odometry: str | None = None
     pose_type: str = ODOMETRY
+    truth: str | None = None
+    truth_type: str = POSE
     calibration: Path | None = None
     replay: Path | None = None
     fast: bool = False
@@ -75,7 +78,8 @@ def serve(
     outputs: list[Any] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
     outputs += [MavlinkOutput(settings.mavlink)] if settings.mavlink else []
     outputs += [FileOutput(settings.out)] if settings.out else []
-    engine = Engine(stage, Predictor.load(settings.model, for_filter=True), outputs, settings.engine, tell)
+    truth = None if settings.truth is None else LateTruth(settings.truth)
+    engine = Engine(stage, Predictor.load(settings.model, for_filter=True), outputs, settings.engine, tell, truth)
     with ending_by_signal(stop):
         for arrival in _arrivals(settings, stage, engine, wire, stop):
             engine.take(arrival)
@@ -127,7 +131,7 @@ def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
 def _arrivals(
     settings: LiveSettings, stage: Stage, engine: Engine, wire: Wire | None, stop: threading.Event
 ) -> Iterator[Arrival | None]:
-    topics = topics_in(stage, settings)
+    topics = topics_in(stage, settings) | ({settings.truth: settings.truth_type} if settings.truth else {})
     if settings.replay is not None:
         with open_bag(settings.replay) as reader:
             present = set(reader.topics)

@@ -21,9 +21,9 @@ class AdaptiveScale:
     Steps are in the log of the scale, so the factor stays positive; it is kept within [1/100, 100].
     """
 
-    def __init__(self, step: float = 0.05, n_axes: int = 6) -> None:
+    def __init__(self, step: float = 0.05, n_axes: int = 6, scale: Array | None = None) -> None:
         self._step = step
-        self._log_scale = np.zeros(n_axes)
+        self._log_scale = np.zeros(n_axes) if scale is None else np.log(scale)
 
     @property
     def scale(self) -> Array:

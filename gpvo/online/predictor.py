@@ -117,13 +117,18 @@ class Predictor:
         """The same model with its Gaussian process held at its mean function, the base variance."""
         return Predictor(arrays_of_base(self.arrays), self.header)
 
-    def reset(self, camera: StereoCamera | None = None) -> None:
+    @property
+    def scale(self) -> Array:
+        """(6,) factor on each standard deviation that late truth has taught; ones before any."""
+        return self._adaptive.scale
+
+    def reset(self, camera: StereoCamera | None = None, scale: Array | None = None) -> None:
         """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with; warns
-        where the two are far apart."""
+        where the two are far apart. ``scale``: what late truth taught of this odometry before."""
         for problem in camera_problems(self.camera, camera):
             warnings.warn(f"this is another camera: {problem}", stacklevel=2)
         self._observer = Observer(self.features, self.target, camera or self.camera)
-        self._adaptive = AdaptiveScale()
+        self._adaptive = AdaptiveScale(scale=scale)
         self._last: tuple[VoRecord, Array] | None = None
         self._stated: dict[int, tuple[Array, Array] | None] = {}
         self._rate_var = np.zeros(6)

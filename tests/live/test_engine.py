@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_maker import BagMaker
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
@@ -14,11 +15,13 @@ from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign, to_records
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
-from gpvo.live.stages import StereoStage
+from gpvo.live.late_truth import LateTruth
+from gpvo.live.stages import PoseStage, StereoStage
 from gpvo.publish.odometry import OdometryBuilder
 from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog
-from shim_bags import STATED, TOPIC, engine, flight, flown, messages, save_model, shim_predictor
+from shim_bags import STATED, TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
+from synthetic_runs import make_run
 
 
 @pytest.mark.parametrize("stated", [None, STATED])
@@ -141,3 +144,47 @@ def test_status_lost_is_not_sent_but_reported() -> None:
     assert lost[0].twist_covariance is None
     assert max(r.level for r in kept.reports) == 2
     assert kept.reports[-1].level == 2 or kept.frames[-1].status is Status.OK
+
+
+def _with_truth(factor: float, state: Path | None = None, covariance: float = 1e-12) -> tuple[Engine, list[Arrival]]:
+    """An engine fed with an odometry whose errors are ``factor`` times its usual ones, and truth half a second late."""
+    log, truth = make_run(9, n=300, geometry=False)
+    T_true = T_FLU_OPTICAL @ truth.T_world_cam @ se3.inverse(T_FLU_OPTICAL)
+    motions = se3.inverse(T_true[:-1]) @ T_true[1:]
+    T_log = T_FLU_OPTICAL @ log.trajectory() @ se3.inverse(T_FLU_OPTICAL)
+    errors = se3.log(se3.inverse(motions) @ se3.inverse(T_log[:-1]) @ T_log[1:])
+    T_est = [T_true[0]]
+    for motion, error in zip(motions, errors):
+        T_est.append(T_est[-1] @ motion @ se3.exp(factor * error))
+    stamps = 10**18 + np.arange(len(T_true)) * 50_000_000
+    maker = BagMaker(ros1=False)
+    for t, T in zip(stamps, T_true):
+        maker.pose_with_covariance("/mocap", int(t), T, covariance * np.eye(6))
+    late = [Arrival("/mocap", m, t + 500_000_000) for t, _, m in maker.messages]
+    arrivals = sorted([*flown(stamps, np.array(T_est)), *late], key=lambda a: a.received_ns)
+    stage = PoseStage(TOPIC)
+    return Engine(stage, shim_predictor(), [Kept()], EngineSettings(state=state), truth=LateTruth("/mocap")), arrivals
+
+
+def test_late_truth_adapts_the_scale_which_a_restart_keeps(tmp_path: Path) -> None:
+    scales = {}
+    for factor in (1.0, 4.0):
+        live, arrivals = _with_truth(factor, tmp_path / f"{factor}.json")
+        for arrival in arrivals:
+            live.take(arrival)
+        live.close()
+        assert live.counts["truth"] > 280
+        assert live.counts["failed"] == 0
+        scales[factor] = live.predictor.scale
+    assert np.exp(np.log(scales[4.0]).mean()) > 2.0 * np.exp(np.log(scales[1.0]).mean())
+    again, arrivals = _with_truth(4.0, tmp_path / "4.0.json")
+    again.take(next(a for a in arrivals if a.topic == TOPIC))
+    np.testing.assert_allclose(again.predictor.scale, scales[4.0])
+
+
+def test_truth_that_knows_less_than_the_odometry_teaches_nothing() -> None:
+    live, arrivals = _with_truth(4.0, covariance=1.0)
+    for arrival in arrivals:
+        live.take(arrival)
+    assert live.counts["truth"] == 0
+    np.testing.assert_array_equal(live.predictor.scale, np.ones(6))

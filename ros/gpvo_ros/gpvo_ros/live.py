@@ -23,6 +23,8 @@ DEFAULTS: dict[str, Any] = {
     "left": "",
     "right": "",
     "imu": "",
+    "truth": "",
+    "truth_type": "pose",
     "calibration": "",
     "topic": "/gpvo/odometry",
     "pose_topic": "",
@@ -41,14 +43,17 @@ def settings_of(given: dict[str, Any]) -> LiveSettings:
         raise GpvoError("the parameter 'model' is empty", cure="name a .gpvo file")
     if (p["left"] is None) != (p["right"] is None):
         raise GpvoError("one of the parameters 'left' and 'right' is empty")
-    if p["odometry_type"] not in POSE_TYPE_NAMES:
-        raise GpvoError(f"odometry_type is '{p['odometry_type']}'", cure="choose odometry or pose")
+    for name in ("odometry_type", "truth_type"):
+        if p[name] not in POSE_TYPE_NAMES:
+            raise GpvoError(f"{name} is '{p[name]}'", cure=f"choose {', '.join(POSE_TYPE_NAMES)}")
     return LiveSettings(
         model=Path(p["model"]),
         stereo=None if p["left"] is None else (p["left"], p["right"]),
         imu=p["imu"],
         odometry=p["odometry"],
         pose_type=POSE_TYPE_NAMES[p["odometry_type"]],
+        truth=p["truth"],
+        truth_type=POSE_TYPE_NAMES[p["truth_type"]],
         calibration=None if p["calibration"] is None else Path(p["calibration"]),
         wire="ros2",
         topic=p["topic"],

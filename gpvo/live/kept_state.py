@@ -1,0 +1,43 @@
+"""What ``gpvo live`` keeps in a file, to go on from after a restart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gpvo.errors import GpvoError
+from gpvo.io.jsonfile import read_json, write_json
+from gpvo.types import Array
+
+
+@dataclass(frozen=True)
+class State:
+    """Pose (4, 4) and its covariance (6, 6) in ``odom``, and the scale (6,) of sigma that late truth taught."""
+
+    T_odom_body: Array
+    pose_covariance: Array
+    scale: Array
+
+
+def save_state(path: Path, state: State) -> None:
+    """Write it, whole or not at all."""
+    write_json(path, {"schema": 1, **vars(state)})
+
+
+def load_state(path: Path | None) -> State | None:
+    """Of a state file; None where there is none yet."""
+    if path is None or not path.exists():
+        return None
+    try:
+        document = read_json(path)
+        T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
+        scale = np.array(document.get("scale", np.ones(6)), dtype=np.float64)
+        if T.shape != (4, 4) or C.shape != (6, 6) or not (np.isfinite(T).all() and np.isfinite(C).all()):
+            raise ValueError("it holds no pose")
+        if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
+            raise ValueError("it holds an impossible scale")
+    except (GpvoError, ValueError, KeyError, TypeError) as error:
+        raise GpvoError(f"is no state of gpvo live: {error}", where=path, cure="remove it to begin anew") from None
+    return State(T, C, scale)
