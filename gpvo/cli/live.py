@@ -38,6 +38,9 @@ def live(
     ] = None,
     domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0,
     mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
+    px4: Annotated[
+        bool, typer.Option("--px4", help="Send px4_msgs/VehicleOdometry too, for PX4 over uXRCE-DDS.")
+    ] = False,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write a bag: .bag, .mcap or a ROS 2 folder.")] = None,
     topic: Annotated[str, typer.Option(help="Topic of the odometry that is published.")] = "/gpvo/odometry",
     pose_topic: Annotated[str | None, typer.Option(help="Publish PoseWithCovarianceStamped here too.")] = None,
@@ -81,6 +84,7 @@ def live(
             address=address,
             domain=domain,
             mavlink=mavlink,
+            px4=px4,
             out=out,
             topic=topic,
             pose_topic=pose_topic,

@@ -238,8 +238,13 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
 
 def _unused(table: Table) -> tuple[str, ...]:
     """A remark on columns that state an uncertainty and that nothing reads."""
-    names = ", ".join(table.unused)
-    return (f"columns not used: {names}; --map COLUMN=cov_00 takes a variance, see --help",) if names else ()
+    names, notes = ", ".join(table.unused), []
+    if names:
+        notes.append(f"columns not used: {names}; --map COLUMN=cov_00 takes a variance, see --help")
+    absent = [f"cov_{i}{i}" for i in range(6) if f"cov_{i}{i}" not in table.columns]
+    if absent and any(c.startswith("cov_") for c in table.columns):
+        notes.append(f"the covariance is not used: it has no {', '.join(absent)}; --map COLUMN=NAME names them")
+    return tuple(notes)
 
 
 def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) -> Array | None:

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from gpvo.errors import require
 from gpvo.live.outputs import Send
 from gpvo.live.zenoh_wire import dds_name
+from gpvo.publish import px4
 
 _DEPTH, _READER_DEPTH = 10, 100
 
@@ -109,7 +110,9 @@ def idl_type(msgtype: str) -> Any:
     """cyclonedds' description of a message type, made of rosbags' definition."""
     from cyclonedds.idl import make_idl_struct
 
-    fields = get_typestore(Stores.ROS2_JAZZY).fielddefs[msgtype][1]
+    store = get_typestore(Stores.ROS2_JAZZY)
+    px4.register(store)
+    fields = store.fielddefs[msgtype][1]
     name = dds_name(msgtype)
     return make_idl_struct(name.rsplit("::", 1)[1], name, {field: _idl_field(kind) for field, kind in fields})
 

@@ -18,7 +18,7 @@ from gpvo.io.bags import info_topic
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival, Mailbox, arrivals
 from gpvo.live.late_truth import LateTruth
-from gpvo.live.outputs import ODOMETRY, POSE, FileOutput, MavlinkOutput, Wire, WireOutput, decode
+from gpvo.live.outputs import ODOMETRY, POSE, FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
 from gpvo.live.replay import odometry_topic, replay
 from gpvo.live.stages import PoseStage, Stage, StereoStage
 from gpvo.online.predictor import Predictor
@@ -45,6 +45,7 @@ class LiveSettings:
     address: str | None = None
     domain: int = 0
     mavlink: str | None = None
+    px4: bool = False
     out: Path | None = None
     topic: str = "/gpvo/odometry"
     pose_topic: str | None = None
@@ -76,6 +77,10 @@ def serve(
     """The same over an open ``wire`` (none: a recording), until ``stop``."""
     stage = make_stage(settings)
     outputs: list[Any] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
+    if settings.px4:
+        if wire is None or wire.ros1:
+            raise GpvoError("--px4 speaks DDS", cure="add --dds or --ros2")
+        outputs.append(Px4Output(wire))
     outputs += [MavlinkOutput(settings.mavlink)] if settings.mavlink else []
     outputs += [FileOutput(settings.out)] if settings.out else []
     truth = None if settings.truth is None else LateTruth(settings.truth)

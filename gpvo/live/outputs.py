@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from gpvo.errors import GpvoError
 from gpvo.live.engine import Health
-from gpvo.publish import ros
+from gpvo.publish import px4, ros
 from gpvo.publish.mavlink import Link
 from gpvo.publish.odometry import Odometry
 
@@ -83,6 +83,24 @@ class WireOutput:
         )
         header = t["std_msgs/msg/Header"](**numbered, stamp=stamp, frame_id="")
         self._send_health(encode(self._wire, t[DIAGNOSTICS](header=header, status=[status])))
+
+    def close(self) -> None:
+        """The wire is closed by whoever opened it."""
+
+
+class Px4Output:
+    """``px4_msgs/VehicleOdometry`` for a flight controller that listens by uXRCE-DDS; a lost frame is NaN."""
+
+    def __init__(self, wire: Wire) -> None:
+        px4.register(wire.store)
+        self._wire, self._send = wire, wire.advertise(px4.TOPIC, px4.TYPE)
+
+    def odometry(self, odometry: Odometry) -> None:
+        """Send one frame."""
+        self._send(encode(self._wire, px4.vehicle_odometry(odometry, self._wire.store.types)))
+
+    def health(self, health: Health) -> None:
+        """It is carried as the message's quality."""
 
     def close(self) -> None:
         """The wire is closed by whoever opened it."""

@@ -1,7 +1,7 @@
 """MAVLink 2 for flight controllers: ODOMETRY, VISION_SPEED_ESTIMATE and HEARTBEAT, to a file, UDP or serial.
 
-FRD and NED live in this module alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w, x, y, z, upper triangles
-row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
+FRD and NED live in this module and :mod:`gpvo.publish.px4` alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w,
+x, y, z, upper triangles row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
 """
 
 from __future__ import annotations
@@ -49,6 +49,18 @@ def quality(odometry: Odometry) -> int:
     return int(np.clip(round(100 * odometry.confidence), 1, 100))
 
 
+def frd(odometry: Odometry) -> tuple[Array, Array]:
+    """Pose (7,), position then quaternion w, x, y, z, and twist (6,) in FRD; NaN where there is none."""
+    pose, twist = np.full(7, np.nan), np.full(6, np.nan)
+    if odometry.tracked:
+        R = R_FRD_FLU @ odometry.T_odom_body[:3, :3] @ R_FRD_FLU
+        pose[:3] = R_FRD_FLU @ odometry.T_odom_body[:3, 3]
+        pose[3:] = np.roll(se3.rotation_to_quaternion_xyzw(R), 1)
+    if odometry.twist_body is not None:
+        twist = np.concatenate([R_FRD_FLU @ odometry.twist_body[:3], R_FRD_FLU @ odometry.twist_body[3:]])
+    return pose, twist
+
+
 def upper_triangle(covariance: Array | None) -> list[float]:
     """21 floats of a (6, 6) covariance; unknown is NaN in element 0 and zeros after it."""
     if covariance is None:
@@ -71,14 +83,9 @@ class Sender:
         PX4 skips what is not finite. Its quality alone would not keep a lost frame out: with EKF2_EV_QMIN at 0, the
         default, every quality passes (src/modules/ekf2/EKF/aid_sources/external_vision/ev_control.cpp).
         """
-        pose, twist = np.full(7, np.nan), np.full(6, np.nan)
-        if odometry.tracked:
-            R = R_FRD_FLU @ odometry.T_odom_body[:3, :3] @ R_FRD_FLU
-            pose[:3] = R_FRD_FLU @ odometry.T_odom_body[:3, 3]
-            pose[3:] = np.roll(se3.rotation_to_quaternion_xyzw(R), 1)
+        pose, twist = frd(odometry)
         velocity_covariance = None
-        if odometry.twist_body is not None and odometry.twist_covariance is not None:
-            twist = np.concatenate([R_FRD_FLU @ odometry.twist_body[:3], R_FRD_FLU @ odometry.twist_body[3:]])
+        if odometry.twist_covariance is not None:
             velocity_covariance = rotate_covariance(R_FRD_FLU, odometry.twist_covariance)
         message = self._link.odometry_encode(
             odometry.t_ns // 1000,

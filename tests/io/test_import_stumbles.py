@@ -46,6 +46,13 @@ def test_columns_of_uncertainty_that_are_not_understood_are_named(tmp_path: Path
     assert "--map" in note
 
 
+def test_a_covariance_of_the_position_alone_is_named(tmp_path: Path) -> None:
+    log = read_foreign(_csv(tmp_path / "log.csv", "cov_xx,cov_yy,cov_zz", "1,2,3"))
+    assert log.covariance is None
+    [note] = log.notes
+    assert "cov_33, cov_44, cov_55" in note
+
+
 def test_odometry_of_a_bag_that_is_not_used_is_named_with_the_option_that_takes_it(tmp_path: Path) -> None:
     maker: BagMaker = stereo_bag(ros1=False)
     for t, T in zip(seq.stamps(12), seq.true_poses(12), strict=True):
