@@ -104,7 +104,10 @@ def ends_in_a_second(process: subprocess.Popen[str]) -> dict[str, int]:
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=20)
     assert process.returncode == 0, err
-    assert time.monotonic() - start < 2.0  # a second, and as much again for a machine that is busy
+    took_s, start = time.monotonic() - start, time.monotonic()
+    subprocess.run([sys.executable, "-c", "import numpy"], check=True)
+    # A second where the machine is idle; as much longer as it is busy.
+    assert took_s < max(1.0, 5.0 * (time.monotonic() - start))
     counts: dict[str, int] = json.loads(out)["counts"]
     assert counts.get("undecodable", 0) == 0
     assert counts.get("failed", 0) == 0
