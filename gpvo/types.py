@@ -171,13 +171,15 @@ class TruthLog:
     """Ground truth poses of the rectified left camera: ``t_ns`` (N,), ``T_world_cam`` (N, 4, 4).
 
     ``sigma_translation_m`` and ``sigma_rotation_rad``: standard deviation of the truth's own white noise per
-    pose and axis; 0 for simulation.
+    pose and axis; 0 for simulation. ``v_world_mps`` (N, 3): velocity of the camera as the source measures it beside the
+    positions, None where it does not.
     """
 
     t_ns: NDArray[np.int64]
     T_world_cam: Array
     sigma_translation_m: float = 0.0
     sigma_rotation_rad: float = 0.0
+    v_world_mps: Array | None = None
 
 
 @dataclass(frozen=True)

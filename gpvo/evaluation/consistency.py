@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gpvo.accumulation import PoseError
 from gpvo.dataset.errors import MotionErrors
+from gpvo.dataset.truth_noise import drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import Interval, block_bootstrap
@@ -38,13 +39,15 @@ class Horizon:
     """Joint NEES per degree of freedom of the motion over a stretch, from ``count`` windows; NaN where none fits.
 
     ``span``: metres of path, or seconds. ``nees_dof_truth_noise``: with the truth's own noise added to what is stated;
-    ``z2_truth_noise`` (6,): likewise, the mean squared error of each axis over its variance.
+    ``z2_truth_noise`` (6,): likewise, the mean squared error of each axis over its variance. ``truth_drift_m`` (3,):
+    standard deviation of the truth's displacement over such a stretch that its own velocities contradict, added too.
     """
 
     span: float
     nees_dof: float
     nees_dof_truth_noise: float
     z2_truth_noise: tuple[float, ...]
+    truth_drift_m: tuple[float, ...]
     count: int
 
 
@@ -94,11 +97,12 @@ def truth_noise(T_true: Array, sigma: Array) -> Array:
 
 def consistency(
     statement: Statement, errors: MotionErrors, log: VoLog, T_true: Array, known: NDArray[np.bool_],
-    noise_sigma: Array = _NOISELESS,
+    noise_sigma: Array = _NOISELESS, by_velocity: Array | None = None,
 ) -> Consistency | None:  # fmt: skip
     """Scores of one method, None where it says nothing about any motion with truth.
 
     ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise_sigma`` (6,): of its poses [m, rad].
+    ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.truth_noise.velocity_path`).
     """
     C = statement.covariance[errors.index]
     stated = np.isfinite(C).all(axis=(1, 2))
@@ -115,6 +119,10 @@ def consistency(
     quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
     progress = se3.path_length_m(T_true[:, :3, 3]), (log.t_ns - log.t_ns[0]) * 1e-9
+
+    def over(along: Array, span: float) -> Horizon:
+        return horizon(statement, log, T_true, known, along, span, noise_sigma, by_velocity)
+
     return Consistency(
         method=statement.method,
         count=int(stated.sum()),
@@ -134,10 +142,8 @@ def consistency(
         coverage_by_difficulty=tuple(quartiles[1].tolist()),
         predicted_final_error_m=final,
         predicted_final_error_independent_m=independent,
-        one_second=horizon(statement, log, T_true, known, progress[1], 1.0, noise_sigma) if d == 6 else None,
-        horizons=tuple(
-            horizon(statement, log, T_true, known, progress[0], m, noise_sigma) for m in HORIZONS_M if d == 6
-        ),
+        one_second=over(progress[1], 1.0) if d == 6 else None,
+        horizons=tuple(over(progress[0], m) for m in HORIZONS_M if d == 6),
     )
 
 
@@ -175,38 +181,48 @@ def _sum_of(T_prev_cur: Sequence[Array] | Array, errors: Sequence[MotionError]) 
 
 def horizon(
     statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
-    noise_sigma: Array,
+    noise_sigma: Array, by_velocity: Array | None = None,
 ) -> Horizon:  # fmt: skip
     """NEES over windows of ``span`` of a growing ``progress`` (N,), at most sixty, without lost frames.
 
     Each begins where the one before has at least half passed.
     """
     assert statement.errors is not None
-    stride = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS)
-    values, t_next = [], float(progress[0])
+    windows = list(_windows(log, known, progress, span))
+    if not windows:
+        nan = float("nan")
+        return Horizon(span, nan, nan, (nan,) * 6, (0.0,) * 3, 0)
+    starts, ends = np.array([[start, chain[-1]] for start, chain in windows]).T
+    T = se3.inverse(T_true[starts]) @ T_true[ends]
+    T_est, C = np.tile(np.eye(4), (len(T), 1, 1)), np.empty((len(T), 6, 6))
+    for i, (_, chain) in enumerate(windows):
+        # The mean is taken off each motion, as a filter would.
+        for k in chain:
+            T_est[i] = T_est[i] @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
+        C[i] = _sum_of([log.records[k].T_prev_cur for k in chain], [statement.errors[k] for k in chain])
+    e, noise, drift = se3.log(se3.inverse(T) @ T_est), truth_noise(T, noise_sigma), np.zeros(3)
+    if by_velocity is not None:
+        moved = T_true[ends, :3, 3] - T_true[starts, :3, 3] - (by_velocity[ends] - by_velocity[starts])
+        drift = drift_variance(np.einsum("nji,nj->ni", T_true[ends, :3, :3], moved), e[:, :3])
+        # The white noise of two poses is in the variance of a displacement, too.
+        noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
+    z2 = (e**2 / np.diagonal(C + noise, axis1=1, axis2=2)).mean(axis=0)
+    plain, noisy = (float(nees(e, S).mean()) / 6 for S in (C, C + noise))
+    return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(windows))
+
+
+def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float) -> Iterator[tuple[int, Sequence[int]]]:
+    """First frame and motions of each window."""
+    stride, t_next = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS), float(progress[0])
     parent, usable = log.parent, log.usable
     # Nothing is long enough behind the last of these; without the cut a short run costs the square of its frames.
     for start in np.flatnonzero(progress[-1] - progress >= span * _HAIR).tolist():
         if progress[start] < t_next or not known[start]:
             continue
-        window = _window(start, parent, usable, progress, span)
-        if not window or not known[window[-1]]:
-            continue
-        t_next = float(progress[start]) + stride
-        T = se3.inverse(T_true[start]) @ T_true[window[-1]]
-        # The mean is taken off each motion, as a filter would.
-        T_est = np.eye(4)
-        for k in window:
-            T_est = T_est @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
-        e, C = (
-            se3.log(se3.inverse(T) @ T_est),
-            _sum_of([log.records[k].T_prev_cur for k in window], [statement.errors[k] for k in window]),
-        )
-        with_noise = C + truth_noise(T, noise_sigma)
-        joint = [float(nees(e, S)) / 6 for S in (C, with_noise)]
-        values.append([*joint, *(e**2 / np.diagonal(with_noise))])
-    plain, noisy, *z2 = np.mean(values, axis=0).tolist() if values else [float("nan")] * 8
-    return Horizon(span, plain, noisy, tuple(z2), len(values))
+        chain = _window(start, parent, usable, progress, span)
+        if chain and known[chain[-1]]:
+            t_next = float(progress[start]) + stride
+            yield start, chain
 
 
 def _window(

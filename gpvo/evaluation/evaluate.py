@@ -16,7 +16,7 @@ from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
 from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
 from gpvo.dataset.rest import without_wandering_truth
-from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m
+from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m, velocity_path
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon, consistency
 from gpvo.evaluation.poses import PoseConsistency, pose_consistency, pose_document
@@ -122,7 +122,8 @@ def evaluate_run(
     sigma = np.maximum(stated, estimate_truth_noise(errors, scored)) if options.truth_sigma is None else stated
     T_est = log.trajectory()
     made = [*statements(log, predictions, predictor), *further]
-    found = {s.method: consistency(s, errors, scored, T_true, known, sigma) for s in made}
+    by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
+    found = {s.method: consistency(s, errors, scored, T_true, known, sigma, by_velocity) for s in made}
     first = int(np.flatnonzero(known)[0])
     lift = T_true[first] @ np.linalg.inv(T_est[first])
     return Evaluation(
@@ -223,8 +224,9 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.
     * ``nll_per_dim`` takes every statement as Gaussian; ``nll_stated_per_dim`` is of the stated density, a Student-t
       for models that learnt their tails, and ``nees_dof_median_stated`` the median NEES/dof that it expects.
-    * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``z2_truth_noise``, ``count``}: of the motion over windows
-      of a second, joint and (6,) by axis; ``horizons`` are the same over lengths of path.
+    * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``z2_truth_noise``, ``truth_drift_m``, ``count``}: of the
+      motion over windows of a second, joint and (6,) by axis, and the truth's drift (3,) that is counted in as its own
+      velocities contradict its positions; ``horizons`` are the same over lengths of path.
     * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
       ``predicted_final_error_independent_m``: the same if all motions were independent.
 
@@ -287,7 +289,7 @@ def _methods_of(e: Evaluation) -> list[str]:
 
 
 def _horizon(h: Horizon | None) -> dict[str, Any]:
-    keys = ("nees_dof", "nees_dof_truth_noise", "z2_truth_noise")
+    keys = ("nees_dof", "nees_dof_truth_noise", "z2_truth_noise", "truth_drift_m")
     return {k: getattr(h, k, None) for k in keys} | {"count": 0 if h is None else h.count}
 
 

@@ -236,7 +236,10 @@ def _read_truth(path: Path) -> TruthLog | None:
         t, T = _stamps(columns), run_table.poses_from(columns)
         _check_poses(T, path)
         sigma_t, sigma_r = (float(metadata.get(k, 0.0)) for k in ("sigma_translation_m", "sigma_rotation_rad"))
-        return TruthLog(t, T, sigma_t, sigma_r)
+        v_world = run_table.velocity_from(columns)
+        if v_world is not None and not np.isfinite(v_world).all():
+            raise SourceError("holds a velocity that is not finite", where=path)
+        return TruthLog(t, T, sigma_t, sigma_r, v_world)
 
     truth: TruthLog = _guarded(path, make)
     return truth

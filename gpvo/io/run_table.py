@@ -249,7 +249,16 @@ def _wide(root: Array) -> Array:
 
 def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:
     """Truth as columns."""
-    return {"t_ns": truth.t_ns, **pose_columns(truth.T_world_cam)}
+    out = {"t_ns": truth.t_ns, **pose_columns(truth.T_world_cam)}
+    if truth.v_world_mps is not None:
+        out |= {f"v_{axis}_mps": truth.v_world_mps[:, i] for i, axis in enumerate(_AXES)}
+    return out
+
+
+def velocity_from(columns: Mapping[str, NDArray[Any]]) -> Array | None:
+    """Velocities of :func:`truth_columns`, None where there are none."""
+    names = [f"v_{axis}_mps" for axis in _AXES]
+    return np.stack([columns[n] for n in names], axis=-1) if all(n in columns for n in names) else None
 
 
 def imu_columns(imu: ImuLog) -> dict[str, NDArray[Any]]:

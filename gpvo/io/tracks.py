@@ -3,7 +3,8 @@
 An ``.npz`` with one row per observation: ``frame`` (M,), ``track`` (M,), ``uv_left``, ``uv_right`` (M, 2) [px]; per
 frame ``t_s`` (N,); ``fx fy cx cy`` [px] and ``baseline_m``. Where present: ``T_world_cam`` (N, 4, 4) truth of the left
 camera, NaN in frames without; ``gyro_body_radps`` and ``acc_body_mps2`` (N, 3) in body axes with ``R_cam_body``
-(3, 3) and ``p_body_cam_in_body_m`` (3,), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``;
+(3, 3) and ``p_body_cam_in_body_m`` (3,), ``vel_body_mps`` (N, 3) of the body as the truth measures it beside its
+positions (with the gyroscope), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``;
 an IMU at its own rate in body axes as ``imu_t_ns`` (K,), ``imu_gyro_radps``, ``imu_acc_mps2`` (K, 3) and
 ``imu_noise`` (4,), the fields of :class:`gpvo.types.ImuNoise`.
 """
@@ -33,8 +34,8 @@ from gpvo.types import Array, ImuLog, ImuNoise, Mounting, StereoCamera, TrackFra
 
 _REQUIRED = ("t_s", "frame", "track", "uv_left", "uv_right", "fx", "fy", "cx", "cy", "baseline_m")
 _OPTIONAL = (
-    "T_world_cam", "gyro_body_radps", "acc_body_mps2", "R_cam_body", "p_body_cam_in_body_m", "width", "height",
-    "sigma_translation_m", "sigma_rotation_rad", "imu_t_ns", "imu_gyro_radps", "imu_acc_mps2", "imu_noise",
+    "T_world_cam", "gyro_body_radps", "acc_body_mps2", "R_cam_body", "p_body_cam_in_body_m", "vel_body_mps", "width",
+    "height", "sigma_translation_m", "sigma_rotation_rad", "imu_t_ns", "imu_gyro_radps", "imu_acc_mps2", "imu_noise",
 )  # fmt: skip
 _MAX_UNPACKED_BYTES = 1_000_000_000
 # Tracks pack to a fifth; zeros to a thousandth.
@@ -166,7 +167,21 @@ class TracksSource:
         if noise is None and all(k in self._data for k in stated):
             noise = TruthNoise(*(abs(float(_shaped(self._data, k, (), self.path, most=1e3))) for k in stated))
         noise = noise or GPS_INS
-        return TruthLog(self._t_ns[keep], np.stack(poses), noise.translation_m, noise.rotation_rad)
+        v_world = self._velocity(np.stack(poses), keep)
+        return TruthLog(self._t_ns[keep], np.stack(poses), noise.translation_m, noise.rotation_rad, v_world)
+
+    def _velocity(self, T_world_cam: Array, keep: NDArray[np.bool_]) -> Array | None:
+        """(K, 3) velocity of the camera, from the body's and its turning; None where the file does not have all."""
+        T_body_cam = self.mounting.T_body_cam
+        if T_body_cam is None or not {"vel_body_mps", "gyro_body_radps"} <= set(self._data):
+            return None
+        v, gyro = (
+            _shaped(self._data, name, (len(self._t_ns), 3), self.path)[keep]
+            for name in ("vel_body_mps", "gyro_body_radps")
+        )
+        v_cam = (v + np.cross(gyro, T_body_cam[:3, 3])) @ T_body_cam[:3, :3]
+        rotated: Array = np.einsum("nij,nj->ni", T_world_cam[:, :3, :3], v_cam)
+        return rotated
 
 
 def load_arrays(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:

@@ -12,6 +12,7 @@ from gpvo.errors import SourceError
 from gpvo.io.run import Run, read_run, read_tracks
 from gpvo.runner import config_of
 from gpvo.twin.adjustment import Structure, adjust, without_loose_frames
+from gpvo.twin.noise import Neighbours
 from gpvo.twin.observations import Observations
 from gpvo.types import Array
 from gpvo.vo.config import VoConfig
@@ -25,8 +26,9 @@ MIN_POINTS = 12
 @dataclass(frozen=True)
 class Original:
     """A run with its structure. ``noise_px`` (M, 3): residuals of the observations as large as the noise was;
-    ``first`` (M,) the first observation of each track; ``repeats`` (F,) frames that repeat the one before. ``rig``:
-    what odometry found of its calibration's errors; measurements are ``seen`` without them."""
+    ``neighbours``: which tracks may err alike; ``first`` (M,) the first observation of each track; ``repeats`` (F,)
+    frames that repeat the one before. ``rig``: what odometry found of its calibration's errors; measurements are
+    ``seen`` without them."""
 
     run: Run
     config: VoConfig
@@ -34,6 +36,7 @@ class Original:
     seen: Observations
     structure: Structure
     noise_px: Array
+    neighbours: Neighbours
     first: NDArray[np.bool_]
     repeats: NDArray[np.bool_]
 
@@ -68,7 +71,8 @@ def estimate(path: Path) -> Original:
         raise SourceError(
             "its structure cannot be estimated: the fit does not hold", where=path, cure="look at the run"
         )
-    return Original(run, config_of(path), rig, seen, structure, _noise(seen, structure), first, repeats)
+    neighbours = Neighbours.of(seen, structure)
+    return Original(run, config_of(path), rig, seen, structure, _noise(seen, structure), neighbours, first, repeats)
 
 
 def _refuse_too_few(frame: NDArray[np.int64], n_frames: int, path: Path) -> None:

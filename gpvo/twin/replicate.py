@@ -20,6 +20,7 @@ from gpvo.io.toml import read_toml
 from gpvo.runner import run as run_odometry
 from gpvo.twin.estimate import Original, estimate
 from gpvo.twin.gap import Gap, widened
+from gpvo.twin.noise import draw_signs
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
 from gpvo.vo.rig_error import N_TERMS, RigError, principal_errors
 
@@ -119,13 +120,10 @@ def _projected(original: Original, settings: TwinSettings, replicate: int) -> tu
 
 
 def _drawn_noise(original: Original, rng: np.random.Generator) -> Array:
-    """(M, 3) noise [px]: the residuals of each track, as a whole, with a random sign.
-
-    So it keeps its size by depth, place and time, and how it goes on along the track. An outlier is an event, not
-    noise: it happens again as it was.
-    """
-    sign = rng.choice([-1.0, 1.0], size=len(original.structure.points_world))[original.seen.track]
-    return original.noise_px * np.where(original.structure.weight > 0, sign, 1.0)[:, None]
+    """(M, 3) noise [px]: the residuals of each track, as a whole, with its sign. An outlier is an event, not noise: it
+    happens again as it was."""
+    signs = draw_signs(len(original.structure.points_world), original.neighbours, rng)[original.seen.track]
+    return original.noise_px * np.where(original.structure.weight > 0, signs, 1.0)[:, None]
 
 
 def make_twins(

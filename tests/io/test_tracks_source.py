@@ -89,6 +89,20 @@ def test_optional_arrays(tmp_path):
     assert source.truth.sigma_translation_m == 0.0
 
 
+def test_the_velocity_of_the_camera_is_that_of_the_body_and_its_turning(tmp_path):
+    data = arrays()
+    # The path is driven at 8 m/s while turning at 0.1 rad/s, both in axes of the camera.
+    gyro = R_FLU_OPTICAL @ [0.0, 0.1, 0.0]
+    body = R_FLU_OPTICAL @ [0.0, 0.0, 8.0] - np.cross(gyro, data["p_body_cam_in_body_m"])
+    data |= {"gyro_body_radps": np.tile(gyro, (6, 1)), "vel_body_mps": np.tile(body, (6, 1))}
+    truth = open_source(save(tmp_path / "a.npz", data)).truth
+    np.testing.assert_allclose(
+        truth.v_world_mps[1:-1], np.gradient(truth.T_world_cam[:, :3, 3], 0.1, axis=0)[1:-1], atol=1e-3
+    )
+    del data["gyro_body_radps"]
+    assert open_source(save(tmp_path / "b.npz", data)).truth.v_world_mps is None
+
+
 def test_stamps_with_disorder(tmp_path):
     data = arrays()
     data["t_s"] = np.array([0.0, 0.1, 0.1, 0.3, 0.25, 0.5])
