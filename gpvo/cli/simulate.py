@@ -37,7 +37,7 @@ def simulate(
         Path | None, typer.Option(help="Recorded path to fly, scaled to fit the world: TUM lines or EuRoC CSV, z up.")
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="pinhole, euroc, t265, or a Kalibr or OpenCV calibration file.")
+        str | None, typer.Option(help="pinhole, euroc, t265, or a calibration file of Kalibr, OpenCV, ROS or KITTI.")
     ] = None,
     points: Annotated[
         bool, typer.Option("--points", help="Landmark tracks instead of images: a thousand times faster.")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
+from gpvo.cameras.projections import read_projections
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
 from gpvo.cameras.tolerance import Tolerance
@@ -45,7 +46,8 @@ CAMERAS = tuple(_PRESETS)
 
 
 def camera_rig(name: str) -> StereoRig:
-    """The nominal rig of a preset (``pinhole``, ``euroc`` or ``t265``) or of a Kalibr or OpenCV calibration file.
+    """The nominal rig of a preset (``pinhole``, ``euroc`` or ``t265``) or of a calibration file: Kalibr, OpenCV, ROS
+    camera_info, or KITTI's ``calib.txt``, which states no size: then the principal point is in the middle.
 
     Raises
     ------
@@ -56,7 +58,10 @@ def camera_rig(name: str) -> StereoRig:
         return _PRESETS[name]()
     if not Path(name).is_file():
         raise GpvoError(f"unknown camera '{name}'", cure=f"choose from {', '.join(CAMERAS)}, or a calibration file")
-    return replace(read_stereo_yaml(Path(name)), T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)
+    path, size = Path(name), None
+    if path.suffix.lower() == ".txt" and (P := read_projections(path).get("P0")) is not None:
+        size = round(2 * P[0, 2]) + 1, round(2 * P[1, 2]) + 1
+    return replace(read_stereo_yaml(path, size=size), T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)
 
 
 def mounted(rig: StereoRig, vehicle: str, pitch_deg: float) -> StereoRig:

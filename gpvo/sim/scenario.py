@@ -187,7 +187,7 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
         raise GpvoError(
             f"camera is '{scenario.camera}'",
             where=where,
-            cure=f"choose from {', '.join(CAMERAS)}, or give a calibration file (Kalibr or OpenCV)",
+            cure=f"choose from {', '.join(CAMERAS)}, or give a calibration file (Kalibr, OpenCV, ROS or KITTI)",
         )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")

@@ -163,6 +163,17 @@ def test_a_recorded_path_must_be_given(quick, tmp_path):
         sequence.simulate(quick(needs_trajectory=True), 1, tmp_path / "seq")
 
 
+def test_the_camera_of_a_kitti_folder(tmp_path):
+    left, right = "700 0 600 0 0 700 180 0 0 0 1 0", "700 0 600 -350 0 700 180 0 0 0 1 0"
+    (tmp_path / "calib.txt").write_text(f"P0: {left}\nP1: {right}\n")
+    rig = camera_rig(str(tmp_path / "calib.txt"))
+    assert rig.baseline_m == pytest.approx(0.5)
+    assert (rig.left.width, rig.left.height) == (1201, 361)  # twice the principal point: the file states no size
+    (tmp_path / "calib.txt").write_text("fx 700")
+    with pytest.raises(GpvoError, match=r"calib\.txt"):
+        camera_rig(str(tmp_path / "calib.txt"))
+
+
 @pytest.mark.parametrize("camera", ["pinhole", "euroc", "t265"])
 def test_drawn_rig(camera):
     written = camera_rig(camera)
