@@ -57,7 +57,7 @@ class Neighbours:
         count = np.maximum(np.bincount(place, minlength=len(key)), 1)
 
         def summed(values: Array) -> Array:
-            return np.bincount(place, values, minlength=len(key))
+            return np.bincount(place, values, minlength=len(key)).astype(np.float64)
 
         return cls(
             first,
