@@ -1,4 +1,4 @@
-"""Landmarks without surfaces: points where a tunnel, a moon or a hall would have texture, and a path among them."""
+"""Landmarks without surfaces: where a tunnel, a moon, a hall or a street would have texture, and a path among them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpvo.sim import paths, recorded
 from gpvo.sim.paths import Path3
 from gpvo.types import Array
 
-WORLDS = ("tunnel", "lunar", "room")
+WORLDS = ("tunnel", "lunar", "room", "street")
 
 
 def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator) -> tuple[Path3, Array]:
@@ -22,13 +22,15 @@ def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.ran
     if world not in WORLDS:
         raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(WORLDS)}")
     reach = duration_s * speed_mps + 25.0
-    centre = _tunnel_line(reach, rng, bend=0.0 if path == "straight" else 1.0)
+    bend = 0.0 if path == "straight" else 1.0
+    centre = _tunnel_line(reach, rng, bend, scale=12.0 if world == "street" else 1.0)
     low, high = {
         "tunnel": (np.array([4.0, -0.6, -0.4]), np.array([6.0, 0.6, 0.5])),
         "lunar": (np.array([-40.0, -20.0, 2.0]), np.array([40.0, 20.0, 4.0])),
         "room": (np.array([-4.0, -4.0, 0.8]), np.array([4.0, 4.0, 3.2])),
+        "street": (np.array([4.0, -1.0, 1.4]), np.array([40.0, 1.0, 1.8])),
     }[world]
-    cloud = {"tunnel": _tunnel, "lunar": _lunar, "room": _room}[world](centre, rng)
+    cloud = {"tunnel": _tunnel, "lunar": _lunar, "room": _room, "street": _street}[world](centre, rng)
     return _path(world, path, centre, low, high, duration_s, speed_mps, rng), cloud
 
 
@@ -47,6 +49,8 @@ def _path(
     if path == "along":
         if world == "lunar":
             centre = centre * [1, 1, 0] + [0, 0, 1.5]
+        if world == "street":
+            return paths.driving(centre + [0, 0, 1.6], duration_s, speed_mps, rng)
         return paths.along_curve(centre, duration_s, speed_mps, rng, sway_m=0.35)
     file = Path(path)
     if not file.is_file():
@@ -54,30 +58,54 @@ def _path(
     return recorded.flown(file, low, high, duration_s, rng)
 
 
-def _tunnel_line(length_m: float, rng: np.random.Generator, bend: float) -> Array:
-    """A winding line (N, 3), half a metre between its points."""
+def _tunnel_line(length_m: float, rng: np.random.Generator, bend: float, scale: float = 1.0) -> Array:
+    """A winding line (N, 3), half a metre between its points; ``scale`` stretches its bends."""
     s = np.arange(0.0, length_m, 0.5)
-    k, ph = rng.uniform(0.03, 0.12, 4), rng.uniform(0, 2 * np.pi, 4)
+    k, ph = rng.uniform(0.03, 0.12, 4) / scale, rng.uniform(0, 2 * np.pi, 4)
     heading = bend * 0.5 * sum(np.sin(k[i] * s + ph[i]) - np.sin(ph[i]) for i in range(2))
     climb = bend * 0.06 * (np.sin(k[2] * s + ph[2]) - np.sin(ph[2]))
     step = 0.5 * np.stack([np.cos(heading), np.sin(heading), climb], 1)
     return np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)[:-1]])
 
 
-def _tunnel(centre: Array, rng: np.random.Generator) -> Array:
-    """Points on the rough wall of a tunnel of 2 m radius with a flattened floor, about 70 per metre."""
-    n = int(len(centre) * 0.5 * 70)
+def _along(centre: Array, per_m: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Random places (n, 3) on the line, so many per metre, and its left (n, 3) there."""
+    n = int(len(centre) * 0.5 * per_m)
     i = rng.uniform(0, len(centre) - 1.001, n)
     j = i.astype(int)
-    at = centre[j] + (i - j)[:, None] * (centre[j + 1] - centre[j])
     along = centre[j + 1] - centre[j]
     left = np.stack([-along[:, 1], along[:, 0], np.zeros(n)], 1)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return centre[j] + (i - j)[:, None] * along, left / np.linalg.norm(left, axis=1, keepdims=True)
+
+
+def _tunnel(centre: Array, rng: np.random.Generator) -> Array:
+    """Points on the rough wall of a tunnel of 2 m radius with a flattened floor, about 70 per metre."""
+    at, left = _along(centre, 70, rng)
+    n = len(at)
     angle = rng.uniform(0, 2 * np.pi, n)
     radius = 2.0 + 0.25 * rng.standard_normal(n)
     wall = at + (radius * np.cos(angle))[:, None] * left
     wall[:, 2] += np.maximum(radius * np.sin(angle), -1.3 + 0.05 * rng.standard_normal(n))
     return wall
+
+
+def _street(centre: Array, rng: np.random.Generator) -> Array:
+    """A road with little texture between kerbs, trees and the fronts of houses with gaps."""
+    ground, left = _along(centre, 6, rng)
+    road = ground + rng.uniform(-7.0, 7.0, (len(ground), 1)) * left
+    at, left = _along(centre, 14, rng)
+    n = len(at)
+    side = rng.choice([-1.0, 1.0], n)
+    # Houses of 25 m each stand back by as much as they like, and every third plot is empty.
+    plot = (np.floor(at[:, 0] / 25.0) + 1000 * (side > 0)).astype(int)
+    back_m, there = rng.uniform(9.0, 16.0, 4096), rng.random(4096) < 0.67
+    at = at + (side * back_m[plot % 4096] + 0.1 * rng.standard_normal(n))[:, None] * left
+    at[:, 2] += rng.uniform(0.0, 9.0, n)
+    trunks, left = _along(centre, 0.08, rng)
+    trunks = trunks + (rng.choice([-1.0, 1.0], len(trunks)) * rng.uniform(5.0, 8.0, len(trunks)))[:, None] * left
+    crown = np.repeat(trunks, 60, axis=0)
+    crown = crown + np.clip(rng.standard_normal(crown.shape), -2, 2) * [0.9, 0.9, 1.0] + [0, 0, 3.5]
+    return np.concatenate([road, at[there[plot % 4096]], crown])
 
 
 def ground_height(xy: Array) -> Array:

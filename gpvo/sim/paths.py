@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
+from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
 from gpvo.errors import GpvoError
@@ -76,6 +76,21 @@ def along_curve(
     position[:, 2] += rise
     yaw = heading + 0.25 * (np.sin(1.6 * w[3] * pace + ph[3]) - np.sin(ph[3])) * start
     return _flat(t, position, yaw, duration_s)
+
+
+def driving(centre: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float = 3.0) -> Path3:
+    """A drive along a polyline (N, 3) [m], level: up to ``speed_mps``, slower in between, now and then a stop."""
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    curve = make_interp_spline(arc, gaussian_filter1d(centre, 6.0, axis=0, mode="nearest"), k=5)
+    t, every_s = knots(duration_s), max(8.0, speed_mps / 2.5)
+    at = np.arange(rest_s + 1.6, duration_s + 3 * every_s, every_s)  # smoothing reaches so far back
+    wanted = speed_mps * rng.uniform(0.35, 1.0, len(at)) * (rng.random(len(at)) > 0.12)
+    wanted[0] = 0.0
+    speed = np.maximum(PchipInterpolator(at, wanted)(np.maximum(t, at[0])), 0.0)
+    speed = gaussian_filter1d(speed, 0.4 * _KNOTS_PER_S, mode="nearest")
+    s = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
+    tangent = curve.derivative(1)(s)
+    return _flat(t, curve(s), np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), duration_s, lean=0.0)
 
 
 def wandering(

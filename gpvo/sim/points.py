@@ -18,7 +18,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.atomic import replacing
-from gpvo.sim import clouds, imu
+from gpvo.sim import clouds, imu, movers
 from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3
 from gpvo.types import Array, ImuLog, StereoCamera
@@ -28,7 +28,7 @@ from gpvo.types import Array, ImuLog, StereoCamera
 class PointsScenario:
     """A kind of flight. Times in s, lengths in m, pixels of the rectified image."""
 
-    world: str = "tunnel"  # tunnel, lunar, room
+    world: str = "tunnel"  # tunnel, lunar, room, street
     world_seed: int | None = None  # of landmarks and path, in place of the flight's own
     path: str = "along"  # along, wander, straight, hover, or a TUM file
     duration_s: float = 60.0
@@ -49,6 +49,11 @@ class PointsScenario:
     noise_px: float = 0.0
     dark: tuple[float, float] | None = None  # no tracks from, to
     frozen: tuple[float, float] | None = None  # the same picture from, to
+    cars: int = 0  # that drive beside, before or towards the camera, for 5 to 20 s each
+    smoke: float = 0.0  # share of the time with a plume that drifts along
+    dust: float = 0.0  # share of the time with dust that turns about the vehicle
+    texture: float = 1.0  # share of the world's points that are there
+    reach_m: float = 40.0  # as far as points are seen
     tolerance: Tolerance = field(default_factory=Tolerance)
     offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
 
@@ -69,7 +74,18 @@ SCENARIOS: dict[str, PointsScenario] = {
         sigma_px=0.25,
         tolerance=Tolerance(baseline=0.01, focal=0.003, rotation_rad=5e-4),
     ),
+    "street": PointsScenario(
+        world="street",
+        speed_mps=22.0,
+        rate_hz=10.0,
+        camera=StereoCamera(718.0, 718.0, 619.5, 187.5, 0.5, 1240, 376),
+        tracks=400,
+        reach_m=80.0,
+    ),
 }
+SCENARIOS["street-traffic"] = replace(SCENARIOS["street"], cars=6, texture=0.5)
+SCENARIOS["tunnel-smoke"] = PointsScenario(smoke=0.3)
+SCENARIOS["lunar-dust"] = replace(SCENARIOS["lunar-straight"], duration_s=60.0, dust=0.3)
 
 
 @dataclass(frozen=True)
@@ -150,7 +166,7 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     except TypeError as error:
         raise GpvoError(f"unknown scenario value: {error}", cure="see gpvo.sim.points.PointsScenario") from None
     # One stream per purpose: more noise must not move the path.
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 77]).spawn(6)]
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 77]).spawn(7)]
     scene = streams[0]
     if chosen.world_seed is not None:
         scene = np.random.default_rng(np.random.SeedSequence([chosen.world_seed, 77]).spawn(1)[0])
@@ -167,7 +183,12 @@ def _fly(
     T_world_cam = se3.from_rt(at_frames.R_world_body, at_frames.position_m) @ T_BODY_CAM
     log, _, _ = imu.measured_imu(motion, imu.PRESETS[scenario.imu], streams[1])
     episodes = draw_episodes(scenario.duration_s, streams[2], causes=scenario.causes) if scenario.bursts else ()
-    frames = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams)
+    if scenario.texture < 1.0:
+        cloud = cloud[streams[6].random(len(cloud)) < scenario.texture]
+    bodies = movers.draw_movers(
+        at_frames.t_s, T_world_cam, streams[6], cars=scenario.cars, smoke=scenario.smoke, dust=scenario.dust
+    )
+    frames = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams, bodies)
     counts = [len(f[0]) for f in frames]
     return PointsFlight(
         name=name,
@@ -190,15 +211,16 @@ Seen = tuple[NDArray[np.int64], Array, Array]
 
 def observe(
     scenario: PointsScenario, t_s: Array, T_world_cam: Array, cloud: Array, episodes: tuple[Episode, ...],
-    streams: list[np.random.Generator],
+    streams: list[np.random.Generator], bodies: tuple[movers.Body, ...] = (),
 ) -> list[Seen]:  # fmt: skip
-    """Tracks of each frame: identities (n,), left and right pixels (n, 2)."""
+    """Tracks of each frame: identities (n,), left and right pixels (n, 2); points of ``bodies`` follow the cloud's."""
     rig = TrueRig.of(scenario.camera, scenario.tolerance, streams[3].standard_normal(RIG_ERRORS), scenario.offset)
     life, noise = streams[4], streams[5]
     quality = np.exp(scenario.spread * noise.standard_normal())
-    active = np.zeros(len(cloud), bool)
-    generation = np.zeros(len(cloud), np.int64)
-    last_uv = np.full((len(cloud), 2), np.nan)
+    total = len(cloud) + sum(len(b.points) for b in bodies)
+    active = np.zeros(total, bool)
+    generation = np.zeros(total, np.int64)
+    last_uv = np.full((total, 2), np.nan)
     out: list[Seen] = []
     for k, t in enumerate(t_s):
         if scenario.frozen and scenario.frozen[0] <= t < scenario.frozen[1] and out:
@@ -209,7 +231,10 @@ def observe(
             out.append((np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2))))
             continue
         bad = next((e for e in episodes if e.begin_s <= t < e.end_s), None)
-        left, right, visible = _visible(rig, T_world_cam[k], cloud)
+        points = np.concatenate([cloud, *(b.at(k, streams[6]) for b in bodies)]) if bodies else cloud
+        left, right, visible, depth = _visible(rig, T_world_cam[k], points, scenario.reach_m)
+        if bodies:
+            visible &= ~movers.hidden(bodies, len(cloud), left, depth)
         wanted = int(scenario.tracks * (bad.count_factor if bad else 1.0))
         _renew(active, generation, visible, wanted, min(1.0, scenario.drop * (3.0 if bad else 1.0)), life)
         i = np.flatnonzero(active)
@@ -226,7 +251,7 @@ def observe(
         uv_right = right[i] + sigma[:, None] * noise.standard_normal((n, 2))
         wrong = noise.random(n) < scenario.outliers * (bad.outlier_factor if bad else 1.0)
         jump = noise.uniform(-25, 25, (n, 2)) * wrong[:, None]
-        out.append((i + generation[i] * len(cloud), uv_left + jump, uv_right + jump))
+        out.append((i + generation[i] * total, uv_left + jump, uv_right + jump))
     return out
 
 
@@ -246,11 +271,13 @@ def _renew(
         active[rng.choice(candidates, room, replace=False)] = True
 
 
-def _visible(rig: TrueRig, T_world_cam: Array, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Left and right pixels (n, 2) of world points, and which are in both images between 0.4 and 40 m."""
+def _visible(
+    rig: TrueRig, T_world_cam: Array, points: Array, reach_m: float
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Left and right pixels (n, 2) of world points, which are in both images from 0.4 m on, and depths (n,) [m]."""
     c = rig.camera
     depth = (points - T_world_cam[:3, 3]) @ T_world_cam[:3, 2]
-    near = np.flatnonzero((depth > 0.4) & (depth < 40.0))
+    near = np.flatnonzero((depth > 0.4) & (depth < reach_m))
     seen, pixels = np.ones(len(near), bool), []
     for uv in rig.pixels(se3.transform(se3.inverse(T_world_cam), points[near])):
         u, v = uv[:, 0], uv[:, 1]
@@ -260,4 +287,4 @@ def _visible(rig: TrueRig, T_world_cam: Array, points: Array) -> tuple[Array, Ar
         pixels.append(whole)
     visible = np.zeros(len(points), bool)
     visible[near] = seen
-    return pixels[0], pixels[1], visible
+    return pixels[0], pixels[1], visible, depth

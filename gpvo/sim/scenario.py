@@ -41,7 +41,7 @@ class Scenario(BaseModel):
 
     name: str
     about: str = ""
-    world: Literal["tunnel", "lunar", "room"] = "tunnel"
+    world: Literal["tunnel", "lunar", "room", "street"] = "tunnel"
     world_seed: int | None = Field(None, ge=0)
     world_params: dict[str, Any] = {}
     vehicle: Literal["quadrotor", "rover", "path"] = "quadrotor"
@@ -51,7 +51,7 @@ class Scenario(BaseModel):
     needs_trajectory: bool = False
     duration_s: float = Field(60.0, ge=4.0, le=7200.0)
     rate_hz: float = Field(20.0, ge=1.0, le=200.0)
-    speed_mps: float = Field(1.2, ge=0.05, le=10.0)
+    speed_mps: float = Field(1.2, ge=0.05, le=40.0)
     sway_m: float = Field(0.3, ge=0.0, le=2.0)
     agility: float = Field(1.0, ge=0.1, le=5.0)
     rest_s: float = Field(3.0, ge=0.0, le=60.0)
@@ -149,6 +149,13 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
         "offset": replace(scenario.offset, distortion=0.0),
     }
     return replace(base, **{**values, **scenario.points})
+
+
+def require_pictures(scenario: Scenario) -> None:
+    """Raise GpvoError for a scenario that exists as landmarks alone: a street, and what moves beside the camera."""
+    flown = points_scenario(scenario)
+    if scenario.world == "street" or flown.cars or flown.smoke or flown.dust:
+        raise GpvoError(f"'{scenario.name}' has no pictures", cure="add --points: landmark tracks instead of images")
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:

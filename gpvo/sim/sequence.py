@@ -25,7 +25,7 @@ from gpvo.sim.episodes import Episode
 from gpvo.sim.eye import Eye, optical_flow
 from gpvo.sim.imu import Motion
 from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
-from gpvo.sim.scenario import Scenario
+from gpvo.sim.scenario import Scenario, require_pictures
 from gpvo.sim.sequence_plan import FramePlan
 from gpvo.sim.worlds import build_world
 from gpvo.types import Array
@@ -63,10 +63,12 @@ def simulate(
     Raises
     ------
     GpvoError
-        Where the flight crashes or leaves its world, the disk is full, or the folder holds something else.
+        For a scenario of landmarks alone; where the flight crashes or leaves its world, the disk is full, or the folder
+        holds something else.
     MissingExtraError
         Without the extra ``sim``.
     """
+    require_pictures(scenario)
     target = Path(out)
     resolved = to_toml({"seed": seed, **scenario.model_dump()})
     with _only_writer(target):

@@ -28,6 +28,7 @@ class VoConfig:
     ransac_iterations: int = 150
     min_inliers: int = 8  # fewer: lost; P3P needs four
     weak_inliers: int = 20  # fewer: degraded
+    max_acceleration_mps2: float = 40.0  # of the vehicle: beyond, a motion is something else's
     keyframe_parallax_px: float = 1.0  # keep the reference while the median image motion is below this; 0: never
     methods: tuple[str, ...] = ("triangulation", "pointing_matching")
     sigma_px: float = 1.0  # triangulation: of each image coordinate
@@ -72,6 +73,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "ransac_iterations": (1, 100_000),
     "min_inliers": (4, 10_000),
     "weak_inliers": (0, 10_000),
+    "max_acceleration_mps2": (0.1, 1e6),
     "keyframe_parallax_px": (0, 1000),
     "sigma_px": (1e-6, 100),
     "sigma_p_px": (1e-6, 100),

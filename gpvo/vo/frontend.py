@@ -123,7 +123,8 @@ class TrackFrontend:
         if self._previous is None or self._current is None:
             return EMPTY
         _, i, j = np.intersect1d(self._previous[0], self._current[0], assume_unique=True, return_indices=True)
-        return Matches(self._previous[1][i], self._current[1][j], self._row_error[j], len(i))
+        sought = self._previous[1]
+        return Matches(sought[i], self._current[1][j], self._row_error[j], len(i), sought_uvd=sought)
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """See :class:`Frontend`."""

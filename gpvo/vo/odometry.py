@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,10 @@ from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, 
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.rig_error import RigError, RigState
-from gpvo.vo.rivals import areas, unexplained
+from gpvo.vo.rivals import Choice, Expected, areas, choose, unexplained
 from gpvo.vo.sigmas import PersistentNoise, ResidualMoments, SigmaEstimator
 
+_RIVAL_STAYS = 0.85  # per frame
 _GUESS_S = 0.5  # for so long a velocity is taken to last
 
 
@@ -98,7 +99,7 @@ class StereoOdometry:
         guess = self._state.guess(frame.t_ns)
         matches, motion = self._solve(guess, clock)
         doubts = self.pair.step(seen, matches.right)
-        motion = self._choose(matches, motion, guess, doubts)
+        motion, choice = self._choose(matches, motion, guess, frame.t_ns, doubts)
         clock.lap("motion")
         raw = self._raw
         self.last = Followed(raw, np.zeros(len(raw.uvd_cur), bool) if motion is None else motion.inliers)
@@ -111,9 +112,9 @@ class StereoOdometry:
             usual_inliers=self._state.usual_inliers,
             doubts=doubts,
         )
-        record = self._record(frame.t_ns, guess, matches, motion, verdict)
+        record = self._record(frame.t_ns, guess, matches, motion, verdict, choice.otherwise)
         clock.lap("covariance")
-        is_reference, counts = self._advance(record, matches, motion)
+        is_reference, counts = self._advance(record, matches, motion, tells=choice.tells)
         clock.lap("reference")
         sensed = self._imu.with_later(ImuMoments.of(imu))
         self._imu = ImuMoments.of(None) if is_reference else sensed
@@ -153,28 +154,33 @@ class StereoOdometry:
         raw = self._raw = self._frontend.match(guess, from_scratch=from_scratch)
         return replace(raw, uvd_prev=self.rig_error.correct(raw.uvd_prev), uvd_cur=self.rig_error.correct(raw.uvd_cur))
 
-    def _choose(self, matches: Matches, motion: Motion | None, guess: Array, doubts: list[str]) -> Motion | None:
-        """The motion, or its rival among the points that disagree: a second one is added to the doubts.
-
-        Between two the one nearer to the expected motion is taken; without an expectation, the one seen over more.
-        """
+    def _choose(
+        self, matches: Matches, motion: Motion | None, guess: Array, t_ns: int, doubts: list[str]
+    ) -> tuple[Motion | None, Choice]:
+        """The motion, or its rival among the points that disagree: a second one is added to the doubts, and so is a
+        motion that the vehicle cannot make."""
         assert self._state is not None
         self._state.rival = None
-        free = None if motion is None else unexplained(motion, matches, self.camera, self.config)
+        if motion is None:
+            return None, Choice()
+        free = unexplained(motion, matches, self.camera, self.config)
         second = None if free is None else self._estimate(matches, free)
-        covered = (
-            (0, 0) if motion is None or second is None else areas(motion, second, matches, self.camera, self.config)
-        )
-        self._state.rivalry = 0.85 * self._state.rivalry + float(covered[1] > 0)
-        if motion is None or second is None or covered[1] == 0:
-            if self._state.rivalry > 1.5:
-                doubts.append("two motions in the frames before")
-            return motion
-        self._state.rival = motion.inliers | second.inliers
-        doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the picture")
-        off_m = [float(np.linalg.norm((se3.inverse(guess) @ m.T_prev_cur)[:3, 3])) for m in (motion, second)]
-        rival_is_better = off_m[1] < off_m[0] if self._state.twist.any() else covered[1] > covered[0]
-        return second if rival_is_better else motion
+        covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, self.config)
+        self._state.rivalry = _RIVAL_STAYS * self._state.rivalry + float(covered[1] > 0)
+        motions = [motion]
+        if second is not None and covered[1] > 0:
+            self._state.rival = motion.inliers | second.inliers
+            motions.append(second)
+            doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the picture")
+        elif self._state.rivalry > 1.5:
+            doubts.append("two motions in the frames before")
+        chosen = choose(motions, covered, self._state.expected(t_ns, guess, self.config.max_acceleration_mps2))
+        if len(motions) == 1 and chosen.plausible:  # a rival that is not found in one frame has not gone
+            chosen = replace(chosen, otherwise=_RIVAL_STAYS * self._state.otherwise)
+        self._state.odds, self._state.otherwise = chosen.odds, chosen.otherwise
+        if not chosen.plausible:
+            doubts.append("no vehicle changes its velocity like this")
+        return motions[chosen.index], chosen
 
     def _estimate(self, matches: Matches, among: NDArray[np.bool_] | None = None) -> Motion | None:
         """P3P in RANSAC on the left image, then the weighted refinement over both; of the points ``among``, (N,)."""
@@ -205,8 +211,11 @@ class StereoOdometry:
         inliers[np.flatnonzero(close)[motion.inliers]] = True
         return replace(motion, inliers=inliers)
 
-    def _record(self, t_ns: int, guess: Array, matches: Matches, motion: Motion | None, verdict: Verdict) -> VoRecord:
-        """The record of this motion, still without counts and image statistics of the new reference."""
+    def _record(
+        self, t_ns: int, guess: Array, matches: Matches, motion: Motion | None, verdict: Verdict, otherwise: Array
+    ) -> VoRecord:
+        """The record of this motion, still without counts and image statistics of the new reference. ``otherwise``:
+        covariance (6, 6) of being the wrong one of several motions."""
         assert self._state is not None
         state, config = self._state, self.config
         record = VoRecord(t_ns, state.t_ref_ns, verdict.status, guess, reason=verdict.reason)
@@ -239,9 +248,11 @@ class StereoOdometry:
             sigma_m_px=sigma_m_px,
             sigma_pairs_px=config.sigma_pairs_px,
         )
-        unknown = np.zeros((6, 6))
+        unknown = otherwise
         if config.self_calibration:
-            unknown = self.rig_error.update(motion, matches.row_error[motion.inliers], config.min_disparity_px)
+            unknown = otherwise + self.rig_error.update(
+                motion, matches.row_error[motion.inliers], config.min_disparity_px
+            )
         return replace(
             record,
             T_prev_cur=motion.T_prev_cur,
@@ -249,7 +260,9 @@ class StereoOdometry:
             v_t={m: c.v_t for m, c in by_method.items()},
         )
 
-    def _advance(self, record: VoRecord, matches: Matches, motion: Motion | None) -> tuple[bool, tuple[int, int]]:
+    def _advance(
+        self, record: VoRecord, matches: Matches, motion: Motion | None, *, tells: bool
+    ) -> tuple[bool, tuple[int, int]]:
         """Choose the reference of the next motion; whether it is this frame, and the counts of points."""
         assert self._frontend is not None
         assert self._state is not None
@@ -268,7 +281,8 @@ class StereoOdometry:
             state.restart(record.t_ns, counts[1])
             return True, counts
         inliers = motion.inliers
-        state.believe(record.t_ns, record.T_prev_cur, median_parallax_px(matches, inliers), int(inliers.sum()))
+        parallax_px = median_parallax_px(matches, inliers)
+        state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), tells=tells)
         at_rest = state.parallax_from_reference_px < config.keyframe_parallax_px
         # Beside a rival the reference stays fresh: what moves otherwise is seen in two frames or never.
         if at_rest and state.rivalry < 0.2 and inliers.sum() > 0.6 * state.reference_points:
@@ -296,6 +310,9 @@ class _State:
     usual_inliers: float = 0.0
     rival: NDArray[np.bool_] | None = None  # the points of the last motion and of its rival, if there was one
     rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
+    otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
+    odds: float = 0.0  # log odds that the last velocity is that against the scene
+    t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
 
     def frozen(self, seen: Observation) -> str:
         """What repeats itself although the camera was moving; empty for nothing."""
@@ -312,11 +329,20 @@ class _State:
         dt_s = min((t_ns - self.t_believed_ns) * 1e-9, _GUESS_S)
         return self.T_ref_believed @ se3.exp(self.twist * dt_s)
 
-    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int) -> None:
-        """Take over a measured motion from the reference."""
+    def expected(self, t_ns: int, guess: Array, max_acceleration_mps2: float) -> Expected | None:
+        """What the vehicle's last velocity lets expect of the motion to ``t_ns``; None before there is one."""
+        if self.t_twist_ns is None:
+            return None
+        step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
+        return Expected(guess, max_acceleration_mps2 * age_s * step_s, self.odds)
+
+    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, *, tells: bool) -> None:
+        """Take over a measured motion from the reference; its velocity only where it ``tells``."""
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
-        step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
-        self.twist = step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
+        if tells:
+            step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
+            self.twist = step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
+            self.t_twist_ns = t_ns
         self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
         self.parallax_from_reference_px = parallax_px
         self.T_ref_believed = T_ref_cur

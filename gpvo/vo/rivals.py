@@ -1,25 +1,89 @@
 """Several motions in one picture: does something else than the scene move with the points that agree?
 
 A lorry alongside, smoke, or a texture that travels with the camera may hold more corners than what stands still. Counts
-of corners then say nothing; a scene shows itself by the share of the picture that its motion explains.
+of corners then say nothing; a scene shows itself by the share of the picture that its motion explains, and by going on
+as a vehicle goes on. Which motion is the scene's is never sure: the covariance is that of the mixture.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import Matches
 from gpvo.vo.motion import Motion, transfer
+from gpvo.vo.quality import worst_translation_sigma_m
 
 _CELLS = 96  # of the whole picture
 _EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
 _LEAST = 8  # points: a motion through any three is found by chance, a tight one through eight is not
 _SHARE = 1 / 8  # of the other's cells: a motion seen over less is that of an object
+_NOISE = 9.0  # standard deviations of odometry's own noise that are no change of velocity
+_AREA = 0.5  # power of the parts covered in the odds of being the scene, frame by frame: neighbours tell the same
+_UNSEEN = -0.2  # log odds of the expected motion that nothing in the picture makes
+_SUREST = 3.0  # log odds at most: whoever is surer could not be put right
+_REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the motion
+
+
+@dataclass(frozen=True)
+class Expected:
+    """``T_prev_cur`` (4, 4) at the last velocity, off which a vehicle is by ``reach_m`` at most; ``odds``: log odds
+    that this velocity is that against the scene, and not against something that moves in it."""
+
+    T_prev_cur: Array
+    reach_m: float
+    odds: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which motion is taken; covariance (6, 6) of its being another one; whether a vehicle can have made it; whether it
+    tells the velocity, and is not just too noisy to contradict; log odds of what is expected from now on."""
+
+    index: int = 0
+    otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    plausible: bool = True
+    tells: bool = True
+    odds: float = 0.0
+
+
+def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None) -> Choice:
+    """The likeliest of the motions to be the scene's: the one that goes on as expected, until the parts of the picture
+    have spoken long enough for another. Where none goes on, what was expected is a candidate of its own.
+
+    Moments of the mixture: ``sum p_i d_i d_i^T``, with d_i from the chosen motion to another.
+    """
+    candidates = [m.T_prev_cur for m in motions]
+    weight = _AREA * np.log(np.array(covered[: len(motions)], np.float64))
+    goes_on, tells = np.ones(len(motions), bool), np.ones(len(motions), bool)
+    if expected is not None:
+        off_m = np.array([np.linalg.norm((se3.inverse(expected.T_prev_cur) @ T)[:3, 3]) for T in candidates])
+        noise_m = np.array([_NOISE * worst_translation_sigma_m(m) for m in motions])
+        goes_on = (off_m <= np.hypot(expected.reach_m, noise_m)) & (off_m == off_m.min())
+        tells = np.minimum(off_m, noise_m) <= expected.reach_m
+        weight = weight + expected.odds * goes_on
+        if not goes_on.any():
+            candidates.append(expected.T_prev_cur)
+            weight = np.append(weight, weight.max() + expected.odds + _UNSEEN)
+    best, likeliest = int(np.argmax(weight[: len(motions)])), int(np.argmax(weight))
+    plausible = best == likeliest
+    if len(candidates) > 1:
+        odds = float(weight[likeliest] - np.delete(weight, likeliest).max())
+    else:
+        odds = (0.0 if expected is None else expected.odds) + _REGAINED
+    share = np.exp(weight - weight.max())
+    # However often the same was seen, it may be wrong.
+    share = np.maximum(share / share.sum(), np.exp(-_SUREST) / (1 + np.exp(-_SUREST)))
+    d = np.stack([se3.log(se3.inverse(candidates[best]) @ T) for T in candidates])
+    otherwise = np.einsum("i,ij,ik->jk", share, d, d)
+    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST))
 
 
 def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int64]:

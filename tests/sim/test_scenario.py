@@ -77,3 +77,10 @@ def test_a_calibration_file_is_a_camera(tmp_path):
     (tmp_path / "rig.yaml").write_text("cam0: 3\n")
     with pytest.raises(GpvoError, match=r"rig\.yaml"):
         sc.points_scenario(scenario)
+
+
+@pytest.mark.parametrize("name", ["street", "street-traffic", "tunnel-smoke", "lunar-dust"])
+def test_what_has_no_pictures_says_so(name):
+    with pytest.raises(GpvoError, match="has no pictures"):
+        sc.require_pictures(sc.load_scenario(name))
+    sc.require_pictures(sc.load_scenario("tunnel"))

@@ -1,0 +1,74 @@
+"""Which of several motions is the scene's: belief goes on, gives way to lasting evidence, and never takes all."""
+
+import numpy as np
+import pytest
+from gpvo.dataset.errors import motion_errors
+from gpvo.geometry import se3
+from gpvo.io import open_source
+from gpvo.runner import steps
+from gpvo.sim.points import simulate_points
+from gpvo.types import Status, VoLog
+from gpvo.vo.config import make_config
+from gpvo.vo.motion import Motion
+from gpvo.vo.rivals import Expected, choose
+
+
+def moving(z_m: float, sigma_m: float = 0.003) -> Motion:
+    """A motion along z that its points tell to ``sigma_m``."""
+    T = se3.exp(np.array([0.0, 0.0, z_m, 0.0, 0.0, 0.0]))
+    nothing = np.zeros((0, 3))
+    return Motion(T, np.ones(9, bool), 1.0, nothing, nothing, np.eye(6) / sigma_m**2, True, 3, 0.0)
+
+
+def expecting(z_m: float, odds: float) -> Expected:
+    return Expected(moving(z_m).T_prev_cur, 0.1, odds)
+
+
+def test_what_goes_on_is_taken_against_a_larger_rival_and_its_covariance_reaches_the_rival():
+    choice = choose([moving(0.0), moving(2.0)], (30, 12), expecting(1.98, 3.0))
+    assert choice.index == 1
+    assert choice.plausible
+    assert 0.2 < np.sqrt(choice.otherwise[2, 2]) < 2.0  # five sigma reach over the two metres
+    assert 0 < choice.odds < 3.0
+
+
+def test_the_larger_part_of_the_picture_wins_in_the_end():
+    odds, frames = 3.0, 0
+    while True:
+        choice = choose([moving(0.0), moving(2.0)], (30, 12), expecting(2.0, odds))
+        if choice.index == 0:
+            break
+        odds, frames = choice.odds, frames + 1
+    assert 3 <= frames <= 20
+
+
+def test_a_second_bad_motion_is_not_believed_because_the_first_was():
+    odds = 3.0
+    for _ in range(5):
+        choice = choose([moving(0.0)], (1,), expecting(2.0, odds))
+        assert not choice.plausible
+        assert np.sqrt(choice.otherwise[2, 2]) > 1.0
+        odds = choice.odds
+
+
+def test_alone_and_as_expected_it_is_sure_of_itself():
+    choice = choose([moving(2.0)], (1,), expecting(1.99, 0.5))
+    assert choice.plausible
+    assert not choice.otherwise.any()
+    assert choice.odds > 0.5
+    assert not choose([moving(2.0)], (1,), None).otherwise.any()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_traffic_is_never_called_ok_and_is_covered(tmp_path, seed):
+    source = open_source(simulate_points("street-traffic", seed, duration_s=25.0, cars=3).save(tmp_path / "a.npz"))
+    log = VoLog([step.record for step in steps(source, make_config())], source.camera)
+    errors = motion_errors(log, source.truth)
+    wrong_m = np.linalg.norm(errors.xi[:, :3], axis=1)
+    records = [log.records[i] for i in errors.index]
+    ok = np.array([r.status is Status.OK for r in records])
+    sigma_m = np.array([np.sqrt(np.trace(r.covariances["pointing_matching"][:3, :3])) for r in records])
+    locked = wrong_m > 0.3
+    assert ok.sum() > 50
+    assert (locked & ok).sum() <= 0.005 * ok.sum()
+    assert (locked & (wrong_m > 6 * sigma_m)).sum() <= 0.05 * locked.sum()
