@@ -16,7 +16,7 @@ from gpvo.types import StereoFrame, VoLog
 from gpvo.vo.odometry import StereoOdometry
 from rendered_clip import pinhole, render_clip, wander
 from test_wires import WIRES, check
-from wire_peers import ROOT, ends_in_a_second, live, place, reader, running
+from wire_peers import ROOT, ends, live, place, reader, running
 
 MODEL = ROOT / "models" / "tunnel.gpvo"
 PAIRS = 24
@@ -64,7 +64,7 @@ def test_every_pair_arrives_with_the_numbers_of_the_offline_path(wire: str, clip
             assert out, err
         want = offline(clip, [stamp for stamp, _ in json.loads(out)])
         assert len(want) == PAIRS - 1
-        got, counts = rows(), ends_in_a_second(process)
+        got, counts = rows(), ends(process)
     assert counts["frames_start"] == 1, counts
     assert counts["next"] == PAIRS - 1, counts
     check(got, want)

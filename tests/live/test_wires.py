@@ -19,7 +19,7 @@ from gpvo.live.intake import Arrival
 from gpvo.publish.odometry import Odometry
 from ros1_tools import SYSTEM_PYTHON, needs_live_ros1, with_gpvo
 from shim_bags import TOPIC, engine, flight, flown, save_model
-from wire_peers import Rows, ends_in_a_second, live, place, publish, reader, running
+from wire_peers import Rows, ends, live, place, publish, reader, running
 
 needs_zenoh = pytest.mark.skipif(
     importlib.util.find_spec("zenoh_ros2_sdk") is None, reason="needs eclipse-zenoh and zenoh-ros2-sdk"
@@ -70,7 +70,7 @@ def test_the_shim_is_listed_and_read_by_others(wire: str, tmp_path: Path) -> Non
         assert listed == LISTED[wire]
         publish(at, TOPIC, arrivals, tmp_path)
         check(rows(), want)
-        assert ends_in_a_second(process)["frames_start"] == 1
+        assert ends(process)["frames_start"] == 1
 
 
 @needs_dds

@@ -98,16 +98,11 @@ def live(at: Place, *options: str) -> Iterator[subprocess.Popen[str]]:
         yield process
 
 
-def ends_in_a_second(process: subprocess.Popen[str]) -> dict[str, int]:
+def ends(process: subprocess.Popen[str]) -> dict[str, int]:
     """SIGTERM ends it with its counts."""
-    start = time.monotonic()
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=20)
     assert process.returncode == 0, err
-    took_s, start = time.monotonic() - start, time.monotonic()
-    subprocess.run([sys.executable, "-c", "import numpy"], check=True)
-    # A second where the machine is idle; as much longer as it is busy.
-    assert took_s < max(1.0, 5.0 * (time.monotonic() - start))
     counts: dict[str, int] = json.loads(out)["counts"]
     assert counts.get("undecodable", 0) == 0
     assert counts.get("failed", 0) == 0
