@@ -167,8 +167,8 @@ def test_a_model_of_windows_is_refused_by_name(capsys, tmp_path):
 @pytest.mark.slow
 def test_forecast_along_unseen_simulated_flights(tmp_path):
     """Odometry on simulated tracks: training on ten flights, forecast along the truth of twenty others."""
+    from bench.experiment_flights import Campaign, flights
     from gpvo.dataset.build import build_run
-    from gpvo.evaluation.fusion_flights import Campaign, flights
     from gpvo.learning.config import TrainConfig
     from gpvo.learning.train import train_sets
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench.experiment_flights import Campaign, Rise, rise, training_runs, unseen_runs
+from bench.fusion_experiment import Outcome, experiment, main, markdown, trained, write
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport
-from gpvo.evaluation.fusion_experiment import Outcome, experiment, main, markdown, trained, write
-from gpvo.evaluation.fusion_flights import Campaign, Rise, rise, training_runs, unseen_runs
 from gpvo.filters.metrics import Scores
 from gpvo.filters.study import Study
 from gpvo.geometry import se3

@@ -1,6 +1,6 @@
 """Is the learned covariance true in simulated scenarios, per motion and over a distance? Few flights, wide bounds.
 
-The full experiment is ``python -m gpvo.evaluation.scenario_experiment``: more flights, whose means must lie within
+The full experiment is ``python -m bench.scenario_experiment``: more flights, whose means must lie within
 [0.8, 1.25] per motion and [0.7, 1.5] over 1, 10 and 100 m. The three test flights here leave those means uncertain by
 about a fifth where only noise differs between flights, so the bounds are twice as far from one on the log scale.
 """
@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 import pytest
+from bench.scenario_experiment import MethodScores, fly, judge, main, markdown
 from gpvo.errors import GpvoError
-from gpvo.evaluation.scenario_experiment import MethodScores, fly, judge, main, markdown
 
 
 def _scores(nees: list[list[float]]) -> MethodScores:

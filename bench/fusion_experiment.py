@@ -1,6 +1,6 @@
 """What a filter gains, measured: simulated flights, VO, a model from some, the policies on the others.
 
-    python -m gpvo.evaluation.fusion_experiment tunnel-bursts --train 12 --test 50 -o experiment
+    python -m bench.fusion_experiment tunnel-bursts --train 12 --test 50 -o experiment
 
 Training and test seeds differ, and with them path, world and sensors. Prints every run, paired intervals, and by how
 much VO's error rose; writes the same as Markdown, JSON and a figure. Flights that the folder holds are not flown again.
@@ -12,20 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from gpvo.dataset.build import build_run
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
-from gpvo.evaluation.fusion_flights import (
-    FIRST_TEST_SEED,
-    Campaign,
-    Rise,
-    check_numbers,
-    experiment_parser,
-    rise,
-    training_runs,
-    unseen_runs,
-    with_accidents,
-)
-from gpvo.evaluation.fusion_plot import experiment_figure, save
+from gpvo.evaluation.fusion_plot import save
 from gpvo.evaluation.fusion_report import document
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
@@ -37,9 +27,24 @@ from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.experiment_flights import (
+    FIRST_TEST_SEED,
+    Campaign,
+    Rise,
+    check_numbers,
+    experiment_parser,
+    rise,
+    training_runs,
+    unseen_runs,
+    with_accidents,
+)
 
 LEARNED_WHITE, LEARNED_PREDICTED = "learned_white", "learned_predicted"
 _POINTS_S, _PICTURES_S = 60.0, 25.0
+_HONEST = (0.7, 1.5)
 _COLUMNS = (
     ("ATE m", "ate_rmse_m", 4),
     ("final m", "final_error_m", 4),
@@ -131,6 +136,38 @@ def write(outcome: Outcome, stem: Path) -> None:
     extra = {"share": risen.share, "standard_deviation": risen.standard_deviation, "median": risen.median}
     write_json(stem.with_suffix(".json"), {**document(outcome.report), "title": outcome.title, "rise": extra})
     save(experiment_figure(outcome.study, outcome.title), stem.with_suffix(".png"))
+
+
+def experiment_figure(result: Study, title: str) -> Figure:
+    """Left: position error of each run. Right: the learned policy's NEES of each run."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    figure.suptitle(title)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    _errors_of_runs(left, result)
+    _consistency(right, result)
+    return figure
+
+
+def _errors_of_runs(axes: Axes, result: Study) -> None:
+    """One dot per run and policy; lines join the runs, so that pairs can be seen."""
+    names = list(result.scores)
+    ate = np.array([result.column(n, "ate_rmse_m") for n in names])  # (policies, runs)
+    axes.plot(ate, color="grey", lw=0.4, alpha=0.5)
+    for i, name in enumerate(names):
+        colour = "tab:green" if name == LEARNED else "tab:blue"
+        axes.plot(np.full(ate.shape[1], i), ate[i], "o", ms=3, color=colour, alpha=0.6)
+        axes.plot([i - 0.3, i + 0.3], [np.nanmean(ate[i])] * 2, color="black", lw=2)
+    axes.set_xticks(range(len(names)), names, rotation=20, ha="right", fontsize=8)
+    axes.set(ylabel="ATE of each run [m]; bar: mean", yscale="log")
+
+
+def _consistency(axes: Axes, result: Study) -> None:
+    for part, marker in (("position", "o"), ("attitude", "^")):
+        values = result.column(LEARNED, f"nees_{part}")
+        axes.plot(values, marker, ms=4, label=f"{part}, mean {np.nanmean(values):.2f}")
+    axes.axhspan(*_HONEST, color="grey", alpha=0.3)
+    axes.set(xlabel="run", ylabel="NEES per degree of freedom, learned", yscale="log")
+    axes.legend(fontsize=8)
 
 
 def trained(training: Sequence[Run], path: Path) -> Path:

@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
 from gpvo.io import open_source
@@ -27,6 +25,7 @@ from gpvo.sim.points import simulate_points
 from gpvo.sim.scenario import load_scenario, points_scenario
 from gpvo.sim.sequence import simulate
 from gpvo.types import Array
+from numpy.typing import NDArray
 
 FIRST_TRAIN_SEED, FIRST_TEST_SEED = 1000, 0
 _DARK_S, _FROZEN_S, _FROZEN_SHARE = 2.0, 1.0, 0.05

@@ -1,6 +1,6 @@
 """Is the learned covariance true in every scenario, per motion and over 1, 10 and 100 m? Simulated flights, a model.
 
-    python -m gpvo.evaluation.scenario_experiment --train 10 --test 12 -o scenarios
+    python -m bench.scenario_experiment --train 10 --test 12 -o scenarios
 
 Per scenario: a model from the training flights, judged on flights whose seeds, and with them path, world, noise and
 calibration, it has never seen; ``--together`` adds one model of all scenarios at the same rate, and ``--twins 8`` for
@@ -17,14 +17,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
 from gpvo.evaluation.evaluate import judged, predictions_by_stamp
-from gpvo.evaluation.fusion_flights import Campaign, check_numbers, experiment_parser, flights, training_runs
 from gpvo.evaluation.statements import statements
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run import Run, read_run
@@ -35,6 +33,8 @@ from gpvo.online.predictor import Predictor
 from gpvo.sim.scenario import load_scenario, points_scenario
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 from gpvo.twin.replicate import TwinSettings, make_twins
+
+from bench.experiment_flights import Campaign, check_numbers, experiment_parser, flights, training_runs
 
 DURATIONS_S: Mapping[str, float] = {
     "tunnel-clean": 125.0,
