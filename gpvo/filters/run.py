@@ -185,7 +185,8 @@ def fuse_flight(
     """Filter one run under one policy; one result per member (a policy may set several noises side by side)."""
     options = options or FuseOptions()
     start, gravity = begin(flight, options)
-    records = [flight.records[int(i)] for i in np.flatnonzero(flight.covered) if i >= flight.first]
+    first = flight.first
+    records = [flight.records[int(i)] for i in np.flatnonzero(flight.covered) if i >= first]
     filter = make_filter(flight, start, gravity, batch, options)
     timeline = Timeline(
         filter,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -17,6 +18,9 @@ from gpvo.types import ImuLog, Status, VoRecord
 from synthetic_flights import synthetic_flight
 
 AT_S = 3.0
+# Errors of one flight go together, so its NEES spreads by about .6 around 1 and the mean of a dozen by .17: the bounds
+# [0.5, 2] are three of that away.
+FLIGHTS = int(os.environ.get("GPVO_FAULT_FLIGHTS", "12"))
 Fault = Callable[[np.ndarray, np.ndarray, np.ndarray, int], None]
 
 
@@ -81,15 +85,17 @@ def fused(flight: Flight) -> FusedRun:
     )[0]
 
 
-def nees_after(flight: Flight, run: FusedRun) -> tuple[float, float]:
-    """Mean NEES per degree of freedom of position and attitude after the fault."""
+def after(flight: Flight, run: FusedRun) -> tuple[float, float, float, float]:
+    """Mean NEES per degree of freedom of position and attitude after the fault; error of position [m], its largest
+    and its last."""
     index = {r.t_ns: i for i, r in enumerate(flight.records)}
     truth = flight.T_world_imu[[index[int(t)] for t in run.t_ns]]
     late = (run.t_ns - run.t_ns[0]) * 1e-9 > AT_S
     T, true, C = run.T_world_imu[late], truth[late], run.covariance[late]
     position = metrics.position_nees(T[:, :3, 3], true[:, :3, 3], C[:, :3, :3])
     attitude = metrics.attitude_nees(T[:, :3, :3], true[:, :3, :3], C[:, 6:9, 6:9])
-    return float(position.mean()), float(attitude.mean())
+    error_m = np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)
+    return float(position.mean()), float(attitude.mean()), float(error_m.max()), float(error_m[-1])
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -105,24 +111,14 @@ def test_a_momentary_fault_costs_little(fault: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", ["none", *FAULTS, *LONG_FAULTS])
 def test_the_filter_stays_consistent_after_a_fault(fault: str) -> None:
-    """Fifty flights each."""
-    nees = []
-    for seed in range(50):
-        flight = faulty(seed, FAULTS[fault], 10.0)
-        nees.append(nees_after(flight, fused(flight)))
-    position, attitude = np.mean(nees, axis=0)
-    assert 0.5 <= position <= 2.0
-    assert 0.5 <= attitude <= 2.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", LONG_FAULTS)
-def test_the_filter_stays_consistent_after_a_long_fault(fault: str) -> None:
-    """Twelve flights each."""
-    flights = [faulty(seed, LONG_FAULTS[fault], 14.0) for seed in range(12)]
-    position, attitude = np.mean([nees_after(flight, fused(flight)) for flight in flights], axis=0)
+    faults = {"none": _set(0.0, 0.0, add=True), **FAULTS, **LONG_FAULTS}
+    flights = [faulty(seed, faults[fault], 14.0 if fault in LONG_FAULTS else 10.0) for seed in range(FLIGHTS)]
+    told = np.array([after(flight, fused(flight)) for flight in flights])
+    position, attitude = told[:, :2].mean(axis=0)
+    largest_m, last_m = told[:, 2].max(), np.sqrt((told[:, 3] ** 2).mean())
+    print(f"NEES {position:.2f}, {attitude:.2f}, largest error {largest_m:.2f} m, rms at the end {last_m:.2f} m")
     assert 0.5 <= position <= 2.0
     assert 0.5 <= attitude <= 2.0
 

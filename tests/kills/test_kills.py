@@ -210,19 +210,28 @@ WRITERS = {
 }
 
 
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of ten seconds, its run and a model."""
+    folder = tmp_path_factory.mktemp("short")
+    simulate_points("tunnel-bursts", 0, duration_s=10.0, rate_hz=10.0).save(folder / "0.npz")
+    finish(*GPVO, "run", folder / "0.npz", "-o", folder / "run0")
+    shutil.copy(Path(__file__).parents[2] / "models" / "tunnel.gpvo", folder)
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_costs_one_line_and_leaves_what_was_there(name: str, flights: Path, tmp_path: Path) -> None:
-    shutil.copy(Path(__file__).parents[2] / "models" / "tunnel.gpvo", flights)
+def test_a_full_disk_costs_one_line_and_leaves_what_was_there(name: str, short: Path, tmp_path: Path) -> None:
     out = tmp_path / ("points.npz" if name == "points" else name)
     if name in ("run", "import"):
-        shutil.copytree(flights / "run0", out)
+        shutil.copytree(short / "run0", out)
     before = bytes_of(tmp_path)
-    for limit_bytes in (0, 1_000, 30_000):
+    for limit_bytes in (0, 1_000, 10_000):
         limited = f"import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
         code = f"{limited}; runpy.run_module('gpvo.cli', run_name='__main__')"
         call = subprocess.run(
-            [sys.executable, "-c", code, *WRITERS[name], out], capture_output=True, text=True, cwd=flights, timeout=300
+            [sys.executable, "-c", code, *WRITERS[name], out], capture_output=True, text=True, cwd=short, timeout=300
         )
         if call.returncode == 0:
             assert limit_bytes > 0

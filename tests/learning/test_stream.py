@@ -63,11 +63,11 @@ def test_what_fits_into_memory_is_trained_as_ever(tmp_path):
 
 @pytest.mark.slow
 def test_same_bytes_again(stored_file, tmp_path):
-    config = replace(QUICK, max_rows=4096)
+    config = replace(QUICK, max_rows=2048)
     for name in ("a", "b"):
         trained = train_stored(stored_file, config, judge=False, chunk_rows=500)
         rows = trained.header["rows"]
-        assert rows == {"given": len(StoredSets(stored_file)), "in_memory": 4096}
+        assert rows == {"given": len(StoredSets(stored_file)), "in_memory": 2048}
         save_model(trained, tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 

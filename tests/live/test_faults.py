@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -17,6 +18,7 @@ from shim_bags import Kept, engine, flight, flown, shim_predictor
 
 SECOND = 10**9
 RATE = 20
+TRIALS = int(os.environ.get("GPVO_FAULT_TRIALS", "20"))
 
 
 def _moved(arrival: Arrival, seconds: float) -> Arrival:
@@ -115,7 +117,7 @@ def healthy(recording: list[Arrival]) -> np.ndarray:
     return np.median([np.diagonal(o.twist_covariance) for o in kept.frames if o.twist_covariance is not None], axis=0)
 
 
-@pytest.mark.parametrize("trials", [2, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", [2, pytest.param(TRIALS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__.strip("_"))
 def test_fault_campaign(
     fault: Callable[..., list[Arrival]], trials: int, recording: list[Arrival], healthy: np.ndarray

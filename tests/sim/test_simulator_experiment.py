@@ -13,7 +13,7 @@ from bench import simulator_experiment as experiment
 
 @pytest.mark.slow
 def test_clean_flights_are_exact_and_a_wrong_baseline_shows_as_scale(tmp_path: Path) -> None:
-    clean = experiment.clean(tmp_path, 2)
+    clean = experiment.clean(tmp_path, 1)
     assert max(clean["mean_error_percent"]["values"]) < 0.4  # one flight of 9 s; over ten seeds the mean is below 0.2
     assert max(clean["drift_percent"]["values"]) < 1.0
     off = experiment.fly(seed=0, folder=tmp_path, **experiment.CLEAN, calibration_offset__baseline=0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,8 @@ import pytest
 pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
 from rendered_clip import pinhole, render_clip, wander
 
-FRAMES = 10_000
+FRAMES = int(os.environ.get("GPVO_LONG_FRAMES", "4000"))
+MOST_GROWTH_MB = 2e-3 * FRAMES
 # In a process of its own: the renderer's memory is none of the odometry's.
 PROGRAM = """
 import sys, resource
@@ -39,7 +41,7 @@ class Endless:
         for k in range(len(self)):
             i = k % (2 * count - 2)
             i = i if i < count else 2 * count - 2 - i
-            if k % 1000 == 999:
+            if (k + 1) % (len(self) // 10) == 0:
                 sizes.append(psutil.Process().memory_info().rss / 1e6)
             yield StereoFrame((k + 1) * 50_000_000, left[i], right[i])
 
@@ -49,8 +51,8 @@ print(max(sizes), sizes[-1] - sizes[1])
 
 
 @pytest.mark.slow
-def test_ten_thousand_frames(tmp_path: Path) -> None:
-    """Forth and back through a clip: under 400 MB in all, and no more than 20 MB of growth after the first 2,000."""
+def test_thousands_of_frames(tmp_path: Path) -> None:
+    """Forth and back through a clip: under 400 MB in all, and at most 2 kB of growth a frame after the first fifth."""
     clip = render_clip(pinhole(320, 240), wander(12, seed=2))
     c = clip.camera
     np.savez(
@@ -65,4 +67,4 @@ def test_ten_thousand_frames(tmp_path: Path) -> None:
     peak_mb, growth_mb = (float(x) for x in done.stdout.split())
     print(f"peak {peak_mb:.0f} MB, growth {growth_mb:.0f} MB")
     assert peak_mb < 400
-    assert growth_mb < 20
+    assert growth_mb < MOST_GROWTH_MB
