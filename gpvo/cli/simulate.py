@@ -34,10 +34,15 @@ def simulate(
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     speed: Annotated[float | None, typer.Option(help="Speed [m/s].")] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Recorded path to fly, scaled to fit the world: TUM lines or EuRoC CSV, z up.")
+        Path | None, typer.Option(help="Path to fly, scaled to fit the world: TUM lines or EuRoC CSV, z up, or a run.")
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="pinhole, euroc, t265, or a calibration file of Kalibr, OpenCV, ROS or KITTI.")
+        str | None,
+        typer.Option(help="pinhole, euroc, t265, a file of Kalibr, OpenCV, ROS or KITTI, or a run."),
+    ] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(help="Run folder with tracks: fly its path with its camera, rate, depths, counts and noise."),
     ] = None,
     points: Annotated[
         bool, typer.Option("--points", help="Landmark tracks instead of images: a thousand times faster.")
@@ -69,7 +74,9 @@ def simulate(
 
     given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,
              "trajectory": None if trajectory is None else str(trajectory)}  # fmt: skip
-    overrides = {k: v for k, v in given.items() if v is not None} | dict(map(_assignment, set_ or []))
+    overrides = (
+        _like(like, points) | {k: v for k, v in given.items() if v is not None} | dict(map(_assignment, set_ or []))
+    )
     chosen = load_scenario(scenario, overrides)
     if seeds is not None and seed is not None:
         raise GpvoError("--seed and --seeds exclude one another", cure="leave out one of them")
@@ -85,6 +92,16 @@ def simulate(
                 chosen, _seeds(seeds), target, points=points, jobs=jobs, backend=backend, scheduler=scheduler
             )
         _tell(chosen, flights, json_, preview)
+
+
+def _like(run: Path | None, points: bool) -> dict[str, Any]:
+    if run is None:
+        return {}
+    if not points:
+        raise GpvoError("--like knows no pictures", cure="add --points: landmark tracks instead of images")
+    from gpvo.sim.like import like
+
+    return like(run)
 
 
 def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -> Flight:

@@ -12,18 +12,25 @@ from gpvo.sim.paths import Path3
 from gpvo.types import Array
 
 WORLDS = ("tunnel", "lunar", "room", "street")
+PATHS = ("along", "wander", "straight", "hover")
+_CAMERA_HEIGHT_M = 1.6  # over the road
+_STEP_M = 0.5  # between the points of a centre line
+_BEYOND_M = 80.0
 
 
 def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator) -> tuple[Path3, Array]:
     """A path and the landmarks (N, 3) [m] around it.
 
-    ``path``: ``along``, ``wander``, ``straight``, ``hover``, or a TUM file of a recorded flight.
+    ``path``: one of :data:`PATHS`, or a recorded one, a file or run folder, which is scaled to fit the world; a street
+    is laid along it.
     """
     if world not in WORLDS:
         raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(WORLDS)}")
     reach = duration_s * speed_mps + 25.0
     bend = 0.0 if path == "straight" else 1.0
     centre = _tunnel_line(reach, rng, bend, scale=12.0 if world == "street" else 1.0)
+    if world == "street" and path not in PATHS:
+        return _street_along(_recording(path, duration_s), duration_s, rng)
     low, high = {
         "tunnel": (np.array([4.0, -0.6, -0.4]), np.array([6.0, 0.6, 0.5])),
         "lunar": (np.array([-40.0, -20.0, 2.0]), np.array([40.0, 20.0, 4.0])),
@@ -50,12 +57,28 @@ def _path(
         if world == "lunar":
             centre = centre * [1, 1, 0] + [0, 0, 1.5]
         if world == "street":
-            return paths.driving(centre + [0, 0, 1.6], duration_s, speed_mps, rng)
+            return paths.driving(centre + [0, 0, _CAMERA_HEIGHT_M], duration_s, speed_mps, rng)
         return paths.along_curve(centre, duration_s, speed_mps, rng, sway_m=0.35)
-    file = Path(path)
-    if not file.is_file():
-        raise GpvoError(f"'{path}' is neither a path kind nor a file", cure="along, wander, straight, hover or a file")
-    return recorded.flown(file, low, high, duration_s, rng)
+    return _recording(path, duration_s).fitted(low, high, duration_s, rng)
+
+
+def _recording(path: str, duration_s: float) -> recorded.Recording:
+    if not Path(path).exists():
+        raise GpvoError(f"'{path}' is neither a kind of path nor a file", cure=f"{', '.join(PATHS)}, or a file")
+    return recorded.read_recording(Path(path), duration_s)
+
+
+def _street_along(recording: recorded.Recording, duration_s: float, rng: np.random.Generator) -> tuple[Path3, Array]:
+    """The recording as it is, and a street below it that goes on straight beyond both of its ends."""
+    path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0, duration_s)
+    at = path.position(np.arange(0.0, duration_s, 0.05)) - [0, 0, _CAMERA_HEIGHT_M]
+    steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
+    at = at[np.concatenate([[True], steps > 1e-3])]
+    ahead = path.attitude(np.array([0.0, duration_s]))[:, :, 0] * [1, 1, 0]
+    at = np.concatenate([at[:1] - _BEYOND_M * ahead[0], at, at[-1:] + _BEYOND_M * ahead[1]])
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
+    even = np.arange(0.0, arc[-1], _STEP_M)
+    return path, _street(np.stack([np.interp(even, arc, at[:, i]) for i in range(3)], axis=1), rng)
 
 
 def _tunnel_line(length_m: float, rng: np.random.Generator, bend: float, scale: float = 1.0) -> Array:

@@ -40,7 +40,10 @@ class Path3:
         return Motion(t, self.position(t), R, velocity, acceleration, rate)
 
 
-def smooth_start(t_s: Array, rest_s: float, ramp_s: float = 2.0) -> Array:
+RAMP_S = 2.0
+
+
+def smooth_start(t_s: Array, rest_s: float, ramp_s: float = RAMP_S) -> Array:
     """Time that stands still for ``rest_s`` and then takes ``ramp_s`` to run at full pace (C3)."""
     x = np.clip((np.asarray(t_s) - rest_s) / ramp_s, 0.0, None)
     y = np.minimum(x, 1.0)

@@ -30,7 +30,7 @@ class PointsScenario:
 
     world: str = "tunnel"  # tunnel, lunar, room, street
     world_seed: int | None = None  # of landmarks and path, in place of the flight's own
-    path: str = "along"  # along, wander, straight, hover, or a TUM file
+    path: str = "along"  # along, wander, straight, hover, or a recorded one: a TUM file, or a run folder
     duration_s: float = 60.0
     rate_hz: float = 20.0
     speed_mps: float = 1.2
@@ -39,6 +39,7 @@ class PointsScenario:
     imu_rate_hz: float = 200.0
     tracks: int = 220  # wanted per frame
     sigma_px: float = 0.15  # of each image coordinate
+    persistent_px: float = 0.0  # of a point's disparity, the same for as long as it is followed
     blur_px: float = 0.008  # further noise per pixel of image motion
     spread: float = 0.15  # standard deviation of log sigma between flights
     outliers: float = 0.03  # share of the tracks that jump
@@ -220,7 +221,7 @@ def observe(
     total = len(cloud) + sum(len(b.points) for b in bodies)
     active = np.zeros(total, bool)
     generation = np.zeros(total, np.int64)
-    last_uv = np.full((total, 2), np.nan)
+    last_uv, kept_px = np.full((total, 2), np.nan), np.zeros(total)
     out: list[Seen] = []
     for k, t in enumerate(t_s):
         if scenario.frozen and scenario.frozen[0] <= t < scenario.frozen[1] and out:
@@ -236,8 +237,11 @@ def observe(
         if bodies:
             visible &= ~movers.hidden(bodies, len(cloud), left, depth)
         wanted = int(scenario.tracks * (bad.count_factor if bad else 1.0))
+        before = active.copy()
         _renew(active, generation, visible, wanted, min(1.0, scenario.drop * (3.0 if bad else 1.0)), life)
-        i = np.flatnonzero(active)
+        i, new = np.flatnonzero(active), np.flatnonzero(active & ~before)
+        if scenario.persistent_px:
+            kept_px[new] = scenario.persistent_px * streams[6].standard_normal(len(new))
         flow = np.hypot(*(left[i] - last_uv[i]).T)
         last_uv[:] = np.nan
         last_uv[i] = left[i]
@@ -249,6 +253,7 @@ def observe(
         n = len(i)
         uv_left = left[i] + sigma[:, None] * noise.standard_normal((n, 2))
         uv_right = right[i] + sigma[:, None] * noise.standard_normal((n, 2))
+        uv_right[:, 0] -= kept_px[i]
         wrong = noise.random(n) < scenario.outliers * (bad.outlier_factor if bad else 1.0)
         jump = noise.uniform(-25, 25, (n, 2)) * wrong[:, None]
         out.append((i + generation[i] * total, uv_left + jump, uv_right + jump))

@@ -11,7 +11,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.sim.paths import Path3, knots, smooth_start
+from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.sim.paths import RAMP_S, Path3, knots, smooth_start
 from gpvo.types import Array
 
 _STEP_S = 0.02
@@ -53,9 +54,20 @@ class Recording:
 
         return Path3(make_interp_spline(t, place(smooth_start(t, rest_s)), k=5), attitude, duration_s)
 
+    def fitted(
+        self, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
+    ) -> Path3:
+        """The recording scaled down to fit a box [m], looking in a random direction at its start."""
+        low, high = np.asarray(low, float), np.asarray(high, float)
+        scale = min(1.0, float(((high - low) / np.maximum(np.ptp(self.position_m, axis=0), 1e-6)).min()))
+        return self.placed((high + low) / 2, 0.0, scale, rng.uniform(-np.pi, np.pi), duration_s, rest_s)
+
 
 def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Recording:
-    """The part of a trajectory file that a flight of ``duration_s`` needs. ``.csv`` is EuRoC's layout, else TUM lines.
+    """The part of a trajectory that a flight of ``duration_s`` needs.
+
+    Of a file, ``.csv`` in EuRoC's layout, else TUM lines, or of a run folder, whose first camera pose is taken as
+    level.
 
     Laser and motion capture jitter by millimetres: the motion is smoothed over a tenth of a second.
 
@@ -64,10 +76,7 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
     SourceError
         Where the file is no trajectory, or is shorter than the flight.
     """
-    from gpvo.io.trajectory import read_euroc_csv, read_tum
-
-    recorded = read_euroc_csv(file) if file.suffix.lower() == ".csv" else read_tum(file)
-    clock = (recorded.t_ns - recorded.t_ns[0]) * 1e-9
+    clock, T_world_body = _read(file)
     needed = float(smooth_start(np.array([duration_s]), rest_s)[0])
     if clock[-1] < needed:
         longest = clock[-1] + duration_s - needed
@@ -77,27 +86,30 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
             cure=f"a duration of at most {np.floor(longest * 10) / 10:g} s",
         )
     grid = np.arange(0.0, needed + 0.3, _STEP_S)
-    poses = _resample(clock, recorded.T_world_body, np.minimum(grid, clock[-1]))
+    poses = _resample(clock, T_world_body, np.minimum(grid, clock[-1]))
     p = gaussian_filter1d(poses[:, :3, 3], 5.0, axis=0, mode="nearest")
     turned = _continuous(se3.rotation_to_quaternion_xyzw(poses[:, :3, :3] @ poses[0, :3, :3].T))
     turned = gaussian_filter1d(turned, 5.0, axis=0, mode="nearest")
     return Recording(p - (p.max(0) + p.min(0)) / 2, turned)
 
 
-def flown(
-    file: Path, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
-) -> Path3:
-    """A recorded path scaled down to fit a box [m], looking in a random direction at its start.
+def _read(path: Path) -> tuple[Array, Array]:
+    """Times (N,) [s] from 0 and poses (N, 4, 4) of a body (forward, left, up) in a world whose z points up."""
+    from gpvo.io.run_read import is_run, read_run
+    from gpvo.io.trajectory import read_euroc_csv, read_tum
 
-    Raises
-    ------
-    SourceError
-        As :func:`read_recording`.
-    """
-    recording = read_recording(file, duration_s, rest_s)
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    scale = min(1.0, float(((high - low) / np.maximum(np.ptp(recording.position_m, axis=0), 1e-6)).min()))
-    return recording.placed((high + low) / 2, 0.0, scale, rng.uniform(-np.pi, np.pi), duration_s, rest_s)
+    if is_run(path):
+        log = read_run(path).log
+        turn = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+        return (log.t_ns - log.t_ns[0]) * 1e-9, turn @ log.trajectory() @ turn.T
+    recorded = read_euroc_csv(path) if path.suffix.lower() == ".csv" else read_tum(path)
+    return (recorded.t_ns - recorded.t_ns[0]) * 1e-9, recorded.T_world_body
+
+
+def longest_flight_s(path: Path, rest_s: float = 3.0) -> float:
+    """Duration [s] of the longest flight that the trajectory allows, in tenths."""
+    length = float(_read(path)[0][-1])
+    return float(np.floor(10 * (length + rest_s + RAMP_S / 2)) / 10)
 
 
 def _about_z(angle_rad: float) -> Array:

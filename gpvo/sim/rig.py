@@ -16,6 +16,7 @@ from gpvo.cameras.tolerance import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.io.run_read import is_run, read_run
 from gpvo.types import Array
 
 # The left camera looks forward from the nose, level. The IMU is the body's origin.
@@ -47,7 +48,8 @@ CAMERAS = tuple(_PRESETS)
 
 def camera_rig(name: str) -> StereoRig:
     """The nominal rig of a preset (``pinhole``, ``euroc`` or ``t265``) or of a calibration file: Kalibr, OpenCV, ROS
-    camera_info, or KITTI's ``calib.txt``, which states no size: then the principal point is in the middle.
+    camera_info, or KITTI's ``calib.txt``, which states no size: then the principal point is in the middle; or the
+    rectified one of a run folder.
 
     Raises
     ------
@@ -56,12 +58,22 @@ def camera_rig(name: str) -> StereoRig:
     """
     if name in _PRESETS:
         return _PRESETS[name]()
+    if is_run(name):
+        return _of_run(Path(name))
     if not Path(name).is_file():
         raise GpvoError(f"unknown camera '{name}'", cure=f"choose from {', '.join(CAMERAS)}, or a calibration file")
     path, size = Path(name), None
     if path.suffix.lower() == ".txt" and (P := read_projections(path).get("P0")) is not None:
         size = round(2 * P[0, 2]) + 1, round(2 * P[1, 2]) + 1
     return replace(read_stereo_yaml(path, size=size), T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)
+
+
+def _of_run(path: Path) -> StereoRig:
+    c = read_run(path).log.camera
+    if c is None:
+        raise GpvoError("the run does not know its camera", where=path, cure="give a calibration file")
+    lens = PinholeRadtan(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height)
+    return _pair(lens, lens, c.baseline_m, np.eye(3))
 
 
 def mounted(rig: StereoRig, vehicle: str, pitch_deg: float) -> StereoRig:

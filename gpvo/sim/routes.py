@@ -51,7 +51,7 @@ def plan_path(scenario: Scenario, world: World, rng: np.random.Generator) -> Pat
         raise GpvoError(f"'{scenario.name}' flies a recorded path", cure="give --trajectory FILE (TUM lines, z up)")
     if scenario.trajectory:
         file = Path(scenario.trajectory)
-        if not file.is_file():
+        if not file.exists():
             raise GpvoError("no such trajectory", where=file)
         return _place_recording(scenario, world, read_recording(file, duration, rest), rng)
     start, ahead = world.start_pose[:3, 3], world.start_pose[:3, 0]

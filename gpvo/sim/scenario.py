@@ -190,11 +190,11 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
     known = {f.name for f in fields(PointsScenario)}
     if unknown := sorted(set(scenario.points) - known):
         raise GpvoError(f"unknown parameter 'points.{unknown[0]}'", where=where, cure=_nearest(unknown[0], known))
-    if scenario.camera not in CAMERAS and not Path(scenario.camera).is_file():
+    if scenario.camera not in CAMERAS and not Path(scenario.camera).exists():
         raise GpvoError(
             f"camera is '{scenario.camera}'",
             where=where,
-            cure=f"choose from {', '.join(CAMERAS)}, or give a calibration file (Kalibr, OpenCV, ROS or KITTI)",
+            cure=f"choose from {', '.join(CAMERAS)}, or give a file of Kalibr, OpenCV, ROS or KITTI, or a run",
         )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")
