@@ -76,10 +76,11 @@ def run(
         If the source holds no frames, or its left and right images look swapped.
     """
     config = config or VoConfig()
-    known = {"source": str(source.name), "source_format": source.format, "kind": source.kind, **(meta or {})}
+    known: dict[str, object] = {"source": str(source.name), "source_format": source.format, "kind": source.kind}
+    known |= {"vehicle": asdict(config.vehicle), **(meta or {})}
     if predictor is not None:
         known["model_digest"] = predictor.digest
-        predictor.reset(source.camera)
+        predictor.reset(source.camera, vehicle=config.vehicle)
     status: Counter[str] = Counter()
     length_m = busy_s = 0.0
     recorder = TrackRecorder() if keep_tracks else None

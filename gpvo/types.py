@@ -167,6 +167,25 @@ class Mounting:
 
 
 @dataclass(frozen=True)
+class Vehicle:
+    """What a camera's acceleration [m/s^2] and angular acceleration [rad/s^2] never exceed on this vehicle."""
+
+    max_acceleration_mps2: float = 40.0
+    max_turn_radps2: float = 200.0
+
+
+VEHICLES = {
+    "any": Vehicle(),
+    "car": Vehicle(12.0, 20.0),
+    "rover": Vehicle(20.0, 50.0),
+    "multirotor": Vehicle(40.0, 200.0),
+    "handheld": Vehicle(40.0, 100.0),
+}
+"""Tyres hold a car to about one g, a rover that drops off a stone sees two; a multirotor has two to four times its
+weight in thrust and turns over within a tenth of a second; an arm moves a camera at up to four g, a wrist flicks."""
+
+
+@dataclass(frozen=True)
 class TruthLog:
     """Ground truth poses of the rectified left camera: ``t_ns`` (N,), ``T_world_cam`` (N, 4, 4).
 
@@ -252,10 +271,12 @@ class VoRecord:
 
 @dataclass(frozen=True)
 class VoLog:
-    """All records of a run, in time order, with the camera that made them (None for imported poses)."""
+    """All records of a run, in time order, with the camera that made them (None for imported poses), and what carried
+    it."""
 
     records: Sequence[VoRecord]
     camera: StereoCamera | None = None
+    vehicle: Vehicle = Vehicle()
 
     def __len__(self) -> int:
         return len(self.records)

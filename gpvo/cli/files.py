@@ -66,6 +66,9 @@ def import_(
         str, typer.Option(help="Whether the covariances in a CSV are of poses or motions.")
     ] = "pose",
     covariance_axes: Annotated[str, typer.Option(help="Axes of the covariances in a CSV: world or body.")] = "world",
+    vehicle: options.VehicleName = "any",
+    max_acceleration: options.MaxAcceleration = None,
+    max_turn: options.MaxTurn = None,
     overwrite: options.Overwrite = False,
     json_: Json = False,
 ) -> None:
@@ -102,6 +105,7 @@ def import_(
         **chosen,
         time_offset_s=offset,
         truth_sigma=sigma,
+        vehicle=options.vehicle_of(vehicle, max_acceleration, max_turn),
         overwrite=overwrite,
     )
     if json_:

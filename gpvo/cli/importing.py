@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, to_records
 from gpvo.io.run import write_run
 from gpvo.io.truth import check_overlap
-from gpvo.types import Mounting, TruthLog, VoLog
+from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,15 @@ def import_log(
     align: str = "none",
     time_offset_s: float | None = 0.0,
     truth_sigma: tuple[float, float] | None = None,
+    vehicle: Vehicle | None = None,
     overwrite: bool = True,
 ) -> ImportSummary:
     """Make a run folder of another odometry's log, with a truth of the same frame.
 
     ``frame``: whose poses these are, ``cam`` or ``body``. ``align``: the fixed transform to fit between log and truth,
     ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None to estimate it.
-    ``truth_sigma``: noise of the truth per pose [m, rad]. ``overwrite``: also in place of a finished run.
+    ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: what slips are told by, any by
+    default. ``overwrite``: also in place of a finished run.
 
     Raises
     ------
@@ -62,7 +64,7 @@ def import_log(
         One line that names the file, the place and the cure.
     """
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
-    log, given = log.seen_from(place), None
+    log, given, carrier = log.seen_from(place), None, vehicle or Vehicle()
     if truth is not None:
         sigma = truth_sigma or (0.0, 0.0)
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
@@ -86,7 +88,13 @@ def import_log(
         truth=given,
         mounting=Mounting(T_body_cam=T_FLU_OPTICAL if frame == "body" else None),
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
-        meta={"source": log.path.name, "format": "import", "kind": "import", "notes": notes},
+        meta={
+            "source": log.path.name,
+            "format": "import",
+            "kind": "import",
+            "notes": notes,
+            "vehicle": asdict(carrier),
+        },
     )
     return ImportSummary(
         frames=len(records),

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from gpvo.cli import source_options as flags
 from gpvo.cli.output import one_of, print_json
 from gpvo.errors import GpvoError, printable
 
@@ -56,6 +57,9 @@ def live(
     state: Annotated[
         Path | None, typer.Option(help="File that keeps the state, and from which a restart continues.")
     ] = None,
+    vehicle: flags.VehicleName = "any",
+    max_acceleration: flags.MaxAcceleration = None,
+    max_turn: flags.MaxTurn = None,
     depth: Annotated[int, typer.Option(help="Longest queue of a topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
@@ -67,6 +71,7 @@ def live(
     from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings, run_live
 
     one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
+    carrier = flags.vehicle_of(vehicle, max_acceleration, max_turn)
     one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
     result = run_live(
         LiveSettings(
@@ -89,7 +94,7 @@ def live(
             topic=topic,
             pose_topic=pose_topic,
             depth=depth,
-            engine=EngineSettings(correct_twist, pose_covariance == "increment", state),
+            engine=EngineSettings(correct_twist, pose_covariance == "increment", state, carrier),
         )
     )
     if json_:

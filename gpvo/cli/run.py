@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +33,9 @@ def run(
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
     min_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is lost; at least 4.")] = 8,
     weak_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is degraded.")] = 20,
+    vehicle: flags.VehicleName = "any",
+    max_acceleration: flags.MaxAcceleration = None,
+    max_turn: flags.MaxTurn = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
@@ -79,7 +83,9 @@ def run(
     from gpvo.vo.config import make_config, read_settings
     from gpvo.vo.rig_findings import read_state
 
+    carrier = flags.vehicle_of(vehicle, max_acceleration, max_turn)
     shorthand = {
+        **asdict(carrier),
         "methods": methods,
         "sigma_px": sigma,
         "sigma_p_px": sigma_p,

@@ -83,7 +83,7 @@ class TrainingSet:
 
 def observe(log: VoLog, names: Sequence[str], target: str = "frame") -> tuple[list[VoRecord], Array]:
     """Replay a log: the records as flight judges (or joins) them and their features (N, d)."""
-    observer = Observer(names, target, log.camera)
+    observer = Observer(names, target, log.camera, log.vehicle)
     seen = [s for s in map(observer.step, log.records) if s is not None]
     return [r for r, _ in seen], np.array([x for _, x in seen]).reshape(len(seen), len(names))
 
@@ -159,7 +159,7 @@ def build(
 def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
     """How many records are lost, those that are so for their motion alone, and the distance (m, 6) of each such motion
     from the expected one. From the log itself: windows leave lost frames out before they become records."""
-    detector, n_lost, slips, jumps = SlipDetector(), 0, [], []
+    detector, n_lost, slips, jumps = SlipDetector(log.vehicle), 0, [], []
     for record in log.records:
         judged = detector.step(record)
         n_lost += judged.status is Status.LOST

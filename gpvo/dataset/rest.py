@@ -8,6 +8,7 @@ motion does not deceive a gyroscope.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
         return log
     inside = in_waits(log.records, waits)
     marked = [r.with_status(Status.LOST, "truth moves at rest") if i else r for r, i in zip(log.records, inside)]
-    return VoLog(marked, log.camera)
+    return replace(log, records=marked)
 
 
 def _waits(log: VoLog, T_est: Array, camera: StereoCamera) -> list[tuple[int, int]]:

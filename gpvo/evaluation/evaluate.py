@@ -162,7 +162,7 @@ def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
     for r in log:
         p = predictions.get(r.t_ns)
         records.append(r if p is None or r.status is Status.START else r.with_status(p.status, "prediction"))
-    return VoLog(records, log.camera)
+    return replace(log, records=records)
 
 
 def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from gpvo.types import (
     StereoCamera,
     StereoTracks,
     TruthLog,
+    Vehicle,
     VoLog,
     field_names,
 )
@@ -81,7 +82,7 @@ def read_run(path: str | Path) -> Run:
     if not isinstance(schema, int) or schema > _MAX_SCHEMA:
         raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=p / "run.json", cure="upgrade")
     camera, mounting = _read_rig(p / "rig.json")
-    log = _read_log(p, camera)
+    log = replace(_read_log(p, camera), vehicle=_vehicle_of(meta, p / "run.json"))
     return Run(
         path=p,
         name=printable(meta.get("name") or p.resolve().name),
@@ -136,6 +137,15 @@ def read_tracks(path: str | Path) -> StereoTracks:
         )
     read = [_guarded(part, lambda part=part: run_table.tracks_from(read_columns(part)[0])) for part in parts]
     return StereoTracks.join(read)
+
+
+def _vehicle_of(meta: dict[str, Any], path: Path) -> Vehicle:
+    """What carried the camera; any vehicle where an older run does not say."""
+    known = meta.get("vehicle") or {}
+    vehicle: Vehicle = _guarded(path, lambda: Vehicle(**{k: float(v) for k, v in known.items()}))
+    if not all(v > 0 for v in vars(vehicle).values()):
+        raise SourceError("its vehicle cannot move: an acceleration is not above 0", where=path)
+    return vehicle
 
 
 def _guarded(path: Path, make: Any) -> Any:

@@ -22,7 +22,7 @@ from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 from gpvo.publish.odometry import Odometry, OdometryBuilder
-from gpvo.types import Array, Prediction, Status, VoRecord
+from gpvo.types import VEHICLES, Array, Prediction, Status, Vehicle, VoRecord
 from gpvo.vo.quality import lost_covariance
 
 REPEAT_S = 10.0
@@ -60,12 +60,13 @@ class EngineSettings:
     """``increment``: the pose's covariance is that of its last motion, not accumulated since the start.
 
     ``state``: file that holds where the odometry stood and what late truth taught; taken up at the start, written every
-    10 s and at the end.
+    10 s and at the end. ``vehicle``: what slips are told by.
     """
 
     correct_twist: bool = False
     increment: bool = False
     state: Path | None = None
+    vehicle: Vehicle = VEHICLES["any"]
 
 
 class Engine:
@@ -134,7 +135,7 @@ class Engine:
     def _step(self, taken: Taken) -> Odometry:
         builder = self._builder
         if taken.begins:
-            self.predictor.reset(self.stage.camera, self._scale)
+            self.predictor.reset(self.stage.camera, self._scale, self.settings.vehicle)
             if self._truth is not None:
                 self._truth.forget()
         if builder is None:

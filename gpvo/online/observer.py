@@ -18,7 +18,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import covariance as transport
 from gpvo.online.features import FeatureStream
 from gpvo.online.slip import SlipDetector
-from gpvo.types import Array, Status, StereoCamera, VoRecord
+from gpvo.types import Array, Status, StereoCamera, Vehicle, VoRecord
 
 LONGEST_STEP_S = 60.0
 """A record that comes later than this after the one before is believed when the next one confirms its clock."""
@@ -49,12 +49,19 @@ _PATTERN = re.compile(r"(window|length):([0-9]*\.?[0-9]+)(s|m)")
 class Observer:
     """Judges stamps, flags slips, joins motions over a window, computes features: record by record, causally.
 
-    ``names``: feature columns. ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``.
+    ``names``: feature columns. ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``vehicle``: what
+    its motions are judged by.
     """
 
-    def __init__(self, names: Sequence[str], target: str = "frame", camera: StereoCamera | None = None) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        target: str = "frame",
+        camera: StereoCamera | None = None,
+        vehicle: Vehicle | None = None,
+    ) -> None:
         self._intake = Intake()
-        self.slip = SlipDetector()
+        self.slip = SlipDetector(vehicle)
         self._window = Window.of(target)
         self._stream = FeatureStream(names, camera)
 

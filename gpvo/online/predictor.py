@@ -24,7 +24,7 @@ from gpvo.online.features import known_columns
 from gpvo.online.for_filter import arrays_for_filter, arrays_of_base
 from gpvo.online.guard import DEGRADED_BELOW, camera_problems
 from gpvo.online.observer import Observer
-from gpvo.types import Array, Prediction, Status, StereoCamera, VoLog, VoRecord
+from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
 """Of the arrays and header keys described in :mod:`gpvo.online.modelfile`."""
@@ -122,12 +122,15 @@ class Predictor:
         """(6,) factor on each standard deviation that late truth has taught; ones before any."""
         return self._adaptive.scale
 
-    def reset(self, camera: StereoCamera | None = None, scale: Array | None = None) -> None:
+    def reset(
+        self, camera: StereoCamera | None = None, scale: Array | None = None, vehicle: Vehicle | None = None
+    ) -> None:
         """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with; warns
-        where the two are far apart. ``scale``: what late truth taught of this odometry before."""
+        where the two are far apart. ``scale``: what late truth taught of this odometry before. ``vehicle``: of the run,
+        any by default."""
         for problem in camera_problems(self.camera, camera):
             warnings.warn(f"this is another camera: {problem}", stacklevel=2)
-        self._observer = Observer(self.features, self.target, camera or self.camera)
+        self._observer = Observer(self.features, self.target, camera or self.camera, vehicle)
         self._adaptive = AdaptiveScale(scale=scale)
         self._last: tuple[VoRecord, Array] | None = None
         self._stated: dict[int, tuple[Array, Array] | None] = {}
@@ -144,7 +147,7 @@ class Predictor:
 
     def replay(self, log: VoLog) -> dict[int, Prediction]:
         """Predictions for a recorded run, by time stamp and in order; begins anew with its camera."""
-        self.reset(log.camera)
+        self.reset(log.camera, vehicle=log.vehicle)
         return {p.t_ns: p for p in map(self.step, log) if p is not None}
 
     def predict(

@@ -1,6 +1,6 @@
 """Is this motion possible at all? Slips are caught from what is known at the time, before any truth is seen.
 
-The implied acceleration is compared with what any vehicle can have. Odometry's own noise, which counts by the square of
+The implied acceleration is compared with what the vehicle can have. Odometry's own noise, which counts by the square of
 the frame rate, raises the bound to eight times the median of what was seen, and no further than to four times the
 vehicle's. Disagreement with a gyro is compared with its far quantile, extrapolated from the history's
 upper tail (B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after
@@ -16,16 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from gpvo.online.features import twist
-from gpvo.types import STANDARD_GRAVITY_MPS2, Array, Status, VoLog, VoRecord
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, Status, Vehicle, VoLog, VoRecord
 
 FALSE_FLAG_RATE = 1e-6
 """Wanted share of good motions that are called impossible."""
-
-MAX_ACCELERATION_MPS2 = 40.0
-"""No vehicle has more: a car about one g, a rover that drops off a stone two; a multirotor has two to four times its
-weight in thrust, and an arm moves a camera at up to four g."""
-MAX_TURN_RADPS2 = 200.0
-"""The same of angular acceleration: a racing multirotor turns over within a tenth of a second, a wrist flicks."""
 
 _NOISE_MEDIANS = 8.0
 _MOST_NOISE = 4.0  # times the vehicle's bound
@@ -68,7 +62,8 @@ class SlipDetector:
     more than a second away, or the clock was set, it starts afresh.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, vehicle: Vehicle | None = None) -> None:
+        self._vehicle = vehicle or Vehicle()
         self._linear: deque[float] = deque(maxlen=_HISTORY)
         self._angular: deque[float] = deque(maxlen=_HISTORY)
         self._gyro: deque[float] = deque(maxlen=_HISTORY)
@@ -108,12 +103,12 @@ class SlipDetector:
         acc = record.imu_acc_mean_mps2
         # Whatever the attitude, a camera accelerates by no more than specific force plus gravity.
         felt = 0.0 if acc is None or not np.isfinite(acc).all() else STANDARD_GRAVITY_MPS2 + float(np.linalg.norm(acc))
-        if change[0] > felt and _is_beyond(change[0], self._linear, MAX_ACCELERATION_MPS2):
+        if change[0] > felt and _is_beyond(change[0], self._linear, self._vehicle.max_acceleration_mps2):
             return f"acceleration of {change[0]:.3g} m/s^2"
         if disagreement is not None:
             if disagreement > _GYRO_TRUST_RADPS and disagreement > tail_quantile(np.array(self._gyro)):
                 return f"{disagreement:.3g} rad/s from the gyro"
-        elif _is_beyond(change[1], self._angular, MAX_TURN_RADPS2):
+        elif _is_beyond(change[1], self._angular, self._vehicle.max_turn_radps2):
             return f"angular acceleration of {change[1]:.3g} rad/s^2"
         return ""
 
@@ -141,5 +136,5 @@ def _rates(middle_s: float, now: Array, before: tuple[float, Array]) -> tuple[fl
 
 def flag_slips(log: VoLog) -> VoLog:
     """The log with impossible motions called ``lost``; causal, and the same when applied twice."""
-    detector = SlipDetector()
-    return VoLog([detector.step(r) for r in log.records], log.camera)
+    detector = SlipDetector(log.vehicle)
+    return replace(log, records=[detector.step(r) for r in log.records])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, get_type_hints
 
 from gpvo.errors import GpvoError
+from gpvo.types import Vehicle
 
 METHODS = ("triangulation", "pointing_matching", "spherical")
 
@@ -29,6 +30,7 @@ class VoConfig:
     min_inliers: int = 8  # fewer: lost; P3P needs four
     weak_inliers: int = 20  # fewer: degraded
     max_acceleration_mps2: float = 40.0  # of the vehicle: beyond, a motion is something else's
+    max_turn_radps2: float = 200.0  # its angular acceleration: beyond, a motion is a slip
     keyframe_parallax_px: float = 1.0  # keep the reference while the median image motion is below this; 0: never
     methods: tuple[str, ...] = ("triangulation", "pointing_matching")
     sigma_px: float = 1.0  # triangulation: of each image coordinate
@@ -38,6 +40,11 @@ class VoConfig:
     self_calibration: bool = True  # estimate what the calibration has wrong between the cameras
     persistent_noise: bool = True  # estimate the error of disparity that a point keeps while it is followed
     seed: int = 0
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """What carries the camera."""
+        return Vehicle(self.max_acceleration_mps2, self.max_turn_radps2)
 
     @property
     def stated(self) -> tuple[str, ...]:
@@ -74,6 +81,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "min_inliers": (4, 10_000),
     "weak_inliers": (0, 10_000),
     "max_acceleration_mps2": (0.1, 1e6),
+    "max_turn_radps2": (0.1, 1e6),
     "keyframe_parallax_px": (0, 1000),
     "sigma_px": (1e-6, 100),
     "sigma_p_px": (1e-6, 100),

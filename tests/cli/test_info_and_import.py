@@ -13,10 +13,11 @@ import sequences as seq
 from bag_maker import stereo_bag
 from gpvo import cli
 from gpvo.cameras.models import PinholeRadtan
+from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.io.trajectory import write_euroc_csv, write_kitti_poses, write_tum
-from gpvo.types import Status, VoLog, VoRecord
+from gpvo.types import Status, Vehicle, VoLog, VoRecord
 
 N = 400
 T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
@@ -131,6 +132,17 @@ def test_import_of_a_perfect_log(gpvo, tmp_path):
     assert run.truth is not None
 
 
+def test_a_run_keeps_what_its_slips_are_told_by(gpvo, tmp_path):
+    write_tum(tmp_path / "log", T_NS, _poses())
+    words = ("--vehicle", "car", "--max-turn", "7.5")
+    assert gpvo("import", tmp_path / "log", "-o", tmp_path / "run", *words)[0] == 0
+    assert read_run(tmp_path / "run").log.vehicle == Vehicle(12.0, 7.5)
+    meta = json.loads((tmp_path / "run" / "run.json").read_text())
+    (tmp_path / "run" / "run.json").write_text(json.dumps({**meta, "vehicle": {"max_turn_radps2": -1.0}}))
+    with pytest.raises(SourceError, match="cannot move"):
+        read_run(tmp_path / "run")
+
+
 def test_the_columns_of_a_truth_are_named_like_those_of_a_log(gpvo, tmp_path):
     write_tum(tmp_path / "est.txt", T_NS, _poses())
     write_euroc_csv(tmp_path / "gt.csv", T_NS, _poses())
@@ -181,6 +193,8 @@ def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
         (["{log}", "-o", "{out}", "--truth-map", "abc"], "--truth-map is 'abc'"),
         (["{log}", "-o", "{out}", "--format", "xml"], "there is no format 'xml'"),
         (["{log}", "-o", "{out}", "--truth-sigma", "1"], "--truth-sigma is '1'"),
+        (["{log}", "-o", "{out}", "--vehicle", "boat"], "--vehicle is 'boat'"),
+        (["{log}", "-o", "{out}", "--max-turn", "0"], "--max-turn is 0"),
         (["{log}", "-o", "{out}", "--truth", "{late}"], "does not overlap"),
         (["{log}", "-o", "{out}", "--truth", "{nan}"], "line 5 holds NaN"),
         (["{missing}", "-o", "{out}"], "no such file"),

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from gpvo.geometry import se3
 from gpvo.online.slip import SlipDetector, flag_slips, tail_quantile
-from gpvo.types import Status, VoLog
+from gpvo.types import VEHICLES, Status, VoLog
 from synthetic_runs import make_run
 
 
 def _with_jump(log: VoLog, k: int, metres: float) -> VoLog:
     jump = se3.exp(np.array([0, 0, metres, 0, 0, 0]))
-    return VoLog([replace(r, T_prev_cur=r.T_prev_cur @ jump) if i == k else r for i, r in enumerate(log)], log.camera)
+    return replace(
+        log, records=[replace(r, T_prev_cur=r.T_prev_cur @ jump) if i == k else r for i, r in enumerate(log)]
+    )
 
 
 def _lost(log: VoLog) -> list[int]:
@@ -50,6 +52,19 @@ def test_what_was_accepted_cannot_raise_the_bound_without_limit():
         [replace(r, T_prev_cur=r.T_prev_cur @ se3.exp(0.1 * rng.standard_normal(6) * [1, 1, 1, 0, 0, 0])) for r in log]
     )
     assert 500 in _lost(flag_slips(_with_jump(jerky, 500, metres=2.2)))
+
+
+def test_a_car_cannot_do_what_any_vehicle_can():
+    """A noisy log, whose noise raises the bounds, and then jumps of 80 m/s^2."""
+    log, _ = make_run(4, n=600, speed=3.0, rate_hz=10.0)
+    rng = np.random.default_rng(0)
+    noisy = [r.T_prev_cur @ se3.exp(0.05 * rng.standard_normal(6) * [1, 1, 1, 0, 0, 0]) for r in log]
+    log = replace(log, records=[replace(r, T_prev_cur=T) for r, T in zip(log, noisy)])
+    jumps = [300, 400, 500]
+    for k in jumps:
+        log = _with_jump(log, k, metres=0.8)
+    assert _lost(flag_slips(log)) == []
+    assert _lost(flag_slips(replace(log, vehicle=VEHICLES["car"]))) == jumps
 
 
 def test_the_gyro_catches_a_turn_that_never_was():
@@ -91,3 +106,4 @@ def test_jumps_of_metres_in_real_logs(real_data: Path):
     start = VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4))
     log = VoLog([start] + [VoRecord(int(b), int(a), Status.OK, m) for a, b, m in zip(t[:-1], t[1:], motions)])
     assert _lost(flag_slips(log)) == [97, 315]
+    assert _lost(flag_slips(replace(log, vehicle=VEHICLES["car"]))) == [97, 315]
