@@ -1,7 +1,8 @@
 """What the page draws by itself: plain numbers for each panel, thinned to what a screen can show.
 
 A panel is ``{"title", "x": label, "y": label, "lines", "bands", "shades"}`` with optional ``log`` ("x", "y" or "xy"),
-``equal`` axes, ``limit`` (low, high) of y and ``level``, a reference line. NaN is None, a gap.
+``equal`` axes, ``limit`` (low, high) of y, ``level``, a reference line, and ``along``, what is told of each point of a
+path. NaN is None, a gap.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ def views(e: Evaluation) -> list[Panel]:
     statement = curves.best_statement(e)
     stated = None if statement is None else statement.pose_covariance(e.run.log)
     bounds = np.zeros((0, 6, 6)) if stated is None else stated
-    panels = []
+    keep, panels = _spread(len(p)), []
+    told = {name: _rounded(values[keep]) for name, values in _along(e, stated).items()}
     for i, j in ((0, 1), (0, 2)):
         lines = []
         for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
@@ -76,8 +78,20 @@ def views(e: Evaluation) -> list[Panel]:
         if len(q):
             lines.append(_line(*_thin(q[:, i], q[:, j]), "truth", _BLACK, 1.6))
         lines.append(_line(*_thin(p[:, i], p[:, j]), "visual odometry", _RED))
-        panels.append(_panel("", f"{names[i]} [m]", f"{names[j]} [m]", lines, equal=True))
+        along = {"x": _rounded(p[keep, i]), "y": _rounded(p[keep, j]), "told": told}
+        panels.append(_panel("", f"{names[i]} [m]", f"{names[j]} [m]", lines, equal=True, along=along))
     return panels
+
+
+def _along(e: Evaluation, stated: Array | None) -> dict[str, Array]:
+    """What the pointer shows of each pose of the path, with units: (N,) each."""
+    out = {"time [s]": (e.run.log.t_ns - e.run.log.t_ns[0]) * 1e-9}
+    if e.covered.any():
+        off = np.linalg.norm(e.T_est[:, :3, 3] - e.T_true[:, :3, 3], axis=1)
+        out["off by [m]"] = np.where(e.covered, off, np.nan)
+    if stated is not None:
+        out["stated sigma [m]"] = np.sqrt(np.trace(stated[:, :3, :3], axis1=1, axis2=2))
+    return out
 
 
 def errors(e: Evaluation) -> list[Panel]:
@@ -114,7 +128,7 @@ def stated(e: Evaluation) -> list[Panel]:
     for s in (s for s in e.statements if s.errors is not None):
         for of_kind, sigma in zip(lines, curves.stated_sigma(s)):
             keep = _spread(len(t))
-            of_kind.append(_line(t[keep], 1e3 * sigma[keep], s.method, colour(s.method)))
+            of_kind.append(_line(t[keep], 1e3 * sigma[keep], s.method, colour(s.method), _width(e, s.method)))
     names = ("translation [mm]", "rotation [mrad]")
     return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
 
@@ -122,7 +136,8 @@ def stated(e: Evaluation) -> list[Panel]:
 def reliability(e: Evaluation) -> Panel:
     """Share of errors inside against the stated probability, of every method."""
     lines = [
-        _line(curves.LEVELS, curves.reliability(e, s), s.method, colour(s.method)) for s in curves.full_statements(e)
+        _line(curves.LEVELS, curves.reliability(e, s), s.method, colour(s.method), _width(e, s.method))
+        for s in curves.full_statements(e)
     ]
     lines.append({**_line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
     return _panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])
@@ -133,7 +148,7 @@ def nees(e: Evaluation) -> Panel:
     lines = []
     for s in curves.full_statements(e):
         t, values = curves.nees_over_time(e, s)
-        lines.append(_line(*_thin(t, values), s.method, colour(s.method)))
+        lines.append(_line(*_thin(t, values), s.method, colour(s.method), _width(e, s.method)))
     return _panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)
 
 
@@ -192,6 +207,12 @@ def _panel(title: str, x: str, y: str, lines: list[dict[str, Any]], **more: Any)
 
 def _line(x: Array, y: Array, name: str, tint: str, width: float = 1.3) -> dict[str, Any]:
     return {"x": _rounded(x), "y": _rounded(y), "name": name, "colour": tint, "width": width}
+
+
+def _width(e: Evaluation, method: str) -> float:
+    """The method that the page is about stands out."""
+    shown = curves.best_statement(e)
+    return 2.4 if shown is not None and shown.method == method else 1.2
 
 
 def _ring(C: Array) -> Array:

@@ -90,7 +90,8 @@ def _spread(n: int) -> NDArray[np.int64]:
 
 def _worded(found: dict[str, Any], judged: bool) -> dict[str, Any]:
     words = {"green": "true", "amber": "partly true", "red": "not true"}
-    return {**found, "word": words[found["colour"]] if judged else "not judged"}
+    told = (word for word in ("overconfident", "too cautious") if word in found["headline"])
+    return {**found, "word": next(told, words[found["colour"]]) if judged else "not judged"}
 
 
 def _camera(e: Evaluation) -> str:
@@ -103,7 +104,7 @@ def _camera(e: Evaluation) -> str:
 def _made(evaluations: Sequence[Evaluation]) -> str:
     """When the runs were made, so that the same runs give the same page."""
     days = sorted({str(e.run.meta.get("finished") or e.run.meta.get("created") or "")[:10] for e in evaluations} - {""})
-    return f"runs of {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "runs of an unknown day"
+    return f"runs of {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "undated runs"
 
 
 def _axes(C: Array) -> Array:

@@ -42,6 +42,10 @@ const svg = document.querySelector("svg.timed"), box = svg.getBoundingClientRect
 const move = (type, share) => svg.dispatchEvent(new PointerEvent(type,
   { clientX: box.left + share * box.width, pointerType: "mouse", bubbles: true }));
 move("pointermove", 0.5);
+const view = document.querySelector("figure.panel svg"), seen = view.getBoundingClientRect();
+view.dispatchEvent(new PointerEvent("pointermove",
+  { clientX: seen.left + seen.width / 2, clientY: seen.top + seen.height / 2, pointerType: "mouse", bubbles: true }));
+told.along = view.parentElement.querySelector(".values").textContent.replace(/ [\\d.e-]+/g, "").replaceAll("\\n", ", ");
 told.values = svg.parentElement.querySelector(".values").textContent.split("\\n").length;
 const ticks = () => [...document.querySelectorAll("svg.timed")].map(s => s.querySelector("text").textContent).join();
 const whole = ticks();
@@ -101,6 +105,9 @@ def test_a_browser_shows_the_page_without_errors(
     # A click on a name hides its curve wherever it is drawn, and another brings it back.
     assert int(found["hidden"]) >= 1
     assert found["back"] == "0"
+    # Pointed at, the path says when the camera was there, how far off it is and what was stated.
+    stated = "time s, stated sigma m" if case == "no truth" else "time s, off by m, stated sigma m"
+    assert found["along"] == stated
     # The pointer shows the time and what each curve has there; dragging zooms all times together.
     assert int(found["values"]) >= 2
     assert (found["zoomed"], found["unzoomed"]) == ("true", "true")

@@ -14,7 +14,8 @@
     if (key === "y" && finite(panel.level) && (!log || panel.level > 0)) all.push(panel.level);
     let low = all.reduce((a, b) => Math.min(a, b), Infinity), high = all.reduce((a, b) => Math.max(a, b), -Infinity);
     if (!(low <= high)) [low, high] = log ? [0.1, 10] : [0, 1];
-    if (log) return [low / 1.2, high * 1.2];
+    // So wide that 1, 2 or 5 lies within.
+    if (log) return high / low < 2 ? [low / 1.6, high * 1.6] : [low / 1.2, high * 1.2];
     const pad = (high - low || Math.abs(high) || 1) * (key === "x" && !panel.equal ? 0.01 : 0.06);
     return [low - pad, high + pad];
   };
@@ -104,7 +105,7 @@
     const middle = top + (height - top - bottom) / 2;
     make(svg, "text", { x: 12, y: middle, "text-anchor": "middle", transform: `rotate(-90 12 ${middle})` }, panel.y);
     const back = u => logX ? x0 * (x1 / x0) ** ((u - left) / inner) : x0 + (x1 - x0) * (u - left) / inner;
-    listen(figure, svg, { X, back, left, right: width - right, top, bottom: height - bottom, width }, panel);
+    listen(figure, svg, { X, Y, back, left, right: width - right, top, bottom: height - bottom, width }, panel);
     const named = panel.lines.filter(l => l.name);
     if (named.length === 0) return;
     const key = figure.appendChild(document.createElement("figcaption"));
@@ -122,17 +123,36 @@
 
   // What the curves say at the pointer, and a stretch of time chosen by dragging.
   function listen(figure, svg, frame, panel) {
-    const { X, back, left, right, top, bottom, width } = frame;
-    const at = event => {
-      const box = svg.getBoundingClientRect();
-      return (event.clientX - box.left) * width / box.width;
+    const { X, Y, back, left, right, top, bottom, width } = frame;
+    const place = event => {
+      const box = svg.getBoundingClientRect(), unit = width / box.width;
+      return [(event.clientX - box.left) * unit, (event.clientY - box.top) * unit];
     };
+    const at = event => place(event)[0];
     const label = figure.appendChild(document.createElement("div"));
     label.className = "values";
     label.hidden = true;
     const pointer = make(svg, "line", { y1: top, y2: bottom, class: "pointer", visibility: "hidden" });
     const choice = make(svg, "rect", { y: top, height: bottom - top, width: 0, class: "zoom" });
+    const aside = u => label.classList.toggle("left", u > (left + right) / 2);
     let from = null;
+    if (panel.along) {
+      const { x, y, told } = panel.along, dot = make(svg, "circle", { r: 4, class: "here", visibility: "hidden" });
+      svg.addEventListener("pointermove", event => {
+        const [u, v] = place(event), away = i => Math.hypot(X(x[i]) - u, Y(y[i]) - v);
+        const k = x.reduce((best, _, i) => away(i) < away(best) ? i : best, 0);
+        const short = name => name.replace(/ \[(.*)\]/, "");
+        label.textContent = Object.entries(told).filter(([, values]) => finite(values[k])).map(([name, values]) =>
+          `${short(name)} ${Number(values[k].toPrecision(3))} ${name.match(/\[(.*)\]/)[1]}`).join("\n");
+        aside(u);
+        dot.setAttribute("cx", X(x[k]));
+        dot.setAttribute("cy", Y(y[k]));
+        label.hidden = false;
+        dot.setAttribute("visibility", "visible");
+      });
+      svg.addEventListener("pointerleave", () => { label.hidden = true; dot.setAttribute("visibility", "hidden"); });
+      return;
+    }
     svg.addEventListener("pointermove", event => {
       const u = Math.min(Math.max(at(event), left), right), x = back(u);
       if (from !== null) {
@@ -144,7 +164,8 @@
         return finite(l.y[k]) ? `${l.name || panel.y.replace(/ \[.*/, "")} ${Number(l.y[k].toPrecision(3))}` : null;
       }).filter(Boolean);
       label.textContent = [`${panel.x.replace(/ \[.*/, "")} ${Number(x.toPrecision(4))}`, ...rows].join("\n");
-      label.hidden = panel.equal || rows.length === 0;
+      label.hidden = rows.length === 0;
+      aside(u);
       pointer.setAttribute("x1", X(x));
       pointer.setAttribute("x2", X(x));
       pointer.setAttribute("visibility", label.hidden ? "hidden" : "visible");
