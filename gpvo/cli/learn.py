@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, cell, new_table, note, print_json, show
+from gpvo.cli.output import Json, cell, new_table, note, print_json, say, show
 from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
 from gpvo.errors import GpvoError
 
@@ -56,6 +56,9 @@ def train(
     replicates: Replicates = 8,
     tolerance: ToleranceOption = "none",
     gap: GapOption = None,
+    statements: Annotated[
+        Path | None, typer.Option(help="Folder for what each method states of the runs left out: files for gpvo score.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
     backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
@@ -64,7 +67,7 @@ def train(
 ) -> None:
     """Train an error model; score it by leaving each run out.
 
-    A training that was broken off goes on from its finished folds when it is started again.
+    An interrupted training resumes from its finished folds when it is started again.
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
@@ -84,10 +87,15 @@ def train(
         settings = _settings_of(update) | {k: v for k, v in settings.items() if _is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
+    if statements is not None:
+        _check_statements(runs, settings, update)
     with in_place_of_runs_without_truth(
         runs if twins else [], settings_of(replicates, tolerance, seed, gap), jobs
     ) as found:
-        trained = _with_origin(_train(found if twins else runs, settings, update), found if twins else runs)
+        paths = found if twins else runs
+        trained = _with_origin(_train(paths, settings, update), paths)
+        if statements is not None:
+            _write_statements(trained, paths, settings, statements)
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:
@@ -98,6 +106,25 @@ def train(
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", of {given} that streamed" if given > kept else ""
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
+
+
+def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path | None) -> None:
+    """Raise GpvoError, before any work, where a training leaves out no run that ``gpvo score`` could judge."""
+    whole = len(runs) > 1 and all(p.is_dir() for p in runs) and update is None
+    if not whole or settings["target"] != "frame" or settings["backend"] != "local":
+        raise GpvoError(
+            "--statements needs two run folders or more, --target frame and --backend local, without --update",
+            cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER",
+        )
+
+
+def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[str, Any], folder: Path) -> None:
+    from gpvo.evaluation.score import write_left_out
+    from gpvo.io.run import read_run
+    from gpvo.learning.config import TrainConfig
+
+    write_left_out(trained, [read_run(p) for p in paths], TrainConfig(**settings), folder)
+    note(f"gpvo: {folder} holds what each method states of the runs left out: gpvo score {folder}")
 
 
 def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:
@@ -133,9 +160,9 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     config = TrainConfig(**settings)
     _refuse_twice(paths)
     if config.regressor != "auto" and config.target != "position":
-        note("gpvo: --regressor applies to --target position alone: the log-variance GP is sparse")
+        note("gpvo: --regressor applies only to --target position; the log-variance GP is always sparse")
     if update is not None and config.target == "position":
-        raise GpvoError("a model of positions cannot be updated", where=update, cure="train anew from all runs")
+        raise GpvoError("a model of positions cannot be updated", where=update, cure="train again from all runs")
     if any(p.is_file() for p in paths):
         return _train_file(paths, config, update)
     if update is None and config.target != "position" and _frames(paths) > config.max_rows:
@@ -167,7 +194,7 @@ def _train_file(paths: list[Path], config: TrainConfig, update: Path | None) -> 
     from gpvo.learning.update import train_stored
 
     if len(paths) > 1 or update is not None:
-        raise GpvoError("a file of training rows stands alone", where=paths[0], cure="give that file, or run folders")
+        raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
     return train_stored(paths[0], config)
 
 
@@ -193,13 +220,12 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
 
 
 def _print_table(document: dict[str, Any]) -> None:
-
     if not document["folds"]:
         print("one short run alone: nothing could be left out, so there is no table")
         return
     few = len(document["folds"]) <= _MOST_COLUMNS
     columns = [str(k + 1) for k in range(len(document["folds"]))] if few else ["least", "most"]
-    table = new_table("method", *columns, "mean", "median", "1 sigma", "NLL/axis", "as stated")
+    table = new_table("method", *columns, "mean", "median", "1 sig", "NLL", "stated")
     for method, mean in document["mean"].items():
         per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
         rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"]]
@@ -209,15 +235,17 @@ def _print_table(document: dict[str, Any]) -> None:
         if any(v is not None for v in (*per_fold, *rest)):
             table.add_row(method, *(cell(v) for v in (*per_fold, *rest)))
     what = (
-        "run" if document.get("folds_are") != "time blocks" else "part of the one run (nothing is said of another one)"
+        "run" if document.get("folds_are") != "time blocks" else "part of the one run (this says nothing of other runs)"
     )
-    show(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
-    show(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
+    say(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
+    say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     show(table)
+    say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis of a Gaussian, lower is better;")
+    say("stated: of the stated density, where it has heavier tails. _vt: of the translation alone.")
     resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
     if resting:
         told = ", ".join(f"{n} of {name}" for name, n in resting.items())
-        show(f"left out, as the vehicle stands there and the truth moves: {told}  (--stationary keep)")
+        say(f"left out, because the truth moves while the vehicle stands: {told} (--stationary keep keeps them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
@@ -225,14 +253,14 @@ def _print_table(document: dict[str, Any]) -> None:
             f"{method} {sum(s['nees_dof_with_slips'][method] for s in slips) / len(slips):.3g}"
             for method in ("learned", "constant")
         )
-        show(
+        say(
             f"slips: {total['caught']} caught, {total['missed']} missed, {total['falsely_flagged']} falsely flagged;"
-            f" NEES with the flagged counted in: {', '.join(counted_in)}"
+            f" NEES with the flagged ones counted in: {', '.join(counted_in)}"
         )
     c = document["comparison"]
     if c is not None:
-        show(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {_interval(c, 'nll_per_dim_difference')}")
-        show(f"learned minus base (what the Gaussian process adds): {_interval(c, 'learned_less_base')}")
+        say(f"best row by NLL: {c['best_row']}; learned minus {c['rival']}: {_interval(c, 'nll_per_dim_difference')}")
+        say(f"learned minus base (what the Gaussian process adds): {_interval(c, 'learned_less_base')}")
 
 
 def _interval(comparison: dict[str, Any], name: str) -> str:
@@ -248,7 +276,7 @@ def _nees(block: dict[str, float | None]) -> float | None:
 def predict(
     model: Model,
     runs: Annotated[list[Path], typer.Argument(help="Run folders.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file to write; of several runs, a folder of them.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file to write; for several runs, a folder.")],
     json_: Json = False,
 ) -> None:
     """Predict the error of every motion of a run.
@@ -260,7 +288,7 @@ def predict(
     from gpvo.online.predictor import Predictor
 
     if len(runs) == 1 and out.suffix.lower() != ".parquet":
-        raise GpvoError("is no name for a Parquet file", where=out, cure="give -o a name that ends in .parquet")
+        raise GpvoError("does not have the suffix of a Parquet file", where=out, cure="end it in .parquet")
     predictor, documents = Predictor.load(model), []
     for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
         predictions = list(predictor.replay(read_run(path).log).values())

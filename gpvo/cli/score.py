@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, cell, new_table, print_json, show
+from gpvo.cli.output import Json, cell, new_table, print_json, say, show
 from gpvo.errors import GpvoError
 
 
@@ -16,11 +16,12 @@ def score(
         list[Path], typer.Argument(help="Files of stated motions (or CSV), one per sequence; or one folder of methods.")
     ],
     truth: Annotated[
-        list[Path] | None, typer.Option("--truth", help="TUM poses of the same camera, in the same order.")
+        list[Path] | None,
+        typer.Option("--truth", metavar="<path>", help="TUM poses of the same camera, in the same order."),
     ] = None,
     truth_sigma: Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians].")] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Of a folder of methods: write METHOD.json and board.csv here.")
+        Path | None, typer.Option("-o", "--out", help="With a folder of methods: write METHOD.json and board.csv here.")
     ] = None,
     json_: Json = False,
 ) -> None:
@@ -58,11 +59,11 @@ def score(
 
 def _print_board(columns: dict[str, list[Any]]) -> None:
 
-    table = new_table("method", "E [mm]", "E [mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
+    table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     for row in zip(*columns.values()):
         table.add_row(*map(cell, row))
     show(table)
-    print("E: energy score. NEES per motion, then over a second and lengths of path; 1 is right.")
+    print("E: energy score, lower is better. NEES: of a motion, then over 1 s, 10 m and 100 m; 1 is right.")
     print("easy, hard: share within 1 sigma (0.68 is right) in the calmest and the worst quarter.")
 
 
@@ -82,7 +83,7 @@ def _print(found: dict[str, Any]) -> None:
         ("nees_dof", "", 1.0),
     ):
         i = pooled[name]
-        told = "too few sequences for an interval"
+        told = "(too few sequences for an interval)"
         if i["low"] is not None:
             told = f"[{factor * i['low']:.4g}, {factor * i['high']:.4g}] (95 %, by whole sequences)"
-        show(f"{name}: {factor * i['mean']:.4g} {unit} {told}")
+        say(f"{name}: {factor * i['mean']:.4g} {unit} {told}")

@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from gpvo.dataset.rest import wandering_waits
+from gpvo.dataset.splits import leave_one_out
 from gpvo.errors import SourceError
-from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run
+from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
 from gpvo.geometry import se3
 from gpvo.io.foreign import read_foreign, to_records
 from gpvo.io.jsonfile import write_json
@@ -22,6 +24,9 @@ from gpvo.io.run_read import Run
 from gpvo.io.stated import read_stated, write_stated
 from gpvo.io.tables import write_csv
 from gpvo.io.trajectory import read_tum, write_tum
+from gpvo.learning.config import TrainConfig
+from gpvo.learning.train import TrainedModel, fold_model
+from gpvo.online.predictor import Predictor
 from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog
 
@@ -128,7 +133,7 @@ def _of_sequence(method: Path, truth: Path) -> Path:
         if path.is_file():
             return path
     raise SourceError(
-        f"says nothing of the sequence {truth.stem}", where=method, cure="each method must state them all"
+        f"states nothing for the sequence {truth.stem}", where=method, cure="each method must state all sequences"
     )
 
 
@@ -177,12 +182,31 @@ def _charged(log: VoLog, e: Evaluation) -> tuple[Array, Array]:
     return np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)
 
 
-def write_statements(evaluation: Evaluation, folder: Path, name: str) -> list[Path]:
-    """What each method states of a run's motions, a file per method ``METHOD/RUN.txt``, and the ``truth/RUN.txt``."""
+def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConfig, folder: Path) -> None:
+    """What each method, fitted to the other runs, states of every run: the training's table, as files.
+
+    ``trained`` from the same ``runs``, in their order, with its folds kept in ``config.keep``.
+    """
+    assert config.keep is not None
+    names, options = distinct([run.name for run in runs]), EvaluateOptions(align=config.align)
+    folds = leave_one_out(trained.sets)
+    for run, name, (held_out, others) in zip(runs, names, folds, strict=True):
+        predictor = Predictor.load(fold_model(held_out, others, config, config.keep))
+        write_statements(evaluate_run(run, predictor, options), folder, name, waits=config.waits)
+
+
+def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str = "drop") -> list[Path]:
+    """What each method states of a run's motions, a file per method ``METHOD/RUN.txt``, and the ``truth/RUN.txt``.
+
+    Truth that wanders while the vehicle stands is left out of its file, except with ``waits`` "keep".
+    """
     log, name = evaluation.run.log, f"{name}.txt"
-    truth = folder / "truth" / name
+    truth, known = folder / "truth" / name, evaluation.covered
+    if waits == "drop" and evaluation.unscored and evaluation.run.truth is not None:
+        for first, last in wandering_waits(log, evaluation.run.truth):
+            known = known & ~((log.t_ns > first) & (log.t_ns < last))
     truth.parent.mkdir(parents=True, exist_ok=True)
-    write_tum(truth, log.t_ns[evaluation.covered], evaluation.T_true[evaluation.covered])
+    write_tum(truth, log.t_ns[known], evaluation.T_true[known])
     written = [truth]
     for statement in evaluation.statements:
         if statement.dof != 6:

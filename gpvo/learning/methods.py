@@ -108,9 +108,8 @@ def _translation_only(method: str) -> Statement:
     return lambda s: (np.zeros_like(s.Y), s.v_t[method]) if method in s.v_t else None
 
 
-def thesis_gp(sets: Sequence[TrainingSet], *, seed: int = 0) -> Statement:
-    """What the thesis' model, fitted to these sequences, says of another."""
-    model = fit_thesis(sets, seed=seed)
+def thesis_statement(model: ThesisModel) -> Statement:
+    """What the thesis' model states of a sequence."""
     return lambda s: model.predict(s.select(model.columns))
 
 

@@ -21,11 +21,12 @@ from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
-from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_gp
+from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_statement
 from gpvo.learning.parallel import map_jobs
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score, stated_and_actual
+from gpvo.online import modelfile
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import units
 from gpvo.online.predictor import Predictor
@@ -74,10 +75,9 @@ def train_sets(
     """The same from training sets. ``judge`` False leaves the table out."""
     sets = _checked(sets, config.target)
     table = train_table(sets, config) if judge else {}
-    learned = fit_model(sets, config)
+    learned, thesis = fit_model(sets, config), fit_thesis(sets, seed=config.seed)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
-    arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays()}
-    arrays |= fit_thesis(sets, seed=config.seed).to_arrays()
+    arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays(), **thesis.to_arrays()}
     header = _header(sets, config, learned, table)
     return TrainedModel(
         arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets
@@ -145,23 +145,34 @@ def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: T
     """A fold, from ``config.keep`` where a training that was broken off has left it."""
     if config.keep is None:
         return _fold(held_out, train_on, config)
-    sha = hashlib.sha256(repr((code_digest(), versions(), config.settings())).encode())
-    for s in (held_out, *train_on):
-        sha.update(repr((s.digest(), s.counts, s.camera)).encode() + s.lost_xi.tobytes() + s.lost_jump.tobytes())
-    path = Path(config.keep) / f"{sha.hexdigest()}.json"
+    model = fold_model(held_out, train_on, config, config.keep)
+    path = model.with_suffix(".json")
     if not path.is_file():
         path.parent.mkdir(exist_ok=True)
-        write_json(path, _fold(held_out, train_on, config))
+        write_json(path, _fold(held_out, train_on, config, model))
     return read_json(path)
 
 
+def fold_model(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig, keep: str) -> Path:
+    """Where a training under way keeps the model that has not learned from one sequence; the scores lie beside it."""
+    sha = hashlib.sha256(repr((code_digest(), versions(), config.settings())).encode())
+    for s in (held_out, *train_on):
+        sha.update(repr((s.digest(), s.counts, s.camera)).encode() + s.lost_xi.tobytes() + s.lost_jump.tobytes())
+    return Path(keep) / f"{sha.hexdigest()}.gpvo"
+
+
 @fixed_threads(1)
-def _fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
-    """All methods fitted without one sequence and scored on it."""
-    arrays = method_arrays(train_on)
-    statements = {**simple_statements(arrays), "gp_thesis": thesis_gp(train_on, seed=config.seed)}
+def _fold(
+    held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig, model: Path | None = None
+) -> dict[str, Any]:
+    """All methods fitted without one sequence and scored on it; the fitted ones go into the file ``model``."""
+    arrays, thesis = method_arrays(train_on), fit_thesis(train_on, seed=config.seed)
+    statements = {**simple_statements(arrays), "gp_thesis": thesis_statement(thesis)}
     stated: dict[str, tuple[Any, ...] | None] = {name: state(held_out) for name, state in statements.items()}
     learned = fit_model(train_on, config)
+    if model is not None:
+        fitted = {**learned.arrays, **arrays, **thesis.to_arrays()}
+        modelfile.save(model, fitted, _header(train_on, config, learned, {}))
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
     stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)

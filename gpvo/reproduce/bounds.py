@@ -172,7 +172,7 @@ class BoundsJob:
         elif kind == "joint":
             found = [_joint(r, name) for r in runs]
         elif kind == "motion":
-            gp = methods.thesis_gp(sets_of(self.training))
+            gp = methods.thesis_statement(methods.fit_thesis(sets_of(self.training)))
             found = [_motion(r, gp) for r in runs]
         else:
             assert self.model is not None

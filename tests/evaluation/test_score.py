@@ -13,15 +13,17 @@ from evaluation_runs import CAMERA, make_run, stated_covariance
 from gpvo import cli
 from gpvo.dataset.build import build_run
 from gpvo.dataset.errors import motion_errors
-from gpvo.errors import SourceError
+from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.baselines import baselines, rtabmap_covariance
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.score import board, score, score_folder, score_sequence, write_statements
 from gpvo.geometry import se3
+from gpvo.io.run import write_run
 from gpvo.io.run_read import Run, read_run
 from gpvo.io.stated import HEADER, read_stated, write_stated
 from gpvo.io.trajectory import tum_line, write_tum
 from gpvo.types import Mounting, Status, StereoTracks, VoLog, VoRecord
+from synthetic_runs import make_run as synthetic_run
 
 ROOT = Path(__file__).parents[2]
 N = 300
@@ -158,10 +160,38 @@ def test_a_method_that_leaves_a_sequence_out_is_refused(written, tmp_path: Path)
     folder, _ = written
     shutil.copytree(folder, tmp_path / "all")
     shutil.copy(tmp_path / "all" / "truth" / "hall.txt", tmp_path / "all" / "truth" / "other.txt")
-    with pytest.raises(SourceError, match="says nothing of the sequence other"):
+    with pytest.raises(SourceError, match="states nothing for the sequence other"):
         score_folder(tmp_path / "all")
     with pytest.raises(SourceError, match="holds no truth"):
         score_folder(tmp_path / "all" / "triangulation")
+
+
+def test_the_table_of_a_training_is_scored_again_from_files_alone(tmp_path: Path, capsys) -> None:
+    """Each run left out in turn: what was stated of it goes into files, which hold all that the table shows."""
+    runs = [tmp_path / f"run{k}" for k in range(2)]
+    for seed, path in enumerate(runs):
+        log, truth = synthetic_run(seed, n=80)
+        write_run(path, log, truth=truth)
+    command = ["train", *map(str, runs), "--features", "n_inliers", "-o", str(tmp_path / "m.gpvo"), "--json"]
+    stated = tmp_path / "stated"
+    cli.app([*command, "--statements", str(stated)], standalone_mode=False)
+    folds = json.loads(capsys.readouterr().out)["folds"]
+    for method in ("constant", "pointing_matching_scaled", "gp_thesis", "base", "learned"):
+        for fold in folds:
+            sequence, of_table = f"{fold['held_out']}.txt", fold["methods"][method]
+            found = score_sequence(stated / method / sequence, stated / "truth" / sequence)
+            assert found.motions == fold["rows"], method
+            assert found.nees_dof == pytest.approx(of_table["nees_dof"]["joint"], rel=1e-3), method
+            assert found.nll_per_dim == pytest.approx(of_table["nll_per_dim"], abs=1e-3), method
+
+
+def test_statements_of_a_run_that_nothing_was_left_out_for_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    with pytest.raises(GpvoError, match="two run folders or more"):
+        cli.app(
+            ["train", str(tmp_path / "run"), "-o", str(tmp_path / "m.gpvo"), "--statements", str(tmp_path / "stated")],
+            standalone_mode=False,
+        )
 
 
 SHOWN = ROOT / "docs" / "scoreboard"
