@@ -150,8 +150,8 @@ def steps(
             _refuse_swapped(frame, source.path)
         if k < len(done):
             if done[k].t_ns != frame.t_ns:
-                cure = "remove the run folder to begin anew"
-                raise SourceError("is not what the run that broke off was of", where=source.path, cure=cure)
+                cure = "remove the run folder to start afresh"
+                raise SourceError("is not the source of the interrupted run", where=source.path, cure=cure)
             t_last_ns = frame.t_ns
             yield Step(frame, done[k], odometry.last, sum(done[k].stage_ms.values()) * 1e-3)
             continue

@@ -155,7 +155,7 @@ def _right_left(
         by_imu = T_right_imu @ se3.inverse(T_left_imu)
     if chained is None and by_imu is None:
         raise CalibrationError(
-            f"does not say how '{right}' sits to '{left}'",
+            f"does not say where '{right}' sits relative to '{left}'",
             where=path,
             cure="add T_cn_cnm1 to the second camera, or T_cam_imu to both",
         )

@@ -52,7 +52,7 @@ def read_camera_infos(path: Path) -> StereoRig:
         raise CalibrationError("is of one camera, and its name does not say which", where=path, cure=cure)
     for file in pair:
         if not file.is_file():
-            raise CalibrationError(f"the other camera's file {file.name} does not lie beside it", where=path)
+            raise CalibrationError(f"the other camera's file {file.name} is not beside it", where=path)
     return rig_from_camera_info(*(_read_camera_info(file) for file in pair), rectified=False, where=path)
 
 
@@ -62,7 +62,7 @@ def _read_camera_info(path: Path) -> CameraInfo:
     def matrix(name: str, rows: int, columns: int) -> Array:
         holder = document.get(name)
         if not isinstance(holder, dict):
-            raise CalibrationError(f"lacks '{name}'", where=path, cure="this is no camera_info YAML of ROS")
+            raise CalibrationError(f"lacks '{name}'", where=path, cure="give a camera_info YAML of ROS")
         return np.reshape(get_numbers(holder, "data", rows * columns, path), (rows, columns))
 
     holder = document.get("distortion_coefficients")

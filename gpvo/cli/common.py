@@ -93,7 +93,7 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
     words: list[str] = []
     for key, value in found.items():
         if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
-            raise GpvoError(f"'{key}' is no table of a command", where=path, cure=f"write options under [{name}]")
+            raise GpvoError(f"'{key}' names no table of a command", where=path, cure=f"write options under [{name}]")
     known = {word.lstrip("-").replace("-", "_"): p for p in command.params for word in p.opts if word.startswith("--")}
     del known["config"]
     context = command.context_class(command, info_name=name)

@@ -240,7 +240,7 @@ def _print(d: dict[str, Any]) -> None:
         for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):
             say(line)
     if d["truth_moves_at_rest"]:
-        say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands there, and the truth moves")
+        say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands still while its truth moves")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
     relative = (f"{name} {cell(m)} m, {cell(math.degrees(rad))} deg" for name, m, rad in errors)
     say(f"  relative error (rms) over a {'; '.join(relative)}")

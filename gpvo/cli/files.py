@@ -46,9 +46,12 @@ def import_(
     format_: Annotated[str | None, typer.Option("--format", help="tum, kitti, csv or bag; guessed by default.")] = None,
     truth_format: Annotated[str | None, typer.Option(help="The same for the ground truth.")] = None,
     map_: Annotated[
-        list[str] | None, typer.Option("--map", help="COLUMN=NAME of a CSV, e.g. var_x=cov_00; repeatable.")
+        list[str] | None,
+        typer.Option("--map", metavar="COLUMN=NAME", help="Columns of a CSV, e.g. var_x=cov_00."),
     ] = None,
-    truth_map: Annotated[list[str] | None, typer.Option(help="The same for a CSV of the ground truth.")] = None,
+    truth_map: Annotated[
+        list[str] | None, typer.Option(metavar="COLUMN=NAME", help="The same for a CSV of the ground truth.")
+    ] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the odometry in a bag.")] = None,
     truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
     times: Annotated[

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, new_table, print_json, show
+from gpvo.cli.output import Json, new_table, print_json, say, show
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def forecast(
     from gpvo.online.predictor import Predictor
 
     if out is not None and out.suffix not in (".parquet", ".csv"):
-        raise GpvoError("is no kind of table", where=out, cure="give -o a name that ends in .parquet or .csv")
+        raise GpvoError("does not have the suffix of a table", where=out, cure="end it in .parquet or .csv")
     predictor = Predictor.load(model)
     predictor.require_motions(model)
     found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
@@ -95,14 +95,14 @@ def _row(f: Forecast, k: int) -> dict[str, float]:
 def _print(f: Forecast, path: Path, frame: str) -> None:
 
     p = f.plan
-    show(
+    say(
         f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m of the {frame}, {len(p.t_s) - 1} motions at"
         f" {1 / p.step_s:.3g} Hz"
     )
-    show(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
+    say(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
     for o in f.outside:
         a, b = o.planned, o.trained
-        show(
+        say(
             f"  {o.feature}: {a[0]:.3g} to {a[1]:.3g}, the training knows {b[0]:.3g} to {b[1]:.3g}"
             f" ({100 * o.share:.0f} % beyond)"
         )
@@ -111,10 +111,10 @@ def _print(f: Forecast, path: Path, frame: str) -> None:
         row = _row(f, k)
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
     show(table)
-    show("1 sigma of the position since the first pose, in the axes of the plan's world")
+    say("1 sigma of the position since the first pose, in the axes of the plan's world")
     if f.mean[-1].any():
         x, y, z = f.mean_error_m[-1]
-        show(f"and an error to be expected at the end of {x:.3g}, {y:.3g}, {z:.3g} m")
+        say(f"expected error at the end: {x:.3g}, {y:.3g}, {z:.3g} m")
 
 
 def _write(out: Path, f: Forecast) -> None:

@@ -19,9 +19,10 @@ def fuse(
     runs: Annotated[list[Path], typer.Argument(help="Run folders to filter.")],
     model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the runs.")] = None,
     train: Annotated[
-        list[Path] | None, typer.Option(help="Training run for the constants; repeatable. Default: the model's.")
+        list[Path] | None,
+        typer.Option(metavar="<path>", help="Training run for the constants; repeatable. Default: the model's."),
     ] = None,
-    policies: Annotated[str, typer.Option(help="Comma-separated; default all.")] = "",
+    policies: Annotated[str, typer.Option(help="Policies to compare, comma-separated; all by default.")] = "",
     init: Annotated[str, typer.Option(help="Start from truth, or from rest (static).")] = "truth",
     gate: Annotated[
         str, typer.Option(help="What happens to a measurement beyond 3 sigma: discard or inflate.")

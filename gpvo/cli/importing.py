@@ -70,7 +70,7 @@ def import_log(
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
     if time_offset_s is None:
         if given is None:
-            raise SourceError("a time offset is estimated against a truth", cure="give --truth")
+            raise SourceError("a time offset can only be estimated against ground truth", cure="give --truth")
         time_offset_s = estimate_time_offset(VoLog(to_records(log)[0]), given)
     log = log.shifted(time_offset_s) if time_offset_s else log
     records, notes = to_records(log)

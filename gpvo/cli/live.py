@@ -14,53 +14,51 @@ from gpvo.errors import GpvoError, printable
 
 def live(
     model: Annotated[Path, typer.Option(help="Error model of this camera, or of this odometry.")],
-    stereo: Annotated[
-        tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the pictures.")
-    ] = None,
+    stereo: Annotated[tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the images.")] = None,
     imu: Annotated[str | None, typer.Option(help="Topic of the IMU, with --stereo.")] = None,
     odometry: Annotated[
-        str | None, typer.Option(help="Topic of another odometry, to be published again with its covariance.")
+        str | None, typer.Option(help="Topic of another odometry, to be republished with an honest covariance.")
     ] = None,
     odometry_type: Annotated[
         str, typer.Option(help="Type of that topic: odometry, or pose (PoseWithCovarianceStamped).")
     ] = ("odometry"),
     truth: Annotated[
-        str | None, typer.Option(help="Topic of truth that comes late (mocap, tags): adapts the covariance.")
+        str | None, typer.Option(help="Topic of delayed ground truth (mocap, tags): adapts the covariance.")
     ] = None,
     truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
     replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False,
     dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 by rclpy, where it is installed.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 by rospy, where it is installed.")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False,
     address: Annotated[
         str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
     ] = None,
     domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0,
     mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
     px4: Annotated[
-        bool, typer.Option("--px4", help="Send px4_msgs/VehicleOdometry too, for PX4 over uXRCE-DDS.")
+        bool, typer.Option("--px4", help="Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS.")
     ] = False,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write a bag: .bag, .mcap or a ROS 2 folder.")] = None,
-    topic: Annotated[str, typer.Option(help="Topic of the odometry that is published.")] = "/gpvo/odometry",
-    pose_topic: Annotated[str | None, typer.Option(help="Publish PoseWithCovarianceStamped here too.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the pictures.")] = (
+    topic: Annotated[str, typer.Option(help="Topic on which the odometry is published.")] = "/gpvo/odometry",
+    pose_topic: Annotated[str | None, typer.Option(help="Also publish PoseWithCovarianceStamped here.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the images.")] = (
         None
     ),
-    pose_covariance: Annotated[str, typer.Option(help="accumulated since the start, or of the last increment.")] = (
+    pose_covariance: Annotated[str, typer.Option(help="accumulated since the start, or the last increment.")] = (
         "accumulated"
     ),
     correct_twist: Annotated[
         bool, typer.Option("--correct-twist", help="Subtract the predicted mean error from the twist.")
     ] = False,
     state: Annotated[
-        Path | None, typer.Option(help="File that keeps the state, and from which a restart continues.")
+        Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
     ] = None,
     vehicle: flags.VehicleName = "any",
     max_acceleration: flags.MaxAcceleration = None,
     max_turn: flags.MaxTurn = None,
-    depth: Annotated[int, typer.Option(help="Longest queue of a topic; older messages are dropped.", min=2)] = 10,
+    depth: Annotated[int, typer.Option(help="Length of the queue of a topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
     """Publish odometry with an honest covariance, live.
@@ -108,8 +106,8 @@ def doctor(
     topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Listen over Zenoh.")] = False,
     dds: Annotated[bool, typer.Option("--dds", help="Listen over DDS.")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="Listen by rclpy.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="Listen by rospy.")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Listen through rclpy.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="Listen through rospy.")] = False,
     odometry_type: Annotated[str, typer.Option(help="Type of a topic: odometry, pose, or pose_stamped.")] = "odometry",
     address: Annotated[str | None, typer.Option(help="Zenoh router.")] = None,
     domain: Annotated[int, typer.Option(help="ROS domain id.", min=0, max=232)] = 0,

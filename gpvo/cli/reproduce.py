@@ -13,7 +13,7 @@ from gpvo.cli.output import Json, print_json, progress
 def reproduce(
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", help="Folder of results; finished stages are kept, so that a second run goes on."),
+        typer.Option("-o", "--out", help="Folder of results. Finished stages are kept, and a second run continues."),
     ],
     quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
     seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,

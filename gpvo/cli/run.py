@@ -65,7 +65,7 @@ def run(
     truth_topic: flags.TruthTopic = None,
     truth_frame: flags.TruthFrame = None,
     keep_tracks: Annotated[
-        bool, typer.Option("--keep-tracks", help="Keep what odometry saw: 'gpvo twin' needs it.")
+        bool, typer.Option("--keep-tracks", help="Keep the tracks of the points; 'gpvo twin' needs them.")
     ] = False,
     view: Annotated[bool, typer.Option("--view", help="Watch it live in rerun (extra gpvo[viz]).")] = False,
     record_view: Annotated[Path | None, typer.Option(help="Write what --view would show to this .rrd file.")] = None,
@@ -173,6 +173,6 @@ def calibration(
     if json_:
         print_json({"run": str(run), **found})
         return
-    print("\n".join(found["findings"] or ["nothing found wrong between the cameras"]))
+    print("\n".join(found["findings"] or ["no calibration error was found between the cameras"]))
     if out is not None:
-        print(f"{out}: corrected calibration; bends that no turn or focal length explains remain")
+        print(f"{out}: corrected calibration; distortions that neither a rotation nor a focal length explains remain")

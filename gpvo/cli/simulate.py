@@ -55,7 +55,7 @@ def simulate(
     list_: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Setting of the scenario as key=value, with dots for tables. Repeatable."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Setting of the scenario, with dots for tables; repeatable."),
     ] = None,
     json_: Json = False,
 ) -> None:
@@ -148,7 +148,7 @@ def _assignment(text: str) -> tuple[str, Any]:
 
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise GpvoError(f"--set '{text}' is no key=value", cure="such as --set noise_sigma=0.05")
+        raise GpvoError(f"--set '{text}' is not key=value", cure="such as --set noise_sigma=0.05")
     try:
         return key.strip(), tomllib.loads(f"v = {value}")["v"]
     except tomllib.TOMLDecodeError:
@@ -166,5 +166,5 @@ def _seeds(text: str) -> list[int]:
                 raise ValueError
             out += range(a, b + 1)
     except ValueError:
-        raise GpvoError(f"--seeds '{text}' is no list of seeds", cure="such as 0..9 or 1,4,7") from None
+        raise GpvoError(f"--seeds '{text}' is not a list of seeds", cure="such as 0..9 or 1,4,7") from None
     return list(dict.fromkeys(out))

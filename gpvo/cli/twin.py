@@ -16,7 +16,7 @@ from gpvo.errors import GpvoError
 if TYPE_CHECKING:
     from gpvo.twin.replicate import TwinSettings
 
-Replicates = Annotated[int, typer.Option(min=2, max=1000, help="Twins of each run.")]
+Replicates = Annotated[int, typer.Option(min=2, max=1000, help="Twins per run.")]
 ToleranceOption = Annotated[
     str,
     typer.Option(
@@ -58,7 +58,7 @@ def twin(
 
     settings = settings_of(replicates, tolerance, seed, gap)
     if out is None and not against:
-        raise GpvoError("nowhere to put the twins", cure="give a folder with -o, or compare with --against")
+        raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")
     with nullcontext(out) if out is not None else TemporaryDirectory(prefix="gpvo-twins-") as folder:
         made = make_all(runs, Path(folder), settings, jobs)
         if against:

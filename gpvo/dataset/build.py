@@ -106,7 +106,7 @@ def build(
     """
     check_target(target)
     if waits not in ("drop", "keep"):
-        raise GpvoError(f"there is no way '{waits}' with waits", cure="drop or keep")
+        raise GpvoError(f"unknown treatment of waits: '{waits}'", cure="drop or keep")
     names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
         raise GpvoError(
@@ -182,7 +182,7 @@ def build_run(
     if align == "rotation" and truth is not None:
         truth = align_rotation(run.log, truth)
     elif align not in ("none", "rotation"):
-        raise GpvoError(f"there is no alignment '{align}'", cure="none or rotation")
+        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
     return build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, where=run.path)
 
 

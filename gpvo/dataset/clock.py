@@ -78,8 +78,8 @@ def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float, max_
     best = int(np.argmax(score))
     if score[best] < _MIN_CORRELATION:
         raise GpvoError(
-            f"the motions of log and truth do not resemble one another (correlation {score[best]:.2f})",
-            cure="is it the truth of this log? Else give --time-offset in seconds",
+            f"the motions of log and truth do not match (correlation {score[best]:.2f})",
+            cure="is it the truth of this log? If so, give --time-offset in seconds",
         )
     return float(offset[best])
 

@@ -114,7 +114,7 @@ def evaluate_run(
         raise SourceError(
             "ground truth and frames do not overlap in time",
             where=run.path,
-            cure="use --time-offset auto, or its own truth",
+            cure="use --time-offset auto, or give the truth of this run",
         )
     scored = without_wandering_truth(log, truth)
     errors = motion_errors(scored, truth)
@@ -176,7 +176,7 @@ def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
     if options.align == "rotation":
         truth = align_rotation(run.log, truth)
     elif options.align != "none":
-        raise GpvoError(f"there is no alignment '{options.align}'", cure="none or rotation")
+        raise GpvoError(f"unknown alignment '{options.align}'", cure="none or rotation")
     return truth, float(offset_s)
 
 

@@ -19,7 +19,7 @@ def require_picture(path: Path) -> None:
     """Raise GpvoError where the name's ending is no format that can be drawn."""
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix[1:].lower() not in known:
-        raise GpvoError("is no picture by its ending", where=path, cure=f"choose from {', '.join(known)}")
+        raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
 
 
 def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:

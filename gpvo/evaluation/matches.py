@@ -33,7 +33,7 @@ class MatchPicture:
 def match_pictures(source: Source, config: VoConfig, frames: Sequence[int]) -> list[MatchPicture]:
     """Pictures of the frames of these indices. Raises GpvoError for a frame that the sequence does not have."""
     if min(frames) < 0:
-        raise GpvoError(f"there is no frame {min(frames)}", where=source.path, cure="frames are counted from 0")
+        raise GpvoError(f"there is no frame {min(frames)}", where=source.path, cure="frames are numbered from 0")
     wanted, last, found = set(frames), max(frames), []
     for k, step in enumerate(steps(source, config)):
         if k in wanted:

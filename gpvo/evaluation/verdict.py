@@ -123,7 +123,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         )
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
-        yield f"The truth's noise outweighs the odometry's errors {where}: there the truth cannot tell."
+        yield f"The truth's noise outweighs the odometry's errors {where}: there it cannot judge them."
     if e.turned is not None:
         yield (
             f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg (mounting or calibration)."

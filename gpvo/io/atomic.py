@@ -77,7 +77,7 @@ class FolderLock:
         except OSError:
             self.release()
             cure = "wait for it, or choose another folder with -o"
-            raise SourceError("is being written by somebody else", where=where or path, cure=cure) from None
+            raise SourceError("is being written by another process", where=where or path, cure=cure) from None
 
     def release(self) -> None:
         """Let others write; a second time does nothing."""

@@ -135,7 +135,7 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
             out.append((integer_ns(stamp), name))
         except ValueError:
             known.unreadable += 1
-            known.note(f"{path.parent.name}/{path.name} line {number} is no 'stamp_ns,file'")
+            known.note(f"{path.parent.name}/{path.name} line {number} is not 'stamp_ns,file'")
     if not out:
         raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
     in_time = sorted(out, key=lambda line: line[0])

@@ -133,7 +133,7 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
     if rate_hz is not None and 1e-3 <= rate_hz <= 1e5 and len(numbers) == len(keys):
         return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
     raise SourceError(
-        "the image names are no stamps and there is no times.txt",
+        "the image names are not stamps, and there is no times.txt",
         where=path,
         cure="name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz",
     )

@@ -122,7 +122,7 @@ def read_foreign(
     p = Path(path)
     name = kind or guess_format(p)
     if name not in FORMATS:
-        raise SourceError(f"there is no format '{name}'", cure=f"choose one of {', '.join(FORMATS)}")
+        raise SourceError(f"unknown format '{name}'", cure=f"choose one of {', '.join(FORMATS)}")
     if not p.exists():
         raise SourceError("no such file", where=p)
     if name == "tum":

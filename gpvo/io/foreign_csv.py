@@ -134,7 +134,7 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     for column, target in mapping.items():
         if target not in TARGETS:
             raise SourceError(
-                f"--map {column}={target}: there is no '{target}'",
+                f"--map {column}={target}: unknown name '{target}'",
                 where=path,
                 cure="targets are t_s, t_ms, t_us, t_ns, p_x.., q_x..q_w, cov_00..cov_55, n_inliers and the like",
             )

@@ -152,7 +152,7 @@ def open_source(path: str | Path, kind: str | None = None, **options: Any) -> So
     """
     kinds = source_kinds()
     if kind is not None and kind not in kinds:
-        raise SourceError(f"there is no source '{kind}'", cure=f"choose one of {', '.join(kinds)}")
+        raise SourceError(f"unknown source '{kind}'", cure=f"choose one of {', '.join(kinds)}")
     name = kind if kind is not None else guess(path)
     if not Path(path).exists():
         raise SourceError("no such file or folder", where=path)

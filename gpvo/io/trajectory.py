@@ -93,7 +93,7 @@ def read_kitti_poses(path: str | Path) -> Array:
     deviation = np.abs(M[:, :, :3] @ np.swapaxes(M[:, :, :3], 1, 2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((deviation > _UNIT_TOLERANCE) | (np.linalg.det(M[:, :, :3]) < 0))
     if len(bad):
-        raise SourceError(f"pose {bad[0] + 1} is no rigid transform", where=p, cure="12 numbers: rows of [R | t]")
+        raise SourceError(f"pose {bad[0] + 1} is not a rigid transform", where=p, cure="12 numbers: rows of [R | t]")
     return se3.orthonormalise(T)
 
 

@@ -42,7 +42,7 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}): {inputs}",
-            f"* mean that a filter takes off: {_steady(choices)}",
+            f"* mean that a filter subtracts: {_steady(choices)}",
         ]
     )
 
@@ -76,10 +76,10 @@ def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
                 f"* On flights like `{fold['held_out']}`: left out of training, it was {wrong} (NEES/dof {found:.3g})."
             )
         elif inside < 0.9:
-            lines.append(f"* On flights like `{fold['held_out']}`: left out, {100 * inside:.0f} % of it was in domain.")
+            lines.append(f"* On flights like `{fold['held_out']}`: only {100 * inside:.0f} % of it was in domain.")
     if h.get("simulated_truth"):
         lines.append("* As proof that a vehicle is safe: its truth was simulated.")
-    return "\n".join(["## Where not to use it", "", *lines, "", "`gpvo check MODEL RUN` tells before a flight."])
+    return "\n".join(["## Where not to use it", "", *lines, "", "`gpvo check MODEL RUN` checks this before a flight."])
 
 
 def _steady(choices: Mapping[str, Any]) -> str:
@@ -105,8 +105,8 @@ def _simulated(h: Mapping[str, Any]) -> str:
         told.append(f"* {s['twins']} twins of `{s['of']}`; tolerance of the rig `{s['tolerance_name']}` ({rig}){gap}")
     if not told:
         return ""
-    head = "Truth was simulated: these sequences are twins, made of the tracks of a run. Twins of one run left out"
-    return "\n".join(["\n", f"{head} in turn show how far the fit goes, not how far another flight is.", "", *told])
+    head = "The truth was simulated: these sequences are twins, made from the tracks of a run. Leaving out twins of one"
+    return "\n".join(["\n", f"{head} run tests the fit, not how well it carries over to another flight.", "", *told])
 
 
 def _sequences(h: Mapping[str, Any]) -> str:
@@ -199,7 +199,7 @@ def _gain_of_gp(d: Mapping[str, float | None]) -> str:
         verdict = "the Gaussian process gains"
     else:
         loses = low is not None and low > 0
-        verdict = "the Gaussian process loses" if loses else "what the Gaussian process changes may be chance"
+        verdict = "the Gaussian process loses" if loses else "the Gaussian process changes nothing beyond chance"
     return f"`learned` minus `base` (the Gaussian process held at its mean): {_difference(d)}: {verdict}."
 
 
@@ -217,7 +217,7 @@ def _calibration(h: Mapping[str, Any]) -> str:
             f"By {c['by']} ({c['groups']} left out in turn).{marked}",
             _tails(h["calibration"]),
             f"Half widths in sigma that covered left-out data on the first axis: {widths}.",
-            *(["These sequences differ in the camera's calibration; errors of that are a part of their own."] * apart),
+            *(["These sequences differ in the camera's calibration; its errors are a part of their own."] * apart),
         ]
     )
 

@@ -26,7 +26,7 @@ def map_jobs(
     if backend == "dask":
         return _told(_on_dask(function, jobs_arguments, scheduler), on_done)
     if backend != "local":
-        raise GpvoError(f"there is no backend '{backend}'", cure="local or dask")
+        raise GpvoError(f"unknown backend '{backend}'", cure="local or dask")
     if jobs == 1 or len(jobs_arguments) < 2:
         return _told((function(*arguments) for arguments in jobs_arguments), on_done)
     from joblib import Parallel, delayed

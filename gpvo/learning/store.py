@@ -63,9 +63,9 @@ def training_rows(path: str | Path) -> list[TrainingSet]:
     header = modelfile.read_header(path)
     if not rows_path(path).is_file():
         raise ModelError(
-            "the training rows are not beside the model", where=rows_path(path), cure="train anew from all runs"
+            "the training rows are not beside the model", where=rows_path(path), cure="train again from all runs"
         )
     sets = read_sets(rows_path(path))
     if training_digest(sets) != header.get("training_digest"):
-        raise ModelError("holds rows of another model", where=rows_path(path), cure="train anew from all runs")
+        raise ModelError("holds rows of another model", where=rows_path(path), cure="train again from all runs")
     return sets

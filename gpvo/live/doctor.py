@@ -169,7 +169,7 @@ def _stamps(s: Stated) -> list[Finding]:
     if len(good) and good.max() > 10 * np.median(good):
         what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"
         out.append(
-            Finding("stamp-gap", what, "what covers a gap is no measurement: the first message after it must say so")
+            Finding("stamp-gap", what, "what covers a gap is not a measurement: the first message after it must say so")
         )
     return out
 

@@ -27,7 +27,7 @@ def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]
         Where the path is no bag, or has no such topic.
     """
     if not path.exists() or not is_bag(path):
-        raise SourceError("is no bag", where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
+        raise SourceError("is not a bag", where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
     with open_bag(path) as reader:
         found = list(topics_of(reader, POSE_TYPES))
         if not found or (topic is not None and topic not in found):

@@ -102,7 +102,7 @@ def make_stage(settings: LiveSettings) -> Stage:
     if settings.odometry is not None:
         return PoseStage(settings.odometry)
     if settings.replay is None:
-        raise GpvoError("what comes in?", cure="give --stereo LEFT RIGHT or --odometry TOPIC")
+        raise GpvoError("no input was given", cure="give --stereo LEFT RIGHT or --odometry TOPIC")
     return PoseStage(odometry_topic(settings.replay))
 
 
@@ -130,7 +130,7 @@ def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
         from gpvo.live.ros_wire import Ros1Wire, Ros2Wire
 
         return Ros1Wire() if name == "ros1" else Ros2Wire()
-    raise GpvoError(f"there is no transport '{name}'", cure=f"choose {', '.join(WIRES)}")
+    raise GpvoError(f"unknown transport '{name}'", cure=f"choose {', '.join(WIRES)}")
 
 
 def _arrivals(

@@ -39,5 +39,5 @@ def load_state(path: Path | None) -> State | None:
         if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
             raise ValueError("it holds an impossible scale")
     except (GpvoError, ValueError, KeyError, TypeError) as error:
-        raise GpvoError(f"is no state of gpvo live: {error}", where=path, cure="remove it to begin anew") from None
+        raise GpvoError(f"is not a state file of gpvo live: {error}", where=path, cure="remove it") from None
     return State(T, C, scale)

@@ -307,7 +307,7 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
             out[name] = None
         else:
             raise GpvoError(
-                f"there is no feature '{name}'",
+                f"unknown feature '{name}'",
                 cure=f"thesis, full, or any of: {', '.join(groups())}, or a column of them",
             )
     if not out:

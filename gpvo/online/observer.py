@@ -161,7 +161,7 @@ class Window:
             return None
         match = _PATTERN.fullmatch(target)
         if match is None or (match[1] == "window") != (match[3] == "s") or float(match[2]) <= 0:
-            raise GpvoError(f"there is no target '{target}'", cure="frame, window:1s, length:1m or position")
+            raise GpvoError(f"unknown target '{target}'", cure="frame, window:1s, length:1m or position")
         return cls(match[1], float(match[2]))
 
     def step(self, record: VoRecord) -> VoRecord | None:

@@ -61,7 +61,7 @@ class ArraySpec:
         if self.semidefinite and not all(_is_semidefinite(C) for C in array.reshape(-1, *array.shape[-2:])):
             return "is not symmetric positive semidefinite"
         if self.unit_diagonal and np.abs(np.diagonal(array, axis1=-2, axis2=-1) - 1.0).max() > 1e-6:
-            return "is no correlation: its diagonal is not one"
+            return "is not a correlation: its diagonal is not one"
         return ""
 
     def _fits(self, shape: tuple[int, ...], d: int | None) -> bool:

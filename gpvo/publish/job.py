@@ -126,7 +126,7 @@ def _target(settings: PublishSettings) -> str | None:
     told = None if settings.out is None else _SUFFIXES.get(settings.out.suffix.lower())
     if settings.to in TARGETS and told not in (None, settings.to):
         raise GpvoError(
-            f"is no name for --to {settings.to}", where=settings.out, cure=f"use --to {told}, or another -o"
+            f"is not a file name for --to {settings.to}", where=settings.out, cure=f"use --to {told}, or another -o"
         )
     return settings.to or told
 

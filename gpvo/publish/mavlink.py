@@ -186,7 +186,7 @@ class Link:
         kind, _, rest = self.address.partition(":")
         place, _, number = rest.rpartition(":")
         if kind not in ("udp", "serial") or not place or not number.isdecimal():
-            raise GpvoError(f"'{self.address}' is no address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
+            raise GpvoError(f"'{self.address}' is not an address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
         if kind == "udp" and not 1 <= int(number) <= 65535:
             raise GpvoError(f"'{self.address}' has no port of UDP", cure="give one of 1 to 65535")
         self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))

@@ -36,12 +36,12 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.seeds < 0 or self.points_seeds < 0 or self.seeds + self.points_seeds == 0:
-            raise GpvoError("there is nothing to fly", cure="--seeds or --points-seeds above 0")
+            raise GpvoError("no flight was asked for", cure="--seeds or --points-seeds above 0")
         if self.data is not None and not self.data.is_dir():
             raise GpvoError("no such folder", where=self.data, cure="--data FOLDER, or set GPVO_DATA")
         known = list(dict.fromkeys(name for e in ALL for name in (e.table, e.key)))
         if unknown := [name for name in self.only if name not in known]:
-            raise GpvoError(f"there is no experiment '{unknown[0]}'", cure=f"one of: {', '.join(known)}")
+            raise GpvoError(f"unknown experiment '{unknown[0]}'", cure=f"one of: {', '.join(known)}")
 
     @classmethod
     def quick(cls, **given: Any) -> Plan:

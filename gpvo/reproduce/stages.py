@@ -104,7 +104,7 @@ def only_user(root: Path) -> Iterator[None]:
     try:
         lock = FolderLock(folder)
     except SourceError:
-        raise GpvoError("another reproduction is at work here", where=root, cure="give another --out") from None
+        raise GpvoError("another reproduction is running here", where=root, cure="give another --out") from None
     try:
         yield
     finally:

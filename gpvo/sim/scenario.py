@@ -165,7 +165,7 @@ def _put(table: dict[str, Any], key: str, value: Any) -> None:
         return
     inner = table.setdefault(head, {})
     if not isinstance(inner, dict):
-        raise GpvoError(f"'{head}' is no table", cure=f"set {head} itself")
+        raise GpvoError(f"'{head}' is not a table", cure=f"set {head} itself")
     _put(inner, rest, value)
 
 

@@ -126,7 +126,7 @@ def _is_finished(target: Path, resolved: str) -> bool:
         )
     if target.is_dir() and not any(target.iterdir()):
         return False
-    raise GpvoError("exists and is no simulated sequence", where=target, cure="give another --out")
+    raise GpvoError("exists and is not a simulated sequence", where=target, cure="give another --out")
 
 
 def _difference(text: str, resolved: str) -> str:

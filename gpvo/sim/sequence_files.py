@@ -148,5 +148,5 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
 def _read(file: Path) -> NDArray[np.uint8]:
     image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise GpvoError("is no picture", where=file)
+        raise GpvoError("is not an image", where=file)
     return np.asarray(image, np.uint8)

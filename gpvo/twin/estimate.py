@@ -68,9 +68,7 @@ def estimate(path: Path) -> Original:
     seen = Observations(camera, frame, track, uvd, tracks.is_inlier & ~repeats[frame])
     structure = without_loose_frames(adjust(seen, run.log.trajectory()), seen, t_ns)
     if not np.isfinite(structure.residual_px).all():
-        raise SourceError(
-            "its structure cannot be estimated: the fit does not hold", where=path, cure="look at the run"
-        )
+        raise SourceError("its structure cannot be estimated: the fit fails", where=path, cure="look at the run")
     neighbours = Neighbours.of(seen, structure)
     return Original(run, config_of(path), rig, seen, structure, _noise(seen, structure), neighbours, first, repeats)
 

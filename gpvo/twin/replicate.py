@@ -179,10 +179,10 @@ def read_tolerance(text: str) -> tuple[str, Tolerance]:
     known = {f.name for f in fields(Tolerance)} - {"distortion"}
     cure = f"give one of {', '.join(TOLERANCES)}, or a TOML file with {', '.join(sorted(known))}"
     if not path.is_file():
-        raise GpvoError(f"there is no tolerance '{text}'", cure=cure)
+        raise GpvoError(f"unknown tolerance '{text}'", cure=cure)
     values = read_toml(path)
     if not values or set(values) - known or not all(_is_small(v) for v in values.values()):
-        raise GpvoError("is no tolerance: numbers from 0 to 0.2", where=path, cure=cure)
+        raise GpvoError("does not describe a tolerance: numbers from 0 to 0.2", where=path, cure=cure)
     return path.stem, Tolerance(**{k: float(v) for k, v in values.items()})
 
 

@@ -17,7 +17,7 @@ _CURES = {
     "frozen": "the right picture repeats itself while the left one changes; look at the right camera's driver",
     "late": "left and right are a frame apart; pair them by time stamp, or trigger both cameras together",
     "swapped": "most points lie behind the cameras; exchange left and right",
-    "rows": "most points are in another row on the right; calibrate the pair anew",
+    "rows": "most points are in another row on the right; calibrate the pair again",
     "few": "most points are not found in the right picture; look at its exposure, focus and lens",
     "light": "the right picture has other light than the left one; give both cameras the same exposure and gain",
     "size": "the calibration is of pictures twice as large; scale it, or use pictures of full size",

@@ -92,7 +92,7 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
         mean, covariance = np.array(read["mean"], np.float64), np.array(read["covariance"], np.float64)
         probability, of = float(read["probability"]), np.array(read["camera_px"], np.float64)
     except (KeyError, TypeError, ValueError):
-        raise SourceError("is no state of a calibration", where=path, cure=f"give the {STATE_FILE} of a run") from None
+        raise SourceError("is not a calibration state", where=path, cure=f"give the {STATE_FILE} of a run") from None
     n = 2 * N_TERMS
     fits = mean.shape == (n,) and covariance.shape == (n, n) and 0 <= probability <= 1
     # Comparisons with NaN are false.

@@ -191,7 +191,7 @@ def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
         (["{log}", "-o", "{out}", "--time-offset", "auto"], "give --truth"),
         (["{log}", "-o", "{out}", "--map", "abc"], "--map is 'abc'"),
         (["{log}", "-o", "{out}", "--truth-map", "abc"], "--truth-map is 'abc'"),
-        (["{log}", "-o", "{out}", "--format", "xml"], "there is no format 'xml'"),
+        (["{log}", "-o", "{out}", "--format", "xml"], "unknown format 'xml'"),
         (["{log}", "-o", "{out}", "--truth-sigma", "1"], "--truth-sigma is '1'"),
         (["{log}", "-o", "{out}", "--vehicle", "boat"], "--vehicle is 'boat'"),
         (["{log}", "-o", "{out}", "--max-turn", "0"], "--max-turn is 0"),

@@ -68,7 +68,7 @@ def test_motions_of_something_else():
     rng = np.random.default_rng(0)
     s = np.arange(0, 40, 0.05)
     other = se3.from_rt(np.tile(np.eye(3), (len(s), 1, 1)), np.cumsum(rng.normal(size=(len(s), 3)), axis=0))
-    with pytest.raises(GpvoError, match="do not resemble"):
+    with pytest.raises(GpvoError, match="do not match"):
         estimate_time_offset(log_of(s, other), truth_of(np.arange(0, 40, 0.01)))
     with pytest.raises(GpvoError, match="too few"):
         estimate_time_offset(log_of(s[:5], path(s[:5])), truth_of(s))

@@ -134,8 +134,8 @@ def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
         (("--mean", "magic"), "steady, predicted, absorb"),
         (("--policies", "best"), "unknown policy"),
         (("--model", "nowhere.gpvo"), "nowhere.gpvo"),
-        (("--plot", "fuse.xyz"), "fuse.xyz: is no picture.*png"),
-        (("--plot", "fuse"), "fuse: is no picture.*png"),
+        (("--plot", "fuse.xyz"), "fuse.xyz: does not have the suffix of an image.*png"),
+        (("--plot", "fuse"), "fuse: does not have the suffix of an image.*png"),
     ],
 )
 def test_bad_options_are_one_line(runs: list[Path], arguments: tuple[str, str], words: str) -> None:
@@ -226,7 +226,7 @@ def test_the_name_tells_what_to_publish(
 
 @pytest.mark.parametrize("to, name", [("mcap", "x.tlog"), ("bag", "x.mcap"), ("mavlink", "x.bag")])
 def test_a_name_for_something_else_is_refused(runs: list[Path], tmp_path: Path, to: str, name: str) -> None:
-    with pytest.raises(GpvoError, match=f"{name}: is no name for --to {to}"):
+    with pytest.raises(GpvoError, match=f"{name}: is not a file name for --to {to}"):
         _run("publish", runs[0], "--to", to, "-o", tmp_path / name)
     assert not list(tmp_path.iterdir())
 

@@ -128,7 +128,7 @@ def test_a_full_disk_names_the_file_and_leaves_nothing_half_written(
 def test_two_writers_do_not_mix(log: VoLog, tmp_path: Path) -> None:
     first = RunWriter(tmp_path / "run", camera=log.camera)
     first.append(log.records[0])
-    with pytest.raises(SourceError, match="being written by somebody else"):
+    with pytest.raises(SourceError, match="being written by another process"):
         RunWriter(tmp_path / "run", camera=log.camera)
     for record in log.records[1:]:
         first.append(record)

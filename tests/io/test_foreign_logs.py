@@ -211,7 +211,7 @@ def test_a_column_mapped_to_seconds_is_seconds(tmp_path):
 
 def test_bad_mapping(tmp_path):
     path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
-    with pytest.raises(SourceError, match="there is no 'speed'"):
+    with pytest.raises(SourceError, match="unknown name 'speed'"):
         read_foreign(path, mapping={"p_x": "speed"})
     with pytest.raises(SourceError, match="no column 'foo'"):
         read_foreign(path, mapping={"foo": "p_x"})

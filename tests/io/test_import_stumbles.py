@@ -83,7 +83,7 @@ def test_calibration_takes_ros_camera_info_of_both_cameras(tmp_path: Path) -> No
         assert rig.baseline_m == pytest.approx(0.12)
         assert (rig.left.width, rig.left.fx_px) == (640, 400.0)
     (tmp_path / "right.yaml").unlink()
-    with pytest.raises(CalibrationError, match=r"right\.yaml does not lie beside"):
+    with pytest.raises(CalibrationError, match=r"right\.yaml is not beside"):
         read_stereo_yaml(tmp_path / "left.yaml")
 
 

@@ -280,7 +280,7 @@ def test_nothing_there_and_nothing_known(tmp_path):
     (tmp_path / "readme.md").write_text("hello")
     with pytest.raises(SourceError, match="not recognised"):
         open_source(tmp_path)
-    with pytest.raises(SourceError, match="there is no source 'x'"):
+    with pytest.raises(SourceError, match="unknown source 'x'"):
         open_source(tmp_path, kind="x")
     with pytest.raises(SourceError, match="no option 'colour'"):
         open_source(seq.write_folder(tmp_path / "s"), colour=True)

@@ -79,7 +79,7 @@ def test_bad_kitti_and_times(tmp_path):
     with pytest.raises(SourceError, match="line 2 holds 11 numbers"):
         read_kitti_poses(path)
     path.write_text("2 0 0 0 0 1 0 0 0 0 1 0\n")
-    with pytest.raises(SourceError, match="pose 1 is no rigid transform"):
+    with pytest.raises(SourceError, match="pose 1 is not a rigid transform"):
         read_kitti_poses(path)
     path.write_text("0.0\n0.1 0.2\n")
     with pytest.raises(SourceError, match="line 2"):

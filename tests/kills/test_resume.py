@@ -152,5 +152,5 @@ def test_a_source_that_changed_is_told(tmp_path: Path, monkeypatch: pytest.Monke
     source = open_source(tracks(tmp_path))
     done = [r.record for _, r in zip(range(3), runner.steps(source, runner.VoConfig()))]
     shifted = [type(r)(r.t_ns + 1, r.t_prev_ns + 1, r.status, r.T_prev_cur) for r in done]
-    with pytest.raises(SourceError, match="not what the run that broke off was of"):
+    with pytest.raises(SourceError, match="not the source of the interrupted run"):
         list(runner.steps(source, runner.VoConfig(), done=shifted))

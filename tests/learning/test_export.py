@@ -323,8 +323,8 @@ def test_the_name_tells_the_format_and_does_not_contradict_it(tmp_path: Path) ->
     CliRunner().invoke(app, ["export", str(model), "-o", str(tmp_path / "x.h")], catch_exceptions=False)
     assert "gpvo_predict" in (tmp_path / "x.h").read_text()
     for words, message in (
-        (["--to", "c", "-o", str(tmp_path / "x.onnx")], "x.onnx: is no name for --to c"),
-        (["--to", "onnx", "-o", str(tmp_path / "y.h")], "y.h: is no name for --to onnx"),
+        (["--to", "c", "-o", str(tmp_path / "x.onnx")], "x.onnx: is not a file name for --to c"),
+        (["--to", "onnx", "-o", str(tmp_path / "y.h")], "y.h: is not a file name for --to onnx"),
         (["-o", str(tmp_path / "z")], "the format is not given"),
     ):
         with pytest.raises(GpvoError, match=message):
@@ -332,7 +332,7 @@ def test_the_name_tells_the_format_and_does_not_contradict_it(tmp_path: Path) ->
 
 
 def test_predictions_go_to_parquet_alone(tmp_path: Path) -> None:
-    with pytest.raises(GpvoError, match=r"p\.csv: is no name for a Parquet file"):
+    with pytest.raises(GpvoError, match=r"p\.csv: does not have the suffix of a Parquet file"):
         CliRunner().invoke(app, ["predict", "m.gpvo", "run", "-o", str(tmp_path / "p.csv")], catch_exceptions=False)
 
 

@@ -292,7 +292,7 @@ def test_an_update_keeps_the_settings_of_the_model(tmp_path):
 def test_a_model_of_positions_is_not_updated(tmp_path):
     path = tmp_path / "m.gpvo"
     save_model(train_sets(training_sets(range(3), n=120), QUICK, judge=False), path)
-    with pytest.raises(GpvoError, match="train anew"):
+    with pytest.raises(GpvoError, match="train again"):
         _train([tmp_path], asdict(replace(QUICK, target="position")), path)
 
 

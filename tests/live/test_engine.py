@@ -95,7 +95,7 @@ def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
     np.testing.assert_allclose(resumed.T_odom_body, stopped.T_odom_body, atol=1e-9)
     assert np.linalg.eigvalsh(resumed.pose_covariance - stopped.pose_covariance).min() > 1e-3
     (tmp_path / "state.json").write_text("[]")
-    with pytest.raises(GpvoError, match="no state of gpvo live"):
+    with pytest.raises(GpvoError, match="not a state file of gpvo live"):
         engine(settings)
 
 

@@ -104,7 +104,7 @@ def test_resolved_scenario_flies_the_same_again(quick, tmp_path):
 def test_one_writer_at_a_time(quick, tmp_path):
     with (
         sequence._only_writer(tmp_path / "seq"),
-        pytest.raises(GpvoError, match="seq: is being written by somebody else"),
+        pytest.raises(GpvoError, match="seq: is being written by another process"),
     ):
         sequence.simulate(quick(), 1, tmp_path / "seq")
     assert sequence.simulate(quick(), 1, tmp_path / "seq").redone

@@ -25,7 +25,7 @@ def format_of(to: str | None, path: str | os.PathLike[str] | None) -> str:
     if chosen not in FORMATS:
         raise GpvoError(f"cannot export to '{chosen}'", cure=f"one of: {', '.join(FORMATS)}")
     if told not in (None, chosen):
-        raise GpvoError(f"is no name for --to {chosen}", where=path, cure=f"use --to {told}, or another -o")
+        raise GpvoError(f"is not a file name for --to {chosen}", where=path, cure=f"use --to {told}, or another -o")
     return chosen
 
 

@@ -48,6 +48,6 @@ def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Re
     else:
         outside = {entry.name: entry for entry in entry_points(group="gpvo.regressors")}
         if name not in outside:
-            raise GpvoError(f"there is no regressor '{name}'", cure=f"one of: auto, {', '.join(regressor_names())}")
+            raise GpvoError(f"unknown regressor '{name}'", cure=f"one of: auto, {', '.join(regressor_names())}")
         found = outside[name].load()
     return found(**options)
