@@ -23,7 +23,8 @@ sys.path.insert(0, str(_TESTS))
 from gpvo.learning.logvariance import fit_log_variance  # noqa: E402
 from gpvo.learning.regressors import get_regressor  # noqa: E402
 from gpvo.online import modelfile  # noqa: E402
-from gpvo.online.basis import SharedBasis  # noqa: E402
+from gpvo.online.projected import NoisyGP, ProjectedGP  # noqa: E402
+from gpvo.online.rowplan import RowPlan  # noqa: E402
 from synthetic_errors import Problem, gaussian_nll, make_problem  # noqa: E402
 
 Results = dict[str, dict[str, Any]]
@@ -35,12 +36,13 @@ N = 2000
 class Fit:
     """GPs of the mean and of the log noise variance of six outputs."""
 
-    basis: SharedBasis
+    mean: ProjectedGP
+    log_noise: ProjectedGP
 
     def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and total variance, (n, 6) each."""
-        out = self.basis.predict(X)
-        return out.mean, np.exp(out.log_noise_var) + out.epistemic_var
+        (mean, epistemic_var), (log_noise, spread) = (gp.evaluate(X) for gp in (self.mean, self.log_noise))
+        return mean, np.exp(log_noise + 0.5 * spread) + epistemic_var
 
 
 def fit_mean_and_noise(problem: Problem) -> Fit:
@@ -52,8 +54,7 @@ def fit_mean_and_noise(problem: Problem) -> Fit:
     noise = fit_log_variance(U, left / left.mean(axis=0), ones, problem.run)
     stated, spread = noise.evaluate(U)
     level = np.log((left * np.exp(-stated - 0.5 * spread)).mean(axis=0))
-    noise = replace(noise, centre=centre, lengthscale=noise.lengthscale * scale)
-    return Fit(SharedBasis(mean.gp, noise, level))
+    return Fit(mean.gp, replace(noise, centre=centre, lengthscale=noise.lengthscale * scale, offset=level))
 
 
 def entry(value: float, unit: str, peer: str | None = None, peer_value: float | None = None) -> dict[str, Any]:
@@ -75,7 +76,7 @@ def microseconds(call: Callable[[np.ndarray], Any], rows: np.ndarray, *, repeats
 
 def prediction(fit: Fit, rows: np.ndarray) -> Results:
     """One row: mean, aleatoric and epistemic variance of six outputs; mean and standard deviation by the peers."""
-    ours = microseconds(fit.basis.predict_one, rows, repeats=5000, warm_up=500)
+    ours = microseconds(RowPlan((fit.mean, fit.log_noise)), rows, repeats=5000, warm_up=500)
     few = make_problem(N, 1)
     from_sklearn = microseconds(sklearn_predictor(few), rows, repeats=100, warm_up=5)
     from_gpytorch = microseconds(gpytorch_predictor(few), rows, repeats=100, warm_up=20)
@@ -126,7 +127,7 @@ def loading(fit: Fit) -> Results:
     """Import of everything that flies, the model file, and one prediction, in a fresh interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.gpvo"
-        modelfile.save(path, fit.basis.to_arrays(), {"features": []})
+        modelfile.save(path, NoisyGP(fit.mean, np.zeros(6)).to_arrays(""), {"features": []})
         code = f"""
 import json, time
 def megabytes():
@@ -135,8 +136,8 @@ before, begin = megabytes(), time.perf_counter()
 import numpy as np
 import gpvo.online.predictor
 from gpvo.online import modelfile
-from gpvo.online.basis import SharedBasis
-SharedBasis.from_arrays(modelfile.load({str(path)!r})[0]).predict_one(np.zeros(8))
+from gpvo.online.projected import NoisyGP
+NoisyGP.from_arrays(modelfile.load({str(path)!r})[0], "").predict(np.zeros((1, 8)))
 print(json.dumps([time.perf_counter() - begin, megabytes() - before]))
 """
         found = np.array([child(code) for _ in range(7)])

@@ -42,7 +42,7 @@ from bench.experiment_flights import (
     with_accidents,
 )
 
-LEARNED_WHITE, LEARNED_PREDICTED = "learned_white", "learned_predicted"
+LEARNED_WHITE = "learned_white"
 _POINTS_S, _PICTURES_S = 60.0, 25.0
 _HONEST = (0.7, 1.5)
 _COLUMNS = (
@@ -75,7 +75,6 @@ def experiment(
     """Tune the constants on the training runs and filter the others under every policy.
 
     ``learned_white`` is the learned covariance taken as independent from motion to motion: what the parts are worth.
-    ``learned_predicted`` takes the predicted mean off in place of the steady one: what that costs or brings.
     """
     options = FuseOptions(history_s=0.0)
     constants = constants_of(training)
@@ -93,10 +92,6 @@ def experiment(
         traces.append(trace_of(flight, fused))
 
     result = study(flights, policies, options, constants=constants, on_run=keep)
-    predictor = load_predictor(model, "predicted")
-    flights = [flight_of(r, predictor) for r in test]
-    otherwise = study(flights, {LEARNED_PREDICTED: LearnedPolicy(LEARNED_PREDICTED, mean="predicted")}, options)
-    result = replace(result, scores={**result.scores, **otherwise.scores})
     calm = [r for r in test if not with_accidents(r)]
     return Outcome(title, FusionReport(result, tuple(traces), ()), rise(calm))
 

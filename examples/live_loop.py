@@ -19,7 +19,7 @@ from gpvo.vo.odometry import StereoOdometry
 def main(sequence: str, model: str, address: str) -> None:
     source = open_source(sequence)
     odometry = StereoOdometry(source.camera, mask=source.mask)
-    predictor = Predictor.load(model, for_filter=True)
+    predictor = Predictor.load(model)
     predictor.reset(source.camera)
     builder = OdometryBuilder(source.mounting.T_body_cam, method="pointing_matching")
     link = Link(address)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,10 +27,7 @@ def fuse(
     gate: Annotated[
         str, typer.Option(help="What happens to a measurement beyond 3 sigma: discard or inflate.")
     ] = "discard",
-    mean: Annotated[
-        str,
-        typer.Option(help="Mean error to subtract: steady (one rule for all frames), predicted, or absorb (none)."),
-    ] = "steady",
+    mean: Annotated[str, typer.Option(hidden=True)] = "",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
@@ -43,13 +40,14 @@ def fuse(
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
     from gpvo.evaluation.fusion_report import document, write_log
     from gpvo.filters.gate import Gate
-    from gpvo.filters.policies import LEARNED, MeanUse
+    from gpvo.filters.policies import LEARNED
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
-    one_of("--mean", mean, get_args(MeanUse))
+    if mean:
+        print("gpvo: --mean changes nothing any more: a model states no mean of the error", file=sys.stderr)
     if plot is not None:
         from gpvo.evaluation.fusion_plot import plot_fusion, require_picture
 
@@ -60,7 +58,6 @@ def fuse(
         model=model,
         training=tuple(train or ()),
         use_imu=not no_imu,
-        mean=cast(MeanUse, mean),
         options=FuseOptions(
             init="static" if init == "static" else "truth",
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -351,10 +352,7 @@ def export(
     model: Model,
     to: Annotated[str | None, typer.Option(help="onnx or c; guessed from the suffix of --out.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write; by default beside the model.")] = None,
-    for_filter: Annotated[
-        bool,
-        typer.Option("--for-filter", help="Export the model for filters, with the mean that a filter may subtract."),
-    ] = False,
+    for_filter: Annotated[bool, typer.Option("--for-filter", hidden=True)] = False,
     prefix: Annotated[
         str, typer.Option(help="Prefix of every C symbol, so that several models fit into one program.")
     ] = "gpvo",
@@ -366,7 +364,8 @@ def export(
     from gpvo.learning.export import SUFFIXES, export_model, format_of
 
     chosen = format_of(to, out)
-    name = f"{model.stem}-for-filter" if for_filter else model.stem
-    target = out or model.with_name(name + SUFFIXES[chosen])
-    export_model(model, target, chosen, for_filter=for_filter, prefix=prefix)
+    if for_filter:
+        print("gpvo: --for-filter changes nothing any more: a model states no mean of the error", file=sys.stderr)
+    target = out or model.with_name(model.stem + SUFFIXES[chosen])
+    export_model(model, target, chosen, prefix=prefix)
     print(f"{target}: {target.stat().st_size} bytes")

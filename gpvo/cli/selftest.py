@@ -147,7 +147,7 @@ def _messages(bench: _Bench) -> str:
     from gpvo.publish.odometry import OdometryBuilder
 
     run = read_run(bench.runs[-1])
-    predictor, builder = Predictor.load(bench.model, for_filter=True), OdometryBuilder(run.mounting.T_body_cam)
+    predictor, builder = Predictor.load(bench.model), OdometryBuilder(run.mounting.T_body_cam)
     predictor.reset(run.log.camera)
     messages = [builder.step(record, predictor.step(record)) for record in run.log]
     return f"{len(messages)} odometry messages"

@@ -20,7 +20,6 @@ from gpvo.filters.policies import (
     LEARNED,
     POLICIES,
     STATED,
-    MeanUse,
     constant_from_errors,
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, begin
@@ -33,9 +32,9 @@ from gpvo.online.predictor import Predictor
 from gpvo.types import IMPORTED, Array, TruthLog
 
 
-def load_predictor(path: str | Path, mean: MeanUse = "steady") -> Predictor:
-    """A model that predicts the error of single motions, with the mean that is to be used."""
-    predictor = Predictor.load(path, for_filter=mean != "predicted")
+def load_predictor(path: str | Path) -> Predictor:
+    """A model that predicts the error of single motions."""
+    predictor = Predictor.load(path)
     predictor.require_motions(path)
     return predictor
 
@@ -124,7 +123,6 @@ class FusionSettings:
     model: Path | None = None
     training: tuple[Path, ...] = ()
     use_imu: bool = True
-    mean: MeanUse = "steady"
     options: FuseOptions = field(default_factory=FuseOptions)
 
 
@@ -167,7 +165,7 @@ def fuse_runs(
     unknown = [p for p in settings.policies if p not in known]
     if unknown:
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(known)}")
-    predictor = None if settings.model is None else load_predictor(settings.model, settings.mean)
+    predictor = None if settings.model is None else load_predictor(settings.model)
     runs = [read_run(path) for path in paths]
     if not settings.policies:
         imported = any(IMPORTED in run.log.methods for run in runs)
@@ -181,9 +179,7 @@ def fuse_runs(
             warnings += [f"{name}: the model does not fit: {problem}" for problem in check(predictor, run).problems]
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
-    # What a run stores has the predicted mean, which is not for filters.
-    mean = "absorb" if predictor is None and settings.mean == "steady" else settings.mean
-    policies = make_policies(constants, names=settings.policies, learned=learned, mean=mean)
+    policies = make_policies(constants, names=settings.policies, learned=learned)
     traces: list[Trace] = []
     unscored: dict[tuple[str, str], Scores] = {}
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -15,9 +15,6 @@ TRIANGULATION, POINTING_MATCHING, LEARNED = "triangulation", "pointing_matching"
 POLICIES = (CONSTANT, CONSTANT_BEST, CONSTANT_HINDSIGHT, TRIANGULATION, POINTING_MATCHING, LEARNED)
 STATED = (TRIANGULATION, POINTING_MATCHING, IMPORTED)
 """Covariances that the records themselves hold: of VO's geometry, or another odometry's own."""
-
-MeanUse = Literal["steady", "predicted", "absorb"]
-"""Which mean comes off the measurement: the one steady in good frames and bad, the predicted one, or none."""
 
 
 class Policy(Protocol):
@@ -67,25 +64,19 @@ class GeometricPolicy:
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """The predicted error: its covariance in the parts by which it accumulates, and its mean.
+    """The predicted error: its covariance in the parts by which it accumulates.
 
-    ``mean``: ``steady`` takes off that of a predictor loaded ``for_filter``, ``predicted`` that of a usual one;
-    ``absorb`` leaves the measurement alone and adds the mean's square to the covariance.
     ``use_parts`` False treats the total as independent from motion to motion, to show what the parts are worth.
     """
 
     name: str = LEARNED
     use_parts: bool = True
-    mean: MeanUse = "steady"
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
         """The prediction in its parts; None without a prediction for this frame."""
         if prediction is None or not is_positive_definite(prediction.covariance):
             return None
         error: MotionError = prediction
-        if self.mean == "absorb":
-            squared = np.outer(error.mean, error.mean)
-            error = replace(error, mean=np.zeros(6), white=error.white + squared)
         if not self.use_parts:
             error = MotionError.independent(error.covariance, error.mean, dt_s=error.dt_s, status=error.status)
         return error.batch()

@@ -18,7 +18,6 @@ from gpvo.filters.policies import (
     ConstantPolicy,
     GeometricPolicy,
     LearnedPolicy,
-    MeanUse,
     Policy,
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
@@ -90,17 +89,15 @@ def _pairs(a: Array, b: Array) -> Array:
     return np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def make_policies(
-    constants: Constants | None, *, names: Sequence[str], learned: bool, mean: MeanUse = "steady"
-) -> dict[str, Policy | None]:
-    """The named policies; None for one that lacks what it needs. ``mean``: what the learned one does with its mean."""
+def make_policies(constants: Constants | None, *, names: Sequence[str], learned: bool) -> dict[str, Policy | None]:
+    """The named policies; None for one that lacks what it needs."""
     out: dict[str, Policy | None] = {}
     for name in names:
         out[name] = None
         if name in STATED:
             out[name] = GeometricPolicy(name)
         elif name == LEARNED:
-            out[name] = LearnedPolicy(mean=mean) if learned else None
+            out[name] = LearnedPolicy() if learned else None
         elif constants is not None:
             scalars = {CONSTANT: (1.0, 1.0), CONSTANT_BEST: constants.best, CONSTANT_HINDSIGHT: constants.hindsight}
             if scalars.get(name) is not None:

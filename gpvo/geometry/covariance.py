@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.types import Array
 
-TURN_FIRST = np.array([3, 4, 5, 0, 1, 2])
 _LARGEST = 1e100  # No element of a covariance is larger, no variance as small as its inverse: squares stay finite.
 
 
@@ -59,14 +58,6 @@ def scaled_root(C: Array) -> Array:
     values, vectors = np.linalg.eigh(C / (unit[..., :, None] * unit[..., None, :]))
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.asarray(sigma[..., :, None] * root)
-
-
-def turn_first_root(C: Array) -> Array:
-    """U (..., 6, 6) with ``U U^T = C``: of an error ``U z`` each of rx, ry, rz, x, y, z in turn has an element of z for
-    what those before it leave unexplained. Raises LinAlgError where C is not positive definite.
-    """
-    L = np.linalg.cholesky(C[..., TURN_FIRST[:, None], TURN_FIRST])
-    return np.asarray(L[..., TURN_FIRST[:, None], TURN_FIRST])
 
 
 def correlation(C: Array) -> Array:

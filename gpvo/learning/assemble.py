@@ -17,7 +17,7 @@ from gpvo.learning.calibrate import (
     fit_outside_power,
     fit_scale,
 )
-from gpvo.learning.logvariance import basis_of, log_ratio
+from gpvo.learning.logvariance import log_ratio
 from gpvo.learning.partcorrelation import part_correlations
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
@@ -27,10 +27,10 @@ from gpvo.learning.selection import significant_gain
 from gpvo.learning.spans import at_most
 from gpvo.learning.velocities import learn_velocities
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
-from gpvo.online.basis import ProjectedGP
 from gpvo.online.division import Division, ln_faster, of_calibration
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import Domain
+from gpvo.online.projected import ProjectedGP
 from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
@@ -67,7 +67,7 @@ def assemble(
     model = ErrorModel(
         columns=columns,
         inputs=places,
-        basis=basis_of(gp),
+        gp=gp or ProjectedGP.constant(np.zeros(6)),
         domain=domain,
         base=base,
         division=sums.division,
@@ -76,8 +76,6 @@ def assemble(
         outside_power=np.array([outside_power]),
         high=high,
         typical_ln_det=np.zeros(1),
-        mean_in_sigma=np.array([True]),
-        steady_mean=np.zeros(6),
         nu=np.zeros(1),
         dt_s=rows.step_s,
     )

@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Any
 
-from gpvo.online.features import AXES
-
 
 def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -> str:
     """Markdown from a model's header and its table of left-out sequences."""
@@ -42,7 +40,6 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}): {inputs}",
-            f"* mean that a filter subtracts: {_steady(choices)}",
         ]
     )
 
@@ -80,11 +77,6 @@ def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
     if h.get("simulated_truth"):
         lines.append("* As proof that a vehicle is safe: its truth was simulated.")
     return "\n".join(["## Where not to use it", "", *lines, "", "`gpvo check MODEL RUN` checks this before a flight."])
-
-
-def _steady(choices: Mapping[str, Any]) -> str:
-    told = [f"{a} {c:+.3f}" for a, c in zip(AXES, choices.get("steady_mean") or ()) if c]
-    return f"{', '.join(told)} (in sigma that turn and earlier axes leave unexplained, at 1 px)" if told else "none"
 
 
 def _position(h: Mapping[str, Any], name: str) -> str:

@@ -20,12 +20,11 @@ from gpvo.learning.config import TrainConfig, base_candidates, candidates, guard
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
 from gpvo.learning.rows import Rows
 from gpvo.learning.selection import group_folds, significant_gain, simplest_sufficient
-from gpvo.learning.steadymean import steady_mean
 from gpvo.online.base import BaseVariance, base_columns
-from gpvo.online.basis import ProjectedGP
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.for_filter import BASE, FOR_FILTER, different_arrays
 from gpvo.online.guard import Domain
+from gpvo.online.projected import ProjectedGP
+from gpvo.online.variants import different_arrays
 from gpvo.stats.student_t import negative_log_likelihood
 from gpvo.types import Array
 
@@ -83,15 +82,8 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     base, arrays = model, dict(model.to_arrays())
     if variance.gp is not None:
         base, _ = assemble(rows, alone.base, columns, (), None, alone.oof)
-        arrays |= different_arrays(BASE, base.to_arrays(), arrays)
-    arrays[f"{FOR_FILTER}steady_mean"] = steady = steady_mean(rows, model, variance.oof)
-    choices = {
-        "base": str(choice),
-        "inputs": name,
-        "inputs_nll": losses,
-        "steady_mean": steady.tolist(),
-        "grouped_by": rows.grouped_by,
-    }
+        arrays |= different_arrays(base.to_arrays(), arrays)
+    choices = {"base": str(choice), "inputs": name, "inputs_nll": losses, "grouped_by": rows.grouped_by}
     return Learned(model, base, arrays, choices, calibration)
 
 

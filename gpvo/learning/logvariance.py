@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.learning.regressors.inducing import greedy_points
-from gpvo.online.basis import ProjectedGP, SharedBasis
+from gpvo.online.projected import ProjectedGP
 from gpvo.stats.student_t import NU, log_fisher, log_scale_score
 from gpvo.types import Array
 
@@ -122,16 +122,3 @@ def log_ratio(gp: ProjectedGP, inputs: Array) -> Array:
     """(n, 6) log of the expected variance ratio: half the posterior's variance is the mean of a log-normal's share."""
     mean, variance = gp.evaluate(inputs)
     return mean + 0.5 * variance
-
-
-def basis_of(gp: ProjectedGP | None) -> SharedBasis:
-    """What the predictor evaluates: no mean of the error, and the log ratio on the same kernel; nothing without it."""
-    none = np.zeros((6, 1))
-    if gp is None:
-        one = np.zeros((1, 1))
-        return SharedBasis(
-            ProjectedGP(one[0], np.ones(1), one, one, none, none, none[:, 0], none[:, 0]), None, none[:, 0]
-        )
-    blank = np.zeros_like(gp.weights)
-    still = ProjectedGP(gp.centre, gp.lengthscale, gp.points, gp.projection, blank, blank, none[:, 0], none[:, 0])
-    return SharedBasis(still, gp, none[:, 0])

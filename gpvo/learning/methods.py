@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.config import supported_columns
 from gpvo.learning.regressors import get_regressor
-from gpvo.online.basis import SharedBasis
 from gpvo.online.features import THESIS
+from gpvo.online.projected import NoisyGP
 from gpvo.online.thesis import ThesisModel
 from gpvo.types import IMPORTED, Array
 
@@ -126,5 +126,5 @@ def fit_thesis(sets: Sequence[TrainingSet], *, seed: int = 0) -> ThesisModel:
     axes = []
     for j in range(Y.shape[1]):
         fit = get_regressor("sparse", isotropic=True, inducing=128).fit(U, Y[:, [j]] / scale[j], seed=seed)
-        axes.append(SharedBasis(fit.gp, None, np.log(fit.hyper.noise_var)))
+        axes.append(NoisyGP(fit.gp, np.log(fit.hyper.noise_var)))
     return ThesisModel(tuple(names), centre, spread, scale, tuple(axes))

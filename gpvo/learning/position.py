@@ -15,9 +15,9 @@ from gpvo.learning.methods import METHODS
 from gpvo.learning.regressors import get_regressor
 from gpvo.learning.scores import average, empty
 from gpvo.learning.train import TrainedModel, training_digest, versions
-from gpvo.online.basis import SharedBasis
 from gpvo.online.features import THESIS, resolve, units
 from gpvo.online.position import PositionPredictor
+from gpvo.online.projected import NoisyGP
 from gpvo.stats.consistency import coverage, crps_gaussian
 
 
@@ -57,8 +57,8 @@ def _fit(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[dict[str, An
     fitted = get_regressor(name, n_rows=len(X), isotropic=True, **options).fit(
         (X - centre) / scale, Y, seed=config.seed
     )
-    basis = SharedBasis(fitted.gp, None, np.log(fitted.hyper.noise_var))
-    arrays = {**basis.to_arrays("basis."), "feature.centre": centre, "feature.scale": scale}
+    gp = NoisyGP(fitted.gp, np.log(fitted.hyper.noise_var))
+    arrays = {**gp.to_arrays("basis."), "feature.centre": centre, "feature.scale": scale}
     cameras = [s.camera for s in sets if s.camera is not None]
     header: dict[str, Any] = {
         "model_schema": 1,

@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import t as t_distribution
 
 from gpvo.types import Array
 
@@ -29,15 +28,6 @@ def simplest_sufficient(loss_by_group: Mapping[Candidate, Array]) -> Candidate:
     simplest first."""
     best = min(loss_by_group.values(), key=np.mean)
     return next(name for name, loss in loss_by_group.items() if not significant_gain(loss - best))
-
-
-def significantly_positive(gain: Array, risk: float = 0.05) -> NDArray[np.bool_]:
-    """(D,) whether the mean over groups of gain (G, D) is positive: one-sided t-test, risk shared among the D axes."""
-    groups, axes = gain.shape
-    if groups < 2:
-        return np.zeros(axes, dtype=bool)
-    statistic = gain.mean(axis=0) / np.maximum(gain.std(axis=0, ddof=1) / np.sqrt(groups), 1e-300)
-    return np.asarray(statistic > t_distribution.ppf(1.0 - risk / axes, groups - 1))
 
 
 def group_folds(groups: NDArray, max_folds: int) -> NDArray[np.int64]:

@@ -84,7 +84,7 @@ def serve(
     outputs += [MavlinkOutput(settings.mavlink)] if settings.mavlink else []
     outputs += [FileOutput(settings.out)] if settings.out else []
     truth = None if settings.truth is None else LateTruth(settings.truth)
-    engine = Engine(stage, Predictor.load(settings.model, for_filter=True), outputs, settings.engine, tell, truth)
+    engine = Engine(stage, Predictor.load(settings.model), outputs, settings.engine, tell, truth)
     with ending_by_signal(stop):
         for arrival in _arrivals(settings, stage, engine, wire, stop):
             engine.take(arrival)

@@ -47,8 +47,7 @@ class Division:
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file."""
-        left_out = () if self._calibrated else NO_CALIBRATION
-        return {name: getattr(self, name) for name in field_names(Division) if name not in left_out}
+        return {name: getattr(self, name) for name in field_names(Division)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Division:

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
-from gpvo.geometry.covariance import turn_first_root
 from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, Velocities, feature_noise, motion_noise, positions
-from gpvo.online.basis import SharedBasis
 from gpvo.online.division import Division
 from gpvo.online.guard import Domain, DomainCheck, growth
+from gpvo.online.projected import ProjectedGP
 from gpvo.online.validation import LARGEST, check_arrays, check_related
 from gpvo.types import Array, MotionError, Prediction
 
@@ -26,30 +25,17 @@ LEAST_VAR = 1e-24
 DURATIONS_S = (1e-6, 1e4)
 """A motion whose stated duration lies outside has the usual one."""
 
-_OWN = (
-    "inputs",
-    "factor",
-    "outside_power",
-    "high",
-    "typical_ln_det",
-    "mean_in_sigma",
-    "steady_mean",
-    "nu",
-)
+_OWN = ("inputs", "factor", "outside_power", "high", "typical_ln_det", "nu")
 
 
 @dataclass(frozen=True)
 class Variances:
-    """Of n rows, before calibration: ``place``, where they lie; (n, 6) each: ``unit`` of the mean, ``known`` aleatoric
-    variance, ``total`` with ignorance of it, ``mean`` and its ``mean_var``; ``limit``, as wrong as a motion can be.
-    ``dt_s`` (n,): durations that were used."""
+    """Of n rows, before calibration: ``place``, where they lie; (n, 6) each: ``known`` aleatoric variance, ``total``
+    with ignorance of it; ``limit``, as wrong as a motion can be. ``dt_s`` (n,): durations that were used."""
 
     place: DomainCheck
-    unit: Array
     known: Array
     total: Array
-    mean: Array
-    mean_var: Array
     limit: Array
     dt_s: Array
 
@@ -58,27 +44,24 @@ class Variances:
 class ErrorModel:
     """Everything the arithmetic needs; axes in the order of the tangent vector.
 
-    ``columns``: all features, in order; ``inputs``: positions of those the GP sees. ``factor`` (6,): calibration of the
-    variance; ``outside_power`` (1,): its growth away from the training domain. ``high`` (6,): log
-    ratio to the base that few training rows exceeded. ``typical_ln_det`` (1,): median over the training rows.
-    ``mean_in_sigma`` (1,): whether the GP's mean is in units of the base's standard deviation, not the error's own at
-    the usual duration ``dt_s``. ``steady_mean`` (6,): see :meth:`steady`; zero but in a model for filters. ``nu`` (1,):
-    degrees of freedom of a single motion's error, 0 for a Gaussian.
+    ``columns``: all features, in order; ``inputs``: positions of those that the ``gp`` sees, which gives the log of the
+    variance over ``base``. ``factor`` (6,): calibration of the variance; ``outside_power`` (1,): its growth away from
+    the training domain. ``high`` (6,): log ratio to the base that few training rows exceeded. ``typical_ln_det`` (1,):
+    median over the training rows. ``nu`` (1,): degrees of freedom of a single motion's error, 0 for a Gaussian.
+    ``dt_s``: usual duration of a motion.
     """
 
     columns: tuple[str, ...]
-    inputs: NDArray[np.int64]
-    basis: SharedBasis
+    gp: ProjectedGP
     domain: Domain
     base: BaseVariance
     division: Division
     velocities: Velocities
+    inputs: NDArray[np.int64]
     factor: Array
     outside_power: Array
     high: Array
     typical_ln_det: Array
-    mean_in_sigma: NDArray[np.bool_]
-    steady_mean: Array
     nu: Array
     dt_s: float
 
@@ -90,7 +73,7 @@ class ErrorModel:
             **self.velocities.to_arrays(),
             "theta": self.base.theta,
             "theta_plain": self.base.plain,
-            **self.basis.to_arrays("basis."),
+            **self.gp.to_arrays("gp."),
             **self.domain.to_arrays("domain."),
         }
 
@@ -102,7 +85,7 @@ class ErrorModel:
         :mod:`gpvo.online.validation` says."""
         check_arrays(arrays, len(columns))
         try:
-            arrays = {"nu": np.zeros(1), "steady_mean": np.zeros(6), **arrays}
+            arrays = {"nu": np.zeros(1), **arrays}
             own = {name: arrays[name] for name in _OWN}
             division, velocities = Division.from_arrays(arrays), Velocities.from_arrays(arrays)
             base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
@@ -111,19 +94,10 @@ class ErrorModel:
         check_related(arrays, len(columns))
         if unknown := set(base.columns) - set(columns):
             raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")
-        domain, basis = Domain.from_arrays(arrays, "domain."), SharedBasis.from_arrays(arrays, "basis.")
-        if basis.n_inputs != len(own["inputs"]) or basis.n_outputs != 6:
-            raise ModelError("the model file's GPs do not fit its inputs and the six axes")
-        return cls(
-            columns=columns,
-            basis=basis,
-            domain=domain,
-            base=base,
-            division=division,
-            velocities=velocities,
-            dt_s=dt_s,
-            **own,
-        )
+        domain, gp = Domain.from_arrays(arrays, "domain."), ProjectedGP.from_arrays(arrays, "gp.")
+        if gp.n_inputs != len(own["inputs"]) or gp.n_outputs != 6:
+            raise ModelError("the model file's GP does not fit its inputs and the six axes")
+        return cls(columns, gp, domain, base, division, velocities, **own, dt_s=dt_s)
 
     def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Prediction:
         """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown.
@@ -134,53 +108,28 @@ class ErrorModel:
         X = np.where(np.abs(X) < LARGEST, X, np.nan)
         v = self.variances(X, dt_s)
         place = v.place
-        unlimited = v.total + v.mean_var
-        variance = within(unlimited * self.factor, v.limit)
+        variance = within(v.total * self.factor, v.limit)
         stated = self.split(variance, X, geometry)
         _, ln_det = np.linalg.slogdet(stated.covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
-        mean = v.mean
-        if self._has_steady_mean:
-            mean = mean + self.steady(stated.covariance, place.inside) * place.in_domain[:, None]
         return Prediction(
-            mean=mean,
+            mean=stated.mean,
             jitter=stated.jitter,
             white=stated.white,
             persistent_root=stated.persistent_root,
             persistent_tau_s=stated.persistent_tau_s,
             dt_s=v.dt_s,
             nu=self.degrees_of_freedom,
-            epistemic=variance * (1.0 - v.known / unlimited),
+            epistemic=variance * (1.0 - v.known / v.total),
             confidence=place.in_domain * precision,
             in_domain=place.in_domain,
         )
-
-    def steady(self, covariance: Array, inside: Array) -> Array:
-        """(n, 6) mean error ``r U c`` of covariances ``U U^T`` (n, 6, 6): what noise biases in an estimate.
-
-        That bias goes with the variance of the noise (M. Box, "Bias in nonlinear estimation" (1971)): with its
-        deviation, of which U is the root, times the noise r that the residuals show. It is seen along an axis when what
-        the turn and the other axes explain is taken off (:func:`gpvo.geometry.covariance.turn_first_root`): then
-        ``c``, which is ``steady_mean``, is the same in good frames and bad. ``inside``: rows drawn into the domain.
-        """
-        return np.asarray((turn_first_root(covariance) @ self.steady_mean) * self.residual_px(inside)[:, None])
-
-    def residual_px(self, inside: Array) -> Array:
-        """(n,) noise [px] that the residuals show; 1 where the base does not look at it."""
-        if not self.base.residual:
-            return np.ones(len(inside))
-        k = self._base_place[0][-1]
-        return np.asarray(np.exp(inside[:, k] * self.domain.scale[k] + self.domain.centre[k]))
 
     @cached_property
     def degrees_of_freedom(self) -> float:
         """Of the Student-t that a single motion's error has; infinite for a Gaussian."""
         return float(self.nu[0]) or np.inf
-
-    @cached_property
-    def _has_steady_mean(self) -> bool:
-        return bool(self.steady_mean.any())
 
     def locate(self, X: Array, dt_s: Array | None = None) -> DomainCheck:
         """Where rows X (n, d) lie, given how well their motions are known."""
@@ -205,22 +154,18 @@ class ErrorModel:
         duration, columns = self._duration(X, dt_s), self._base_columns(X)
         base, plain = (np.maximum(v, LEAST_VAR) for v in self.base.both(columns, duration))
         place = self._locate(X, base, duration)
-        predicted = self.basis.predict(place.inside[:, self.inputs])
+        log_ratio, spread = self.gp.evaluate(place.inside[:, self.inputs])
         outside = (1.0 - place.in_domain)[:, None]
-        # A bias of noise goes with the noise; what VO is wrong by on average of its motion, with the motion's duration.
-        unit = np.sqrt(base) if self.mean_in_sigma[0] else np.repeat((duration / self.dt_s)[:, None], 6, axis=1)
-        usual = predicted.mean * unit
-        log_noise = np.maximum(np.minimum(predicted.log_noise_var, LN_LARGEST), -LN_LARGEST)
-        known = log_noise - 0.5 * predicted.log_noise_spread
+        # The mean of a log-normal has half the variance of the log in it: that half is owed to ignorance.
+        log_noise = np.maximum(np.minimum(log_ratio + 0.5 * spread, LN_LARGEST), -LN_LARGEST)
+        known = log_noise - 0.5 * spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = log_noise + outside * np.maximum(self.high - log_noise, 0.0)
         grown = growth(place.distance, self.outside_power)[:, None]
-        mean = usual * place.in_domain[:, None]
-        mean_var = (predicted.epistemic_var * unit**2 + (usual - mean) ** 2) * grown
         # What odometry says of itself means what it meant in training only where the surroundings are alike.
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
         limit = self.velocities.largest_error_var(columns[:, :6], duration)
-        return Variances(place, unit, base * np.exp(known), total, mean, mean_var, limit, duration)
+        return Variances(place, base * np.exp(known), total, limit, duration)
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones by :attr:`absent`, geometric log variances never below the training's

@@ -7,18 +7,19 @@ type, shape and bytes. Equal content gives equal bytes.
 Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers ignore what they do not know, and older
 files lack what is marked optional:
 
-* ``basis.*``: GPs of the mean and of the log noise variance, see :class:`gpvo.online.basis.SharedBasis`;
+* ``gp.*``: the GP of the log variance, see :class:`gpvo.online.projected.ProjectedGP`;
 * ``domain.*``: the training domain, see :class:`gpvo.online.guard.Domain`;
 * ``theta``, ``theta_plain`` (6, 5): the base variance, see :class:`gpvo.online.base.BaseVariance`;
 * ``inputs``, ``factor``, ``outside_power``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``growth``,
-  ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``, ``usual_rate_var``,
-  ``mean_in_sigma``: see :class:`gpvo.online.estimate.ErrorModel`;
-* ``steady_mean`` (6,), ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,),
-  ``nu`` (1,) (all optional): the same class;
-* ``for_filter.*`` (optional): those of these arrays in which the model for filters differs;
+  ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``, ``usual_rate_var``: see
+  :class:`gpvo.online.estimate.ErrorModel`;
+* ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,), ``nu`` (1,) (all
+  optional): the same class;
 * ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
 * ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`;
+* ``basis.*``, ``for_filter.*``: of older files, see :func:`gpvo.online.variants.upgraded`; of a model of positions,
+  its GP, see :class:`gpvo.online.position.PositionPredictor`;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.online.sample.TrainingSample`.
 """
 

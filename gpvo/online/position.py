@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
 from gpvo.online import modelfile
-from gpvo.online.basis import SharedBasis
 from gpvo.online.observer import Observer
+from gpvo.online.projected import NoisyGP
 from gpvo.types import Array, StereoCamera, VoRecord
 
 
@@ -37,7 +37,7 @@ class PositionPredictor:
             raise ModelError("this model predicts the error of a motion", cure="use Predictor")
         self.header = dict(header)
         self.features = tuple(header["features"])
-        self._basis = SharedBasis.from_arrays(arrays, "basis.")
+        self._gp = NoisyGP.from_arrays(arrays, "basis.")
         self._centre, self._scale = arrays["feature.centre"], arrays["feature.scale"]
         camera = header.get("camera")
         self._observer = Observer(self.features, "position", None if camera is None else StereoCamera(**camera))
@@ -51,9 +51,8 @@ class PositionPredictor:
         """Mean and standard deviation [m], (n, 3) each, for rows (n, d); (3,) each for one row (d,)."""
         X = np.asarray(features, dtype=np.float64)
         U = (np.where(np.isfinite(X), X, self._centre) - self._centre) / self._scale
-        out = self._basis.predict(np.atleast_2d(U))
-        sigma = np.sqrt(out.epistemic_var + np.exp(out.log_noise_var))
-        return (out.mean[0], sigma[0]) if X.ndim == 1 else (out.mean, sigma)
+        mean, variance = self._gp.predict(np.atleast_2d(U))
+        return (mean[0], np.sqrt(variance[0])) if X.ndim == 1 else (mean, np.sqrt(variance))
 
     def step(self, record: VoRecord) -> PositionPrediction:
         """Prediction for the next record of a run."""

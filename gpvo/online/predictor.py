@@ -21,9 +21,9 @@ from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import known_columns
-from gpvo.online.for_filter import arrays_for_filter, arrays_of_base
 from gpvo.online.guard import DEGRADED_BELOW, camera_problems
 from gpvo.online.observer import Observer
+from gpvo.online.variants import arrays_of_base, upgraded
 from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
@@ -69,19 +69,11 @@ def _check_known(features: tuple[str, ...]) -> None:
 class Predictor:
     """Predicts the error of VO's motions. One instance per run: it remembers what its features need.
 
-    ``header``: the model file's. ``digest``: of the model file. ``features``: columns, in order. ``for_filter``:
-    predict as a filter needs it, with the mean that is steady in good frames and bad (see ``arrays_for_filter``).
+    ``header``: the model file's. ``digest``: of the model file. ``features``: columns, in order.
     """
 
-    def __init__(
-        self,
-        arrays: Mapping[str, NDArray[Any]],
-        header: Mapping[str, Any],
-        digest: str = "",
-        *,
-        for_filter: bool = False,
-    ) -> None:
-        arrays = arrays_for_filter(arrays) if for_filter else dict(arrays)
+    def __init__(self, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any], digest: str = "") -> None:
+        arrays = upgraded(arrays)
         self.header, self.digest, self.arrays = dict(header), digest, arrays
         _check_schema(header)
         if header.get("target") == "position":
@@ -102,14 +94,14 @@ class Predictor:
         self.reset()
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, for_filter: bool = False) -> Predictor:
+    def load(cls, path: str | PathLike[str]) -> Predictor:
         """From a model file. Raises ModelError, one line, where the file cannot be used."""
         if not Path(path).exists():
             raise ModelError("no such model file", where=path, cure="'gpvo train RUN... -o MODEL' makes one")
         arrays, header = modelfile.load(path)
         try:
             digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-            return cls(arrays, header, digest, for_filter=for_filter)
+            return cls(arrays, header, digest)
         except GpvoError as problem:
             raise ModelError(problem.what, where=Path(path), cure=problem.cure or "train the model again") from None
 

@@ -6,21 +6,23 @@ All outputs share the squared-exponential kernel and its points, ``k_i(x) = exp(
     mean_j = offset_j + sum_r A_jr z_r
     var_j  = s_j^2 - sum_r W_jr z_r^2
 
-P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs squares of z alone. One
-P serves all outputs, exactly, while the rows' noise weights are one common profile times a scale per output;
-otherwise P has one slice per output. Mean and variance: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for
-Machine Learning" (2006), equations 2.25 and 2.26; with inducing points M. Titsias (2009), equation 6.
+P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs squares of z alone; one P
+serves all outputs, exactly, as the rows' noise weights are one common profile times a scale per output. Mean and
+variance: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), equations 2.25 and 2.26;
+with inducing points M. Titsias (2009), equation 6.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
-from gpvo.types import Array
+from gpvo.types import Array, field_names
 
 _CHUNK_ROWS = 4096
 
@@ -30,8 +32,8 @@ class ProjectedGP:
     """Posterior of a GP with d inputs and D outputs on m points and r directions, all arrays float64.
 
     ``centre``, ``lengthscale`` (d,): inputs are taken as ``u = (x - centre) / lengthscale``, in the inputs' units.
-    ``points`` (m, d): training or inducing points, as u. ``projection`` (r, m), or (D, r, m) with one slice per output.
-    ``weights`` (D, r): A. ``reduction`` (D, r): W. ``signal_var``, ``offset`` (D,): prior variance and mean.
+    ``points`` (m, d): training or inducing points, as u. ``projection`` (r, m): P. ``weights``, ``reduction`` (D, r): A
+    and W. ``signal_var``, ``offset`` (D,): prior variance and mean.
     """
 
     centre: Array
@@ -44,19 +46,17 @@ class ProjectedGP:
     offset: Array
 
     def __post_init__(self) -> None:
-        m, d = self.points.shape
-        D, r = self.weights.shape
-        wanted = {
-            "centre": {(d,)},
-            "lengthscale": {(d,)},
-            "projection": {(r, m), (D, r, m)},
-            "reduction": {(D, r)},
-            "signal_var": {(D,)},
-            "offset": {(D,)},
-        }
-        for name, shapes in wanted.items():
-            if getattr(self, name).shape not in shapes:
-                raise ModelError(f"GP array '{name}' has shape {getattr(self, name).shape}, expected {sorted(shapes)}")
+        (m, d), (D, r) = self.points.shape, self.weights.shape
+        shapes = {"projection": (r, m), "reduction": (D, r), "signal_var": (D,), "offset": (D,)}
+        for name, wanted in {**shapes, "centre": (d,), "lengthscale": (d,)}.items():
+            if getattr(self, name).shape != wanted:
+                raise ModelError(f"GP array '{name}' has shape {getattr(self, name).shape}, expected {wanted}")
+
+    @classmethod
+    def constant(cls, offset: Array) -> ProjectedGP:
+        """One that says the same (D,) of every place, from one input."""
+        zeros, one = np.zeros((len(offset), 1)), np.zeros((1, 1))
+        return cls(one[0], np.ones(1), one, one, zeros, zeros, zeros[:, 0], offset)
 
     @property
     def n_inputs(self) -> int:
@@ -67,11 +67,6 @@ class ProjectedGP:
     def n_outputs(self) -> int:
         """D."""
         return int(self.weights.shape[0])
-
-    @property
-    def flat_projection(self) -> Array:
-        """(r, m), or (D r, m) with the outputs' slices below one another."""
-        return self.projection.reshape(-1, self.points.shape[0])
 
     def kernel(self, X: ArrayLike) -> Array:
         """(n, m) unit kernel between the rows of X (n, d) and the points."""
@@ -87,10 +82,46 @@ class ProjectedGP:
         mean, var = np.empty((len(X), self.n_outputs)), np.empty((len(X), self.n_outputs))
         for i in range(0, len(X), _CHUNK_ROWS):
             rows = slice(i, i + _CHUNK_ROWS)
-            z = self.kernel(X[rows]) @ self.flat_projection.T
-            if self.projection.ndim == 2:
-                mean[rows], var[rows] = z @ self.weights.T, (z * z) @ self.reduction.T
-            else:
-                z = z.reshape(len(z), *self.weights.shape)
-                mean[rows], var[rows] = (z * self.weights).sum(2), (z * z * self.reduction).sum(2)
+            z = self.kernel(X[rows]) @ self.projection.T
+            mean[rows], var[rows] = z @ self.weights.T, (z * z) @ self.reduction.T
         return mean + self.offset, np.maximum(self.signal_var - var, 0.0)
+
+    def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
+        return {prefix + name: getattr(self, name) for name in field_names(ProjectedGP)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> ProjectedGP:
+        """The GP from named arrays. Raises ModelError where one is missing or of the wrong shape."""
+        try:
+            return cls(**{n: np.asarray(arrays[prefix + n], np.float64) for n in field_names(cls)})
+        except KeyError as missing:
+            raise ModelError(f"the model file lacks the array {missing}") from None
+        except ValueError as wrong:
+            raise ModelError(f"the model file's GP arrays do not fit together: {wrong}") from None
+
+
+@dataclass(frozen=True)
+class NoisyGP:
+    """A GP of what is measured, with a noise that is everywhere the same: ``log_noise_var`` (D,)."""
+
+    latent: ProjectedGP
+    log_noise_var: Array
+
+    def predict(self, X: ArrayLike) -> tuple[Array, Array]:
+        """Mean and variance (n, D) of what is measured at rows X (n, d)."""
+        mean, variance = self.latent.evaluate(X)
+        return mean, variance + np.exp(self.log_noise_var)
+
+    def to_arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
+        return {**self.latent.to_arrays(f"{prefix}mean."), f"{prefix}log_noise_offset": self.log_noise_var}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str) -> NoisyGP:
+        """The GP from named arrays. Raises ModelError where one is missing or of the wrong shape."""
+        latent = ProjectedGP.from_arrays(arrays, f"{prefix}mean.")
+        log_noise = arrays.get(f"{prefix}log_noise_offset")
+        if log_noise is None or log_noise.shape != (latent.n_outputs,):
+            raise ModelError(f"the model file's array '{prefix}log_noise_offset' is missing or of the wrong shape")
+        return cls(latent, np.asarray(log_noise, np.float64))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
-from gpvo.online.basis import SharedBasis
 from gpvo.online.features import THESIS
+from gpvo.online.projected import NoisyGP
 from gpvo.types import Array
 
 _PREFIX = "thesis."
@@ -34,15 +34,13 @@ class ThesisModel:
     centre: Array
     spread: Array
     scale: Array
-    axes: tuple[SharedBasis, ...]
+    axes: tuple[NoisyGP, ...]
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Mean (n, D) and covariance (n, D, D), diagonal, of rows X (n, d); a missing value counts as zero."""
         U = (np.nan_to_num(np.asarray(X, dtype=np.float64), nan=0.0) - self.centre) / self.spread
-        predictions = [basis.predict(U) for basis in self.axes]
-        mean = np.hstack([s.mean for s in predictions]) * self.scale
-        variance = np.hstack([s.epistemic_var + np.exp(s.log_noise_var) for s in predictions]) * self.scale**2
-        return mean, variance[:, :, None] * np.eye(len(self.axes))
+        mean, variance = (np.hstack(of_axes) for of_axes in zip(*(gp.predict(U) for gp in self.axes)))
+        return mean * self.scale, (variance * self.scale**2)[:, :, None] * np.eye(len(self.axes))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Named arrays for a model file; :meth:`from_arrays` is the inverse, projections to single precision."""
@@ -52,8 +50,8 @@ class ThesisModel:
             f"{_PREFIX}scale": self.scale,
             f"{_PREFIX}columns": np.array([THESIS.index(c) for c in self.columns], dtype=np.int64),
         }
-        for j, basis in enumerate(self.axes):
-            for name, values in basis.to_arrays(f"{_PREFIX}{j}.").items():
+        for j, gp in enumerate(self.axes):
+            for name, values in gp.to_arrays(f"{_PREFIX}{j}.").items():
                 out[name] = values.astype(np.float32) if name.endswith(_SINGLE) else values
         return out
 
@@ -67,9 +65,9 @@ class ThesisModel:
             columns = tuple(THESIS[i] for i in arrays[f"{_PREFIX}columns"])
         except (KeyError, IndexError) as missing:
             raise ModelError(f"the model file lacks the array or feature {missing}") from None
-        axes = tuple(SharedBasis.from_arrays(arrays, f"{_PREFIX}{j}.") for j in range(len(scale)))
+        axes = tuple(NoisyGP.from_arrays(arrays, f"{_PREFIX}{j}.") for j in range(len(scale)))
         if not len(columns) == len(centre) == len(spread) or any(
-            a.n_inputs != len(centre) or a.n_outputs != 1 for a in axes
+            (gp.latent.n_inputs, gp.latent.n_outputs) != (len(centre), 1) for gp in axes
         ):
             raise ModelError("the model file's thesis arrays do not fit together")
         return cls(columns, centre, spread, scale, axes)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import ModelError
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.online.for_filter import BASE, FOR_FILTER
+from gpvo.online.variants import BASE
 
 LARGEST = 1e12
 """No number of a model is larger, nor is a feature: a value beyond counts as missing, as its powers would overflow."""
@@ -103,8 +103,6 @@ _ARRAYS: dict[str, ArraySpec] = {
     "typical_ln_det": ArraySpec((1,), low=-1e4, high=1e4),
     "usual_rate_var": ArraySpec((6,), low=1e-24),
     "rate_change_var": _not_negative(6, 6),
-    "mean_in_sigma": ArraySpec((1,), kind="b"),
-    "steady_mean": ArraySpec((6,), low=-1e6, high=1e6),
     "calibration_patterns": ArraySpec((6, 6, 6), low=-1e6, high=1e6),
     "calibration_tau_s": _positive(6),
     "nu": ArraySpec((1,), low=0.0, high=1e6),
@@ -143,7 +141,7 @@ _ARRAYS: dict[str, ArraySpec] = {
 @cache
 def spec_of(name: str) -> ArraySpec | None:
     """The specification of an array, None where nothing is known of it; the first line that fits its name counts."""
-    name = name.removeprefix(FOR_FILTER).removeprefix(BASE)
+    name = name.removeprefix(BASE)
     return _ARRAYS.get(name) or next((spec for key, spec in _ARRAYS.items() if fnmatchcase(name, key)), None)
 
 

@@ -99,10 +99,10 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
 
 
 def predictions_of(run: Run, model: Path | None) -> dict[int, Prediction]:
-    """What the model for filters in a file predicts of every motion, else what is stored with the run."""
+    """What a model file predicts of every motion, else what is stored with the run."""
     if model is None:
         return run.predictions_of_motions
-    predictor = Predictor.load(model, for_filter=True)
+    predictor = Predictor.load(model)
     predictor.require_motions(model)
     return predictor.replay(run.log)
 

@@ -16,7 +16,7 @@ from gpvo.filters.policies import POLICIES
 from gpvo.filters.run import FuseOptions
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
-from gpvo.io.run import read_run, write_run
+from gpvo.io.run import write_run
 from gpvo.types import ImuLog, Mounting, Status, TruthLog, VoLog, VoRecord
 from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
 from typer.testing import CliRunner
@@ -107,17 +107,6 @@ def test_without_imu(runs: list[Path]) -> None:
     assert out["runs"][0]["policies"]["learned"]["ate_rmse_m"] < 2.0
 
 
-def test_the_mean_that_a_run_stores_is_taken_off_only_on_request(runs: list[Path], tmp_path: Path) -> None:
-    run = read_run(runs[0])
-    leaning = [replace(p, mean=p.mean + 0.01) for p in run.predictions]
-    write_run(tmp_path / "run", run.log, predictions=leaning, mounting=MOUNTING, truth=run.truth, imu=run.imu)
-    fuse = ("fuse", tmp_path / "run", "--policies", "learned", "--json")
-    options: list[tuple[str, ...]] = [(), ("--mean", "absorb"), ("--mean", "predicted")]
-    usual, absorb, predicted = (json.loads(_run(*fuse, *option)) for option in options)
-    assert usual == absorb
-    assert usual["mean"]["learned"]["ate_rmse_m"] < 0.5 * predicted["mean"]["learned"]["ate_rmse_m"]
-
-
 def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
     wrong = _write(tmp_path / "in_g", 5, 1 / 9.80665)
     with pytest.raises(GpvoError, match="it is in g") as error:
@@ -131,7 +120,6 @@ def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
         (("--init", "magic"), "truth or static"),
         (("--init", "static"), "not at rest"),
         (("--gate", "magic"), "discard or inflate"),
-        (("--mean", "magic"), "steady, predicted, absorb"),
         (("--policies", "best"), "unknown policy"),
         (("--model", "nowhere.gpvo"), "nowhere.gpvo"),
         (("--plot", "fuse.xyz"), "fuse.xyz: does not have the suffix of an image.*png"),

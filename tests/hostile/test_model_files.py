@@ -80,11 +80,11 @@ ARRAYS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "fractional inputs": ("inputs", lambda a: a + 0.5),
     "inputs beyond the features": ("inputs", lambda a: a + 1000),
     "negative inputs": ("inputs", lambda a: a - 1000),
-    "length scale of zero": ("basis.mean.lengthscale", _full(0.0)),
-    "points not a number": ("basis.mean.points", _full(np.nan)),
-    "negative signal variance": ("basis.mean.signal_var", _full(-1.0)),
-    "huge offset of log noise": ("basis.log_noise_offset", _full(1e6)),
-    "steady mean not a number": ("for_filter.steady_mean", _full(np.nan)),
+    "length scale of zero": ("gp.lengthscale", _full(0.0)),
+    "points not a number": ("gp.points", _full(np.nan)),
+    "negative signal variance": ("gp.signal_var", _full(-1.0)),
+    "huge offset of log noise": ("thesis.0.log_noise_offset", _full(1e6)),
+    "offset of another length": ("gp.offset", lambda a: a[:-1]),
     "constant not semidefinite": ("method.constant", _full(-1.0)),
     "negative scale": ("method.triangulation.scale", _full(-1.0)),
     "sample at no time": ("sample.dt_s", _full(0.0)),
@@ -98,7 +98,7 @@ def test_arrays_against_the_schema_are_refused(case: str, parts, tmp_path: Path)
     arrays[name] = np.ascontiguousarray(change(arrays[name]))
     modelfile.save(tmp_path / "evil.gpvo", arrays, header)
     with pytest.raises(ModelError, match=r"evil\.gpvo: ") as refusal:
-        Predictor.load(tmp_path / "evil.gpvo", for_filter=name.startswith("for_filter."))
+        Predictor.load(tmp_path / "evil.gpvo")
     assert "\n" not in str(refusal.value)
 
 

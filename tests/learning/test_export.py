@@ -5,23 +5,19 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from gpvo.cli import app
-from gpvo.errors import GpvoError, ModelError
-from gpvo.geometry.covariance import turn_first_root
+from gpvo.errors import GpvoError
 from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
-from gpvo.online.base import COASTED, RESIDUAL_COLUMN, BaseVariance, Velocities, base_columns
-from gpvo.online.basis import ProjectedGP, SharedBasis
+from gpvo.online.base import COASTED, BaseVariance, Velocities, base_columns
 from gpvo.online.division import PARTS, Division
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.for_filter import FOR_FILTER
 from gpvo.online.guard import Domain
-from gpvo.online.predictor import Predictor
+from gpvo.online.projected import ProjectedGP
 from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner
@@ -50,9 +46,8 @@ def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> Project
 def some_model(
     *,
     method: str | None = "triangulation",
-    noise: str = "own",
+    ratio: str = "of conditions",
     residual: bool = False,
-    in_sigma: bool = True,
     calibration: dict[str, np.ndarray] | None = None,
 ) -> ErrorModel:
     """A model of random but sensible numbers."""
@@ -61,21 +56,14 @@ def some_model(
     X = rng.standard_normal((400, len(columns)))
     X[:, 6 : len(columns) - 3] -= 9.0
     X[::7, -1] = np.nan
-    inputs = np.array([0, 2, 5, len(columns) - 2])
-    mean = random_gp(rng, 4, 30, 0.01)
-    second = random_gp(rng, 4, 20, 0.3)
-    if noise == "shared":
-        weights, offset = 30.0 * mean.weights[::-1], 30.0 * mean.offset
-        second = replace(
-            mean, weights=weights, reduction=900 * mean.reduction, signal_var=900 * mean.signal_var, offset=offset
-        )
+    inputs = np.array([0, 2, 5, len(columns) - 2] if ratio == "of conditions" else [0])
     correlation = np.array([np.corrcoef(rng.standard_normal((6, 30))) for _ in range(3)])
     theta = rng.uniform(1e-4, 1.0, (6, 5)) * [1.0 if method else 0.0, 1e-4, 1e-3, 1e-3, 1.0 if residual else 0.0]
     share = rng.uniform(0.1, 1.0, (3, 6))
     return ErrorModel(
         columns=columns,
         inputs=inputs,
-        basis=SharedBasis(mean, None if noise == "constant" else second, rng.standard_normal(6)),
+        gp=random_gp(rng, 4, 20, 0.3) if ratio == "of conditions" else ProjectedGP.constant(rng.standard_normal(6)),
         domain=Domain.learn(X),
         base=BaseVariance(theta, theta[::-1] * [1.0, 1.0, 1.0, 1.0, 0.0], method, residual),
         division=Division(
@@ -93,8 +81,6 @@ def some_model(
         outside_power=np.array([0.6]),
         high=rng.uniform(0.0, 2.0, 6),
         typical_ln_det=np.array([-60.0]),
-        mean_in_sigma=np.array([in_sigma]),
-        steady_mean=np.zeros(6),
         nu=np.array([4.5]),
         dt_s=0.1,
     )
@@ -109,15 +95,11 @@ def some_calibration() -> dict[str, np.ndarray]:
 
 
 CASES = {
-    "own noise kernel": some_model(),
-    "shared kernel": some_model(noise="shared"),
-    "constant noise": some_model(noise="constant"),
+    "of conditions": some_model(),
+    "a constant ratio": some_model(ratio="constant"),
     "no geometry": some_model(method=None),
     "noise of the residuals": some_model(residual=True),
-    "a mean of its own": some_model(in_sigma=False),
-    "a steady mean": replace(some_model(residual=True), steady_mean=np.array([0.02, -0.1, 0.3, -0.2, 0.4, 0.1])),
     "errors of calibration": some_model(calibration=some_calibration()),
-    "a steady mean without residuals": replace(some_model(), steady_mean=np.array([0.0, 0.1, 0.0, -0.2, 0.0, 0.3])),
 }
 
 
@@ -136,18 +118,6 @@ def some_inputs(model: ErrorModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     dt_s = rng.uniform(0.05, 0.3, n)
     dt_s[50:54] = 0.0, -1.0, np.nan, 1e300
     return X, geometry, dt_s
-
-
-def test_the_steady_mean_goes_with_the_noise_of_the_residuals() -> None:
-    c = np.array([0.0, 0.1, 0.0, -0.2, 0.0, 0.3])
-    model = replace(some_model(residual=True), steady_mean=c)
-    X = np.repeat(model.domain.centre[None], 3, axis=0)
-    k = model.columns.index(RESIDUAL_COLUMN)
-    X[:, k] += np.array([0.0, 0.2, -0.3]) * model.domain.scale[k]
-    plain, leaning = replace(model, steady_mean=np.zeros(6)).estimate(X), model.estimate(X)
-    np.testing.assert_array_equal(plain.covariance, leaning.covariance)
-    off = turn_first_root(plain.covariance) @ c * np.exp(X[:, k])[:, None] * plain.in_domain[:, None]
-    np.testing.assert_allclose(leaning.mean, plain.mean + off, atol=1e-15)
 
 
 def assert_equal(got: dict[str, np.ndarray], wanted: Prediction) -> None:
@@ -246,23 +216,13 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
 _VECTORS = ("mean", "covariance", *PARTS, "epistemic")
 
 
-def _export_both(model: Path, to: str) -> tuple[Path, Path]:
-    """A model with a steady mean in the file ``model``, and its exports for prediction and for filters beside it."""
-    trained, c = small_model(), np.array([0.0, 0.0, -0.1234375, 0.0, 0.25, 0.0])
-    modelfile.save(model, {**trained.arrays, f"{FOR_FILTER}steady_mean": c}, trained.header)
-    for flag in ([], ["--for-filter"]):
-        result = CliRunner().invoke(app, ["export", str(model), "--to", to, *flag], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-    end = {"onnx": ".onnx", "c": ".h"}[to]
-    return model.with_suffix(end), model.with_name(f"{model.stem}-for-filter{end}")
-
-
-def test_c_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> None:
-    plain, for_filter = (path.read_text() for path in _export_both(tmp_path / "errors.gpvo", "c"))
-    assert "For prediction." in plain
-    assert "For filters." in for_filter
-    assert "-0.1234375" in for_filter
-    assert "-0.1234375" not in plain
+def test_the_flag_for_filters_changes_nothing(tmp_path: Path) -> None:
+    trained, model = small_model(), tmp_path / "errors.gpvo"
+    modelfile.save(model, trained.arrays, trained.header)
+    for name, flags in (("a.h", []), ("b.h", ["--for-filter"])):
+        command = ["export", str(model), "-o", str(tmp_path / name), *flags]
+        CliRunner().invoke(app, command, catch_exceptions=False)
+    assert (tmp_path / "a.h").read_bytes() == (tmp_path / "b.h").read_bytes()
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler 'cc' on this machine")
@@ -289,32 +249,9 @@ def test_onnx_has_no_prefix(tmp_path: Path) -> None:
         export_model(tmp_path / "model", tmp_path / "out", "onnx", prefix="mine")
 
 
-def test_onnx_for_filters_has_the_steady_mean_and_says_so(tmp_path: Path) -> None:
-    pytest.importorskip("onnx")
-    runtime = pytest.importorskip("onnxruntime")
-    model = tmp_path / "errors.gpvo"
-    plain, for_filter = _export_both(model, "onnx")
-    X, geometry, dt_s = some_inputs(Predictor.load(model).model)
-    for path, wanted in ((plain, False), (for_filter, True)):
-        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        assert session.get_modelmeta().custom_metadata_map["purpose"] == ("filters" if wanted else "prediction")
-        out = session.run(["mean"], {"features": X, "geometry": geometry, "dt_s": dt_s})[0]
-        expected = Predictor.load(model, for_filter=wanted).model.estimate(X, geometry, dt_s)
-        assert np.abs((out - expected.mean) / expected.sigma).max() < 1e-5
-        assert bool(expected.mean.any()) == wanted
-
-
-def test_no_filter_takes_a_model_of_windows(tmp_path: Path) -> None:
-    trained, model = small_model(), tmp_path / "windows.gpvo"
-    modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
-    with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s"):
-        export_model(model, tmp_path / "out.h", "c", for_filter=True)
-    export_model(model, tmp_path / "out.h", "c")
-
-
 def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="no C identifier"):
-        to_c(CASES["own noise kernel"], tmp_path / "model.h", name="1+1")
+        to_c(CASES["of conditions"], tmp_path / "model.h", name="1+1")
 
 
 def test_the_name_tells_the_format_and_does_not_contradict_it(tmp_path: Path) -> None:
@@ -339,27 +276,3 @@ def test_predictions_go_to_parquet_alone(tmp_path: Path) -> None:
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="one of: onnx, c"):
         export_model(tmp_path / "model", tmp_path / "out", "fortran")
-
-
-def test_the_mean_is_in_units_of_the_base():
-    """Where the base variance is four times as large, the mean is twice as large, its variance four times."""
-    model = some_model()
-    twice = replace(model.base, theta=4.0 * model.base.theta, plain=4.0 * model.base.plain)
-    # Inside the domain; outside, how far away a motion is depends on how well its velocity is known.
-    X = 0.3 * np.random.default_rng(3).standard_normal((5, len(model.columns)))
-    X[:, 6:12] -= 9.0
-    once, other = (m.variances(X, None) for m in (model, replace(model, base=twice)))
-    assert np.abs(once.mean).max() > 0
-    np.testing.assert_allclose(other.mean, 2.0 * once.mean, rtol=1e-12)
-    np.testing.assert_allclose(other.mean_var, 4.0 * once.mean_var, rtol=1e-12)
-
-
-def test_a_mean_of_the_motion_goes_with_its_duration():
-    """A motion of twice the duration drifts twice as far, and its drift is twice as uncertain."""
-    model = some_model(in_sigma=False)
-    X = 0.3 * np.random.default_rng(3).standard_normal((5, len(model.columns)))
-    X[:, 6:12] -= 9.0
-    once, twice = (model.variances(X, np.full(5, k * model.dt_s)) for k in (1.0, 2.0))
-    assert np.abs(once.mean).max() > 0
-    np.testing.assert_allclose(twice.mean, 2.0 * once.mean, rtol=1e-12)
-    np.testing.assert_allclose(twice.mean_var, 4.0 * once.mean_var, rtol=1e-12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.learning.logvariance import basis_of, fit_log_variance, log_ratio
+from gpvo.learning.logvariance import fit_log_variance, log_ratio
 from gpvo.learning.selection import group_folds
 
 
@@ -60,19 +60,6 @@ def test_the_same_rows_give_the_same_bits_and_a_row_of_weight_two_is_two_rows() 
     twice = fit_log_variance(*(np.repeat(x, 2, axis=0) for x in (X, ratio, ones, group)))
     heavy = fit_log_variance(X, ratio, 2.0 * ones, group)
     np.testing.assert_allclose(log_ratio(heavy, X), log_ratio(twice, X), atol=0.02)
-
-
-def test_the_predictor_evaluates_it_on_one_kernel_without_a_mean() -> None:
-    X, ratio, group, _ = drawn(3, 5)
-    gp = fit_log_variance(X, ratio, np.ones(len(X)), group)
-    basis = basis_of(gp)
-    out = basis.predict(X[:50])
-    assert basis.shares_kernel
-    assert not out.mean.any()
-    assert not out.epistemic_var.any()
-    np.testing.assert_allclose(out.log_noise_var, log_ratio(gp, X[:50]))
-    np.testing.assert_allclose(basis.predict_one(X[0]).log_noise_var, out.log_noise_var[0], atol=1e-5)
-    assert not basis_of(None).predict(np.ones((2, 1))).log_noise_var.any()
 
 
 def test_folds_keep_groups_whole() -> None:

@@ -43,7 +43,7 @@ def offline(clip: Path, stamps: list[int]) -> list[Odometry]:
     rectifier = Rectifier(StereoRig(lens, lens, se3.exp(np.array([-b, 0, 0, 0, 0, 0]))))
     odometry = StereoOdometry(rectifier.camera, mask=rectifier.mask)
     frames = [StereoFrame(t, *rectifier.apply(*pair)) for t, pair in zip(stamps, pairs, strict=True)]
-    predictor = Predictor.load(MODEL, for_filter=True)
+    predictor = Predictor.load(MODEL)
     predictor.reset(rectifier.camera)
     log = VoLog([odometry.step(frame) for frame in frames], rectifier.camera)
     builder = OdometryBuilder(method="pointing_matching")

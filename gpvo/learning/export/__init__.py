@@ -34,27 +34,22 @@ def export_model(
     path: str | os.PathLike[str],
     to: str,
     *,
-    for_filter: bool = False,
     prefix: str = PREFIX,
 ) -> None:
     """Write the model file ``model`` as ``to`` ("onnx" or "c").
 
-    ``for_filter``: its model for filters, as ``Predictor.load`` would. ``prefix``: of every symbol in C, so that one
-    program can hold several models. GpvoError for other formats or names, a prefix that is no C identifier, a bad
-    file, or a model for filters that predicts the error over windows of motions.
+    ``prefix``: of every symbol in C, so that one program can hold several models. GpvoError for other formats or names,
+    a prefix that is no C identifier, or a bad file.
     """
     to = format_of(to, path)
     if prefix != PREFIX and to != "c":
         raise GpvoError(f"{to} has no symbols that a prefix '{prefix}' could go before", cure="give it with c alone")
-    predictor = Predictor.load(model, for_filter=for_filter)
-    if for_filter:
-        predictor.require_motions(model)
+    predictor = Predictor.load(model)
     units = tuple(str(u) for u in predictor.header.get("units") or ())
-    purpose = "filters" if for_filter else "prediction"
     if to == "c":
-        note = f"For {purpose}. Model file SHA-256: {predictor.digest}"
+        note = f"Model file SHA-256: {predictor.digest}"
         to_c(predictor.model, path, name=prefix, units=units, note=note)
     else:
-        metadata = {"digest": predictor.digest, "units": ",".join(units), "purpose": purpose}
+        metadata = {"digest": predictor.digest, "units": ",".join(units)}
         metadata["nu"] = f"{float(predictor.model.nu[0]):g}"
         to_onnx(predictor.model, path, metadata=metadata)

@@ -14,7 +14,6 @@ from gpvo.errors import GpvoError
 from gpvo.io.atomic import write_text
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
-from gpvo.online.rowplan import StackedBasis
 from gpvo.online.validation import LARGEST
 
 PREFIX = "gpvo"
@@ -82,18 +81,15 @@ def _comment(text: object) -> str:
 
 
 def _constants(model: ErrorModel) -> list[str]:
-    stacked, domain, d = model.basis.stacked(), model.domain, len(model.columns)
+    gp, domain, d = model.gp, model.domain, len(model.columns)
     columns = positions(model.columns, model.base.columns)
     by_velocity, by_acceleration = motion_noise(model.columns)
     sizes = {
         "N_FEATURES": d,
         "N_INPUTS": len(model.inputs),
-        "N_KERNELS": len(stacked.kernels),
-        "N_KERNEL": stacked.B.shape[2],
-        "N_DIRECTIONS": stacked.H.shape[2],
+        "N_POINTS": len(gp.points),
+        "N_DIRECTIONS": len(gp.projection),
         "N_BASE": len(columns),
-        "POINTS": "{" + ", ".join(str(len(gp.points)) for gp in stacked.kernels) + "}",
-        "DIRECTIONS": "{" + ", ".join(str(len(gp.flat_projection)) for gp in stacked.kernels) + "}",
         "RADIUS": _number(domain.radius[0]),
         "DT_S": _number(model.dt_s),
         "GEOMETRY_WEIGHT": _number(model.division.geometry_weight[0]),
@@ -106,7 +102,6 @@ def _constants(model: ErrorModel) -> list[str]:
         "SHORTEST_S": _number(DURATIONS_S[0]),
         "LONGEST_S": _number(DURATIONS_S[1]),
         "NU": _number(model.nu[0]),
-        "MEAN_IN_SIGMA": int(model.mean_in_sigma[0]),
     }
     return [
         *(f"#define GPVO_{key} {value}" for key, value in sizes.items()),
@@ -133,23 +128,16 @@ def _constants(model: ErrorModel) -> list[str]:
         *_array("share", model.division.share),
         *_array("growth", model.division.growth),
         *_array("level", model.division.level),
-        *_array("steady_mean", model.steady_mean),
         *_array("calibration_patterns", model.division.calibration_patterns),
-        *_basis_arrays(stacked),
+        *_array("gp_centre", gp.centre),
+        *_array("lengthscale", gp.lengthscale),
+        *_array("point", gp.points),
+        *_array("offset", gp.offset),
+        *_array("signal_var", gp.signal_var),
+        *_array("kernel_weight", gp.weights @ gp.projection),
+        *_array("reduction", gp.reduction, "float"),
+        *_array("projection", gp.projection, "float"),
         "",
-    ]
-
-
-def _basis_arrays(stacked: StackedBasis) -> list[str]:
-    kernels = stacked.kernels
-    return [
-        *_array("kernel_centre", [gp.centre for gp in kernels]),
-        *_array("lengthscale", [gp.lengthscale for gp in kernels]),
-        *_array("point", np.concatenate([gp.points for gp in kernels])),
-        *_array("offset", stacked.offset),
-        *_array("mean_weight", stacked.B),
-        *_array("variance_weight", stacked.H, "float"),
-        *_array("projection", np.concatenate([gp.flat_projection.ravel() for gp in kernels]), "float"),
     ]
 
 

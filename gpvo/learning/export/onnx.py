@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
-from gpvo.geometry.covariance import TURN_FIRST
 from gpvo.io.atomic import replacing
-from gpvo.online.base import RESIDUAL_COLUMN, motion_noise, positions
+from gpvo.online.base import motion_noise, positions
 from gpvo.online.division import LN_FASTEST, PARTS
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.validation import LARGEST
@@ -111,20 +110,16 @@ def _predict(g: _Graph, model: ErrorModel) -> None:
     g.dt = g("Where", g("And", *(g(op, "dt_s", s) for op, s in _USUAL_DURATIONS)), "dt_s", model.dt_s)
     base, plain = (g("Max", _base(g, model, theta), LEAST_VAR) for theta in (model.base.theta, model.base.plain))
     inside, distance, in_domain = _locate(g, model, base)
-    ratio, ratio_var, log_noise, spread = _basis(g, model, g.take(inside, model.inputs, axis=1))
-    log_noise = g("Max", g("Min", log_noise, LN_LARGEST), -LN_LARGEST)
-    unit = g("Sqrt", base) if model.mean_in_sigma[0] else g.expand(g("Div", g.dt, model.dt_s), 1)
-    mean, mean_var = g("Mul", ratio, unit), g("Mul", ratio_var, g("Mul", unit, unit))
+    log_ratio, spread = _log_ratio(g, model, g.take(inside, model.inputs, axis=1))
+    log_noise = g("Max", g("Min", g("Add", log_ratio, g("Mul", spread, 0.5)), LN_LARGEST), -LN_LARGEST)
     near = g.expand(in_domain, 1)
     growth = g.expand(g("Pow", g("Add", distance, 1.0), float(model.outside_power[0])), 1)
     known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
     short = g("Max", g("Sub", g.constant(model.high), log_noise), 0.0)
     cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
-    trusted = g("Mul", mean, near)
-    lost = g("Sub", mean, trusted)
     more = g("Mul", g("Sub", 1.0, near), g("Max", g("Sub", plain, base), 0.0))
     noise = g("Mul", g("Add", base, more), g("Exp", cautious))
-    total = g("Mul", g.add(noise, mean_var, g("Mul", lost, lost)), growth)
+    total = g("Mul", noise, growth)
     factor = g.constant(model.factor)
     variance = _within(g, g("Mul", total, factor), _limit(g, model))
     g("Mul", variance, g("Sub", 1.0, g("Div", known, total)), out="epistemic")
@@ -134,10 +129,8 @@ def _predict(g: _Graph, model: ErrorModel) -> None:
     jitter, white, bias = (g("Mul", g.outer(sigma), R, out=None if name == "bias" else name) for name, sigma, R in each)
     parts = [jitter, white, g("Add", bias, g("MatMul", root, g("Transpose", root, perm=[0, 2, 1])), out="bias")]
     covariance = g.add(*parts, out="covariance")
-    pivots, steady = _turn_first(g, covariance, model.steady_mean)
-    ln_det = g.add(*(g("Log", pivot) for pivot in pivots))
-    noise = g("Mul", _residual_px(g, model, inside), near)
-    g("Add", trusted, g("Mul", steady, noise), out="mean")
+    ln_det = g.add(*(g("Log", pivot) for pivot in _pivots(g, covariance)))
+    g("Mul", base, 0.0, out="mean")
     precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), ln_det), 12.0))
     g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
 
@@ -162,28 +155,17 @@ def _locate(g: _Graph, model: ErrorModel, base: str) -> tuple[str, str, str]:
     return inside, distance, g("Exp", g("Mul", squared, -0.5), out="in_domain")
 
 
-def _basis(g: _Graph, model: ErrorModel, inputs: str) -> tuple[str, str, str, str]:
-    stacked = model.basis.stacked()
-    kernels, squares = [], []
-    for gp in stacked.kernels:
-        u = g("Div", g("Sub", inputs, g.constant(gp.centre)), g.constant(gp.lengthscale))
-        cross = g("MatMul", u, g.constant(gp.points.T))
-        norms = g("Mul", g.expand(g.sum(g("Mul", u, u), 1), 1), 0.5)
-        e = g("Sub", g("Sub", cross, norms), g.constant(0.5 * (gp.points**2).sum(1)))
-        k = g("Exp", g("Min", e, 0.0))
-        z = g("MatMul", k, g.constant(gp.flat_projection.T))
-        kernels.append(k)
-        squares.append(g("Mul", z, z))
-    k, z2 = (g("Concat", *parts, axis=1) if len(parts) > 1 else parts[0] for parts in (kernels, squares))
-    mean, log_noise = (g("MatMul", k, g.constant(B.T)) for B in stacked.B)
-    mean_var, more, spread = (g("MatMul", z2, g.constant(H.T)) for H in stacked.H)
-    offset = [g.constant(row) for row in stacked.offset]
-    return (
-        g("Add", mean, offset[0]),
-        g("Max", g("Add", mean_var, offset[1]), 0.0),
-        g.add(log_noise, more, offset[2]),
-        g("Max", g("Add", spread, offset[3]), 0.0),
-    )
+def _log_ratio(g: _Graph, model: ErrorModel, inputs: str) -> tuple[str, str]:
+    """Log of the variance over the base, and the variance of that log; ``ProjectedGP.evaluate``."""
+    gp = model.gp
+    u = g("Div", g("Sub", inputs, g.constant(gp.centre)), g.constant(gp.lengthscale))
+    cross = g("MatMul", u, g.constant(gp.points.T))
+    norms = g("Mul", g.expand(g.sum(g("Mul", u, u), 1), 1), 0.5)
+    k = g("Exp", g("Min", g("Sub", g("Sub", cross, norms), g.constant(0.5 * (gp.points**2).sum(1))), 0.0))
+    z = g("MatMul", k, g.constant(gp.projection.T))
+    explained = g("MatMul", g("Mul", z, z), g.constant(gp.reduction.T))
+    mean = g("Add", g("MatMul", z, g.constant(gp.weights.T)), g.constant(gp.offset))
+    return mean, g("Max", g("Sub", g.constant(gp.signal_var), explained), 0.0)
 
 
 def _limit(g: _Graph, model: ErrorModel) -> str:
@@ -228,7 +210,7 @@ def _correlations(g: _Graph, model: ErrorModel) -> list[str]:
     flat = g("Reshape", "geometry", g.constant([-1, 36], np.int64))
     both = g("Mul", g("Add", "geometry", g("Transpose", "geometry", perm=[0, 2, 1])), 0.5)
     own = g("Div", both, g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
-    pivots, _ = _turn_first(g, g("Add", own, g.constant(1e-6 * np.eye(6))), np.zeros(6))
+    pivots = _pivots(g, g("Add", own, g.constant(1e-6 * np.eye(6))))
     definite = g("Cast", g("Greater", g("Concat", *(g.expand(p, 1) for p in pivots), axis=1), 0.0), to=_INT64)
     definite = g("Equal", g("ReduceMin", definite, axes=[1], keepdims=0), g.constant(1, np.int64))
     known = g.expand(g.expand(definite, 1), 1)
@@ -272,35 +254,16 @@ def _shares(g: _Graph, model: ErrorModel, variance: str) -> list[str]:
     return [g("Div", part, whole) for part in (jitter, white, bias)]
 
 
-def _residual_px(g: _Graph, model: ErrorModel, inside: str) -> str:
-    """(N, 1), or (1, 1) where the base does not look at the residuals; ``ErrorModel.residual_px``."""
-    if not model.base.residual:
-        return g.constant([[1.0]])
-    k = positions(model.columns, (RESIDUAL_COLUMN,))
-    return g("Exp", g("Add", g("Mul", g.take(inside, k, axis=1), model.domain.scale[k[0]]), model.domain.centre[k[0]]))
-
-
-def _turn_first(g: _Graph, covariance: str, steady_mean: Array) -> tuple[list[str], str]:
-    """Of (N, 6, 6) matrices the six pivots (N,), positive where a matrix is positive definite and its determinant's
-    factors, and their root times ``steady_mean`` (N, 6).
-
-    ``gpvo.geometry.covariance.turn_first_root``: the columns of its Cholesky factor are those of successive Schur
-    complements over the roots of the pivots.
-    """
-    rest = g.take(g.take(covariance, TURN_FIRST, axis=1), TURN_FIRST, axis=2)
-    pivots, lean = [], []
+def _pivots(g: _Graph, matrices: str) -> list[str]:
+    """The six pivots (N,) of matrices (N, 6, 6) by Cholesky's method, of successive Schur complements: the factors of
+    the determinant, all positive where a matrix is positive definite."""
+    rest, pivots = matrices, []
     for size in range(6, 0, -1):
-        column = g.take(rest, [0], axis=2)
-        pivot = g.take(column, [0], axis=1)
+        pivot = g.take(g.take(rest, [0], axis=2), [0], axis=1)
         pivots.append(g("Reshape", pivot, g.constant([-1], np.int64)))
-        # Each axis still there back to its place among the six.
-        back = steady_mean[TURN_FIRST[-size]] * np.eye(6)[TURN_FIRST[-size:]]
-        unit = g("Div", column, g("Sqrt", pivot))
-        lean.append(g("MatMul", g("Reshape", unit, g.constant([-1, size], np.int64)), g.constant(back)))
         if size > 1:
             others = np.arange(1, size)
-            below = g.take(column, others, axis=1)
-            right = g.take(g.take(rest, [0], axis=1), others, axis=2)
-            block = g.take(g.take(rest, others, axis=1), others, axis=2)
+            lower, right = g.take(rest, others, axis=1), g.take(g.take(rest, [0], axis=1), others, axis=2)
+            below, block = g.take(lower, [0], axis=2), g.take(lower, others, axis=2)
             rest = g("Sub", block, g("Div", g("MatMul", below, right), pivot))
-    return pivots, g.add(*lean)
+    return pivots

@@ -1,7 +1,7 @@
 /* What the arithmetic below needs of a motion, and what it gives back. Tangent order: translation x y z [m], rotation
  * x y z [rad], in the rectified left optical frame. Matrices are row-major. */
 typedef struct {
-    double mean[6];
+    double mean[6];        /* of the error: zero, as no mean that was tried gained anything */
     double covariance[36]; /* total, about the mean */
     double jitter[36];     /* the three parts it is the sum of */
     double white[36];
@@ -50,43 +50,30 @@ static double gpvo_locate(const double *features, const double *base, double dt_
     return sqrt(beyond + joint * joint);
 }
 
-/* Mean, its variance, log noise variance and its spread, from inputs (standardised features the model sees). */
-static void gpvo_basis(const double *inputs, double out[4][6]) {
-    static const int points[] = GPVO_POINTS, directions[] = GPVO_DIRECTIONS;
-    double kernel[GPVO_N_KERNEL], square[GPVO_N_DIRECTIONS];
-    const double *point = gpvo_point;
-    const float *row = gpvo_projection;
-    double *k = kernel, *s = square;
-    int g, i, j, r;
-    for (g = 0; g < GPVO_N_KERNELS; ++g) {
-        for (i = 0; i < points[g]; ++i) {
-            double e = 0.0;
-            for (j = 0; j < GPVO_N_INPUTS; ++j) {
-                int at = g * GPVO_N_INPUTS + j;
-                double d = (inputs[j] - gpvo_kernel_centre[at]) / gpvo_lengthscale[at] - *point++;
-                e += d * d;
-            }
-            k[i] = exp(-0.5 * e);
-        }
-        for (r = 0; r < directions[g]; ++r) {
-            double z = 0.0;
-            for (i = 0; i < points[g]; ++i) z += (double)*row++ * k[i];
-            *s++ = z * z;
-        }
-        k += points[g];
-    }
+/* Log of the variance over the base, and the variance of that log, from inputs (standardised features the GP sees). */
+static void gpvo_log_ratio(const double *inputs, double ratio[6], double spread[6]) {
+    double kernel[GPVO_N_POINTS];
+    int i, j, r;
     for (j = 0; j < 6; ++j) {
-        for (g = 0; g < 4; ++g) out[g][j] = gpvo_offset[g * 6 + j];
-        for (i = 0; i < GPVO_N_KERNEL; ++i) {
-            out[0][j] += gpvo_mean_weight[j * GPVO_N_KERNEL + i] * kernel[i];
-            out[2][j] += gpvo_mean_weight[(6 + j) * GPVO_N_KERNEL + i] * kernel[i];
-        }
-        for (r = 0; r < GPVO_N_DIRECTIONS; ++r)
-            for (g = 0; g < 3; ++g)
-                out[g + 1][j] += (double)gpvo_variance_weight[(g * 6 + j) * GPVO_N_DIRECTIONS + r] * square[r];
-        if (out[1][j] < 0.0) out[1][j] = 0.0;
-        if (out[3][j] < 0.0) out[3][j] = 0.0;
+        ratio[j] = gpvo_offset[j];
+        spread[j] = gpvo_signal_var[j];
     }
+    for (i = 0; i < GPVO_N_POINTS; ++i) {
+        double e = 0.0;
+        for (j = 0; j < GPVO_N_INPUTS; ++j) {
+            double d = (inputs[j] - gpvo_gp_centre[j]) / gpvo_lengthscale[j] - gpvo_point[i * GPVO_N_INPUTS + j];
+            e += d * d;
+        }
+        kernel[i] = exp(-0.5 * e);
+        for (j = 0; j < 6; ++j) ratio[j] += gpvo_kernel_weight[j * GPVO_N_POINTS + i] * kernel[i];
+    }
+    for (r = 0; r < GPVO_N_DIRECTIONS; ++r) {
+        double z = 0.0;
+        for (i = 0; i < GPVO_N_POINTS; ++i) z += (double)gpvo_projection[r * GPVO_N_POINTS + i] * kernel[i];
+        for (j = 0; j < 6; ++j) spread[j] -= (double)gpvo_reduction[j * GPVO_N_DIRECTIONS + r] * z * z;
+    }
+    for (j = 0; j < 6; ++j)
+        if (spread[j] < 0.0) spread[j] = 0.0;
 }
 
 /* Variance that is known before anything is learnt: geometry, floor, parts that grow with the motion. */
@@ -131,14 +118,13 @@ static double gpvo_within(double variance, double limit) {
     return limit * ratio / sqrt(1.0 + ratio * ratio);
 }
 
-/* Lower Cholesky factor of a symmetric 6x6 matrix, the turn before the translation: row and column i are of axis
- * (i + 3) % 6. Returns the log-determinant, NaN where the matrix is not positive definite. */
-static double gpvo_turn_first_root(const double C[36], double L[36]) {
-    double sum = 0.0;
+/* Log-determinant of a symmetric 6x6 matrix, NaN where it is not positive definite; by its Cholesky factor. */
+static double gpvo_ln_det(const double C[36]) {
+    double L[36], sum = 0.0;
     int i, j, k;
     for (i = 0; i < 6; ++i)
         for (j = 0; j <= i; ++j) {
-            double v = C[(i + 3) % 6 * 6 + (j + 3) % 6];
+            double v = C[i * 6 + j];
             for (k = 0; k < j; ++k) v -= L[i * 6 + k] * L[j * 6 + k];
             L[i * 6 + j] = i == j ? sqrt(v) : v / L[j * 7];
             if (i == j) sum += 2.0 * log(L[i * 7]);
@@ -149,14 +135,14 @@ static double gpvo_turn_first_root(const double C[36], double L[36]) {
 /* Correlations of jitter, white and bias; the first two mixed with those of the geometric covariance where there is one. */
 static void gpvo_correlations(const double *geometry, double R[3][36]) {
     int i, j, p, known = geometry != 0 && GPVO_GEOMETRY_WEIGHT > 0.0;
-    double own[36], ridge[36], L[36];
+    double own[36], ridge[36];
     for (i = 0; i < 6 && known; ++i)
         for (j = 0; j < 6; ++j) {
             double both = 0.5 * (geometry[i * 6 + j] + geometry[j * 6 + i]);
             own[i * 6 + j] = both / (sqrt(geometry[i * 7]) * sqrt(geometry[j * 7]));
             ridge[i * 6 + j] = own[i * 6 + j] + (i == j ? 1e-6 : 0.0);
         }
-    if (known) known = isfinite(gpvo_turn_first_root(ridge, L));
+    if (known) known = isfinite(gpvo_ln_det(ridge));
     for (p = 0; p < 3; ++p)
         for (i = 0; i < 36; ++i) {
             R[p][i] = gpvo_correlation[36 * p + i];
@@ -206,28 +192,17 @@ static void gpvo_divide(int j, double variance, double faster, double part[3][6]
     part[2][j] = sqrt(variance * bias / whole);
 }
 
-/* Noise [px] that the residuals show; 1 where the base does not look at it. */
-static double gpvo_residual_px(const double *inside) {
-#if GPVO_N_BASE > 12
-    int k = gpvo_base_column[12];
-    return exp(inside[k] * gpvo_scale[k] + gpvo_centre[k]);
-#else
-    (void)inside;
-    return 1.0;
-#endif
-}
-
 /* The error of one motion. features: GPVO_N_FEATURES values in the order above, NAN where missing. geometry: 6x6
  * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; what is none, such as
  * 0, means the training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
-    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], said[4][6], base[6], plain[6], R[3][36], L[36], part[3][6], limit[2], distance, outside, growth, ln_det, noise;
+    double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], ratio[6], spread[6], base[6], plain[6], R[3][36], part[3][6], limit[2], distance, outside, growth;
     double duration = dt_s >= GPVO_SHORTEST_S && dt_s <= GPVO_LONGEST_S ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;
     gpvo_base(features, duration, base, plain);
     distance = gpvo_locate(features, base, duration, inside);
     for (i = 0; i < GPVO_N_INPUTS; ++i) inputs[i] = inside[gpvo_input[i]];
-    gpvo_basis(inputs, said);
+    gpvo_log_ratio(inputs, ratio, spread);
     gpvo_correlations(geometry, R);
     gpvo_limits(features, duration, limit);
     out->distance = distance;
@@ -236,13 +211,10 @@ static void gpvo_predict(const double *features, const double *geometry, double 
     outside = 1.0 - out->in_domain;
     growth = pow(1.0 + distance, GPVO_OUTSIDE_POWER);
     for (j = 0; j < 6; ++j) {
-        double log_noise = gpvo_clip(said[2][j], -GPVO_LN_LARGEST, GPVO_LN_LARGEST), known = base[j] * exp(log_noise - 0.5 * said[3][j]), lost, total, variance;
+        double log_noise = gpvo_clip(ratio[j] + 0.5 * spread[j], -GPVO_LN_LARGEST, GPVO_LN_LARGEST), known = base[j] * exp(log_noise - 0.5 * spread[j]), total, variance;
         double cautious = log_noise + outside * (gpvo_high[j] > log_noise ? gpvo_high[j] - log_noise : 0.0);
-        double unit = GPVO_MEAN_IN_SIGMA ? sqrt(base[j]) : duration / GPVO_DT_S, usual = said[0][j] * unit;
-        out->mean[j] = usual * out->in_domain;
-        lost = usual - out->mean[j];
+        out->mean[j] = 0.0;
         total = (base[j] + outside * (plain[j] > base[j] ? plain[j] - base[j] : 0.0)) * exp(cautious) * growth;
-        total += (said[1][j] * unit * unit + lost * lost) * growth;
         variance = gpvo_within(total * gpvo_factor[j], limit[j / 3]);
         out->epistemic[j] = variance * (1.0 - known / total);
         gpvo_divide(j, gpvo_of_calibration(features, j, variance, out->calibration_root + j * 6), faster, part);
@@ -260,11 +232,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
             for (k = 0; k < 6; ++k) out->bias[at] += out->calibration_root[i * 6 + k] * out->calibration_root[j * 6 + k];
             out->covariance[i * 6 + j] = out->jitter[i * 6 + j] + out->white[i * 6 + j] + out->bias[i * 6 + j];
         }
-    ln_det = gpvo_turn_first_root(out->covariance, L);
-    noise = gpvo_residual_px(inside) * out->in_domain;
-    for (i = 0; i < 6; ++i)
-        for (j = 0; j <= i; ++j) out->mean[(i + 3) % 6] += L[i * 6 + j] * gpvo_steady_mean[(j + 3) % 6] * noise;
-    out->confidence = exp((GPVO_TYPICAL_LN_DET - ln_det) / 12.0);
+    out->confidence = exp((GPVO_TYPICAL_LN_DET - gpvo_ln_det(out->covariance)) / 12.0);
     if (out->confidence > 1.0) out->confidence = 1.0;
     out->confidence *= out->in_domain;
 }

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gpvo.online.basis import ProjectedGP
+from gpvo.online.projected import ProjectedGP
 from gpvo.types import Array
 
 
@@ -27,7 +27,7 @@ class Hyperparameters:
 class FittedGP:
     """A fitted GP: its posterior in projected form, in the units of the data.
 
-    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.basis``). ``hyper``: what was learnt.
+    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.projected``). ``hyper``: what was learnt.
     ``log_evidence``: log marginal likelihood, or its lower bound, in nats and in the units of the data.
     ``regressor``: name. ``n_rows``: rows conditioned on.
     """

@@ -30,7 +30,7 @@ from gpvo.learning.regressors.numerics import (
     unit_kernel,
     unpack,
 )
-from gpvo.online.basis import ProjectedGP
+from gpvo.online.projected import ProjectedGP
 from gpvo.types import Array
 
 CHUNK_ROWS = 8192

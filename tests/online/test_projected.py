@@ -1,0 +1,98 @@
+"""The projected GP: batch and single row agree, arrays survive, wrong shapes are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gpvo.errors import ModelError
+from gpvo.online.projected import NoisyGP, ProjectedGP
+from gpvo.online.rowplan import RowPlan
+
+
+def some_gp(rng: np.random.Generator, d: int = 8, D: int = 6, m: int = 40) -> ProjectedGP:
+    """A posterior of random data: unit kernel on m points, diagonalised statistics."""
+    points = rng.standard_normal((m, d))
+    K = np.exp(-0.5 * ((points[:, None] - points[None]) ** 2).sum(2))
+    eigenvalues, V = np.linalg.eigh(K)
+    ratio = rng.uniform(0.1, 1.0, (D, 1))
+    signal = rng.uniform(0.5, 2.0, D)
+    gain = 1.0 / (eigenvalues + ratio)
+    return ProjectedGP(
+        centre=rng.standard_normal(d),
+        lengthscale=rng.uniform(0.5, 3.0, d),
+        points=points,
+        projection=V.T,
+        weights=gain * (V.T @ rng.standard_normal((m, D))).T,
+        reduction=gain * signal[:, None],
+        signal_var=signal,
+        offset=rng.standard_normal(D),
+    )
+
+
+@pytest.mark.parametrize("sizes", [(40,), (40, 25)])
+def test_single_row_equals_batch(sizes: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    gps = [some_gp(rng, m=m) for m in sizes]
+    plan = RowPlan(gps)
+    X = gps[0].centre + rng.standard_normal((200, 8)) * 1.5
+    rows = [plan(x) for x in X]
+    for k, gp in enumerate(gps):
+        mean, variance = gp.evaluate(X)
+        assert np.abs(np.array([m[k] for m, _ in rows]) - mean).max() <= 5e-6 * np.abs(mean).max()
+        assert np.abs(np.array([v[k] for _, v in rows]) - variance).max() <= 5e-6 * gp.signal_var.max()
+
+
+def test_results_of_single_rows_are_not_overwritten() -> None:
+    plan = RowPlan([some_gp(np.random.default_rng(0))])
+    first = plan(np.zeros(8))
+    kept = [values.copy() for values in first]
+    plan(np.ones(8))
+    for values, before in zip(first, kept, strict=True):
+        np.testing.assert_array_equal(values, before)
+
+
+def test_variance_matches_the_textbook() -> None:
+    rng = np.random.default_rng(2)
+    gp = some_gp(rng, D=1)
+    K = gp.kernel(gp.points * gp.lengthscale + gp.centre)
+    X = rng.standard_normal((20, 8))
+    k = gp.kernel(X)
+    eta = 1.0 / (gp.reduction[0, -1] / gp.signal_var[0]) - np.linalg.eigvalsh(K)[-1]
+    textbook = gp.signal_var[0] * (1 - (k * np.linalg.solve(K + eta * np.eye(len(K)), k.T).T).sum(1))
+    np.testing.assert_allclose(gp.evaluate(X)[1][:, 0], textbook, atol=1e-9)
+
+
+def test_far_away_the_prior_returns_and_variance_never_falls_on_the_way() -> None:
+    gp = some_gp(np.random.default_rng(0))
+    steps = np.linspace(5.0, 60.0, 40)
+    mean, variance = gp.evaluate(gp.centre + steps[:, None] * np.ones(8) / np.sqrt(8) * gp.lengthscale)
+    assert (np.diff(variance, axis=0) >= -1e-12).all()
+    np.testing.assert_allclose(variance[-1], gp.signal_var)
+    np.testing.assert_allclose(mean[-1], gp.offset)
+
+
+def test_a_constant_says_the_same_of_every_place() -> None:
+    mean, variance = ProjectedGP.constant(np.arange(6.0)).evaluate(np.array([[0.0], [7.0]]))
+    np.testing.assert_array_equal(mean, [np.arange(6.0)] * 2)
+    assert not variance.any()
+
+
+def test_arrays_round_trip() -> None:
+    rng = np.random.default_rng(3)
+    noisy = NoisyGP(some_gp(rng), rng.standard_normal(6))
+    again = NoisyGP.from_arrays(noisy.to_arrays("thesis.0."), "thesis.0.")
+    X = rng.standard_normal((5, 8))
+    for a, b in zip(noisy.predict(X), again.predict(X), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_missing_or_misshapen_arrays_are_refused() -> None:
+    arrays = NoisyGP(some_gp(np.random.default_rng(0)), np.zeros(6)).to_arrays("")
+    with pytest.raises(ModelError, match=r"lacks the array 'mean\.points'"):
+        NoisyGP.from_arrays({k: v for k, v in arrays.items() if k != "mean.points"}, "")
+    with pytest.raises(ModelError, match="projection"):
+        NoisyGP.from_arrays(arrays | {"mean.projection": np.zeros((3, 4))}, "")
+    with pytest.raises(ModelError, match="do not fit together"):
+        NoisyGP.from_arrays(arrays | {"mean.points": np.zeros(3)}, "")
+    with pytest.raises(ModelError, match="log_noise_offset"):
+        NoisyGP.from_arrays(arrays | {"log_noise_offset": np.zeros(2)}, "")
