@@ -42,7 +42,8 @@ class Naive:
         good = (left[:, 0] - right[:, 0] > 1) & (np.abs(left[:, 1] - right[:, 1]) < 3)
         P_left = self._camera.K @ np.eye(3, 4)
         P_right = self._camera.K @ np.column_stack([np.eye(3), [-self._camera.baseline_m, 0, 0]])
-        points = opencv.triangulate_dlt(P_left, P_right, left[good], right[good])
+        X = cv2.triangulatePoints(P_left, P_right, left[good].T.astype(np.float64), right[good].T.astype(np.float64))
+        points = (X[:3] / X[3]).T
         bits, before = bits_l[pairs[good, 0]], self._before
         self._before = (points, bits)
         if before is None:

@@ -14,7 +14,6 @@ brings the noise of the frame where it starts.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -150,36 +149,6 @@ def along(T_prev_cur: Array, errors: Sequence[MotionError], parent: Iterable[int
         for old in [j for j in states if j < p]:
             del states[old]
     return mean, covariance
-
-
-@dataclass(frozen=True)
-class WindowError:
-    """Covariances (w, 6, 6) of the error of the last pose of w windows, by the part of the motions' errors."""
-
-    jitter: Array
-    white: Array
-    persistent: Array
-
-    @property
-    def covariance(self) -> Array:
-        """(w, 6, 6) of all parts together."""
-        return self.jitter + self.white + self.persistent
-
-
-def window_error(T_prev_cur: Array, error: MotionError) -> WindowError:
-    """What :class:`PoseError` gives after m motions, for w windows at once, none of them with a lost motion.
-
-    ``T_prev_cur`` (w, m, 4, 4); ``error``: arrays with leading axes (w, m). Time and memory go with w m.
-    """
-    to_end = adjoints_to_end(T_prev_cur)
-    ends = to_end[:, [0, -1]]
-    phi = persistence(np.broadcast_to(error.dt_s, to_end.shape[:2]), error.persistent_tau_s)
-    return WindowError(
-        # The noise of a frame between two motions cancels.
-        _sum(ends @ frame_jitter(error.jitter[:, [0, -1]]), ends),
-        _sum(to_end @ error.white, to_end),
-        persistent_sum(to_end @ error.persistent_root, phi),
-    )
 
 
 def adjoints_to_end(T_prev_cur: Array) -> Array:

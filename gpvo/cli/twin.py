@@ -55,7 +55,6 @@ def twin(
 
     Example: gpvo twin runs/mine -o twins --tolerance d455
     """
-
     settings = settings_of(replicates, tolerance, seed, gap)
     if out is None and not against:
         raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")

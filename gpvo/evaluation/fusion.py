@@ -273,6 +273,7 @@ def _constants(
 
 
 def trace_of(flight: Flight, fused: FusedRun) -> Trace:
+    """What a plot needs of a filtered run."""
     position = fused.T_world_cam[:, :3, 3]
     truth = None
     error = np.full(len(position), np.nan)

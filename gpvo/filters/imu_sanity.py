@@ -36,6 +36,7 @@ class Finding:
 
 
 def units_and_axes(flight: Flight, imu: ImuLog) -> list[Finding]:
+    """What an IMU shows of wrong units or axes; nothing from fewer than 20 samples."""
     clean = _in_time(imu)
     if len(clean.t_ns) < 20:
         return []

@@ -21,9 +21,13 @@ class Policy(Protocol):
     """States the error of one measured motion, for B members or one, None where it has nothing to say about it."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """By which it is chosen and shown."""
+        ...
 
-    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None: ...
+    def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
+        """The error stated of the record's motion."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -66,12 +66,6 @@ def correlation(C: Array) -> Array:
     return np.asarray(C / (sigma[..., :, None] * sigma[..., None, :]))
 
 
-def of_inverse(T_a_b: Array, cov_a_b: Array) -> Array:
-    """Covariance of ``T_b_a`` from ``T_a_b`` and its covariance: ``(T Exp(xi))^-1 = T^-1 Exp(-Ad(T) xi)``."""
-    A = se3.adjoint(T_a_b)
-    return A @ cov_a_b @ np.swapaxes(A, -1, -2)
-
-
 def compound(T_b_c: Array, cov_a_b: Array, cov_b_c: Array) -> Array:
     """Covariance of ``T_a_b T_b_c`` for independent errors: ``Ad(T_b_c)^-1 S_ab Ad(T_b_c)^-T + S_bc``."""
     A = se3.adjoint(se3.inverse(T_b_c))

@@ -89,11 +89,6 @@ def so3_left_jacobian_inverse(phi: Array) -> Array:
     return np.eye(3) - 0.5 * W + d[..., None, None] * (W @ W)
 
 
-def so3_right_jacobian(phi: Array) -> Array:
-    """Right Jacobian of SO(3): ``Exp(phi + d) ~ Exp(phi) Exp(Jr d)``. (..., 3) -> (..., 3, 3)."""
-    return so3_left_jacobian(-np.asarray(phi, dtype=np.float64))
-
-
 def exp(xi: Array) -> Array:
     """Tangent (..., 6) to pose (..., 4, 4)."""
     xi = np.asarray(xi, dtype=np.float64)

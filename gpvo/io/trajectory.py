@@ -128,23 +128,6 @@ def tum_line(t_ns: int, T_world_body: Array) -> str:
     return " ".join([ns_to_seconds_text(int(t_ns)), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
 
 
-def write_kitti_poses(path: str | Path, T_world_body: Array) -> None:
-    """Write KITTI poses, 12 numbers a line."""
-    _write(Path(path), (" ".join(f"{v:.9e}" for v in T[:3].ravel()) for T in T_world_body))
-
-
-def write_euroc_csv(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) -> None:
-    """Write EuRoC's eight columns: stamp [ns], position, quaternion w x y z."""
-
-    def lines() -> Iterator[str]:
-        yield "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
-        for t, T in zip(t_ns, T_world_body, strict=True):
-            q = se3.rotation_to_quaternion_xyzw(T[:3, :3])[[3, 0, 1, 2]]
-            yield ",".join([str(int(t)), *(f"{v:.9f}" for v in (*T[:3, 3], *q))])
-
-    _write(Path(path), lines())
-
-
 def _write(path: Path, lines: Iterator[str]) -> None:
     with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(line + "\n" for line in lines)

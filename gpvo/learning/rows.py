@@ -30,6 +30,7 @@ class Rows:
 
     @classmethod
     def stack(cls, sets: Sequence[TrainingSet]) -> Rows:
+        """The rows of all sequences, one after the other."""
         group, by = group_labels([len(s) for s in sets])
         # Every sequence counts alike, however long: a new sequence is what the model will meet.
         weight = np.concatenate([np.full(len(s), 1.0 / len(s)) for s in sets])
@@ -42,6 +43,7 @@ class Rows:
         return float(np.median(self.dt_s))
 
     def select(self, names: Sequence[str]) -> Array:
+        """(n, d) values of the named features."""
         return np.concatenate([s.select(names) for s in self.sets])
 
     def motions(self) -> Array:
@@ -50,6 +52,7 @@ class Rows:
         return se3.exp(np.where(np.isfinite(twist), twist, 0.0))
 
     def geometry(self, method: str | None) -> Array | None:
+        """(n, 6, 6) covariances by a method, NaN where unknown; None for no method."""
         return None if method is None else np.concatenate([s.covariances[method] for s in self.sets])
 
     def by_group(self, values: Array) -> Array:

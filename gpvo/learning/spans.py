@@ -93,6 +93,7 @@ def _by_block(values: Array) -> Array:
 
 
 def sums(z: Array, m: int) -> Array:
+    """(n - m + 1, D) sums over every m consecutive rows of z (n, D)."""
     total = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
     return total[m:] - total[:-m]
 

@@ -55,6 +55,7 @@ class Chart:
 
     @classmethod
     def of(cls, seen: Observations) -> Chart:
+        """The chart of all landmarks that are seen."""
         order = np.lexsort((-seen.uvd[:, 2], ~seen.trusted, seen.track))
         first = np.unique(seen.track[order], return_index=True)[1]
         return cls(order[first])
@@ -67,6 +68,8 @@ class Chart:
 
 @dataclass(frozen=True)
 class Estimate:
+    """Poses ``T_world_cam`` (F, 4, 4) and landmarks ``points_world`` (N, 3) [m]."""
+
     T_world_cam: Array
     points_world: Array
 

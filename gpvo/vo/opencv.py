@@ -127,11 +127,3 @@ def pose_from_points(
     mask = np.zeros(len(points), bool)
     mask[inliers.ravel()] = True
     return T, mask
-
-
-def triangulate_dlt(
-    P_left: NDArray[np.float64], P_right: NDArray[np.float64], uv_left: Points, uv_right: Points
-) -> NDArray[np.float64]:
-    """Linear triangulation by OpenCV (N, 3): slower than the closed form, kept for the naive pipeline."""
-    X = cv2.triangulatePoints(P_left, P_right, uv_left.T.astype(np.float64), uv_right.T.astype(np.float64))
-    return (X[:3] / X[3]).T

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import sequences as seq
 from bag_maker import stereo_bag
+from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo import cli
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
-from gpvo.io.trajectory import write_euroc_csv, write_kitti_poses, write_tum
+from gpvo.io.trajectory import write_tum
 from gpvo.types import Status, Vehicle, VoLog, VoRecord
 
 N = 400

@@ -23,7 +23,7 @@ def test_kernels_agree_with_the_general_formulas(size: float, batch: int) -> Non
     phi = np.random.default_rng(0).standard_normal((batch, 3)) * size / 2
     E, J = kernels.exp_and_right_jacobian(phi)
     np.testing.assert_allclose(E, se3.so3_exp(phi), atol=1e-14)
-    np.testing.assert_allclose(J, se3.so3_right_jacobian(phi), atol=1e-12)
+    np.testing.assert_allclose(J, se3.so3_left_jacobian(-phi), atol=1e-12)
     np.testing.assert_allclose(kernels.log(E), phi, atol=1e-12, rtol=1e-9)
     xi = np.concatenate([np.random.default_rng(1).standard_normal((batch, 3)), phi], axis=1)
     R, t = kernels.motion_exp(xi)

@@ -30,17 +30,6 @@ def _assert_close(C: np.ndarray, samples: np.ndarray) -> None:
     np.testing.assert_allclose(np.cov(samples.T) / np.outer(sigma, sigma), C / np.outer(sigma, sigma), atol=TOLERANCE)
 
 
-def test_of_inverse_is_that_of_samples():
-    C = _spd(0)
-    T = T_A_B @ se3.exp(_draw(C, 1))
-    _assert_close(cov.of_inverse(T_A_B, C), se3.log(T_A_B @ se3.inverse(T)))
-
-
-def test_of_inverse_twice_gives_back():
-    C = _spd(0)
-    np.testing.assert_allclose(cov.of_inverse(se3.inverse(T_A_B), cov.of_inverse(T_A_B, C)), C, atol=1e-18)
-
-
 def test_compound_is_that_of_samples():
     C_ab, C_bc = _spd(2), _spd(3)
     T = T_A_B @ se3.exp(_draw(C_ab, 4)) @ T_B_C @ se3.exp(_draw(C_bc, 5))

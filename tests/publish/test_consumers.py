@@ -16,6 +16,7 @@ from gpvo.errors import GpvoError
 from gpvo.publish import consumers
 from gpvo.publish.mavlink import upper_triangle
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
+from receivers import ardupilot_errors, px4_sigmas, robot_localization_covariance
 from synthetic_flights import ErrorLaw, synthetic_flight
 
 
@@ -32,7 +33,7 @@ def _px4_intake(wire: list[float], floor: float) -> list[float]:
 
 def test_px4_reads_diagonals_and_floors_them(odometry: list[Odometry]) -> None:
     for item in odometry:
-        ours = consumers.px4_sigmas(item)
+        ours = px4_sigmas(item)
         np.testing.assert_allclose(ours["velocity"], _px4_intake(upper_triangle(item.twist_covariance), 0.1))
         np.testing.assert_allclose(ours["position"], _px4_intake(upper_triangle(item.pose_covariance), 0.1))
         yaw = math.sqrt(max(upper_triangle(item.pose_covariance)[20], 0.1**2))
@@ -40,7 +41,7 @@ def test_px4_reads_diagonals_and_floors_them(odometry: list[Odometry]) -> None:
 
 
 def test_px4_mode_one_ignores_the_message(odometry: list[Odometry]) -> None:
-    sigmas = consumers.px4_sigmas(odometry[0], consumers.Px4Parameters(EKF2_EV_NOISE_MD=1, EKF2_EVV_NOISE=0.3))
+    sigmas = px4_sigmas(odometry[0], consumers.Px4Parameters(EKF2_EV_NOISE_MD=1, EKF2_EVV_NOISE=0.3))
     np.testing.assert_array_equal(sigmas["velocity"], [0.3] * 3)
 
 
@@ -61,16 +62,16 @@ def _ardupilot_intake(wire: list[float], *, old: bool) -> tuple[float, float]:
 def test_ardupilot_collapses_and_clamps(odometry: list[Odometry], old: bool, scale: float) -> None:
     for item in odometry[::10]:
         C = item.pose_covariance * scale
-        ours = consumers.ardupilot_errors(C, before_2026=old)
+        ours = ardupilot_errors(C, before_2026=old)
         np.testing.assert_allclose(ours, _ardupilot_intake(upper_triangle(C), old=old), rtol=1e-9)
-    assert consumers.ardupilot_errors(np.full((6, 6), np.nan), before_2026=old) == (0.2, 0.2)
+    assert ardupilot_errors(np.full((6, 6), np.nan), before_2026=old) == (0.2, 0.2)
 
 
 def test_robot_localization_floors_and_takes_absolutes() -> None:
     C = np.eye(6)
     C[1, 1], C[2, 2] = -0.5, 1e-12
     C[0, 3] = C[3, 0] = 0.4
-    used = consumers.robot_localization_covariance(C)
+    used = robot_localization_covariance(C)
     np.testing.assert_array_equal(np.diagonal(used), [1, 0.5, 1e-9, 1, 1, 1])
     assert used[0, 3] == 0.4
 
