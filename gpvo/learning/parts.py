@@ -9,14 +9,14 @@ L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.signal import lfilter
 
-from gpvo.learning.spans import Chains, at_most, carried, cut, span_variances
+from gpvo.learning.spans import Chains, at_most, cut, span_variances
 from gpvo.types import Array
 
 _TAU_FRAMES = (4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
@@ -53,15 +53,41 @@ class Parts:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Of one span and block of axes: squared sums (w, d); stated variances (w, m, d), their logs above the typical
-    level and those of the speed (w, m, 1); what is known to add up besides (w, d); what a window counts."""
+    """Of one block of d axes, W windows of all spans, one after the other, of R motions together.
+
+    Squared sums (d, W), what is known to add up besides (d, W) and what a window counts (W,); the motions' stated
+    variances (d, R), their logs above the typical level (d, R) and those of the speed (R,). ``spans``: windows and
+    motions of each span.
+    """
 
     square: Array
+    known: Array
+    count: Array
     variance: Array
     above: Array
     faster: Array
-    known: Array
-    count: float
+    spans: Sequence[tuple[int, int]]
+
+    def split(self, each: Array) -> Iterator[Array]:
+        """Per span (d, w, m) of values (d, R) of the motions."""
+        at = 0
+        for w, m in self.spans:
+            yield each[:, at : at + w * m].reshape(-1, w, m)
+            at += w * m
+
+    def sums(self, each: Array) -> Array:
+        """(d, W) over each window of values (d, R) of the motions."""
+        return np.concatenate([x.sum(axis=2) if x.shape[2] > 1 else x[:, :, 0] for x in self.split(each)], axis=1)
+
+    def ends(self, each: Array) -> Array:
+        """(d, W) mean of the first and the last motion of each window."""
+        return 0.5 * np.concatenate([x[:, :, 0] + x[:, :, -1] for x in self.split(each)], axis=1)
+
+    def carried(self, amplitude: Array, phi: float) -> Array:
+        """(d, R) what each motion has of biases of ``amplitude`` (d, R) that last from those before in its window."""
+        given = self.split(amplitude)
+        told = [lfilter([0.0, phi], [1.0, -phi], x, axis=2) if x.shape[2] > 1 else np.zeros_like(x) for x in given]
+        return np.concatenate([x.reshape(len(x), -1) for x in told], axis=1)
 
 
 @dataclass(frozen=True)
@@ -98,7 +124,7 @@ def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float, las
     share, growth, ratio = np.empty((3, D)), np.empty((2, D)), np.empty((len(found.spans), D))
     blocks = [slice(start, min(start + 3, D)) for start in range(0, D, 3)]
     given = (error, ln_var, ln_speed, lasting)
-    windows = [[_windows(given, m, block, level) for m in found.spans] for block in blocks]
+    windows = [_windows(given, found.spans, block, level) for block in blocks]
     tau, shapes = _choose(windows)
     widening = found.widening(tau)
     for block, seen, shape in zip(blocks, windows, shapes):
@@ -111,7 +137,7 @@ def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float, las
 _Choice = tuple[_Shape, _Fit]
 
 
-def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Shape]]:
+def _choose(windows: Sequence[_Windows]) -> tuple[float, list[_Shape]]:
     """The time constant [frames] of all blocks, and the shape of each.
 
     Sideways errors go with the turns that undo them; with time constants of their own they would part on the way.
@@ -127,7 +153,7 @@ def _choose(windows: Sequence[Sequence[_Windows]]) -> tuple[float, list[_Shape]]
     return found, [shape for shape, _ in tried[found]]
 
 
-def _best(windows: Sequence[_Windows], tau: float) -> _Choice:
+def _best(windows: _Windows, tau: float) -> _Choice:
     """The best shape of a block. Expected are shares that do not change."""
     tried = [(s, _fit_shape(windows, s)) for s in (_Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
     by_noise = min(tried, key=_loss)[0].by_noise
@@ -140,62 +166,76 @@ def _loss(choice: _Choice) -> float:
     return fit.loss + _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
 
 
-def _windows(given: Sequence[Chains], m: int, block: slice, level: Array) -> _Windows:
-    e, v, u, root = (np.concatenate([cut(c, m) for chains in x for c in chains]) for x in given)
-    some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
-    e, v, u, root = e[some, :, block], v[some, :, block], u[some], root[some, :, block]
-    known = (root.sum(axis=1) ** 2).sum(axis=-1)
-    return _Windows(e.sum(axis=1) ** 2, np.exp(v), v - level[block], u, known, min(len(e), _MOST_COUNT) / len(e))
+def _windows(given: Sequence[Chains], spans: NDArray[np.int64], block: slice, level: Array) -> _Windows:
+    parts, sizes = [], []
+    for m in spans:
+        e, v, u, root = (np.concatenate([cut(c, m) for chains in x for c in chains]) for x in given)
+        some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
+        e, v, u, root = e[some, :, block], v[some, :, block], u[some], root[some, :, block]
+        known = (root.sum(axis=1) ** 2).sum(axis=-1)
+        each = v.reshape(-1, v.shape[2]).T
+        count = np.full(len(e), min(len(e), _MOST_COUNT) / len(e))
+        parts.append((e.sum(axis=1).T ** 2, known.T, count, each, u.ravel()))
+        sizes.append((len(e), int(m)))
+    square, known, counts, ln_var, faster = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
+    return _Windows(square, known, counts, np.exp(ln_var), ln_var - level[block, None], faster, sizes)
 
 
-def _fit_shape(windows: Sequence[_Windows], shape: _Shape, widen: Array | None = None) -> _Fit:
+def _fit_shape(windows: _Windows, shape: _Shape, widen: Array | None = None) -> _Fit:
     """Shares for one shape, by the likelihood of squared sums, times ``widen`` (S, d) where given.
 
     A squared sum has the deviation of what is stated of it; so the fit is reweighted by its own statement, because
     weights by what is seen would favour statements that are too small.
     """
-    d = windows[0].square.shape[1]
-    widen = np.ones((len(windows), d)) if widen is None else widen
+    d, sizes = len(windows.square), [w for w, _ in windows.spans]
+    widen = np.ones((len(sizes), d)) if widen is None else widen
     share = np.repeat([[0.5], [0.4], [0.1]], d, axis=1)
-    count = np.concatenate([np.full(len(w.square), w.count) for w in windows])
-    square = np.concatenate([w.square * more for w, more in zip(windows, widen)])
-    known = np.concatenate([w.known for w in windows])
-    changes = shape.by_speed > 0 or shape.by_noise > 0
+    square, known = windows.square * np.repeat(widen.T, sizes, axis=1), windows.known
+    gains = None
+    if shape.by_speed > 0 or shape.by_noise > 0:
+        gain = np.broadcast_to(np.exp(shape.by_speed * windows.faster), windows.above.shape)
+        gains = gain, gain * np.exp(shape.by_noise * windows.above)
     for k in range(_REWEIGHTINGS):
-        if k == 0 or (changes and k <= _REDIVISIONS):
-            A = np.concatenate([_terms(w, shape, share) for w in windows])
-        stated = known + np.einsum("wpd,pd->wd", A, share)
+        if k == 0 or (gains is not None and k <= _REDIVISIONS):
+            A = _terms(windows, gains, shape.tau, share)
+        stated = known + (A * share[:, :, None]).sum(axis=0)
         seen = np.minimum(square, _MOST_RATIO * stated) - known
-        share = np.stack([_solve(A[:, :, j], seen[:, j], count / stated[:, j] ** 2) for j in range(d)], axis=1)
-    stated = known + np.einsum("wpd,pd->wd", A, share)
+        share = _solve(A, seen, windows.count / stated**2)
+    stated = known + (A * share[:, :, None]).sum(axis=0)
     ratio = np.minimum(square / stated, _MOST_RATIO)
-    loss = float((count[:, None] * (np.log(stated) + ratio)).sum())
-    edges = np.cumsum([len(w.square) for w in windows])[:-1]
-    return _Fit(loss, share, np.array([r.mean(axis=0) for r in np.split(ratio, edges)]) / widen)
+    loss = float((windows.count * (np.log(stated) + ratio)).sum())
+    means = np.array([r.mean(axis=1) for r in np.split(ratio, np.cumsum(sizes)[:-1], axis=1)])
+    return _Fit(loss, share, means / widen)
 
 
-def _terms(w: _Windows, shape: _Shape, share: Array) -> Array:
-    """(w, 3, d) variance of the sum over each window of jitter, white and bias of unit share at the typical level.
+def _terms(w: _Windows, gains: tuple[Array, Array] | None, tau: float, share: Array) -> Array:
+    """(3, d, W) variance of the sum over each window of jitter, white and bias of unit share at the typical level.
 
-    The motions' variances are divided as :func:`gpvo.online.division.divide` does with ``share``.
+    The motions' variances are divided as :func:`gpvo.online.division.divide` does with ``share``, where white and bias
+    have ``gains`` (d, R) over the jitter.
     """
     each = white = bias = w.variance
-    if shape.by_speed or shape.by_noise:
-        gain = np.exp(shape.by_speed * w.faster)
-        more = gain * np.exp(shape.by_noise * w.above)
-        each = w.variance / (share[0] + share[1] * gain + share[2] * more)
-        white, bias = each * gain, each * more
+    if gains is not None:
+        each = w.variance / (share[0, :, None] + share[1, :, None] * gains[0] + share[2, :, None] * gains[1])
+        white, bias = each * gains[0], each * gains[1]
     amplitude = np.sqrt(bias)
-    before = carried(amplitude, np.full(amplitude.shape[-1], np.exp(-1.0 / shape.tau)))
-    jitter = 0.5 * (each[:, 0] + each[:, -1])
-    return np.stack([jitter, white.sum(axis=1), bias.sum(axis=1) + 2.0 * (amplitude * before).sum(axis=1)], axis=1)
+    bias = bias + 2.0 * amplitude * w.carried(amplitude, float(np.exp(-1.0 / tau)))
+    return np.stack([w.ends(each), w.sums(white), w.sums(bias)])
 
 
 def _solve(A: Array, square: Array, weight: Array) -> Array:
-    """Shares (3,), not negative and of sum one, that explain squared sums (w,) best; white where nothing shows."""
-    M = A[:, [0, 2]] - A[:, 1:2]
-    gram = (M * weight[:, None]).T @ M + 1e-9 * (weight @ A[:, 1] ** 2) * np.eye(2)
-    L = np.linalg.cholesky(gram)
-    jitter, bias = nnls(L.T, np.linalg.solve(L, (M * weight[:, None]).T @ (square - A[:, 1])))[0]
+    """Shares (3, d), not negative and of sum one, that explain squared sums (d, W) best; white where nothing shows."""
+    J, B, rest = A[0] - A[1], A[2] - A[1], square - A[1]
+    least = 1e-9 * (weight * A[1] ** 2).sum(axis=1)
+    wJ, wB = weight * J, weight * B
+    jj, jb, bb = (wJ * J).sum(axis=1) + least, (wJ * B).sum(axis=1), (wB * B).sum(axis=1) + least
+    rj, rb = (wJ * rest).sum(axis=1), (wB * rest).sum(axis=1)
+    # Where the best of both would be negative, the better of one alone.
+    jitter, bias = (bb * rj - jb * rb) / (jj * bb - jb**2), (jj * rb - jb * rj) / (jj * bb - jb**2)
+    both = (jitter >= 0) & (bias >= 0)
+    rj, rb = np.maximum(rj, 0.0), np.maximum(rb, 0.0)
+    by_jitter = rj**2 / jj > rb**2 / bb
+    jitter = np.where(both, jitter, np.where(by_jitter, rj / jj, 0.0))
+    bias = np.where(both, bias, np.where(by_jitter, 0.0, rb / bb))
     share = np.maximum([jitter, 1.0 - jitter - bias, bias], _MIN_SHARE)
-    return share / share.sum()
+    return np.asarray(share / share.sum(axis=0))

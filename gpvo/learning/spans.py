@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from gpvo.types import Array
 
@@ -54,15 +53,6 @@ def at_most(values: Chains, limit: int) -> Chains:
 def cut(values: Array, m: int) -> Array:
     """(w, m, ...) separate windows of m rows; what is left over is dropped."""
     return values[: len(values) // m * m].reshape(-1, m, *values.shape[1:])
-
-
-def carried(amplitude: Array, phi: Array) -> Array:
-    """(w, m, ..., d) what each motion has of the biases of those before it in its window. ``amplitude`` (w, m, ..., d)
-    of biases of unit variance, correlated by ``phi`` (d,) from one motion to the next."""
-    out = np.empty_like(amplitude)
-    for p in np.unique(phi):
-        out[..., phi == p] = lfilter([0.0, p], [1.0, -p], amplitude[..., phi == p], axis=1)
-    return out
 
 
 def span_variances(z: Chains) -> SpanVariances:
