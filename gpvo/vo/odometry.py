@@ -20,7 +20,7 @@ from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, 
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.rig_error import RigError, RigState
-from gpvo.vo.rivals import Choice, Expected, areas, choose, unexplained
+from gpvo.vo.rivals import Choice, Expected, Leaps, areas, choose, unexplained
 from gpvo.vo.sigmas import PersistentNoise, ResidualMoments, SigmaEstimator
 
 _RIVAL_STAYS = 0.85  # per frame
@@ -94,6 +94,7 @@ class StereoOdometry:
         if self._state is None:
             counts = frontend.promote(None)
             self._state = _State(frame.t_ns, frame.t_ns, frame.t_ns, np.eye(4), np.zeros(6), 0.0, counts[1])
+            self._state.leaps.began_ns = frame.t_ns
             record = VoRecord(frame.t_ns, frame.t_ns, Status.START, np.eye(4), n_detected=counts[0], n_stereo=counts[1])
             return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **ImuMoments.of(imu).fields())
         guess = self._state.guess(frame.t_ns)
@@ -180,6 +181,14 @@ class StereoOdometry:
         self._state.odds, self._state.otherwise = chosen.odds, chosen.otherwise
         if not chosen.plausible:
             doubts.append("no vehicle changes its velocity like this")
+        elif chosen.tells and not chosen.goes_on:
+            self._state.leap(t_ns, motions[chosen.index].T_prev_cur, self.config.max_acceleration_mps2)
+        left = self._state.leaps.doubted(t_ns)
+        if left is not None:
+            doubts.append("the velocity leapt: what it was before may be the scene's")
+            T_before = se3.exp(left * (t_ns - self._state.t_ref_ns) * 1e-9)
+            d = se3.log(se3.inverse(motions[chosen.index].T_prev_cur) @ T_before)
+            chosen = replace(chosen, otherwise=chosen.otherwise + 0.5 * np.outer(d, d))
         return motions[chosen.index], chosen
 
     def _estimate(self, matches: Matches, among: NDArray[np.bool_] | None = None) -> Motion | None:
@@ -285,7 +294,8 @@ class StereoOdometry:
         state.believe(record.t_ns, record.T_prev_cur, parallax_px, int(inliers.sum()), tells=tells)
         at_rest = state.parallax_from_reference_px < config.keyframe_parallax_px
         # Beside a rival the reference stays fresh: what moves otherwise is seen in two frames or never.
-        if at_rest and state.rivalry < 0.2 and inliers.sum() > 0.6 * state.reference_points:
+        beside = state.rivalry > 0.2 or state.leaps.before is not None
+        if at_rest and not beside and inliers.sum() > 0.6 * state.reference_points:
             return False, (state.reference_points, state.reference_points)
         kept = inliers if state.rival is None else state.rival
         counts = self._frontend.promote(kept, at_least=config.min_inliers)
@@ -313,6 +323,7 @@ class _State:
     otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
     odds: float = 0.0  # log odds that the last velocity is that against the scene
     t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
+    leaps: Leaps = field(default_factory=lambda: Leaps(0))
 
     def frozen(self, seen: Observation) -> str:
         """What repeats itself although the camera was moving; empty for nothing."""
@@ -336,13 +347,22 @@ class _State:
         step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
         return Expected(guess, max_acceleration_mps2 * age_s * step_s, self.odds)
 
+    def leap(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> None:
+        """The motion from the reference does not go on from the last velocity."""
+        assert self.t_twist_ns is not None
+        now = self._velocity(t_ns, T_ref_cur)
+        self.leaps.step(t_ns, now, self.twist, self.t_twist_ns, max_acceleration_mps2)
+
+    def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
+        """(6,) per second, since the last believed motion."""
+        step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
+        return np.asarray(step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6))
+
     def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, *, tells: bool) -> None:
         """Take over a measured motion from the reference; its velocity only where it ``tells``."""
         self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
         if tells:
-            step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
-            self.twist = step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6)
-            self.t_twist_ns = t_ns
+            self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
         self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
         self.parallax_from_reference_px = parallax_px
         self.T_ref_believed = T_ref_cur

@@ -29,6 +29,7 @@ _NOISE = 9.0  # standard deviations of odometry's own noise that are no change o
 _AREA = 0.5  # power of the parts covered in the odds of being the scene, frame by frame: neighbours tell the same
 _UNSEEN = -0.2  # log odds of the expected motion that nothing in the picture makes
 _SUREST = 3.0  # log odds at most: whoever is surer could not be put right
+_LONGEST_DOUBT_NS = 30 * 10**9
 _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the motion
 
 
@@ -45,13 +46,45 @@ class Expected:
 @dataclass(frozen=True)
 class Choice:
     """Which motion is taken; covariance (6, 6) of its being another one; whether a vehicle can have made it; whether it
-    tells the velocity, and is not just too noisy to contradict; log odds of what is expected from now on."""
+    tells the velocity, and is not just too noisy to contradict; log odds of what is expected from now on; whether the
+    velocity goes on from the last one."""
 
     index: int = 0
     otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))
     plausible: bool = True
     tells: bool = True
     odds: float = 0.0
+    goes_on: bool = True
+
+
+@dataclass
+class Leaps:
+    """Remembers a velocity from which the next one leapt as no vehicle does, as it does on to traffic and off it again.
+
+    One of the two is not the scene's, and as long as the picture holds one motion alone nothing tells which. So the
+    later one is in doubt for as long as the earlier had lasted, or until a leap leads back to where the vehicle can
+    have come from the earlier one meanwhile.
+    """
+
+    began_ns: int
+    before: Array | None = None  # (6,) the velocity that was left
+    left_ns: int = 0
+    until_ns: int = 0
+
+    def step(self, t_ns: int, now: Array, last: Array, t_last_ns: int, max_acceleration_mps2: float) -> None:
+        """The velocity leapt to ``now`` (6,) at ``t_ns``, from ``last`` (6,) at ``t_last_ns``."""
+        if self.before is None:
+            self.before, self.left_ns = last, t_last_ns
+            self.until_ns = t_ns + min(t_last_ns - self.began_ns, _LONGEST_DOUBT_NS)
+        elif np.linalg.norm((now - self.before)[:3]) <= max_acceleration_mps2 * (t_ns - self.left_ns) * 1e-9:
+            self.before = None
+        self.began_ns = t_ns
+
+    def doubted(self, t_ns: int) -> Array | None:
+        """(6,) the velocity that may still be the scene's at ``t_ns`` instead; None where the one seen is believed."""
+        if self.before is not None and t_ns > self.until_ns:
+            self.before = None
+        return self.before
 
 
 def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None) -> Choice:
@@ -83,7 +116,7 @@ def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected
     share = np.maximum(share / share.sum(), np.exp(-_SUREST) / (1 + np.exp(-_SUREST)))
     d = np.stack([se3.log(se3.inverse(candidates[best]) @ T) for T in candidates])
     otherwise = np.einsum("i,ij,ik->jk", share, d, d)
-    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST))
+    return Choice(best, otherwise, plausible, plausible and bool(tells[best]), min(odds, _SUREST), bool(goes_on[best]))
 
 
 def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int64]:

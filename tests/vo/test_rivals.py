@@ -10,7 +10,7 @@ from gpvo.sim.points import simulate_points
 from gpvo.types import Status, VoLog
 from gpvo.vo.config import make_config
 from gpvo.vo.motion import Motion
-from gpvo.vo.rivals import Expected, choose
+from gpvo.vo.rivals import Expected, Leaps, choose
 
 
 def moving(z_m: float, sigma_m: float = 0.003) -> Motion:
@@ -49,6 +49,22 @@ def test_a_second_bad_motion_is_not_believed_because_the_first_was():
         assert not choice.plausible
         assert np.sqrt(choice.otherwise[2, 2]) > 1.0
         odds = choice.odds
+
+
+def test_a_leap_is_in_doubt_until_one_leads_back_or_it_has_lasted_as_long():
+    """From 15 m/s on to a lorry's 0.5 m/s after 8 s, and off it again by a car of 12 m/s^2."""
+    seconds, before, lorry = 10**9, np.array([0, 0, 15.0, 0, 0, 0]), np.array([0, 0, 0.5, 0, 0, 0])
+    leaps = Leaps(began_ns=0)
+    assert leaps.doubted(8 * seconds) is None
+    leaps.step(8 * seconds, lorry, before, 79 * seconds // 10, 12.0)
+    assert leaps.doubted(15 * seconds) is before
+    leaps.step(15 * seconds, before + 4.0, lorry, 149 * seconds // 10, 12.0)
+    assert leaps.doubted(15 * seconds) is None
+    leaps = Leaps(began_ns=0)
+    leaps.step(8 * seconds, lorry, before, 8 * seconds, 12.0)
+    leaps.step(9 * seconds, before + 40.0, lorry, 9 * seconds, 12.0)  # no car has come there
+    assert leaps.doubted(15 * seconds) is before
+    assert leaps.doubted(17 * seconds) is None
 
 
 def test_alone_and_as_expected_it_is_sure_of_itself():
