@@ -241,6 +241,8 @@ def _print(d: dict[str, Any]) -> None:
             say(line)
     if d["truth_moves_at_rest"]:
         say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands still while its truth moves")
+    for text in d["odd_stretches"]:
+        say(f"  {text}: odometry or truth is wrong there")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
     relative = (f"{name} {cell(m)} m, {cell(math.degrees(rad))} deg" for name, m, rad in errors)
     say(f"  relative error (rms) over a {'; '.join(relative)}")

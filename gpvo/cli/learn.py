@@ -41,6 +41,9 @@ def train(
             "--stationary", "--waits", help="Motions in which the vehicle stands while its truth wanders: drop or keep."
         ),
     ] = "drop",
+    odd: Annotated[
+        str, typer.Option(help="Stretches in which odometry and truth differ as nowhere else: keep or drop.")
+    ] = "keep",
     update: Annotated[
         Path | None,
         typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
@@ -81,6 +84,7 @@ def train(
         "regressor": regressor,
         "align": align,
         "waits": waits,
+        "odd": odd,
         "seed": seed,
         "max_rows": max_rows,
     }
@@ -247,6 +251,11 @@ def _print_table(document: dict[str, Any]) -> None:
     if resting:
         told = ", ".join(f"{n} of {name}" for name, n in resting.items())
         say(f"left out, because the truth moves while the vehicle stands: {told} (--stationary keep keeps them)")
+    differing = {f["held_out"]: n for f in document["folds"] if (n := f.get("odd"))}
+    if differing:
+        told = ", ".join(f"{n} of {name}" for name, n in differing.items())
+        say(f"motions in which odometry and truth differ as nowhere else: {told}")
+        say("('gpvo evaluate' names them; 'gpvo train --odd drop' learns and judges without them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}

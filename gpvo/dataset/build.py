@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
+from gpvo.dataset.odd import odd_stretches
+from gpvo.dataset.odd import times as odd_times
 from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.dataset.targets import check_target, motion_targets, position_targets
 from gpvo.errors import GpvoError
@@ -30,7 +32,8 @@ class TrainingSet:
 
     ``X`` (n, d) features ``columns``, NaN where unknown. ``Y`` (n, 6) errors [m, rad], or (n, 3) residuals of a
     position. ``covariances`` (n, 6, 6) and ``v_t`` (n, 3, 3) by method. ``counts``: frames, lost, slips (lost by
-    plausibility alone, also in ``lost``), frames without truth, and those at rest whose truth moves. ``lost_xi``
+    plausibility alone, also in ``lost``), frames without truth, those at rest whose truth moves, and those in odd
+    stretches. ``lost_xi``
     (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from the motion expected.
     """
 
@@ -96,17 +99,20 @@ def build(
     columns: Sequence[str] | None = None,
     target: str = "frame",
     waits: str = "drop",
+    odd: str = "keep",
     where: object = None,
 ) -> TrainingSet:
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
     ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
-    waits in which the truth moves (:func:`gpvo.dataset.rest.wandering_waits`); "keep" learns from them. Raises
-    GpvoError where nothing is left to learn from, which names ``where``, by default ``name``.
+    waits in which the truth moves (:func:`gpvo.dataset.rest.wandering_waits`); "keep" learns from them. ``odd``: the
+    same of stretches in which odometry and truth differ as nowhere else (:mod:`gpvo.dataset.odd`). Raises GpvoError
+    where nothing is left to learn from, which names ``where``, by default ``name``.
     """
     check_target(target)
-    if waits not in ("drop", "keep"):
-        raise GpvoError(f"unknown treatment of waits: '{waits}'", cure="drop or keep")
+    for what, way in (("waits", waits), ("odd stretches", odd)):
+        if way not in ("drop", "keep"):
+            raise GpvoError(f"unknown treatment of {what}: '{way}'", cure="drop or keep")
     names = tuple(columns or (*resolve("full"), RESIDUAL_COLUMN))
     if truth is None or len(truth.t_ns) < 2:
         raise GpvoError(
@@ -123,6 +129,10 @@ def build(
     with_truth = int(known.sum())
     if waits == "drop":
         known &= ~in_waits(records, wandering_waits(log, truth))
+    moves_at_rest = with_truth - int(known.sum())
+    is_odd = known & in_waits(records, odd_times(odd_stretches(log, truth)))
+    if odd == "drop":
+        known &= ~is_odd
     if known.sum() < MIN_ROWS:
         raise GpvoError(
             f"only {int(known.sum())} motions have ground truth, {MIN_ROWS} are needed",
@@ -147,7 +157,8 @@ def build(
             "lost": n_lost,
             "slips": len(slips),
             "without_truth": int(n_usable - with_truth),
-            "truth_moves_at_rest": int(with_truth - known.sum()),
+            "truth_moves_at_rest": moves_at_rest,
+            "odd": int(is_odd.sum()),
         },
         camera=log.camera,
         target=target,
@@ -176,6 +187,7 @@ def build_run(
     target: str = "frame",
     align: str = "none",
     waits: str = "drop",
+    odd: str = "keep",
 ) -> TrainingSet:
     """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
     truth = run.truth
@@ -183,7 +195,7 @@ def build_run(
         truth = align_rotation(run.log, truth)
     elif align not in ("none", "rotation"):
         raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
-    return build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, where=run.path)
+    return build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
 
 
 def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:

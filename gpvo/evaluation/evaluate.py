@@ -15,6 +15,7 @@ from gpvo.dataset.build import align_rotation
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, motion_errors
 from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
+from gpvo.dataset.odd import Stretch, odd_stretches
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m, velocity_path
 from gpvo.errors import GpvoError, SourceError
@@ -60,10 +61,11 @@ class EvaluateOptions:
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands. ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its
-    source states. ``tells_from_m``: length of path from which odometry's errors outweigh it. ``turned``: a fixed
-    rotation between truth and odometry, where it matters. ``in_domain``: share of the predicted frames that lie in the
-    model's training domain, None without a model. ``poses``: scores of the covariances of poses that a log states.
+    stands. ``odd``: stretches in which odometry and truth differ as nowhere else. ``truth_sigma`` (6,): noise of the
+    truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source states. ``tells_from_m``: length of
+    path from which odometry's errors outweigh it. ``turned``: a fixed rotation between truth and odometry, where it
+    matters. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a model.
+    ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run
@@ -80,6 +82,7 @@ class Evaluation:
     tells_from_m: float = 0.0
     turned: FixedRotation | None = None
     unscored: int = 0
+    odd: Sequence[Stretch] = ()
     in_domain: float | None = None
     poses: PoseConsistency | None = None
 
@@ -143,6 +146,7 @@ def evaluate_run(
         turned=fixed_rotation(scored, truth) if options.align == "none" else None,
         time_offset_s=offset_s,
         unscored=int(log.usable.sum() - scored.usable.sum()),
+        odd=odd_stretches(scored, truth),
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None,
     )
@@ -200,6 +204,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
     * ``truth_moves_at_rest``: motions that are not scored, as the vehicle stands and the truth moves; they count in
       ATE, final error and RPE alone.
+    * ``odd_stretches``: motions, in words, in which odometry and truth differ as nowhere else; they are scored.
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :mod:`gpvo.evaluation.poses`); None where it states none.
@@ -260,6 +265,7 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "lost": counts["lost"],
         "degraded": counts["degraded"],
         "truth_moves_at_rest": e.unscored,
+        "odd_stretches": [str(s) for s in e.odd],
         "in_domain": e.in_domain,
         "path_length_m": t.path_length_m,
         "ate_rmse_m": t.ate_rmse_m,

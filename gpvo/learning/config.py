@@ -38,9 +38,10 @@ class TrainConfig:
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of
     positions and of the thesis' model. ``align``:
     ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
-    which the truth moves. ``inducing``: points of its GP. ``max_rows``: held in memory, of larger
-    files the rest streams. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted.
-    ``keep``: folder for finished folds, which a training that was broken off does not fit again; None keeps none.
+    which the truth moves; ``odd`` likewise stretches in which odometry and truth differ as nowhere else. ``inducing``:
+    points of its GP. ``max_rows``: held in memory, of larger files the rest streams. ``jobs``, ``backend`` (``local``
+    or ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for finished folds, which a training that was
+    broken off does not fit again; None keeps none.
     """
 
     features: str = "auto"
@@ -49,6 +50,7 @@ class TrainConfig:
     seed: int = 0
     align: str = "none"
     waits: str = "drop"
+    odd: str = "keep"
     inducing: int = 256
     max_rows: int = 100_000
     jobs: int = 1
@@ -62,7 +64,7 @@ class TrainConfig:
 
     def rows_of(self, run: Run) -> TrainingSet:
         """The training set of a run as these settings want it."""
-        return build_run(run, target=self.target, align=self.align, waits=self.waits)
+        return build_run(run, target=self.target, align=self.align, waits=self.waits, odd=self.odd)
 
 
 def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tuple[str, ...]:

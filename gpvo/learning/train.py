@@ -135,7 +135,7 @@ def time_blocks(s: TrainingSet) -> list[TrainingSet]:
     """A sequence in ``JUDGED_BLOCKS`` parts, one after the other; one part where it is short."""
     if len(s) < JUDGED_BLOCKS * 2 * MIN_ROWS:
         return [s]
-    counts = {**s.counts, "lost": 0, "slips": 0, "truth_moves_at_rest": 0}
+    counts = {**s.counts, "lost": 0, "slips": 0, "truth_moves_at_rest": 0, "odd": 0}
     bare = replace(s, counts=counts, lost_xi=np.zeros((0, 6)), lost_jump=np.zeros((0, 6)))
     rows = np.array_split(np.arange(len(s)), JUDGED_BLOCKS)
     return [replace(bare.rows(r), name=f"{s.name}, part {k + 1}") for k, r in enumerate(rows)]
@@ -182,6 +182,7 @@ def _fold(
         "rows": len(held_out),
         "lost": held_out.counts["lost"],
         "truth_moves_at_rest": held_out.counts.get("truth_moves_at_rest", 0),
+        "odd": held_out.counts.get("odd", 0),
         "methods": methods,
         "in_domain": float(np.mean(estimate.in_domain > 0.5)),
         "stated_and_actual": stated_and_actual(held_out.Y, estimate.mean, estimate.covariance),

@@ -1,0 +1,136 @@
+"""Stretches in which odometry and truth differ as nowhere else in the sequence: one of the two is wrong.
+
+A model that learnt from them would be timid everywhere.
+
+Two differences are looked for, each against its own median and spread in the sequence (by the median absolute
+deviation): the share of the true motion that odometry shows, where what it says of its own noise does not explain it;
+and the direction of travel, as of a truth that climbs while the vehicle does not. Which of the two is wrong is for the
+user to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.errors import MotionErrors, motion_errors
+from gpvo.types import Array, TruthLog, VoLog
+
+_SHORT, _LONG = 5, 50
+"""Motions over which the share, and the direction, are taken."""
+_LEAST_MOTIONS = 4  # in a row whose share is the same
+
+_SIGMAS = 5.0
+_LEAST_SHARE, _LEAST_TURN = 0.1, 0.02
+"""Smaller differences, of the share and in radians, are nobody's gross mistake."""
+_MOST = 1 / 3
+"""Of the sequence: what makes up more is how the sequence is."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """``first``, ``last``: indices of its motions in the log, which begin and end at ``t_ns`` (2,)."""
+
+    first: int
+    last: int
+    t_ns: tuple[int, int]
+    what: str
+
+    def __str__(self) -> str:
+        return f"motions {self.first} to {self.last}: {self.what}"
+
+
+def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
+    """Those of a log against its truth, in order of time."""
+    errors = motion_errors(log, truth)
+    if len(errors.index) < 2 * _LONG:
+        return []
+    found = [*_of_share(errors, _stated_m(log, errors)), *_of_direction(errors)]
+    spans = [(errors.index[a], errors.index[b], what) for a, b, what in found]
+    return sorted(
+        (Stretch(int(i), int(k), (log.records[i].t_prev_ns, log.records[k].t_ns), what) for i, k, what in spans),
+        key=lambda s: s.t_ns,
+    )
+
+
+def _of_share(errors: MotionErrors, sigma_m: Array) -> list[tuple[int, int, str]]:
+    true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
+    length = np.linalg.norm(true, axis=1)
+    own = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
+    moving = length > 0.5 * np.median(length)
+    usual = float(np.median(own[moving]))
+    z = _sums(np.where(moving, (own - usual) * length / sigma_m, 0.0), _SHORT)
+    far = np.abs(z) > _SIGMAS * 1.4826 * np.median(np.abs(z[_moving(length, _SHORT)]))
+    found = []
+    for first, of_window in _runs(far):
+        last = of_window + _SHORT - 1
+        farthest = first + int(np.argmax(np.abs(z[first : of_window + 1])))
+        level = float(np.median(own[farthest : farthest + _SHORT]))
+        # The windows at either end hold motions like all others; a level is steady, what noise makes is not.
+        alike = np.abs(own - level) < 0.5 * abs(level - usual)
+        steady = [(a + first, b + first) for a, b in _runs(alike[first : last + 1])]
+        k, m = max(steady, key=lambda run: run[1] - run[0], default=(0, -1))
+        if m - k + 1 >= _LEAST_MOTIONS and abs(level - usual) > _LEAST_SHARE:
+            level = float(np.mean(own[k : m + 1]))
+            found.append((k, m, f"odometry shows {level:.2f} of the true motion, else {usual:.2f}"))
+    return found
+
+
+def _of_direction(errors: MotionErrors) -> list[tuple[int, int, str]]:
+    true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
+    length = np.linalg.norm(true, axis=1)
+    share = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
+    aside = seen - share[:, None] * true
+    turn = np.stack([_sums(a, _LONG) for a in aside.T], axis=1) / np.maximum(_sums(length, _LONG), 1e-12)[:, None]
+    off, usual = _beyond(turn, _moving(length, _LONG), _LEAST_TURN)
+    found = []
+    for first, last in ((a, b + _LONG - 1) for a, b in _runs(off)):
+        here = aside[first : last + 1].sum(0) / length[first : last + 1].sum() - usual
+        degrees = float(np.rad2deg(np.arctan(np.linalg.norm(here))))
+        axis = ("sideways", "vertically", "along")[int(np.argmax(np.abs(here)))]
+        found.append((first, last, f"truth leaves odometry's direction by {degrees:.1f} deg, {axis}"))
+    return found
+
+
+def _sums(values: Array, count: int) -> Array:
+    """(M - count + 1,) of windows."""
+    return np.convolve(values, np.ones(count), "valid")
+
+
+def _moving(length: Array, count: int) -> NDArray[np.bool_]:
+    """Which windows are no slower than half the usual."""
+    path = _sums(length, count)
+    return np.asarray(path > max(0.5 * float(np.median(path)), 1e-9))
+
+
+def _beyond(values: Array, moving: NDArray[np.bool_], least: float) -> tuple[NDArray[np.bool_], Array]:
+    """Which moving windows (W, D) are far off the median of all of them, and the median (D,)."""
+    usual = np.median(values[moving], axis=0)
+    sigma = 1.4826 * np.median(np.abs(values[moving] - usual), axis=0)
+    off = moving & (np.abs(values - usual) > np.maximum(_SIGMAS * sigma, least)).any(axis=1)
+    return (off if off.mean() <= _MOST else np.zeros_like(off)), usual
+
+
+def _runs(off: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last of each run."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(int)))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+
+
+def _stated_m(log: VoLog, errors: MotionErrors) -> Array:
+    """(M,) what odometry says of its own noise, by the first covariance that all motions have and their residuals."""
+    records = [log.records[k] for k in errors.index]
+    known = [m for m in log.methods if all(m in r.covariances for r in records)]
+    if not known:
+        return np.ones(len(records))
+    stated = np.sqrt([np.trace(r.covariances[known[0]][:3, :3]) for r in records])
+    noise_px = np.array([r.reproj_rms_px for r in records])
+    return np.asarray(stated * np.where(np.isfinite(noise_px), np.maximum(noise_px, 1e-3), 1.0))
+
+
+def times(stretches: Sequence[Stretch]) -> NDArray[np.int64]:
+    """(S, 2) first and last time [ns] of each."""
+    return np.array([s.t_ns for s in stretches], dtype=np.int64).reshape(-1, 2)
