@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.learning.basefit import learn_velocities
 from gpvo.learning.calibrate import (
     LEVELS,
     Scale,
@@ -25,7 +26,6 @@ from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
 from gpvo.learning.rows import Rows
 from gpvo.learning.selection import significant_gain
 from gpvo.learning.spans import at_most
-from gpvo.learning.velocities import learn_velocities
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.division import Division, ln_faster, of_calibration
 from gpvo.online.estimate import ErrorModel
@@ -63,14 +63,14 @@ def assemble(
     places = np.array([columns.index(n) for n in inputs or columns[:1]], dtype=np.int64)
     if gp is not None:
         high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
-    sums = _sums_of(of)
+    division, parts = _division_of(of)
     model = ErrorModel(
         columns=columns,
         inputs=places,
         gp=gp or ProjectedGP.constant(np.zeros(6)),
         domain=domain,
         base=base,
-        division=sums.division,
+        division=division,
         velocities=learn_velocities(rows),
         factor=scale.factor,
         outside_power=np.array([outside_power]),
@@ -79,8 +79,8 @@ def assemble(
         nu=np.zeros(1),
         dt_s=rows.step_s,
     )
-    sums, found = _with_calibration(model, of, (sums, _most_likely(model, of)))
-    return found.model, _calibration(rows, scale, found, sums, np.abs(z) / np.sqrt(found.joint))
+    parts, found = _with_calibration(model, of, (parts, _most_likely(model, of)))
+    return found.model, _calibration(rows, scale, found, parts, np.abs(z) / np.sqrt(found.joint))
 
 
 @dataclass(frozen=True)
@@ -95,14 +95,18 @@ class _Residuals:
     geometry: Array | None
     patterns: Patterns | None = None
 
+    def _folds(self) -> list[tuple[NDArray[np.bool_], Array]]:
+        """Rows (n,) of each fold, and the patterns of the other flights."""
+        assert self.patterns is not None
+        return [(self.patterns.fold == k, patterns) for k, patterns in enumerate(self.patterns.without)]
+
     def of_calibration(self) -> tuple[Array | None, Array, Array]:
         """The root (n, 6, 6) of what a wrong calibration has of the variance, by the patterns of other flights; what is
         left of the variance, and of the errors."""
         if self.patterns is None:
             return None, self.variance, self.error
         twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.error), 6, 6)), self.variance.copy()
-        for k, patterns in enumerate(self.patterns.without):
-            fold = self.patterns.fold == k
+        for fold, patterns in self._folds():
             root[fold], rest[fold] = of_calibration(self.variance[fold], patterns, twist[fold])
         return root, rest, self.error - self.patterns.error
 
@@ -112,41 +116,11 @@ class _Residuals:
         if self.patterns is None:
             return model.division.covariances(self.variance, model.twist(self.X), self.geometry)
         parts, root = np.empty((len(self.error), 3, 6, 6)), np.empty((len(self.error), 6, 6))
-        for k, patterns in enumerate(self.patterns.without):
-            fold = self.patterns.fold == k
-            geometry = None if self.geometry is None else self.geometry[fold]
+        for fold, patterns in self._folds():
             of_fold = replace(model.division, calibration_patterns=patterns)
+            geometry = None if self.geometry is None else self.geometry[fold]
             parts[fold], root[fold] = of_fold.covariances(self.variance[fold], model.twist(self.X[fold]), geometry)
         return parts, root
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """How errors add up: their parts, the correlation (3, 6, 6) of each, the log of the typical speed (1,), and the
-    patterns of wrong calibration."""
-
-    parts: Parts
-    correlation: Array
-    ln_speed: Array
-    patterns: Patterns | None
-
-    @property
-    def division(self) -> Division:
-        """The same as the model has it, without the geometry's correlation."""
-        lasting = self.patterns is not None and {
-            "calibration_patterns": self.patterns.usual,
-            "calibration_tau_s": np.full(6, PERSISTENT_S),
-        }
-        return Division(
-            share=self.parts.share,
-            growth=self.parts.growth,
-            level=self.parts.level,
-            ln_speed=self.ln_speed,
-            correlation=self.correlation,
-            geometry_weight=np.zeros(1),
-            bias_tau_s=self.parts.tau_s,
-            **(lasting or {}),
-        )
 
 
 @dataclass(frozen=True)
@@ -210,7 +184,7 @@ def _motions(model: ErrorModel, of: _Residuals, parts: Array, root: Array) -> tu
     return chains, np.exp(-of.rows.step_s / model.division.persistent_tau_s.reshape(2, 6))
 
 
-_Found = tuple[_Sums, _Consistent]
+_Found = tuple[Parts, _Consistent]
 
 
 def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Found) -> _Found:
@@ -220,12 +194,13 @@ def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Found) -> _Found
     if patterns is None:
         return plain
     of = replace(of, patterns=patterns)
-    sums = _sums_of(of)
-    found = _most_likely(replace(bare, division=sums.division), of)
-    return (sums, found) if significant_gain(plain[1].losses - found.losses) else plain
+    division, parts = _division_of(of)
+    found = _most_likely(replace(bare, division=division), of)
+    return (parts, found) if significant_gain(plain[1].losses - found.losses) else plain
 
 
-def _sums_of(of: _Residuals) -> _Sums:
+def _division_of(of: _Residuals) -> tuple[Division, Parts]:
+    """How errors add up, yet without the geometry's correlation."""
     rows = of.rows
     v_mps = rows.select(TWIST_COLUMNS[:3])
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
@@ -235,8 +210,19 @@ def _sums_of(of: _Residuals) -> _Sums:
     errors, sigmas = rows.chains(left), rows.chains(sigma)
     lasting = None if root is None else rows.chains(root)
     parts = fit_parts(rows.chains(of.error), sigmas, rows.chains(faster), rows.step_s, lasting)
-    correlation = part_correlations(errors, sigmas, parts, rows.step_s)
-    return _Sums(parts, correlation, ln_speed, of.patterns)
+    division = Division(
+        share=parts.share,
+        growth=parts.growth,
+        level=parts.level,
+        ln_speed=ln_speed,
+        correlation=part_correlations(errors, sigmas, parts, rows.step_s),
+        geometry_weight=np.zeros(1),
+        bias_tau_s=parts.tau_s,
+    )
+    if of.patterns is not None:
+        usual = of.patterns.usual
+        division = replace(division, calibration_patterns=usual, calibration_tau_s=np.full(6, PERSISTENT_S))
+    return division, parts
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
@@ -248,7 +234,7 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     return out
 
 
-def _calibration(rows: Rows, scale: Scale, found: _Consistent, sums: _Sums, score: Array) -> dict[str, Any]:
+def _calibration(rows: Rows, scale: Scale, found: _Consistent, parts: Parts, score: Array) -> dict[str, Any]:
     axes = [conformal_quantiles(score[:, j], rows.group) for j in range(6)]
     return {
         "by": rows.grouped_by,
@@ -258,10 +244,10 @@ def _calibration(rows: Rows, scale: Scale, found: _Consistent, sums: _Sums, scor
         "joint_factor": found.joint,
         "added_factor": found.added,
         "nu": float(found.model.nu[0]) or None,
-        "calibration_part": sums.patterns is not None,
+        "calibration_part": bool(found.model.division.calibration_patterns.any()),
         "geometry_correlation_weight": float(found.model.division.geometry_weight[0]),
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
         "interval_guaranteed": [sure for _, sure in axes],
-        "parts": {"spans_frames": sums.parts.spans, "seen_over_stated": sums.parts.ratio},
+        "parts": {"spans_frames": parts.spans, "seen_over_stated": parts.ratio},
     }

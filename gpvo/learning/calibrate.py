@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry.covariance import correlation
+from gpvo.learning.spans import by_block
 from gpvo.online.guard import growth
 from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
@@ -25,37 +26,31 @@ _POWERS = (1.0, 1.25, 1.5, 2.0)
 
 @dataclass(frozen=True)
 class Scale:
-    """``factor`` (D,) on the variance; ``spread`` (D,): standard deviation of the log scale between groups.
-
-    ``by_group`` (G, D): robust mean square of the normalised residuals of each group.
-    """
+    """The scale of the variance of a new group, a random effect. ``factor`` (D,) on what is stated; ``spread`` (D,):
+    standard deviation of the log scale between groups; ``by_group`` (G, D): the scale of each."""
 
     factor: Array
     spread: Array
     by_group: Array
 
+    @classmethod
+    def of_new_group(cls, by_group: Array) -> Scale:
+        """From the scales (G, D) of groups that no fit has seen.
 
-def fit_scale(z: Array, group: NDArray, blocks: tuple[slice, ...] = (slice(0, 3), slice(3, 6))) -> Scale:
-    """Factor on the variance of normalised residuals z (n, D), with the spread between groups added.
-
-    The log scale of a group is taken as normal; the mean of its log-normal over a new group, whose centre is itself
-    known from G groups, is ``exp(m + s^2 (1 + 1/G) / 2)``. The spread is pooled over the axes of each block.
-    """
-    labels = np.unique(group)
-    by_group = np.array([[student_t.second_moment(z[group == g, j] ** 2) for j in range(z.shape[1])] for g in labels])
-    logs = np.log(by_group)
-    G = len(labels)
-    spread = np.zeros(z.shape[1])
-    for block in blocks:
-        if logs[:, block].size:
-            seen = logs[:, block].var(axis=0, ddof=1).mean() if G > 1 else 0.0
-            spread[block] = np.sqrt(_with_prior(seen, G))
-    return Scale(np.exp(logs.mean(axis=0) + 0.5 * spread**2 * (1.0 + 1.0 / G)), spread, by_group)
+        The log scale of a group is taken as normal; the mean of its log-normal over a new group, whose centre is itself
+        known from G groups, is ``exp(m + s^2 (1 + 1/G) / 2)``. The spread is that of each block of three axes, drawn
+        towards the prior: few groups cannot show how much groups differ.
+        """
+        logs, G = np.log(by_group), len(by_group)
+        seen = by_block(logs.var(axis=0, ddof=1)) if G > 1 else np.zeros(logs.shape[1])
+        spread = np.sqrt((_PRIOR_GROUPS * _PRIOR_SPREAD**2 + (G - 1) * seen) / (_PRIOR_GROUPS + G - 1))
+        return cls(np.exp(logs.mean(axis=0) + 0.5 * spread**2 * (1.0 + 1.0 / G)), spread, by_group)
 
 
-def _with_prior(variance: float, groups: int) -> float:
-    """Variance between groups, drawn towards the prior: few groups cannot show how much groups differ."""
-    return (_PRIOR_GROUPS * _PRIOR_SPREAD**2 + (groups - 1) * variance) / (_PRIOR_GROUPS + groups - 1)
+def fit_scale(z: Array, group: NDArray) -> Scale:
+    """Scale of the variance of each axis, from normalised residuals z (n, D)."""
+    of = [z[group == g] ** 2 for g in np.unique(group)]
+    return Scale.of_new_group(np.array([[student_t.second_moment(column) for column in square.T] for square in of]))
 
 
 def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
@@ -80,9 +75,7 @@ def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
 def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
     """One more factor, so that the NEES of all six axes together is right for a new group."""
     squared = nees(error, covariance) / error.shape[1]
-    logs = np.log([robust_mean(squared[group == g]) for g in np.unique(group)])
-    spread2 = _with_prior(logs.var(ddof=1) if len(logs) > 1 else 0.0, len(logs))
-    return float(np.exp(logs.mean() + 0.5 * spread2 * (1.0 + 1.0 / len(logs))))
+    return float(Scale.of_new_group(np.array([[robust_mean(squared[group == g])] for g in np.unique(group)])).factor[0])
 
 
 def robust_mean(values: Array) -> float:

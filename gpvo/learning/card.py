@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
+
+from gpvo.io.tables import markdown_table
 
 
 def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -> str:
@@ -102,37 +104,28 @@ def _simulated(h: Mapping[str, Any]) -> str:
 
 
 def _sequences(h: Mapping[str, Any]) -> str:
-    rows = [
-        f"| {s['name']} | {s['rows']} | {s['lost']} | {s['without_truth']} | {s.get('truth_moves_at_rest', 0)} |"
-        for s in h["sequences"]
-    ]
-    camera = h["camera"]
-    seen = (
-        "no camera known" if camera is None else f"focal length {_camera(camera)}, {camera['width']}x{camera['height']}"
-    )
-    head = [
-        "## Training data",
-        "",
-        f"Camera: {seen}.",
-        "",
-        "| sequence | rows | lost | without truth | truth moves at rest |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    return "\n".join([*head, *rows])
+    keys, camera = ("name", "rows", "lost", "without_truth", "truth_moves_at_rest"), h["camera"]
+    seen = "no camera known"
+    if camera is not None:
+        seen = f"focal length {_camera(camera)}, {camera['width']}x{camera['height']}"
+    rows = [[str(s.get(key, 0)) for key in keys] for s in h["sequences"]]
+    head = ("sequence", "rows", "lost", "without truth", "truth moves at rest")
+    return "\n".join(["## Training data", "", f"Camera: {seen}.", "", *markdown_table(head, rows)])
 
 
 def _camera(camera: Mapping[str, Any]) -> str:
     return f"{camera['fx_px']:.1f} px, baseline {camera['baseline_m']:.4f} m"
 
 
-def _number(value: float | None, digits: str = ".3g") -> str:
-    return "-" if value is None else format(value, digits)
-
-
-_HEAD = (
-    "| | NEES/dof | median | within 1 sigma | NLL per axis, Gaussian | as stated |",
-    "| --- | --- | --- | --- | --- | --- |",
-)
+def _table(scores: Iterable[tuple[str, Mapping[str, Any]]]) -> list[str]:
+    """The lines of a table of scores by name, without those of which nothing is known."""
+    rows = []
+    for name, s in scores:
+        numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"]]
+        numbers += [s["nll_per_dim"], s["nll_stated_per_dim"]]
+        if any(numbers):
+            rows.append([name, *("-" if v is None else f"{v:.3g}" for v in numbers)])
+    return markdown_table(("", "NEES/dof", "median", "within 1 sigma", "NLL per axis, Gaussian", "as stated"), rows)
 
 
 def _scores(table: Mapping[str, Any], name: str) -> str:
@@ -143,10 +136,8 @@ def _scores(table: Mapping[str, Any], name: str) -> str:
         "## Scores on sequences left out" if not blocks else "## Scores on parts of the one sequence, left out in turn",
         "",
         *(["They say nothing about another flight.", ""] if blocks else []),
-        *_HEAD,
+        *_table(table["mean"].items()),
     ]
-    for method, s in table["mean"].items():
-        lines += _row(method, s)
     c = table["comparison"]
     d = c["nll_per_dim_difference"]
     lines += [
@@ -156,10 +147,8 @@ def _scores(table: Mapping[str, Any], name: str) -> str:
         "",
         "`learned` on each:",
         "",
-        *_HEAD,
+        *_table((fold["held_out"], fold["methods"]["learned"]) for fold in table["folds"]),
     ]
-    for fold in table["folds"]:
-        lines += _row(fold["held_out"], fold["methods"]["learned"])
     if any(fold.get("stated_and_actual") for fold in table["folds"]):
         lines += [
             "",
@@ -169,12 +158,6 @@ def _scores(table: Mapping[str, Any], name: str) -> str:
             "sigma is right; above it sigma is too small. In the green band it is right within a factor of 1.4.",
         ]
     return "\n".join(lines)
-
-
-def _row(name: str, s: Mapping[str, Any]) -> list[str]:
-    numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"]]
-    numbers += [s["nll_per_dim"], s["nll_stated_per_dim"]]
-    return [f"| {name} | " + " | ".join(_number(v) for v in numbers) + " |"] if any(numbers) else []
 
 
 def _difference(d: Mapping[str, float | None]) -> str:
@@ -221,10 +204,9 @@ def _tails(calibration: Mapping[str, Any]) -> str:
 
 
 def _domain(h: Mapping[str, Any]) -> str:
-    rows = [
-        f"| `{n}` | {u} | {lo:.4g} | {hi:.4g} |" for (n, (lo, hi)), u in zip(h["training_domain"].items(), h["units"])
-    ]
-    return "\n".join(["## Where it has been", "", "| feature | unit | from | to |", "| --- | --- | --- | --- |", *rows])
+    ranges = zip(h["training_domain"].items(), h["units"])
+    rows = [[f"`{name}`", unit, f"{low:.4g}", f"{high:.4g}"] for (name, (low, high)), unit in ranges]
+    return "\n".join(["## Where it has been", "", *markdown_table(("feature", "unit", "from", "to"), rows)])
 
 
 def _limits(h: Mapping[str, Any]) -> str:

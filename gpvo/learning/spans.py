@@ -68,14 +68,14 @@ def span_variances(z: Chains) -> SpanVariances:
             between = (weight**2) @ (squares / mean - 1.0) ** 2
             spans.append(m)
             mean_square.append(mean)
-            doubt.append(np.clip(_by_block(between), 2.0 / windows.sum(), _MAX_DOUBT))
+            doubt.append(np.clip(by_block(between), 2.0 / windows.sum(), _MAX_DOUBT))
     if not spans:
         raise ValueError("no residuals to fit the parts to")
     return SpanVariances(np.array(spans), np.array(mean_square), np.array(doubt))
 
 
-def _by_block(values: Array) -> Array:
-    """Each block of three axes at its mean, as three axes show better than one by how much sequences differ."""
+def by_block(values: Array) -> Array:
+    """(D,) each block of three axes at its mean, as three axes show better than one by how much sequences differ."""
     out = values.copy()
     for start in range(0, len(out), 3):
         out[start : start + 3] = out[start : start + 3].mean()

@@ -182,90 +182,72 @@ def _lengths(rate: Array) -> Array:
     return np.sqrt(np.array([rate[:3] @ rate[:3], rate[3:] @ rate[3:]]))
 
 
-def _columns(*pairs: str) -> tuple[Feature, ...]:
-    """``"name [unit]"`` each."""
-    return tuple(Feature(name, unit.rstrip("]")) for name, unit in (p.split(" [") for p in pairs))
+def _columns(listed: str) -> tuple[Feature, ...]:
+    """Of ``"name [unit], name [unit]"``."""
+    return tuple(Feature(*pair.rstrip("]").split(" [")) for pair in listed.split(", "))
 
 
-def _variance_columns(*methods: str) -> list[str]:
-    return [
-        column
-        for method in methods
-        for column in (
-            *(f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES),
-            f"ln_det_{method} [ln]",
-        )
-    ]
+def _of_axes(name: str, unit: str) -> str:
+    """The same column for x, y and z, which stand in place of ``*``."""
+    return ", ".join(f"{name.replace('*', axis)} [{unit}]" for axis in "xyz")
+
+
+def _stated_columns(method: str) -> str:
+    variances = (f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES)
+    return ", ".join([*variances, f"ln_det_{method} [ln]"])
 
 
 BUILT_IN = (
-    FeatureGroup(
-        "velocity", _columns("v_x_mps [m/s]", "v_y_mps [m/s]", "v_z_mps [m/s]"), lambda c: lambda r: twist(r)[:3]
-    ),
-    FeatureGroup(
-        "rotation",
-        _columns("w_x_radps [rad/s]", "w_y_radps [rad/s]", "w_z_radps [rad/s]"),
-        lambda c: lambda r: twist(r)[3:],
-    ),
+    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), lambda c: lambda r: twist(r)[:3]),
+    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), lambda c: lambda r: twist(r)[3:]),
     FeatureGroup(
         "counts",
-        _columns("n_detected [1]", "n_stereo [1]", "n_tracked [1]", "n_inliers [1]", "inlier_ratio [1]"),
+        _columns("n_detected [1], n_stereo [1], n_tracked [1], n_inliers [1], inlier_ratio [1]"),
         _stateless(_counts),
     ),
     FeatureGroup(
         "geometry",
         _columns(
-            *(f"ln_disparity_p{q} [ln focal lengths]" for q in (10, 50, 90)),
-            "spread_u [focal lengths]",
-            "spread_v [focal lengths]",
-            "ln_reproj_rms [ln focal lengths]",
-            "log10_condition [log10]",
-            *_variance_columns(*GEOMETRIC_METHODS),
+            "ln_disparity_p10 [ln focal lengths], ln_disparity_p50 [ln focal lengths], "
+            "ln_disparity_p90 [ln focal lengths], spread_u [focal lengths], spread_v [focal lengths], "
+            "ln_reproj_rms [ln focal lengths], log10_condition [log10], "
+            + ", ".join(_stated_columns(method) for method in GEOMETRIC_METHODS)
         ),
         _stateless(_geometry),
     ),
     FeatureGroup(
         "image",
-        _columns("brightness [0..1]", "contrast [0..1]", "sharpness [log10]", "noise_level [0..1]"),
+        _columns("brightness [0..1], contrast [0..1], sharpness [log10], noise_level [0..1]"),
         _stateless(_image),
     ),
     FeatureGroup(
         "trend",
         _columns(
-            "acceleration_mps2 [m/s^2]",
-            "angular_acceleration_radps2 [rad/s^2]",
-            "ln_inliers_change [ln]",
-            "ln_reproj_rms_change [ln]",
-            "brightness_change [0..1]",
+            "acceleration_mps2 [m/s^2], angular_acceleration_radps2 [rad/s^2], "
+            "ln_inliers_change [ln], ln_reproj_rms_change [ln], brightness_change [0..1]"
         ),
         _Trend,
     ),
     FeatureGroup(
         "agility",
         _columns(
-            "ln_speed [ln m/s]",
-            "ln_turn_rate [ln rad/s]",
-            "ln_jerk [ln m/s^3]",
-            "ln_angular_jerk [ln rad/s^3]",
-            "ln_jerk_lately [ln m/s^3]",
-            "ln_angular_jerk_lately [ln rad/s^3]",
+            "ln_speed [ln m/s], ln_turn_rate [ln rad/s], ln_jerk [ln m/s^3], ln_angular_jerk [ln rad/s^3], "
+            "ln_jerk_lately [ln m/s^3], ln_angular_jerk_lately [ln rad/s^3]"
         ),
         _Agility,
     ),
-    FeatureGroup(IMPORTED, _columns(*_variance_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
+    FeatureGroup(IMPORTED, _columns(_stated_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
     FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (_ln(r.reproj_rms_px),))),
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.
     FeatureGroup(
         "imu",
-        _columns(
-            "imu_acc_mps2 [m/s^2]", "imu_gyro_radps [rad/s]", "imu_acc_std_mps2 [m/s^2]", "imu_gyro_std_radps [rad/s]"
-        ),
+        _columns("imu_acc_mps2 [m/s^2], imu_gyro_radps [rad/s], imu_acc_std_mps2 [m/s^2], imu_gyro_std_radps [rad/s]"),
         _stateless(_imu),
     ),
     FeatureGroup(
         "imu_axes",
-        _columns(*(f"imu_acc_{a}_mps2 [m/s^2]" for a in "xyz"), *(f"imu_gyro_{a}_radps [rad/s]" for a in "xyz")),
+        _columns(f"{_of_axes('imu_acc_*_mps2', 'm/s^2')}, {_of_axes('imu_gyro_*_radps', 'rad/s')}"),
         _stateless(_imu_axes),
     ),
 )
@@ -315,15 +297,15 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def known_columns() -> frozenset[str]:
-    """Names of all columns, those of installed packages included."""
-    return frozenset(c.name for g in groups().values() for c in g.columns)
+@cache
+def known_columns() -> dict[str, str]:
+    """All columns with their units, those of installed packages included."""
+    return {c.name: c.unit for g in groups().values() for c in g.columns}
 
 
 def units(names: Sequence[str]) -> tuple[str, ...]:
     """Unit of each column."""
-    known = {c.name: c.unit for g in groups().values() for c in g.columns}
-    return tuple(known[n] for n in names)
+    return tuple(known_columns()[n] for n in names)
 
 
 class FeatureStream:
@@ -341,7 +323,7 @@ class FeatureStream:
             picked = [(place[c.name], j) for j, c in enumerate(group.columns) if c.name in place]
             if picked:
                 self._pick.append((group.start(camera), picked))
-        unknown = set(self.names) - known_columns()
+        unknown = set(self.names) - known_columns().keys()
         if unknown:
             raise GpvoError(
                 f"unknown features: {', '.join(sorted(unknown))}", cure="install the package that defines them"

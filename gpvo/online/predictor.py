@@ -246,14 +246,12 @@ class Predictor:
         if record.dt_s > 0:
             self._rate_var = variance / record.dt_s**2
         self._remember(t_ns, (prediction.mean, np.sqrt(variance)))
-        return Prediction(
-            mean=prediction.mean,
+        return replace(
+            prediction,
             jitter=prediction.jitter * squared,
             white=prediction.white * squared,
             persistent_root=prediction.persistent_root * scale[:, None],
-            persistent_tau_s=prediction.persistent_tau_s,
             dt_s=record.dt_s,
-            nu=prediction.nu,
             status=status,
             t_ns=t_ns,
             epistemic=np.minimum(prediction.epistemic * scale**2, variance),

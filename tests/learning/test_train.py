@@ -17,6 +17,7 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.io.run import write_run
 from gpvo.learning import train as training
+from gpvo.learning.basefit import rate_changes
 from gpvo.learning.card import model_card
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
@@ -27,7 +28,6 @@ from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, folds_path, picture_path, rows_path, save_model
 from gpvo.learning.train import _slips, train_sets
 from gpvo.learning.update import config_of, update
-from gpvo.learning.velocities import rate_changes
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.predictor import Predictor
