@@ -64,6 +64,7 @@ def _rows(name: str, got: dict[str, Any], p50: float | None, p99: float | None) 
         f"{name}: latency, 99 %": row(got["p99_ms"], "ms", p99),
         f"{name}: own latency, median": row(got["own_ms"][0], "ms", None if p50 else 2.0),
         f"{name}: missing of {got['sent']}": row(got["missing"], "messages", None),
+        f"{name}: end after SIGTERM": row(got["end_s"], "s", 1.0),
         f"{name}: memory, end less second reading": row(got["rss_mb"][-1] - got["rss_mb"][1], "MB", None),
     }
     print(f"{name}: memory [MB] {got['rss_mb']}, CPU {got['cpu_percent']:.0f} %", file=sys.stderr, flush=True)
@@ -95,12 +96,16 @@ def measure(wire: str, source: list[str], options: tuple[str, ...], seconds: flo
         cpu = sum(seen.cpu_times()[:2])
         sent_ns = dict(json.loads(sender.communicate(timeout=60)[0]))
         got = json.loads(listener.communicate(timeout=60)[0].splitlines()[-1])
+        start = time.monotonic()
+        live.send_signal(signal.SIGTERM)
+        live.communicate(timeout=20)
+        end_s = time.monotonic() - start
     came = got["came"]
     p50, p99 = np.percentile([(at_ns - sent_ns[stamp]) * 1e-6 for stamp, at_ns in came], [50, 99])
     own = [float(v) for v in got["health"].get("latency_ms_p50_p99", "nan nan").split()]
     missing = sent - 1 - len(came)  # the first message is no motion
     return {"p50_ms": p50, "p99_ms": p99, "own_ms": own, "sent": sent, "missing": missing, "rss_mb": rss,
-            "cpu_percent": 100 * cpu / seconds, "health": got["health"]}  # fmt: skip
+            "cpu_percent": 100 * cpu / seconds, "end_s": end_s, "health": got["health"]}  # fmt: skip
 
 
 def _wires() -> list[str]:

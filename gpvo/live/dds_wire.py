@@ -6,6 +6,7 @@ github.com/ros2/rmw_cyclonedds, rmw_cyclonedds_cpp/src/rmw_node.cpp.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -20,6 +21,8 @@ from gpvo.live.zenoh_wire import dds_name
 from gpvo.publish import px4
 
 _DEPTH, _READER_DEPTH = 10, 100
+# A reader that has stopped acknowledging would hold the end of the process for a second, cyclonedds' default.
+_LINGER = "<Internal><WriterLingerDuration>100 ms</WriterLingerDuration></Internal>"
 
 
 class DdsWire:
@@ -32,6 +35,9 @@ class DdsWire:
         from cyclonedds.domain import DomainParticipant
 
         self.store = get_typestore(Stores.ROS2_JAZZY)
+        settings = os.environ.get("CYCLONEDDS_URI", "")
+        if _LINGER not in settings:  # the user's own come last, and win
+            os.environ["CYCLONEDDS_URI"] = f"{_LINGER},{settings}" if settings else _LINGER
         self._participant: Any = DomainParticipant(domain)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
