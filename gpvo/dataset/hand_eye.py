@@ -76,7 +76,10 @@ def fit_fixed_transform(A: Array, B: Array, *, lever_arm: bool = True) -> FixedT
         For fewer than ten motions, or motions that do not determine the rotation.
     """
     if len(A) < _MIN_MOTIONS:
-        raise GpvoError(f"only {len(A)} motions have truth at both ends, too few to align", cure="check the stamps")
+        raise GpvoError(
+            f"only {len(A)} windows of {WINDOW_S:g} s have truth at both ends and no lost frame, too few to align",
+            cure="give a longer log, check the stamps, or leave --align out",
+        )
     X = _start(A, B)
     free = 6 if lever_arm else 3
     scale = np.array([1.0, 1.0])

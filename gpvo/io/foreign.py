@@ -24,6 +24,7 @@ from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, VoRecord
 FORMATS = ("tum", "kitti", "csv", "bag")
 GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
 UNKNOWN_RAD = 1.0
+_LEAST_MOTIONS, _SLOW, _TIMES_SEEN = 50, 0.02, 3.0  # what covariances of poses are told by
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 
@@ -191,7 +192,7 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
         return "", None, []
     C = transport.symmetrise(log.covariance)
     if log.covariance_of == "motion":
-        return IMPORTED, C, []
+        return IMPORTED, C, _if_of_poses(C[1:], motions)
     A = se3.adjoint(se3.inverse(motions))
     growth = np.full_like(C, np.nan)
     growth[1:] = transport.symmetrise(C[1:] - A @ C[:-1] @ np.swapaxes(A, -1, -2))
@@ -203,6 +204,27 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
         " 'imported_pose' and scored as such by gpvo evaluate"
     )
     return IMPORTED_POSE, C, [note]
+
+
+def _if_of_poses(C: Array, motions: Array) -> list[str]:
+    """A remark where covariances (N, 6, 6) that are said to be of motions (N, 4, 4) look like those of poses: they
+    change slowly, and state many times the noise that shows in the motions.
+
+    The second difference of a velocity has six times its white noise, and the vehicle's own jerk besides.
+    """
+    stated = np.trace(C[:, :3, :3], axis1=1, axis2=2)
+    known = np.isfinite(stated) & (stated > 0)
+    if known.sum() < _LEAST_MOTIONS:
+        return []
+    change = np.abs(np.diff(np.log(stated[known])))
+    seen = float(np.median((np.diff(motions[:, :3, 3], n=2, axis=0) ** 2).sum(axis=1))) / 6.0
+    times = float(np.sqrt(np.median(stated[known]) / max(seen, 1e-18)))
+    if times < _TIMES_SEEN or not 0 < np.median(change) < _SLOW:
+        return []
+    return [
+        f"the covariances look like those of poses: they change by {100 * np.median(change):.1g} % from row to row and"
+        f" state {times:.0f} times the noise that the motions show; if they are, --covariance-of pose"
+    ]
 
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:

@@ -13,8 +13,9 @@ from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 
 _RATE = 0.2
-ENOUGH_INSIDE = 0.9
-"""A model fits a run where at least this share of its frames lies in the training domain."""
+ENOUGH_INSIDE = 0.8
+"""A model fits a run where at least this share of its frames lies in the training domain; of a vehicle's next flight of
+the same kind a tenth may lie outside."""
 
 
 @dataclass(frozen=True)

@@ -224,8 +224,7 @@ def _compare(folds: Sequence[dict[str, Any]], mean: Mapping[str, Any]) -> dict[s
     the sequences."""
     scored = {m: mean[m]["nll_per_dim"] for m in METHODS if mean[m]["nll_per_dim"] is not None}
     rivals = {m: v for m, v in scored.items() if m not in ("base", "learned")}
-    scaled = {m: v for m, v in rivals.items() if m.endswith("_scaled")} or rivals
-    best = min(scaled, key=scaled.__getitem__)
+    best = min(rivals, key=rivals.__getitem__)
     return {
         "rival": best,
         "best_row": min(scored, key=scored.__getitem__),

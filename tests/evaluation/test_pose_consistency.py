@@ -9,7 +9,9 @@ import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.evaluation.poses import pose_consistency
 from gpvo.evaluation.statements import statements
+from gpvo.filters.metrics import umeyama
 from gpvo.geometry import se3
+from gpvo.stats.consistency import nees
 from gpvo.types import IMPORTED_POSE, VoLog
 
 N = 600
@@ -34,6 +36,34 @@ def test_it_is_one_where_the_statement_is_true() -> None:
         mean = np.mean([f.nees_dof[block].mean for f in found])
         # 6,010 poses: four standard deviations of the mean, and the six numbers of each alignment.
         assert abs(mean - 1.0) < 4 * np.sqrt(2 / dof / (10 * (N + 1))) + 6 / N
+
+
+def test_it_is_that_of_the_published_definitions_in_either_convention() -> None:
+    """World axes, ``p_true - p_est`` and ``R_true = Exp(e) R_est``, as by OpenVINS' global orientation error; and the
+    right perturbation with the position's error in the world, as by most filters on a manifold."""
+    known = np.ones(N + 1, bool)
+    for seed in range(3):
+        log, T_est, T_true = filtered(seed)
+        found = pose_consistency(log, T_est, T_true, known)
+        assert found is not None
+        R, t = umeyama(T_est[:, :3, 3], T_true[:, :3, 3])
+        T = se3.from_rt(R, t) @ T_est
+        off_m = T[:, :3, 3] - T_true[:, :3, 3]
+        left = se3.so3_log(T[:, :3, :3] @ np.swapaxes(T_true[:, :3, :3], -1, -2))
+        right = se3.so3_log(np.swapaxes(T_true[:, :3, :3], -1, -2) @ T[:, :3, :3])
+        into_world = np.zeros((N + 1, 6, 6))
+        into_world[:, :3, :3] = into_world[:, 3:, 3:] = T[:, :3, :3]
+        body = log.covariance(IMPORTED_POSE)
+        world = into_world @ body @ np.swapaxes(into_world, -1, -2)
+        published = {
+            "position": nees(off_m, world[:, :3, :3]) / 3,
+            "orientation": nees(left, world[:, 3:, 3:]) / 3,
+            "joint": nees(np.concatenate([off_m, left], axis=1), world) / 6,
+        }
+        for block, values in published.items():
+            assert found.nees_dof[block].mean == pytest.approx(values.mean(), rel=0.01)
+        on_manifold = (nees(right, body[:, 3:, 3:]) / 3).mean()
+        assert found.nees_dof["orientation"].mean == pytest.approx(on_manifold, rel=1e-6)
 
 
 def test_it_shows_by_how_much_a_statement_is_wrong() -> None:

@@ -223,6 +223,8 @@ def test_real_logs(real_data):
     assert len(vo) == 4541
     openvins, notes = to_records(read_foreign(real_data / "openvins_mh01_cov" / "MH01_ov_est.csv"))
     assert set(openvins[9].covariances) == {"imported_pose"}
+    as_motions = read_foreign(real_data / "openvins_mh01_cov" / "MH01_ov_est.csv", covariance_of="motion")
+    assert any("look like those of poses" in note for note in to_records(as_motions)[1])
     assert notes
     for name in ("odometry", "of_opencv_odometry", "optical_flow_odometry"):
         records, _ = to_records(read_foreign(real_data / "euroc_v1_01_vo" / f"stamped_{name}_trajectory_all.txt"))
