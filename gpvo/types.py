@@ -439,3 +439,9 @@ class Prediction(MotionError):
 def field_names(cls: type) -> tuple[str, ...]:
     """Names of a dataclass' fields, in order."""
     return tuple(f.name for f in fields(cls))
+
+
+COUNT_FIELDS = tuple(f.name for f in fields(VoRecord) if f.default == -1)
+FLOAT_FIELDS = tuple(f.name for f in fields(VoRecord) if f.type == "float")
+IMU_FIELDS = tuple(f.name for f in fields(VoRecord) if f.name.startswith("imu_"))
+"""Fields of a record that are counts, plain numbers, and vectors (3,) of an IMU."""

@@ -16,10 +16,9 @@ from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
 from gpvo.io.foreign_csv import Table, is_number, read_table
-from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
 from gpvo.io.stamps import text_lines
 from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
-from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, VoRecord
+from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, VoRecord
 
 FORMATS = ("tum", "kitti", "csv", "bag")
 GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.

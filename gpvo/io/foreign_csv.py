@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.run_table import COUNT_FIELDS, FLOAT_FIELDS
 from gpvo.io.stamps import UNITS_NS, check_interval, text_lines, text_to_ns
-from gpvo.types import Array
+from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
 _COV = tuple(f"cov_{i}{j}" for i in range(6) for j in range(6))

@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
-from gpvo.types import Array, ImuLog, Prediction, Status, StereoTracks, TruthLog, VoRecord
+from gpvo.types import (
+    COUNT_FIELDS,
+    FLOAT_FIELDS,
+    IMU_FIELDS,
+    Array,
+    ImuLog,
+    Prediction,
+    Status,
+    StereoTracks,
+    TruthLog,
+    VoRecord,
+)
 
 Columns = dict[str, list[Any]]
 
@@ -27,29 +38,7 @@ _POSITION = tuple(f"p_{a}_m" for a in _AXES)
 _QUATERNION = ("q_x", "q_y", "q_z", "q_w")
 _ROTATION = tuple(f"R_{i}{j}" for i in range(3) for j in range(3))
 _TWIST = tuple(f"v_{a}_mps" for a in _AXES) + tuple(f"w_{a}_radps" for a in _AXES)
-# Fields of a record that are counts, and those that are plain numbers.
-COUNT_FIELDS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
-FLOAT_FIELDS = (
-    "reproj_rms_px",
-    "residual_sigma_p_px",
-    "residual_sigma_m_px",
-    "disparity_p10_px",
-    "disparity_p50_px",
-    "disparity_p90_px",
-    "spread_u",
-    "spread_v",
-    "log10_condition",
-    "brightness",
-    "contrast",
-    "sharpness",
-    "noise_level",
-)
-_IMU = {
-    "imu_gyro_mean_radps": "imu_gyro_mean_{}_radps",
-    "imu_gyro_std_radps": "imu_gyro_std_{}_radps",
-    "imu_acc_mean_mps2": "imu_acc_mean_{}_mps2",
-    "imu_acc_std_mps2": "imu_acc_std_{}_mps2",
-}
+_IMU = {name: "{}_{{}}_{}".format(*name.rsplit("_", 1)) for name in IMU_FIELDS}
 _UPPER6 = tuple((i, j) for i in range(6) for j in range(i, 6))
 _ALL6 = tuple((i, j) for i in range(6) for j in range(6))
 _UPPER3 = tuple((i, j) for i in range(3) for j in range(i, 3))

@@ -18,7 +18,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import covariance as transport
 from gpvo.online.features import FeatureStream
 from gpvo.online.slip import SlipDetector
-from gpvo.types import Array, Status, StereoCamera, Vehicle, VoRecord
+from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, IMU_FIELDS, Array, Status, StereoCamera, Vehicle, VoRecord
 
 LONGEST_STEP_S = 60.0
 """A record that comes later than this after the one before is believed when the next one confirms its clock."""
@@ -28,21 +28,6 @@ _NOT_RIGID = 1e-3  # Deviation of R^T R from the identity.
 _EYE = np.eye(4)
 _EYE.setflags(write=False)
 T = TypeVar("T")
-_MEANS = (
-    "reproj_rms_px",
-    "disparity_p10_px",
-    "disparity_p50_px",
-    "disparity_p90_px",
-    "spread_u",
-    "spread_v",
-    "log10_condition",
-    "brightness",
-    "contrast",
-    "sharpness",
-    "noise_level",
-)
-_COUNTS = ("n_detected", "n_stereo", "n_tracked", "n_inliers")
-_IMU = ("imu_gyro_mean_radps", "imu_gyro_std_radps", "imu_acc_mean_mps2", "imu_acc_std_mps2")
 _PATTERN = re.compile(r"(window|length):([0-9]*\.?[0-9]+)(s|m)")
 
 
@@ -198,11 +183,11 @@ def joined(motions: list[VoRecord]) -> VoRecord:
             if m in r.covariances
         }
     status = max((r.status for r in motions), key=lambda s: s.severity)
-    known: dict[str, Any] = {name: float(np.mean([getattr(r, name) for r in motions])) for name in _MEANS}
-    known |= {name: int(np.mean([getattr(r, name) for r in motions])) for name in _COUNTS}
+    known: dict[str, Any] = {name: float(np.mean([getattr(r, name) for r in motions])) for name in FLOAT_FIELDS}
+    known |= {name: int(np.mean([getattr(r, name) for r in motions])) for name in COUNT_FIELDS}
     known |= {
         n: None if any(getattr(r, n) is None for r in motions) else np.mean([getattr(r, n) for r in motions], axis=0)
-        for n in _IMU
+        for n in IMU_FIELDS
     }
     return replace(
         last,
