@@ -73,14 +73,14 @@ class Predictor:
     """
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any], digest: str = "") -> None:
-        arrays = upgraded(arrays)
-        self.header, self.digest, self.arrays = dict(header), digest, arrays
         _check_schema(header)
         if header.get("target") == "position":
             raise ModelError(
                 "this model predicts the residual of a position, not the error of a motion",
                 cure="use PositionPredictor, or train with --target frame",
             )
+        arrays = upgraded(arrays)
+        self.header, self.digest, self.arrays = dict(header), digest, arrays
         try:
             self.features = tuple(header["features"])
             method, target = header["base_method"], header["target"]
