@@ -37,7 +37,7 @@ def _peak_mb() -> float:
 
 @pytest.mark.parametrize("text", [
     "a: &a [1,1,1,1,1,1,1,1,1,1]\n"
-    + "".join(f"{y}: &{y} [{','.join(['*' + x] * 10)}]\n" for x, y in zip("abcdefgh", "bcdefghi")),
+    + "".join(f"{y}: &{y} [{','.join(['*' + x] * 10)}]\n" for x, y in zip("abcdefgh", "bcdefghi")) + "T: *i\n",
     "".join(f"k{i}: 1\n" for i in range(350_000)),
     "resolution: [.inf, 480]\n", "image_width: null\nimage_height: 3\nR: 1\n", f"T: [{'9' * 400}, 0, 0]\n",
     "x: " + "[" * 5000,
@@ -50,6 +50,7 @@ def test_yaml_bombs_are_refused_at_once(text: str, tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"camchain\.yaml") as refusal:
         read_stereo_yaml(path)
     assert "\n" not in str(refusal.value)
+    assert ("the alias" in str(refusal.value)) == ("*a" in text)
     assert time.monotonic() - start < 10.0
 
 
