@@ -9,13 +9,12 @@ them. A run that broke off is read from its chunks, and gone on with from the la
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 import shutil
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
@@ -26,10 +25,10 @@ import numpy as np
 from gpvo import __version__
 from gpvo.errors import SourceError
 from gpvo.geometry.covariance import are_positive_definite
-from gpvo.io import run_table
+from gpvo.io import run_folder, run_table
 from gpvo.io.jsonfile import write_json
 from gpvo.io.parquet_write import RowGroup, join_tables, write_table
-from gpvo.io.run_folder import FILES, STATE, claim, is_finished, prepare, put_in_place, take_up
+from gpvo.io.run_folder import SCHEMA, is_finished
 from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.toml import write_toml
@@ -47,8 +46,6 @@ __all__ = [
     "write_predictions",
     "write_run",
 ]
-
-SCHEMA = 1
 
 
 class RunWriter:
@@ -92,7 +89,7 @@ class RunWriter:
         self._meta = dict(meta or {})
         self._chunk = max(1, chunk)
         self._state = _State()
-        self._lock = claim(self._target)
+        self._lock = run_folder.claim(self._target)
         self.path = self._target
         if is_finished(self._target):
             if not overwrite:
@@ -101,19 +98,19 @@ class RunWriter:
                 )
             self.path = self._target.with_name(f".{self._target.name}.new")
         self._chunks, self._resume = self.path / "chunks", resume
-        self.kept = None if resume is None else take_up(self._chunks, resume)
+        self.kept = None if resume is None else run_folder.take_up(self._chunks, resume)
         if self.kept is not None:
             self._state.chunks, self._state.written = len(self.kept.parts["log"]), self.kept.parts
         try:
-            prepare(self.path, keep_chunks=self.kept is not None)
+            run_folder.prepare(self.path, keep_chunks=self.kept is not None)
             # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
             self._write_meta(complete=False)
             self._chunks.mkdir(exist_ok=True)
-            write_json(self.path / "rig.json", _rig(camera, mounting or Mounting(), calibration))
+            write_json(self.path / "rig.json", run_folder.rig_document(camera, mounting or Mounting(), calibration))
             if truth is not None:
-                write_truth(self.path / "truth.parquet", truth)
+                run_folder.write_truth(self.path / "truth.parquet", truth)
             if imu is not None:
-                write_imu(self.path / "imu.parquet", imu)
+                run_folder.write_imu(self.path / "imu.parquet", imu)
             write_toml(self.path / "config.toml", dict(config or {}))
         except BaseException:
             self._release()
@@ -166,7 +163,7 @@ class RunWriter:
         if len(now.records) >= self._chunk:
             self.flush()
             if self._resume is not None:
-                save_snapshot(self._chunks / STATE, self._resume, (now.chunks, state))
+                save_snapshot(self._chunks / run_folder.STATE, self._resume, (now.chunks, state))
 
     def note(self, **meta: Any) -> None:
         """Add keys to ``run.json``, written when the run closes."""
@@ -197,12 +194,12 @@ class RunWriter:
             if complete or not replaces:
                 self._finish(complete)
             if complete and replaces:
-                put_in_place(self.path, self._target)
+                run_folder.put_in_place(self.path, self._target)
         finally:
             self._release()
 
     def _release(self) -> None:
-        if self.path != self._target and not (self._chunks / STATE).is_file():
+        if self.path != self._target and not (self._chunks / run_folder.STATE).is_file():
             # Where the new run is not whole, the finished one that it was to replace is worth more.
             shutil.rmtree(self.path, ignore_errors=True)
         self._lock.release()
@@ -218,7 +215,7 @@ class RunWriter:
 
     def _digests(self) -> dict[str, str]:
         """SHA-256 of each table of the folder."""
-        files = ((name, self.path / name) for name in FILES)
+        files = ((name, self.path / name) for name in run_folder.FILES)
         return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in files if f.is_file()}
 
     def _write_meta(self, *, complete: bool) -> None:
@@ -283,37 +280,9 @@ def write_run(path: str | Path, log: VoLog, *, predictions: Sequence[Prediction]
             writer.append(record, by_stamp.get(record.t_ns))
 
 
-def write_truth(path: Path, truth: TruthLog) -> None:
-    """Write ``truth.parquet``."""
-    metadata = {
-        "schema": str(SCHEMA),
-        "sigma_translation_m": repr(float(truth.sigma_translation_m)),
-        "sigma_rotation_rad": repr(float(truth.sigma_rotation_rad)),
-    }
-    write_table(path, run_table.truth_columns(truth), metadata)
-
-
-def write_imu(path: Path, imu: ImuLog) -> None:
-    """Write ``imu.parquet``."""
-    metadata = {"schema": str(SCHEMA)}
-    if imu.noise is not None:
-        metadata["noise"] = json.dumps(asdict(imu.noise))
-    write_table(path, run_table.imu_columns(imu), metadata)
-
-
 def write_predictions(path: str | Path, predictions: Sequence[Prediction]) -> None:
     """Write predictions as a Parquet file of their own, as ``gpvo predict`` does."""
     write_table(Path(path), run_table.prediction_columns(predictions), {"schema": str(SCHEMA)})
-
-
-def _rig(camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "camera": None if camera is None else asdict(camera),
-        "T_body_cam": None if mounting.T_body_cam is None else mounting.T_body_cam.tolist(),
-        "T_imu_cam": None if mounting.T_imu_cam is None else mounting.T_imu_cam.tolist(),
-        "calibration": None if calibration is None else dict(calibration),
-    }
 
 
 def as_stored(record: VoRecord) -> VoRecord:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,11 @@ from gpvo.errors import SourceError
 from gpvo.io import run_table
 from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import read_json
-from gpvo.io.parquet_write import RowGroup
+from gpvo.io.parquet_write import RowGroup, write_table
 from gpvo.io.snapshot import load_snapshot
-from gpvo.types import VoRecord
+from gpvo.types import ImuLog, Mounting, StereoCamera, TruthLog, VoRecord
 
+SCHEMA = 1
 FILES = (
     "vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "predictions.parquet",
     "tracks.parquet",
@@ -103,3 +106,34 @@ def prepare(path: Path, *, keep_chunks: bool) -> None:
             file.unlink(missing_ok=True)
     except OSError as error:
         raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
+
+
+def write_truth(path: Path, truth: TruthLog) -> None:
+    """Write ``truth.parquet``."""
+    metadata = {
+        "schema": str(SCHEMA),
+        "sigma_translation_m": repr(float(truth.sigma_translation_m)),
+        "sigma_rotation_rad": repr(float(truth.sigma_rotation_rad)),
+    }
+    write_table(path, run_table.truth_columns(truth), metadata)
+
+
+def write_imu(path: Path, imu: ImuLog) -> None:
+    """Write ``imu.parquet``."""
+    metadata = {"schema": str(SCHEMA)}
+    if imu.noise is not None:
+        metadata["noise"] = json.dumps(asdict(imu.noise))
+    write_table(path, run_table.imu_columns(imu), metadata)
+
+
+def rig_document(
+    camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """What ``rig.json`` holds."""
+    return {
+        "schema": SCHEMA,
+        "camera": None if camera is None else asdict(camera),
+        "T_body_cam": None if mounting.T_body_cam is None else mounting.T_body_cam.tolist(),
+        "T_imu_cam": None if mounting.T_imu_cam is None else mounting.T_imu_cam.tolist(),
+        "calibration": None if calibration is None else dict(calibration),
+    }
