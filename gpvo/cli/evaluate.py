@@ -244,8 +244,9 @@ def _print(d: dict[str, Any]) -> None:
     for text in d["odd_stretches"]:
         say(f"  {text}: odometry or truth is wrong there")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
-    relative = (f"{name} {cell(m)} m, {cell(math.degrees(rad))} deg" for name, m, rad in errors)
-    say(f"  relative error (rms) over a {'; '.join(relative)}")
+    spans = {"frame": "over a frame", "1s": "over 1 s", "10m": "over 10 m"}
+    relative = (f"{spans[name]} {cell(m)} m, {cell(math.degrees(rad))} deg" for name, m, rad in errors)
+    say(f"  relative error (rms): {'; '.join(relative)}")
     for s in (s for s in d["segments"] if s["count"]):
         say(
             f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"

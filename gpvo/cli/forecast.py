@@ -50,7 +50,7 @@ def forecast(
     if json_:
         print_json(document(found, model, path, frame))
     else:
-        _print(found, path, frame)
+        _print(found, path)
 
 
 def document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
@@ -92,18 +92,15 @@ def _row(f: Forecast, k: int) -> dict[str, float]:
     }
 
 
-def _print(f: Forecast, path: Path, frame: str) -> None:
+def _print(f: Forecast, path: Path) -> None:
 
     p = f.plan
-    say(
-        f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m of the {frame}, {len(p.t_s) - 1} motions at"
-        f" {1 / p.step_s:.3g} Hz"
-    )
+    say(f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m, {len(p.t_s) - 1} motions at {1 / p.step_s:.3g} Hz")
     say(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
     for o in f.outside:
         a, b = o.planned, o.trained
         say(
-            f"  {o.feature}: {a[0]:.3g} to {a[1]:.3g}, the training knows {b[0]:.3g} to {b[1]:.3g}"
+            f"  {o.feature}: planned {a[0]:.3g} to {a[1]:.3g}, trained {b[0]:.3g} to {b[1]:.3g}"
             f" ({100 * o.share:.0f} % beyond)"
         )
     table = new_table("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")

@@ -348,7 +348,7 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
         print(
             f"{found.usable} of {found.frames} frames usable, {100 * found.in_domain:.0f} % inside the training domain"
         )
-        for name, beyond in found.farthest:
+        for name, beyond in (f for f in found.farthest if f[1] >= 0.1):
             print(f"  {name}: {beyond:.2g} standard deviations outside on average")
         for problem in found.problems:
             print(f"problem: {problem}")
