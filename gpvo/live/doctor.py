@@ -8,19 +8,15 @@ chi-square gate, zeros fall back to 0.1 m and 0.02 rad, off-diagonal elements ar
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError, printable
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.live.stated import ENOUGH, Finding, Stated
 from gpvo.types import Array
 
-_ENOUGH = 10
 _LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds up over as many frames as it lasts
 _SWAPPED = "every consumer reads metres where radians stand, and the other way round"
 _HUGE, _TINY = 1e3, 1e-8
@@ -28,66 +24,6 @@ _ZERO_FALLBACK = "FusionCore takes 0.1 m and 0.02 rad in its place"
 _RL_FLOOR = "robot_localization takes 1e-9, a sigma of 0.03 mm, and lets go of everything else"
 _PX4_FLOOR = "PX4 takes EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) in its place"
 _AP_FLOOR = "ArduPilot takes VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong: ``code`` for scripts, what was seen, and what each consumer makes of it."""
-
-    code: str
-    what: str
-    consequence: str
-    share: float = 1.0
-
-    def __str__(self) -> str:
-        part = "" if self.share >= 1.0 else f" ({100 * self.share:.0f} % of the messages)"
-        return f"{self.code}: {self.what}{part}\n    {self.consequence}"
-
-
-@dataclass(frozen=True)
-class Stated:
-    """A recording of one topic. ``T`` (N, 4, 4); ``pose``, ``twist`` (N, 6, 6) or None where the type has none; ``v``
-    (N, 6) the twist, None likewise; ``quaternion_norm`` (N,); ``frames``: the pairs of frame names that occur.
-    """
-
-    t_ns: np.ndarray
-    T: Array
-    quaternion_norm: Array
-    frames: tuple[tuple[str, str], ...]
-    pose: Array | None
-    twist: Array | None
-    v: Array | None
-
-    @classmethod
-    def of(cls, messages: Iterable[Any], where: object = None) -> Stated:
-        """From messages of a bag ``where``, in the order of their arrival. GpvoError where there are fewer than ten."""
-        kept = list(messages)
-        if len(kept) < _ENOUGH:
-            raise GpvoError(
-                f"{len(kept)} messages are too few to judge", where=where, cure=f"record at least {_ENOUGH}"
-            )
-        rows = np.array([pose_of(m) for m in kept])
-        norm = np.linalg.norm(rows[:, 3:], axis=1)
-        good = np.isfinite(rows).all(axis=1) & (norm > 1e-6)
-        T = np.tile(np.full((4, 4), np.nan), (len(rows), 1, 1))
-        T[good] = se3.from_quaternion(rows[good, :3], rows[good, 3:] / norm[good, None])
-        pairs = ((m.header.frame_id, getattr(m, "child_frame_id", "-")) for m in kept)
-        frames = dict.fromkeys((printable(parent), printable(child)) for parent, child in pairs)
-        v = [_twist(m) for m in kept] if hasattr(kept[0], "twist") else None
-        pose, twist = (_covariances(kept, name) for name in ("pose", "twist"))
-        t_ns = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
-        return cls(t_ns, T, norm, tuple(frames), pose, twist, None if v is None else np.array(v))
-
-
-def _twist(message: Any) -> list[float]:
-    a, b = message.twist.twist.linear, message.twist.twist.angular
-    return [a.x, a.y, a.z, b.x, b.y, b.z]
-
-
-def _covariances(messages: Sequence[Any], name: str) -> Array | None:
-    if not hasattr(getattr(messages[0], name, None), "covariance"):
-        return None
-    return np.array([getattr(m, name).covariance for m in messages], dtype=np.float64).reshape(-1, 6, 6)
 
 
 def examine(stated: Stated) -> list[Finding]:
@@ -226,7 +162,7 @@ def _motions(s: Stated) -> tuple[Array, Array] | None:
     """(M, 6) motions in the axes of the moving frame, and their durations; the stamps must grow."""
     dt = np.diff(s.t_ns) * 1e-9
     good = (dt > 0) & np.isfinite(s.T[1:]).all(axis=(1, 2)) & np.isfinite(s.T[:-1]).all(axis=(1, 2))
-    if good.sum() < _ENOUGH:
+    if good.sum() < ENOUGH:
         return None
     return se3.log((se3.inverse(s.T[:-1]) @ s.T[1:])[good]), dt[good]
 
@@ -316,7 +252,7 @@ def _turned(name: str, C: Array, R: Array) -> list[Finding]:
     off = C[:, ~np.eye(6, dtype=bool)]
     d = np.diagonal(C, axis1=1, axis2=2)[:, :3]
     good = np.isfinite(R).all(axis=(1, 2))
-    if off.any() or good.sum() < _ENOUGH or np.ptp(np.abs(d), axis=0).max() < 1e-2 * np.abs(d).max():
+    if off.any() or good.sum() < ENOUGH or np.ptp(np.abs(d), axis=0).max() < 1e-2 * np.abs(d).max():
         return []
     for turn in (R, np.swapaxes(R, 1, 2)):
         back = np.einsum("nij,nj->ni", turn[good], d[good])

@@ -10,10 +10,11 @@ from typing import Any
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
-from gpvo.live.doctor import Finding, Stated, examine
+from gpvo.live.doctor import examine
 from gpvo.live.intake import Mailbox, arrivals
 from gpvo.live.job import WIRES, open_wire
 from gpvo.live.outputs import decode
+from gpvo.live.stated import Finding, Stated
 
 _DEPTH = 10_000
 

@@ -12,7 +12,8 @@ import pytest
 from bag_maker import BagMaker
 from gpvo.cli import app
 from gpvo.geometry import se3
-from gpvo.live.doctor import Stated, examine
+from gpvo.live.doctor import examine
+from gpvo.live.stated import Stated
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import odometry_message
 from shim_bags import engine, flight, flown
