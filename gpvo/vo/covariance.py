@@ -106,9 +106,13 @@ def covariances_by_method(
     sigma_p_px: float,
     sigma_m_px: float,
     sigma_pairs_px: tuple[tuple[float, float], ...] = (),
+    moved: Transfer | None = None,
 ) -> dict[str, MotionCovariance]:
-    """Every asked-for method and pair of sigmas over the same inliers, sharing the derivatives."""
-    moved = transfer(T_prev_cur, uvd_prev, camera)
+    """Every asked-for method and pair of sigmas over the same inliers, sharing the derivatives.
+
+    ``moved``: the transfer of the same points by the same motion, if at hand.
+    """
+    moved = moved or transfer(T_prev_cur, uvd_prev, camera)
     S = {
         "triangulation": triangulation_pixel_covariance(sigma_px),
         "pointing_matching": pointing_matching_pixel_covariance(sigma_p_px, sigma_m_px),

@@ -72,6 +72,14 @@ class Matches:
 EMPTY = Matches(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), 0)
 
 
+@dataclass(frozen=True)
+class Followed:
+    """The matches of one motion as measured, and which of them (N,) agree with it."""
+
+    matches: Matches
+    inliers: NDArray[np.bool_]
+
+
 class Frontend(Protocol):
     """Turns frames into matches. The odometry calls ``observe``, then ``match``, then perhaps ``promote``."""
 

@@ -141,6 +141,27 @@ class Motion:
         return f"motion of {t:.4f} m, {self.inliers.sum()} of {len(self.inliers)} inliers, noise {self.scale_px:.3f} px"
 
 
+@dataclass(frozen=True)
+class Whitened:
+    """The residuals of a motion at unit covariance, for unit pixel noise.
+
+    ``moved``: the transfer of its smoothed points; ``W`` (3, 3, M) the whitener; ``z`` (3, M) residuals; ``A``
+    (3, 6, M) their derivatives by a right perturbation of the motion.
+    """
+
+    moved: Transfer
+    W: Array
+    z: Array
+    A: Array
+
+
+def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
+    """The residuals behind a motion, whitened as they were to find it."""
+    moved = transfer(motion.T_prev_cur, motion.uvd_prev, camera)
+    W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT, motion.persistent))
+    return Whitened(moved, W, apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H))
+
+
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 4
 _S_UNIT = triangulation_pixel_covariance(1.0)

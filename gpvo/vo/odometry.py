@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,27 +12,19 @@ from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFr
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
-from gpvo.vo.frontend import EMPTY, Frontend, Matches, Observation
+from gpvo.vo.frontend import EMPTY, Followed, Frontend, Matches
 from gpvo.vo.imu_moments import ImuMoments
-from gpvo.vo.motion import Motion, refine, transfer
+from gpvo.vo.motion import Motion, refine, whitened
 from gpvo.vo.pairwatch import PairWatch
 from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.rig_error import RigError, RigState
-from gpvo.vo.rivals import Choice, Expected, Leaps, areas, choose, unexplained
+from gpvo.vo.rivals import Choice, areas, choose, unexplained
 from gpvo.vo.sigmas import PersistentNoise, ResidualMoments, SigmaEstimator
+from gpvo.vo.state import State
 
 _RIVAL_STAYS = 0.85  # per frame
-_GUESS_S = 0.5  # for so long a velocity is taken to last
-
-
-@dataclass(frozen=True)
-class Followed:
-    """The matches of one motion as measured, and which of them (N,) agree with it."""
-
-    matches: Matches
-    inliers: NDArray[np.bool_]
 
 
 class StereoOdometry:
@@ -67,7 +59,7 @@ class StereoOdometry:
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
         self._persistent = PersistentNoise()
-        self._state: _State | None = None
+        self._state: State | None = None
         self._imu = ImuMoments.of(None)  # since the reference
         self.pair = PairWatch(camera)
         self._raw = EMPTY  # the last matches as measured
@@ -93,8 +85,7 @@ class StereoOdometry:
         clock.lap("observe")
         if self._state is None:
             counts = frontend.promote(None)
-            self._state = _State(frame.t_ns, frame.t_ns, frame.t_ns, np.eye(4), np.zeros(6), 0.0, counts[1])
-            self._state.leaps.began_ns = frame.t_ns
+            self._state = State.begin(frame.t_ns, counts[1])
             record = VoRecord(frame.t_ns, frame.t_ns, Status.START, np.eye(4), n_detected=counts[0], n_stereo=counts[1])
             return replace(record, stage_ms=clock.stages, **stats_fields(seen.stats), **ImuMoments.of(imu).fields())
         guess = self._state.guess(frame.t_ns)
@@ -229,8 +220,8 @@ class StereoOdometry:
         state, config = self._state, self.config
         record = VoRecord(t_ns, state.t_ref_ns, verdict.status, guess, reason=verdict.reason)
         if motion is not None:
-            moved = transfer(motion.T_prev_cur, motion.uvd_prev, self.camera)
-            moments = ResidualMoments.of(motion.residuals, moved.G)
+            white = whitened(motion, self.camera)
+            moments = ResidualMoments.of(motion.residuals, white.moved.G)
             record = replace(record, **motion_fields(matches, motion, self.camera, moments))
         if motion is None or verdict.status is Status.LOST:
             C = lost_covariance((t_ns - state.t_believed_ns) * 1e-9, state.twist)
@@ -241,10 +232,10 @@ class StereoOdometry:
                 v_t=dict.fromkeys(config.stated, C[:3, :3]),
             )
         if self.config.persistent_noise:
-            self._persistent.update(motion.residuals, moved.G)
+            self._persistent.update(motion.residuals, white.moved.G)
         self._sigmas.update(moments)
         if self._sigmas.estimates:
-            self._sigmas.design.update(motion, moved, self.camera)
+            self._sigmas.design.update(motion, white, self.camera)
         sigma_p_px, sigma_m_px = self._sigmas.values
         by_method = covariances_by_method(
             config.methods,
@@ -256,12 +247,12 @@ class StereoOdometry:
             sigma_p_px=sigma_p_px,
             sigma_m_px=sigma_m_px,
             sigma_pairs_px=config.sigma_pairs_px,
+            moved=white.moved,
         )
         unknown = otherwise
         if config.self_calibration:
-            unknown = otherwise + self.rig_error.update(
-                motion, matches.row_error[motion.inliers], config.min_disparity_px
-            )
+            row_error = matches.row_error[motion.inliers]
+            unknown = otherwise + self.rig_error.update(motion, white, row_error, config.min_disparity_px)
         return replace(
             record,
             T_prev_cur=motion.T_prev_cur,
@@ -303,74 +294,3 @@ class StereoOdometry:
             return False, counts
         state.restart(record.t_ns, counts[1])
         return True, counts
-
-
-@dataclass
-class _State:
-    """Where the odometry stands between two frames."""
-
-    t_ref_ns: int
-    t_last_ns: int
-    t_believed_ns: int  # end of the last believed motion
-    T_ref_believed: Array
-    twist: Array  # (6,) per second, of the last believed motion
-    parallax_px: float  # median image motion between the last two believed frames
-    reference_points: int
-    parallax_from_reference_px: float = 0.0
-    usual_inliers: float = 0.0
-    rival: NDArray[np.bool_] | None = None  # the points of the last motion and of its rival, if there was one
-    rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
-    otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
-    odds: float = 0.0  # log odds that the last velocity is that against the scene
-    t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
-    leaps: Leaps = field(default_factory=lambda: Leaps(0))
-
-    def frozen(self, seen: Observation) -> str:
-        """What repeats itself although the camera was moving; empty for nothing."""
-        if seen.right_repeated:
-            return "frozen right picture"
-        return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
-
-    def is_fresh(self, t_ns: int, many: int) -> bool:
-        """Whether the reference has ``many`` points, and the last believed motion can still be prolonged."""
-        return self.reference_points >= many and (t_ns - self.t_believed_ns) * 1e-9 < _GUESS_S
-
-    def guess(self, t_ns: int) -> Array:
-        """Motion from the reference to time ``t_ns`` at constant velocity, for at most half a second."""
-        dt_s = min((t_ns - self.t_believed_ns) * 1e-9, _GUESS_S)
-        return self.T_ref_believed @ se3.exp(self.twist * dt_s)
-
-    def expected(self, t_ns: int, guess: Array, max_acceleration_mps2: float) -> Expected | None:
-        """What the vehicle's last velocity lets expect of the motion to ``t_ns``; None before there is one."""
-        if self.t_twist_ns is None:
-            return None
-        step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
-        return Expected(guess, max_acceleration_mps2 * age_s * step_s, self.odds)
-
-    def leap(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> None:
-        """The motion from the reference does not go on from the last velocity."""
-        assert self.t_twist_ns is not None
-        now = self._velocity(t_ns, T_ref_cur)
-        self.leaps.step(t_ns, now, self.twist, self.t_twist_ns, max_acceleration_mps2)
-
-    def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
-        """(6,) per second, since the last believed motion."""
-        step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
-        return np.asarray(step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6))
-
-    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, *, tells: bool) -> None:
-        """Take over a measured motion from the reference; its velocity only where it ``tells``."""
-        self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
-        if tells:
-            self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
-        self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
-        self.parallax_from_reference_px = parallax_px
-        self.T_ref_believed = T_ref_cur
-        self.t_believed_ns = self.t_last_ns = t_ns
-
-    def restart(self, t_ns: int, points: int) -> None:
-        """The frame at ``t_ns`` is the new reference."""
-        self.t_ref_ns = self.t_believed_ns = self.t_last_ns = t_ns
-        self.T_ref_believed = np.eye(4)
-        self.parallax_from_reference_px = 0.0
-        self.reference_points = points

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpvo.types import Array, StereoTracks, VoRecord
-from gpvo.vo.odometry import Followed
+from gpvo.vo.frontend import Followed
 
 
 class TrackRecorder:

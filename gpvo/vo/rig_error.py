@@ -7,13 +7,15 @@ relative error s of its focal length and a shift (c, e) of its centre displace a
     dx = -xy wx + (1 + x^2) wy - y wz + x s + c,    dy = -(1 + y^2) wx + xy wy + x wz + y s + e
 
 (H. Longuet-Higgins, K. Prazdny, "The interpretation of a moving retinal image", 1980, eq. 2.12). Lenses add to each
-term, so the coefficients of both second-order polynomials are free, and a turn is a part of their prior covariance. A
-Kalman filter of constant state estimates them: dx from the residuals of each motion, with the motion as an unknown
-without a prior, and dy from the rows, which need no motion. What cannot be told apart from motion: the depth's scale.
+term, and terms of higher order: a centre shifted under distortion of second and fourth order displaces the picture by
+polynomials of that order (D. Brown, "Decentering distortion of lenses", 1966). So the coefficients of both fourth-order
+polynomials are free, and a turn is a part of their prior covariance. A Kalman filter of constant state estimates them:
+dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
+motion. What cannot be told apart from motion: the depth's scale.
 
 Two things keep it honest. Errors of neighbouring frames are alike (a feature's place is off in the same way for as
 long as it is followed): blocks of frames are compared with their expected scatter, and all information is divided by
-the ratio. And rigs are of several kinds, exact or not, with a mounting and with lenses that are good, usual or bad: the
+the ratio. And rigs are of several kinds, exact or not, with a mounting and with lenses from good to bad: the
 estimate is the mean over the kinds by their probability (J. Dickey, "The weighted likelihood ratio", 1971), so that an
 exact rig keeps its exact geometry, and a camera knocked out of its place the lens that it had.
 """
@@ -27,32 +29,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.motion import Motion, apply_whitener, residual_covariance, transfer, whitener
-from gpvo.vo.points import triangulation_pixel_covariance
+from gpvo.vo.motion import Motion, Whitened, apply_whitener
 
-TERMS = ("1", "x", "y", "x^2", "xy", "y^2")
-N_TERMS = len(TERMS)
-ORDER = np.array([0, 1, 1, 2, 2, 2])
+_HIGHEST = 4  # order
+POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)])  # of x and y, order by order
+ORDER = POWERS.sum(axis=1)
+N_TERMS = len(POWERS)
 _DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
 # Standard deviations of the prior. Terms beyond the constant are given at half the width of the picture.
 _DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
 _ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
 _TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
 # Rigs that are not exact: their mounting, and apart from it their lenses, are so many times as wrong, equally likely.
-_KINDS = (0.3, 1.0, 4.0)
+# A camera can be knocked by any angle; a lens stays what it is.
+_MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: the limit of disparity selects far ones
-_S_UNIT = triangulation_pixel_covariance(1.0)
 
 
 def terms(x: Array, y: Array) -> Array:
-    """(6, N) the polynomials of :data:`TERMS` at normalised coordinates (N,) each."""
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    """(15, N) the monomials of :data:`POWERS` at normalised coordinates (N,) each."""
+    out, first = np.empty((N_TERMS, len(x))), 0
+    out[0] = 1.0
+    for n in range(1, _HIGHEST + 1):
+        below, first = first, first + n
+        out[first : first + n] = out[below:first] * x
+        out[first + n] = out[first - 1] * y
+    return out
 
 
 def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0) -> Array:
-    """(12, 12) of the coefficients of dx, then of dy, each in the order of :data:`TERMS`.
+    """(30, 30) of the coefficients of dx, then of dy, each in the order of :data:`POWERS`.
 
     Of rigs whose right camera stands ``mounting`` times, and whose lenses bend ``lens`` times as wrong as usual.
     """
@@ -68,7 +76,7 @@ def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 
 
 
 def principal_errors(state: RigState, camera: StereoCamera) -> Array:
-    """(6, 6) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the picture
+    """(15, 15) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the picture
     most come first."""
     values, vectors = np.linalg.eigh(state.covariance[_DX, _DX])
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -79,7 +87,7 @@ def principal_errors(state: RigState, camera: StereoCamera) -> Array:
 
 @dataclass(frozen=True)
 class RigState:
-    """Coefficients of dx and dy as known: ``mean`` (12,) and ``covariance`` (12, 12), in the order of :data:`TERMS`.
+    """Coefficients of dx and dy as known: ``mean`` (30,) and ``covariance`` (30, 30), in the order of :data:`POWERS`.
 
     ``probability``: that the disparities are off at all.
     """
@@ -119,7 +127,7 @@ class RigError:
             return
         precision = np.asarray(np.linalg.inv(self._start.covariance), np.float64)
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
-        kinds = product(_KINDS, _KINDS) if self._may_be_exact else ()
+        kinds = product(_MOUNTINGS, _LENSES) if self._may_be_exact else ()
         covariances = [prior_covariance(camera, *kind) for kind in kinds] or [self._start.covariance]
         self._priors = [_Prior.of(self._start.mean, covariance) for covariance in covariances]
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
@@ -141,37 +149,38 @@ class RigError:
             rows = np.abs(row_error - row_expected) <= max_row_error_px + 3.0 * sigma
             return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
 
-    def update(self, motion: Motion, row_error: Array, min_disparity_px: float) -> Array:
-        """Learn from a motion over corrected measurements, whose inliers have these row errors (M,).
+    def update(self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float) -> Array:
+        """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
+        (M,).
 
         Returns
         -------
         (6, 6) covariance that the state before this motion adds to it: ``K P K^T``, K the motion's derivative by dx.
         """
-        fx = self._camera.fx_px
-        moved = transfer(motion.T_prev_cur, motion.uvd_prev, self._camera)
-        W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT, motion.persistent)) / max(motion.scale_px, 0.1)
-        z, A = apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H)
+        fx, moved, scale_px = self._camera.fx_px, white.moved, max(motion.scale_px, 0.1)
+        z = white.z / scale_px
         # At the points as smoothed by both frames: their noise is independent of the residual, that of the measured
         # ones is not and would be taken for an error of the rig.
+        phi = self._terms(moved.uvd.T)
         M = fx * moved.G[:, 2][:, None] * self._terms(motion.uvd_prev)
-        M[2] -= fx * self._terms(moved.uvd.T)
-        B = apply_whitener(W, M)
+        M[2] -= fx * phi
+        B = apply_whitener(white.W, M)
         root = np.sqrt(np.minimum(1.0, 3.2 / np.sqrt((z**2).sum(0) + 1e-9)))
-        A = (A * root).transpose(0, 2, 1).reshape(-1, 6)
-        B = np.column_stack([(B * root).transpose(0, 2, 1).reshape(-1, N_TERMS), (z * root).reshape(-1)])
+        A, B = white.A * (root / scale_px), B * (root / scale_px)
+        A = A.transpose(0, 2, 1).reshape(-1, 6)
+        B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, N_TERMS), (z * root).reshape(-1)])
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
         if self._learn:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.persistent)
             near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px, 3)
             if near.sum() >= 3 * 8:
-                self._learn_from(A[near], B[near], self._terms(moved.uvd.T) * self._camera.fy_px, row_error)
+                self._learn_from(A[near], B[near], phi * self._camera.fy_px, row_error)
         return added
 
     def _learn_from(self, A: Array, B: Array, rows: Array, row_error: Array) -> None:
-        """``A`` (n, 6) and ``B`` (n, 7): whitened derivatives by the motion, by dx, and residuals; ``rows`` (6, M): of
-        the row errors by dy."""
+        """``A`` (n, 6) and ``B`` (n, 16): whitened derivatives by the motion, by dx, and residuals; ``rows`` (15, M):
+        of the row errors by dy."""
         rest = B - A @ np.linalg.solve(A.T @ A, A.T @ B)
         sums = rest.T @ rest
         information = sums[:-1, :-1]
@@ -218,7 +227,7 @@ class RigError:
         return mean, covariance
 
     def _terms(self, uvd: Array) -> Array:
-        """(6, N) the terms at the place in the right picture."""
+        """(15, N) the terms at the place in the right picture."""
         c = self._camera
         return terms((uvd[:, 0] - uvd[:, 2] - c.cx_px) / c.fx_px, (uvd[:, 1] - c.cy_px) / c.fy_px)
 
@@ -230,7 +239,7 @@ class RigError:
 
 @dataclass(frozen=True)
 class _Prior:
-    """One kind of rig: precision (12, 12) and precision times mean (12,), log determinant of the covariance of dx."""
+    """One kind of rig: precision (30, 30) and precision times mean (30,), log determinant of the covariance of dx."""
 
     precision: Array
     score: Array
@@ -238,7 +247,7 @@ class _Prior:
 
     @classmethod
     def of(cls, mean: Array, covariance: Array) -> _Prior:
-        """Of a Gaussian of this mean (12,) and covariance (12, 12)."""
+        """Of a Gaussian of this mean (30,) and covariance (30, 30)."""
         precision = np.asarray(np.linalg.inv(covariance), np.float64)
         return cls(precision, precision @ mean, float(np.linalg.slogdet(covariance[_DX, _DX])[1]))
 

@@ -15,11 +15,23 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.jsonfile import read_json
 from gpvo.types import StereoCamera
-from gpvo.vo.rig_error import N_TERMS, ORDER, TERMS, RigState, terms
+from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 
 STATE_FILE = "calibration_state.json"
 _WORTH_PX = 0.2  # at half the width of the picture; below, no one would calibrate anew
 _SIGMAS = 4.0
+
+
+def _power(name: str, n: int) -> str:
+    return "" if n == 0 else name if n == 1 else f"{name}^{n}"
+
+
+_TERMS = [_power("x", i) + _power("y", j) or "1" for i, j in POWERS.tolist()]
+
+
+def _names() -> list[str]:
+    """Of the coefficients in a file, in the order of a state."""
+    return [f"{d}:{t}" for d in ("dx", "dy") for t in _TERMS]
 
 
 def findings(state: RigState, camera: StereoCamera) -> list[str]:
@@ -56,7 +68,7 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
         reach_px = fx * half**ORDER
         at_border = (np.abs(c[:N_TERMS]) * reach_px)[1:]
         if any(shown(k, reach_px[k]) for k in range(1, N_TERMS)):
-            worst = TERMS[1 + int(np.argmax(at_border))]
+            worst = _TERMS[1 + int(np.argmax(at_border))]
             lines.append(f"disparities bend over the picture by up to {max(at_border):.1f} px, most in {worst}")
     return lines
 
@@ -65,7 +77,7 @@ def document(state: RigState, camera: StereoCamera) -> dict[str, Any]:
     """The state in plain numbers, for the file beside a run."""
     return {
         "schema": 1,
-        "terms": [f"{d}:{t}" for d in ("dx", "dy") for t in TERMS],
+        "terms": _names(),
         "mean": state.mean,
         "covariance": state.covariance,
         "probability": state.probability,
@@ -89,16 +101,22 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
     path = path / STATE_FILE if path.is_dir() else path
     read = read_json(path)
     try:
-        mean, covariance = np.array(read["mean"], np.float64), np.array(read["covariance"], np.float64)
+        place = np.array([_names().index(name) for name in read["terms"]])
+        read_mean, read_covariance = np.array(read["mean"], np.float64), np.array(read["covariance"], np.float64)
         probability, of = float(read["probability"]), np.array(read["camera_px"], np.float64)
     except (KeyError, TypeError, ValueError):
         raise SourceError("is not a calibration state", where=path, cure=f"give the {STATE_FILE} of a run") from None
-    n = 2 * N_TERMS
-    fits = mean.shape == (n,) and covariance.shape == (n, n) and 0 <= probability <= 1
+    n = len(np.unique(place))
+    fits = 0 < n == len(place) and read_mean.shape == (n,) and read_covariance.shape == (n, n) and 0 <= probability <= 1
     # Comparisons with NaN are false.
-    if not fits or not np.abs(mean).max() <= 0.2 or not np.abs(covariance).max() <= 1e3:
+    if not fits or not np.abs(read_mean).max() <= 0.2 or not np.abs(read_covariance).max() <= 1e3:
         raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
-    covariance = 0.5 * (covariance + covariance.T) + 1e-14 * np.eye(n)
+    # Of terms that a file does not name, nothing is known.
+    state = RigState.prior(camera)
+    mean, covariance = state.mean.copy(), state.covariance.copy()
+    covariance[place], covariance[:, place] = 0.0, 0.0
+    mean[place], covariance[np.ix_(place, place)] = read_mean, 0.5 * (read_covariance + read_covariance.T)
+    covariance += 1e-14 * np.eye(len(mean))
     if np.linalg.eigvalsh(covariance)[0] <= 0:
         raise SourceError("its covariance is not positive definite", where=path)
     if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.motion import Motion, Transfer, apply_whitener, persistent_direction, residual_covariance, whitener
+from gpvo.vo.motion import (
+    Motion,
+    Whitened,
+    apply_whitener,
+    persistent_direction,
+    residual_covariance,
+    whitener,
+)
 from gpvo.vo.points import triangulation_pixel_covariance
 
 _MEMORY = 0.97  # of the running mean: about thirty frames
@@ -104,10 +111,9 @@ class DesignEffect:
     def __init__(self) -> None:
         self._scatter = self._expected = 1.0
 
-    def update(self, motion: Motion, moved: Transfer, camera: StereoCamera) -> None:
-        """Take in a motion; ``moved``: the transfer of its smoothed points."""
-        W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT, motion.persistent))
-        z, A = apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H)
+    def update(self, motion: Motion, white: Whitened, camera: StereoCamera) -> None:
+        """Take in a motion and its whitened residuals."""
+        z, A = white.z, white.A
         share = motion.uvd_prev[:, :2] / [camera.width, camera.height]
         column, row = np.clip((share * _PARTS).astype(np.int64), 0, np.array(_PARTS) - 1).T
         part = row * _PARTS[0] + column == np.arange(_PARTS[0] * _PARTS[1])[:, None]

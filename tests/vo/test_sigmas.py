@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gpvo.geometry import se3
 from gpvo.vo.covariance import motion_covariance
-from gpvo.vo.motion import refine, transfer
+from gpvo.vo.motion import refine, transfer, whitened
 from gpvo.vo.points import pointing_matching_pixel_covariance
 from gpvo.vo.sigmas import DesignEffect, PersistentNoise, ResidualMoments, SigmaEstimator
 from stereo_points import CAMERA, noisy, scene
@@ -65,9 +65,9 @@ def test_points_that_err_alike_count_as_fewer(shared_px: float, least: float, mo
         after += shared_px * rng.standard_normal((8, 3))[part]
         motion = refine(T, before, after, CAMERA)
         assert motion is not None
-        moved = transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA)
-        design.update(motion, moved, CAMERA)
-        sigmas.update(ResidualMoments.of(motion.residuals, moved.G))
+        white = whitened(motion, CAMERA)
+        design.update(motion, white, CAMERA)
+        sigmas.update(ResidualMoments.of(motion.residuals, white.moved.G))
         if k >= 20:
             S = pointing_matching_pixel_covariance(*np.multiply(sigmas.values, design.ratio**0.5))
             e = se3.log(se3.inverse(T) @ motion.T_prev_cur)

@@ -1,0 +1,91 @@
+"""Where odometry stands between two frames: the reference, the last believed motion, and what to expect of the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.geometry import se3
+from gpvo.types import Array
+from gpvo.vo.frontend import Observation
+from gpvo.vo.rivals import Expected, Leaps
+
+_GUESS_S = 0.5  # for so long a velocity is taken to last
+
+
+@dataclass
+class State:
+    """See the module's text."""
+
+    t_ref_ns: int
+    t_last_ns: int
+    t_believed_ns: int  # end of the last believed motion
+    T_ref_believed: Array
+    twist: Array  # (6,) per second, of the last believed motion
+    parallax_px: float  # median image motion between the last two believed frames
+    reference_points: int
+    parallax_from_reference_px: float = 0.0
+    usual_inliers: float = 0.0
+    rival: NDArray[np.bool_] | None = None  # the points of the last motion and of its rival, if there was one
+    rivalry: float = 0.0  # running sum over the frames in which a second motion was seen
+    otherwise: Array = field(default_factory=lambda: np.zeros((6, 6)))  # covariance of having taken the wrong motion
+    odds: float = 0.0  # log odds that the last velocity is that against the scene
+    t_twist_ns: int | None = None  # when the velocity was last measured by a plausible motion
+    leaps: Leaps = field(default_factory=lambda: Leaps(0))
+
+    @classmethod
+    def begin(cls, t_ns: int, points: int) -> State:
+        """At rest, before any motion, with the frame at ``t_ns`` as reference."""
+        return cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns))
+
+    def frozen(self, seen: Observation) -> str:
+        """What repeats itself although the camera was moving; empty for nothing."""
+        if seen.right_repeated:
+            return "frozen right picture"
+        return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
+
+    def is_fresh(self, t_ns: int, many: int) -> bool:
+        """Whether the reference has ``many`` points, and the last believed motion can still be prolonged."""
+        return self.reference_points >= many and (t_ns - self.t_believed_ns) * 1e-9 < _GUESS_S
+
+    def guess(self, t_ns: int) -> Array:
+        """Motion from the reference to time ``t_ns`` at constant velocity, for at most half a second."""
+        dt_s = min((t_ns - self.t_believed_ns) * 1e-9, _GUESS_S)
+        return self.T_ref_believed @ se3.exp(self.twist * dt_s)
+
+    def expected(self, t_ns: int, guess: Array, max_acceleration_mps2: float) -> Expected | None:
+        """What the vehicle's last velocity lets expect of the motion to ``t_ns``; None before there is one."""
+        if self.t_twist_ns is None:
+            return None
+        step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
+        return Expected(guess, max_acceleration_mps2 * age_s * step_s, self.odds)
+
+    def leap(self, t_ns: int, T_ref_cur: Array, max_acceleration_mps2: float) -> None:
+        """The motion from the reference does not go on from the last velocity."""
+        assert self.t_twist_ns is not None
+        now = self._velocity(t_ns, T_ref_cur)
+        self.leaps.step(t_ns, now, self.twist, self.t_twist_ns, max_acceleration_mps2)
+
+    def _velocity(self, t_ns: int, T_ref_cur: Array) -> Array:
+        """(6,) per second, since the last believed motion."""
+        step = se3.log(se3.inverse(self.T_ref_believed) @ T_ref_cur)
+        return np.asarray(step / max((t_ns - self.t_believed_ns) * 1e-9, 1e-6))
+
+    def believe(self, t_ns: int, T_ref_cur: Array, parallax_px: float, inliers: int, *, tells: bool) -> None:
+        """Take over a measured motion from the reference; its velocity only where it ``tells``."""
+        self.usual_inliers = inliers if self.usual_inliers == 0 else 0.9 * self.usual_inliers + 0.1 * inliers
+        if tells:
+            self.twist, self.t_twist_ns = self._velocity(t_ns, T_ref_cur), t_ns
+        self.parallax_px = abs(parallax_px - self.parallax_from_reference_px)
+        self.parallax_from_reference_px = parallax_px
+        self.T_ref_believed = T_ref_cur
+        self.t_believed_ns = self.t_last_ns = t_ns
+
+    def restart(self, t_ns: int, points: int) -> None:
+        """The frame at ``t_ns`` is the new reference."""
+        self.t_ref_ns = self.t_believed_ns = self.t_last_ns = t_ns
+        self.T_ref_believed = np.eye(4)
+        self.parallax_from_reference_px = 0.0
+        self.reference_points = points
