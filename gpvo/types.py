@@ -395,21 +395,8 @@ class MotionError:
         """(..., 6) standard deviation per axis [m, m, m, rad, rad, rad]."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
-    def batch(self) -> MotionError:
-        """The same of one motion as a batch of one."""
-        return MotionError(
-            mean=self.mean[None],
-            jitter=self.jitter[None],
-            white=self.white[None],
-            persistent_root=self.persistent_root[None],
-            persistent_tau_s=self.persistent_tau_s,
-            dt_s=self.dt_s,
-            status=self.status,
-            nu=self.nu,
-        )
-
     def row(self: _Error, k: Any) -> _Error:
-        """Row k, or the rows that an index chooses, of a batch along its first axis."""
+        """Row k, or the rows that an index chooses, of a batch along its first axis; by ``None`` a batch of one."""
         chosen = object.__new__(type(self))
         for name, value in vars(self).items():
             batched = isinstance(value, np.ndarray) and value.ndim and name != "persistent_tau_s"

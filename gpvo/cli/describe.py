@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.errors import GpvoError, ModelError, SourceError, printable
+from gpvo.geometry.se3 import path_length_m
 
 
 def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -77,7 +78,7 @@ def _poses(t_ns: Any, T: Any) -> dict[str, Any]:
     return {
         "poses": len(t_ns),
         "duration_s": float(t_ns[-1] - t_ns[0]) * 1e-9,
-        "path_length_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
+        "path_length_m": float(path_length_m(T[:, :3, 3])[-1]),
     }
 
 

@@ -116,7 +116,7 @@ def _print(f: Forecast, path: Path) -> None:
 
 def _write(out: Path, f: Forecast) -> None:
     """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
-    from gpvo.io.parquet_write import write_table
+    from gpvo.io.parquet import write_table
     from gpvo.io.tables import write_csv
 
     position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m

@@ -14,7 +14,7 @@ from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, to_records
 from gpvo.io.run import write_run
-from gpvo.io.truth import check_overlap
+from gpvo.io.trajectory import check_overlap
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
 

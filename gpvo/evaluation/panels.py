@@ -1,4 +1,4 @@
-"""What the page draws by itself: plain numbers for each panel, thinned to what a screen can show.
+"""What is drawn of a run, on the page and in pictures: plain numbers for each panel, thinned to what a screen can show.
 
 A panel is ``{"title", "x": label, "y": label, "lines", "bands", "shades"}`` with optional ``log`` ("x", "y" or "xy"),
 ``equal`` axes, ``limit`` (low, high) of y, ``level``, a reference line, and ``along``, what is told of each point of a
@@ -15,11 +15,24 @@ from numpy.typing import NDArray
 
 from gpvo.evaluation import curves
 from gpvo.evaluation.evaluate import Evaluation
-from gpvo.evaluation.plots import AXES, colour, level
+from gpvo.geometry.frames import R_FLU_OPTICAL
 from gpvo.stats.series import allan_deviation, autocorrelation
 from gpvo.types import Array, Status
 
 Panel = dict[str, Any]
+
+AXES = ("x", "y", "z", "rot x", "rot y", "rot z")
+_COLOURS = {
+    "constant": "#888888", "triangulation": "#1f77b4", "pointing_matching": "#ff7f0e", "spherical": "#8c564b",
+    "triangulation_scaled": "#17becf", "pointing_matching_scaled": "#bcbd22", "learned": "#2ca02c", "base": "#e377c2",
+    "imported": "#d62728", "imported_scaled": "#c49c94", "twin": "#3f51b5",
+}  # fmt: skip
+
+
+def colour(method: str) -> str:
+    """One colour per method, the same in every picture."""
+    return _COLOURS.get(method, "#9467bd")
+
 
 MAX_POINTS = 500
 _BLACK, _RED, _GREEN = "#1b1b1b", "#d62728", "#2ca02c"
@@ -46,7 +59,7 @@ def groups(e: Evaluation) -> list[dict[str, Any]]:
         {
             "title": "Is it honest?",
             "note": "Overconfident: below the diagonal; in NEES over time (mean over 0.5 s), above 1.",
-            "panels": [reliability(e), nees(e)] if len(e.errors.index) else [],
+            "panels": [*reliability(e), *nees(e)] if len(e.errors.index) else [],
         },
         {
             "title": "How errors are correlated in time",
@@ -55,6 +68,19 @@ def groups(e: Evaluation) -> list[dict[str, Any]]:
         },
         {"title": "What odometry saw", "note": "Amber: degraded. Red: lost.", "panels": inputs(e)},
     ]
+
+
+def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
+    """Axes to draw in, so that the third points up."""
+    return level_of(e.T_true[e.covered][0] if e.covered.any() else e.T_est[0])
+
+
+def level_of(T_world_cam: Array) -> tuple[Array, tuple[str, str, str]]:
+    """By the first pose. A camera's world (y down, as KITTI's) is turned."""
+    down = T_world_cam[:3, :3] @ np.array([0.0, 1.0, 0.0])
+    if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
+        return R_FLU_OPTICAL, ("forward z", "left -x", "up -y")
+    return np.eye(3), ("x", "y", "z")
 
 
 def views(e: Evaluation) -> list[Panel]:
@@ -133,23 +159,23 @@ def stated(e: Evaluation) -> list[Panel]:
     return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
 
 
-def reliability(e: Evaluation) -> Panel:
+def reliability(e: Evaluation) -> list[Panel]:
     """Share of errors inside against the stated probability, of every method."""
     lines = [
         _line(curves.LEVELS, curves.reliability(e, s), s.method, colour(s.method), _width(e, s.method))
         for s in curves.full_statements(e)
     ]
     lines.append({**_line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
-    return _panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])
+    return [_panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])]
 
 
-def nees(e: Evaluation) -> Panel:
+def nees(e: Evaluation) -> list[Panel]:
     """NEES per degree of freedom over time, of every method."""
     lines = []
     for s in curves.full_statements(e):
         t, values = curves.nees_over_time(e, s)
         lines.append(_line(*_thin(t, values), s.method, colour(s.method), _width(e, s.method)))
-    return _panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)
+    return [_panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)]
 
 
 def memory(e: Evaluation) -> list[Panel]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
-from gpvo.evaluation import curves, panels, plots
+from gpvo.evaluation import curves, panels
 from gpvo.evaluation.evaluate import Evaluation, document
 from gpvo.evaluation.matches import MatchPicture
 from gpvo.evaluation.verdict import TRUE
@@ -63,7 +63,7 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
 
 def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
-    to_plane, _ = plots.level(e)
+    to_plane, _ = panels.level(e)
     keep, covered = _spread(len(e.T_est)), np.flatnonzero(e.covered)
     shown = covered[_spread(len(covered))]
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T

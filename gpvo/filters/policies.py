@@ -83,7 +83,7 @@ class LearnedPolicy:
         error: MotionError = prediction
         if not self.use_parts:
             error = MotionError.independent(error.covariance, error.mean, dt_s=error.dt_s, status=error.status)
-        return error.batch()
+        return error.row(None)
 
 
 def constant_from_errors(xi: Array) -> Array:

@@ -36,8 +36,7 @@ from gpvo.io.bag_reader import (
 from gpvo.io.images import Image8, ImageSource
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, usual_interval
-from gpvo.io.trajectory import Trajectory
-from gpvo.io.truth import MOTION_CAPTURE, UNKNOWN, TruthNoise, carry, check_overlap
+from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
 from gpvo.types import TruthLog
 
 # How drivers name the two cameras of one head.

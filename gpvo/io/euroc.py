@@ -17,8 +17,7 @@ from gpvo.io.images import FileSource, PairFiles
 from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, text_lines
-from gpvo.io.trajectory import read_euroc_csv
-from gpvo.io.truth import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap
+from gpvo.io.trajectory import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap, read_euroc_csv
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.

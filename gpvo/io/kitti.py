@@ -10,8 +10,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import growing
-from gpvo.io.trajectory import Trajectory, read_kitti_poses, read_times
-from gpvo.io.truth import GPS_INS, TruthNoise, carry
+from gpvo.io.trajectory import GPS_INS, Trajectory, TruthNoise, carry, read_kitti_poses, read_times
 from gpvo.types import TruthLog
 
 

@@ -1,7 +1,16 @@
-"""Small Parquet tables, read with their sizes and checksums checked first."""
+"""Small Parquet tables: read with their sizes and checksums checked first; written with NumPy and the standard library,
+so that odometry can record without a Parquet library.
+
+Format: Apache Parquet 2.10, its footer and page headers in Thrift's compact protocol (the ids of fields are those of
+``parquet.thrift``). Every column is optional, plainly encoded, in one gzip page with its CRC-32 per group of rows.
+"""
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,16 +18,183 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.parquet_write import KIND_OF, RowGroup
+from gpvo.io.atomic import replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+_INTEGERS = ("t_ns", "t_prev_ns", "n_detected", "n_stereo", "n_tracked", "n_inliers")
+KIND_OF = {
+    **dict.fromkeys(_INTEGERS, "int64"),
+    **dict.fromkeys(("status", "reason"), "string"),
+    **dict.fromkeys(("is_reference", "is_inlier"), "bool"),
+    **dict.fromkeys(("u_px", "v_px", "d_px"), "float32"),
+    "track": "int32",
+}
+"""Kinds of the columns that are not float64, by name."""
+_TYPE = {"bool": 0, "int32": 1, "int64": 2, "float32": 4, "float64": 5, "string": 6}
+_MAGIC, _GZIP, _PLAIN, _RLE, _OPTIONAL, _UTF8 = b"PAR1", 2, 0, 3, 1, 0
+_I32, _I64, _TEXT, _LIST, _STRUCT = 5, 6, 8, 9, 12
+_LEVEL = 1  # of gzip: covariances hardly shrink further
 MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
+
+Fields = Sequence[tuple[int, int, Any]]
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """Where the columns of a written file lie: ``names``, and (C, 3) ``offset``, stored and plain ``size`` in bytes."""
+
+    path: Path
+    rows: int
+    names: tuple[str, ...]
+    place: NDArray[np.int64]
+
+
+def write_table(path: Path, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> RowGroup:
+    """Write columns of one length in place of what was there, or not at all. None and NaN become null.
+
+    Raises
+    ------
+    SourceError
+        Naming ``path``, where it cannot be written.
+    """
+    rows = len(next(iter(columns.values()), ()))
+    pages = [_page(values, KIND_OF.get(name, "float64")) for name, values in columns.items()]
+    sizes = np.array([[len(page), plain] for page, plain in pages], dtype=np.int64).reshape(-1, 2)
+    offset = len(_MAGIC) + np.cumsum(sizes[:, 0]) - sizes[:, 0]
+    group = RowGroup(path, rows, tuple(columns), np.column_stack([offset, sizes]))
+    with replacing(path) as temporary:
+        temporary.write_bytes(b"".join([_MAGIC, *(page for page, _ in pages), _footer([group], metadata)]))
+    return group
+
+
+def join_tables(parts: Sequence[RowGroup], target: Path, metadata: Mapping[str, str] | None = None) -> None:
+    """Join tables of a growing set of columns into one file, a part at a time in memory."""
+    names = tuple(dict.fromkeys(name for part in parts for name in part.names))
+    joined, end = [], len(_MAGIC)
+    with replacing(target) as temporary, temporary.open("wb") as file:
+        file.write(_MAGIC)
+        for part in parts:
+            stored, place, rows = part.path.read_bytes(), dict(zip(part.names, part.place)), []
+            for name in names:
+                if name in place:
+                    offset, size, plain = place[name].tolist()
+                    page = stored[offset : offset + size]
+                else:
+                    page, plain = _page([None] * part.rows, KIND_OF.get(name, "float64"))
+                rows.append((end, len(page), plain))
+                end += file.write(page)
+            joined.append(RowGroup(target, part.rows, names, np.array(rows, dtype=np.int64)))
+        file.write(_footer(joined, metadata))
+
+
+def _page(values: Any, kind: str) -> tuple[bytes, int]:
+    """A column's page with its header, and its size before compression."""
+    present, data = _encoded(values, kind)
+    levels = _varint(((len(present) + 7) // 8) << 1 | 1) + np.packbits(present, bitorder="little").tobytes()
+    plain = struct.pack("<I", len(levels)) + levels + data
+    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, 31)
+    packed = packer.compress(plain) + packer.flush()
+    crc = zlib.crc32(packed)
+    of_page = [(1, _I32, len(present)), (2, _I32, _PLAIN), (3, _I32, _RLE), (4, _I32, _RLE)]
+    header = _struct(
+        [
+            (1, _I32, 0),
+            (2, _I32, len(plain)),
+            (3, _I32, len(packed)),
+            (4, _I32, crc - (crc >> 31 << 32)),
+            (5, _STRUCT, of_page),
+        ]
+    )
+    return header + packed, len(header) + len(plain)
+
+
+def _encoded(values: Any, kind: str) -> tuple[NDArray[np.bool_], bytes]:
+    """Which values there are, and these in plain encoding."""
+    if kind.startswith("float"):
+        numbers = np.asarray(values, dtype=f"<f{kind[5:].replace('64', '8').replace('32', '4')}")
+        present = ~np.isnan(numbers)
+        return present, numbers[present].tobytes()
+    present = np.array([v is not None for v in values], dtype=bool)
+    there = [v for v in values if v is not None]
+    if kind == "string":
+        texts = [str(v).encode() for v in there]
+        return present, b"".join(struct.pack("<I", len(t)) + t for t in texts)
+    if kind == "bool":
+        return present, np.packbits(np.asarray(there, dtype=bool), bitorder="little").tobytes()
+    return present, np.asarray(there, dtype="<i8" if kind == "int64" else "<i4").tobytes()
+
+
+def _footer(groups: Sequence[RowGroup], metadata: Mapping[str, str] | None) -> bytes:
+    names = groups[0].names
+    schema: list[Fields] = [[(4, _TEXT, "schema"), (5, _I32, len(names))]]
+    for name in names:
+        kind = KIND_OF.get(name, "float64")
+        text = [(6, _I32, _UTF8)] if kind == "string" else []
+        schema.append([(1, _I32, _TYPE[kind]), (3, _I32, _OPTIONAL), (4, _TEXT, name), *text])
+    body = _struct(
+        [
+            (1, _I32, 2),
+            (2, _LIST, (_STRUCT, schema)),
+            (3, _I64, sum(g.rows for g in groups)),
+            (4, _LIST, (_STRUCT, [_group(g) for g in groups])),
+            (5, _LIST, (_STRUCT, [[(1, _TEXT, k), (2, _TEXT, v)] for k, v in (metadata or {}).items()])),
+            (6, _TEXT, "gpvo"),
+        ]
+    )
+    return body + struct.pack("<I", len(body)) + _MAGIC
+
+
+def _group(group: RowGroup) -> Fields:
+    chunks: list[Fields] = []
+    for name, (offset, size, plain) in zip(group.names, group.place.tolist()):
+        about = [
+            (1, _I32, _TYPE[KIND_OF.get(name, "float64")]),
+            (2, _LIST, (_I32, [_PLAIN, _RLE])),
+            (3, _LIST, (_TEXT, [name])),
+            (4, _I32, _GZIP),
+            (5, _I64, group.rows),
+            (6, _I64, plain),
+            (7, _I64, size),
+            (9, _I64, offset),
+        ]
+        chunks.append([(2, _I64, offset), (3, _STRUCT, about)])
+    return [(1, _LIST, (_STRUCT, chunks)), (2, _I64, int(group.place[:, 2].sum())), (3, _I64, group.rows)]
+
+
+def _struct(fields: Fields) -> bytes:
+    """A Thrift structure of (id, type, value), ids rising by less than 16."""
+    out, before = [], 0
+    for number, kind, value in fields:
+        out.append(bytes([(number - before) << 4 | kind]) + _value(kind, value))
+        before = number
+    return b"".join(out) + b"\x00"
+
+
+def _value(kind: int, value: Any) -> bytes:
+    if kind == _STRUCT:
+        return _struct(value)
+    if kind == _TEXT:
+        text = value.encode()
+        return _varint(len(text)) + text
+    if kind == _LIST:
+        of, entries = value
+        head = bytes([len(entries) << 4 | of]) if len(entries) < 15 else bytes([0xF0 | of]) + _varint(len(entries))
+        return head + b"".join(_value(of, entry) for entry in entries)
+    return _varint(value << 1 ^ value >> 63)  # zigzag
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
 
 
 def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:

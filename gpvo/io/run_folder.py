@@ -14,7 +14,7 @@ from gpvo.errors import SourceError
 from gpvo.io import run_table
 from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import read_json
-from gpvo.io.parquet_write import RowGroup, write_table
+from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
 from gpvo.io.snapshot import load_snapshot
 from gpvo.types import ImuLog, Mounting, StereoCamera, TruthLog, VoRecord
 
@@ -48,8 +48,6 @@ def take_up(chunks: Path, key: str) -> Kept | None:
         parts = {kind: sorted(chunks.glob(f"{kind}_*.parquet")) for kind in KINDS}
         late = [p for paths in parts.values() for p in paths if int(p.stem.rpartition("_")[2]) >= count]
         kept = {kind: [p for p in paths if p not in late] for kind, paths in parts.items() if paths}
-        from gpvo.io.parquet import placed_columns, read_columns
-
         records = [r for path in kept["log"] for r in run_table.records_from(read_columns(path)[0])]
         groups = {kind: [placed_columns(path) for path in paths] for kind, paths in kept.items()}
         whole = len(kept["log"]) == count and all(len(g) in (0, count) for g in groups.values())

@@ -29,7 +29,7 @@ from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import growing, in_order
-from gpvo.io.truth import GPS_INS, TruthNoise
+from gpvo.io.trajectory import GPS_INS, TruthNoise
 from gpvo.types import Array, ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
 
 _REQUIRED = ("t_s", "frame", "track", "uv_left", "uv_right", "fx", "fy", "cx", "cy", "baseline_m")

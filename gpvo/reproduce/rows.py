@@ -16,7 +16,7 @@ from gpvo.errors import GpvoError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign, to_records
 from gpvo.io.run import write_run
-from gpvo.io.truth import check_overlap
+from gpvo.io.trajectory import check_overlap
 from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method_of
 from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Way, printed
 from gpvo.reproduce.flights import Flights, is_complete

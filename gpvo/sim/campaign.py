@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.errors import GpvoError
+from gpvo.geometry.se3 import path_length_m
+from gpvo.learning.parallel import map_jobs
 from gpvo.sim.scenario import Scenario, points_scenario
 
 
@@ -42,22 +43,13 @@ def fly_campaign(
     MissingExtraError
         For ``dask`` without the extra.
     """
+    if backend not in ("joblib", "dask"):
+        raise GpvoError(f"unknown backend '{backend}'", cure="choose joblib or dask")
     suffix = ".npz" if points else ""
     tasks = [(scenario, seed, out / f"seed_{seed}{suffix}", points) for seed in seeds]
     out.mkdir(parents=True, exist_ok=True)
-    if backend == "joblib":
-        from joblib import Parallel, delayed
-
-        return list(Parallel(n_jobs=jobs)(delayed(fly_one)(*task) for task in tasks))
-    if backend != "dask":
-        raise GpvoError(f"unknown backend '{backend}'", cure="choose joblib or dask")
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise MissingExtraError("distributed", "dask") from error
-    options: dict[str, Any] = {"address": scheduler} if scheduler else {"n_workers": jobs, "threads_per_worker": 1}
-    with Client(**options) as client:
-        return list(client.gather([client.submit(fly_one, *task, pure=False) for task in tasks]))
+    where = "local" if backend == "joblib" else backend
+    return map_jobs(fly_one, tasks, jobs=jobs, backend=where, scheduler=scheduler)
 
 
 def fly_one(scenario: Scenario, seed: int, out: Path, points: bool = False) -> Flight:
@@ -83,11 +75,8 @@ def fly(
 
 def fly_points(scenario: Scenario, seed: int, out: Path) -> Flight:
     """One flight without images, written as ``.npz``; an existing file of that name is written anew."""
-    import numpy as np
-
     from gpvo.sim.points import simulate_points
 
     flight = simulate_points(points_scenario(scenario), seed)
     flight.save(out)
-    steps = np.linalg.norm(np.diff(flight.motion.position_m, axis=0), axis=1)
-    return Flight(seed, out, len(flight.t_s), float(steps.sum()))
+    return Flight(seed, out, len(flight.t_s), float(path_length_m(flight.motion.position_m)[-1]))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.geometry import se3
 from gpvo.sim import paths, recorded
 from gpvo.sim.paths import Path3
 from gpvo.types import Array
@@ -76,7 +77,7 @@ def _street_along(recording: recorded.Recording, duration_s: float, rng: np.rand
     at = at[np.concatenate([[True], steps > 1e-3])]
     ahead = path.attitude(np.array([0.0, duration_s]))[:, :, 0] * [1, 1, 0]
     at = np.concatenate([at[:1] - _BEYOND_M * ahead[0], at, at[-1:] + _BEYOND_M * ahead[1]])
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
+    arc = se3.path_length_m(at)
     even = np.arange(0.0, arc[-1], _STEP_M)
     return path, _street(np.stack([np.interp(even, arc, at[:, i]) for i in range(3)], axis=1), rng)
 

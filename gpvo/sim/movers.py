@@ -81,9 +81,8 @@ class _Way:
     @staticmethod
     def of(t_s: Array, T_world_cam: Array) -> _Way:
         position, ahead = T_world_cam[:, :3, 3], T_world_cam[:, :3, 2]
-        steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-        return _Way(t_s, np.concatenate([[0.0], np.cumsum(steps)]), position, heading)
+        return _Way(t_s, se3.path_length_m(position), position, heading)
 
     def beside(self, arc_m: Array, left_m: float) -> tuple[Array, Array]:
         """Positions (K, 3) and headings (K,) at arc lengths (K,), so far to the left; straight on beyond the end."""

@@ -83,7 +83,7 @@ def along_curve(
 
 def driving(centre: Array, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float = 3.0) -> Path3:
     """A drive along a polyline (N, 3) [m], level: up to ``speed_mps``, slower in between, now and then a stop."""
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    arc = path_length_m(centre)
     curve = make_interp_spline(arc, gaussian_filter1d(centre, 6.0, axis=0, mode="nearest"), k=5)
     t, every_s = knots(duration_s), max(8.0, speed_mps / 2.5)
     at = np.arange(rest_s + 1.6, duration_s + 3 * every_s, every_s)  # smoothing reaches so far back

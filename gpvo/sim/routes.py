@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.geometry.se3 import path_length_m
 from gpvo.sim import paths, vehicles
 from gpvo.sim.paths import Path3
 from gpvo.sim.recorded import Recording, read_recording
@@ -106,7 +107,7 @@ def _is_clear(scenario: Scenario, world: World, position_m: Array) -> bool:
 def _along(scenario: Scenario, world: World, rng: np.random.Generator) -> Path3:
     """Along the centre line, with as much of the wanted sway as the walls allow."""
     line = world.centreline
-    length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    length = float(path_length_m(line)[-1])
     reach = scenario.speed_mps * (scenario.duration_s - scenario.rest_s)
     if reach > length:
         raise GpvoError(

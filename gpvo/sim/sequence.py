@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
+from gpvo.geometry.se3 import path_length_m
 from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import write_json
 from gpvo.io.toml import to_toml
@@ -28,7 +29,6 @@ from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
 from gpvo.sim.scenario import Scenario, require_pictures
 from gpvo.sim.sequence_plan import FramePlan
 from gpvo.sim.worlds import build_world
-from gpvo.types import Array
 
 # Stamps of 19 digits, as real recordings have them.
 START_NS = 1_600_000_000_000_000_000
@@ -75,7 +75,7 @@ def simulate(
         if _is_finished(target, resolved):
             poses = np.loadtxt(_truth_file(target), delimiter=",", usecols=(1, 2, 3), ndmin=2)
             frames = sum(1 for _ in (target / "mav0" / "cam0" / "data.csv").open()) - 1
-            return SequenceInfo(target, scenario.name, seed, frames, _length(poses), False)
+            return SequenceInfo(target, scenario.name, seed, frames, float(path_length_m(poses)[-1]), False)
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
         try:
@@ -159,7 +159,7 @@ def _write(
     eye = Eye(scenario, seed, world, true_rig(written, error), motion, threads)
     count = _write_images(scenario, folder, frames, eye, threads, on_frame)
     drawn = {"world_seed": world_seed, "world_params": parameters, "rig_error": asdict(error)}
-    return count, _length(motion.position_m[::50]), drawn
+    return count, float(path_length_m(motion.position_m[::50])[-1]), drawn
 
 
 def _write_episodes(folder: Path, episodes: tuple[Episode, ...], frames: list[FramePlan]) -> None:
@@ -236,7 +236,3 @@ def _save_array(path: Path, values: NDArray[np.float32]) -> None:
 
 def _truth_file(folder: Path) -> Path:
     return folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-
-
-def _length(position_m: Array) -> float:
-    return float(np.linalg.norm(np.diff(position_m, axis=0), axis=1).sum())

@@ -30,9 +30,9 @@ AXES = {
         ("time [s]", "rot z"),
     ],
     "reliability": [("stated probability", "share of errors inside")],
-    "memory": [("lag [s]", "autocorrelation"), ("averaging time [s]", "Allan deviation")],
+    "memory": [("lag [s]", "autocorrelation"), ("averaging time [s]", "deviation")],
     "nees": [("time [s]", "NEES / dof")],
-    "inputs": [("", "points"), ("", "disparity [px]"), ("time [s]", "image")],
+    "inputs": [("time [s]", "points")],
 }
 
 
@@ -61,7 +61,7 @@ def test_figures_have_their_axes(evaluation, name):
 
 
 def test_reliability_of_an_honest_method_is_the_diagonal(evaluation):
-    (ax,) = plots.reliability(evaluation).axes
+    (ax,) = plots.FIGURES["reliability"](evaluation).axes
     line = next(entry for entry in ax.get_lines() if entry.get_label() == "triangulation")
     np.testing.assert_allclose(line.get_ydata(), line.get_xdata(), atol=0.05)
 
@@ -207,10 +207,10 @@ def test_thinning_loses_no_peak():
 
 
 def test_views_are_no_mirror_images(evaluation):
-    to_plane, _ = plots.level(evaluation)
+    to_plane, _ = panels.level(evaluation)
     assert np.linalg.det(to_plane) == pytest.approx(1.0)
     T = np.tile(np.eye(4), (len(evaluation.T_true), 1, 1))
-    to_plane, names = plots.level(replace(evaluation, T_true=T))
+    to_plane, names = panels.level(replace(evaluation, T_true=T))
     assert names[0] == "forward z"
     assert np.linalg.det(to_plane) == pytest.approx(1.0)
 

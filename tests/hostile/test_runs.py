@@ -94,7 +94,7 @@ def test_a_finished_run_stays_until_the_new_one_is_whole(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("gpvo.io.parquet_write._footer", full)
+        patch.setattr("gpvo.io.parquet._footer", full)
         with pytest.raises(SourceError, match="No space left"):
             write_run(run, VoLog(log.records[:20], log.camera))
     assert bytes_of(run) == before
@@ -119,7 +119,7 @@ def test_a_full_disk_names_the_file_and_leaves_nothing_half_written(
     def full(*_: object) -> None:
         raise OSError("Error writing bytes to file")
 
-    monkeypatch.setattr("gpvo.io.parquet_write._footer", full)
+    monkeypatch.setattr("gpvo.io.parquet._footer", full)
     with pytest.raises(SourceError, match=r"log_000000\.parquet: cannot be written"):
         write_run(tmp_path / "run", log)
     assert not list(tmp_path.rglob("*.part"))

@@ -128,7 +128,7 @@ def test_a_filter_that_knows_nothing_else_states_what_adds_up(seed: int) -> None
         filter.P[:, POSE, POSE] = 1e10
         filter.decay_bias((k * STEP_NS - aged_ns) * 1e-9, error.persistent_tau_s)
         aged_ns = k * STEP_NS
-        filter.update_motion(T, error.batch(), Gate(on_fail="accept"))
+        filter.update_motion(T, error.row(None), Gate(on_fail="accept"))
         to_camera = np.eye(6)
         to_camera[:3, :3] = T_world[:3, :3].T
         _assert_same(to_camera @ filter.P[0][np.ix_(POSE, POSE)] @ to_camera.T, stated[k])

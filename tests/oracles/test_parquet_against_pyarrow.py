@@ -8,8 +8,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from gpvo.io.parquet import read_columns
-from gpvo.io.parquet_write import join_tables, write_table
+from gpvo.io.parquet import join_tables, read_columns, write_table
 from hypothesis import given, settings
 
 ROWS = st.integers(0, 70)
