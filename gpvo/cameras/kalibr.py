@@ -25,11 +25,7 @@ def read_camchain(path: Path, *, left: str = "cam0", right: str = "cam1") -> Ste
 
     ``T_cn_cnm1`` (previous camera to this one) and ``T_cam_imu`` (or its inverse ``T_imu_cam``, never both) are read;
     where both give the baseline they must agree, since published files have put other things under ``T_cn_cnm1``.
-
-    Raises
-    ------
-    CalibrationError
-        Where a key is missing, a model unknown, or the rig impossible.
+    Raises CalibrationError where a key is missing, a model unknown, or the rig impossible.
     """
     document = read_yaml(path)
     blocks = {}
@@ -92,10 +88,7 @@ def make_lens(
 ) -> CameraModel:
     """A lens from the names that Kalibr, EuRoC and ROS use for the two models.
 
-    Raises
-    ------
-    CalibrationError
-        For a model other than pinhole with radial-tangential or equidistant distortion.
+    Raises CalibrationError for a model other than pinhole with radial-tangential or equidistant distortion.
     """
     fx, fy, cx, cy = intrinsics
     width, height = resolution

@@ -35,12 +35,8 @@ _SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1"
 def read_camera_infos(path: Path) -> StereoRig:
     """The rig of ROS camera_info YAML (``camera_calibration_parsers``), a file per camera, for raw images.
 
-    ``path``: of either camera, ``left.yaml`` or ``right.yaml``; the other lies beside it.
-
-    Raises
-    ------
-    CalibrationError
-        Where the other file is missing, or one of them lacks a matrix.
+    ``path``: of either camera, ``left.yaml`` or ``right.yaml``; the other lies beside it. Raises CalibrationError where
+    the other file is missing, or one of them lacks a matrix.
     """
     for left, right in _SIDES:
         name = path.name.replace(right, left)
@@ -82,12 +78,8 @@ def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool
     """The rig of two CameraInfo messages; ``rectified`` says that the images already are.
 
     The right camera's ``P[0, 3]`` is ``-fx' B``. For raw images the rectifying rotations ``R`` of both give their
-    relative orientation: ``R_right_left = R_right^T R_left``.
-
-    Raises
-    ------
-    CalibrationError
-        Where the cameras are uncalibrated (``K[0] == 0``), the baseline is absent or the rig impossible.
+    relative orientation: ``R_right_left = R_right^T R_left``. Raises CalibrationError where the cameras are
+    uncalibrated (``K[0] == 0``), the baseline is absent or the rig impossible.
     """
     for name, info in (("left", left), ("right", right)):
         if info.K[0, 0] == 0 or info.P[0, 0] == 0:
@@ -141,10 +133,8 @@ def read_projections(path: Path) -> dict[str, Array]:
 def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]) -> StereoRig:
     """The rectified pair of cameras ``left`` and ``right`` (0 and 1 grey, 2 and 3 colour) with images of ``size``.
 
-    Raises
-    ------
-    CalibrationError
-        Where a matrix is missing, the two do not share their intrinsics, or the baseline is impossible.
+    Raises CalibrationError where a matrix is missing, the two do not share their intrinsics, or the baseline is
+    impossible.
     """
     P = read_projections(path)
     for camera in (left, right):

@@ -35,12 +35,8 @@ CALIBRATION_NAMES = (
 def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> StereoRig:
     """A Kalibr camera chain, an OpenCV stereo file, ROS camera_info YAML or KITTI's ``calib.txt``, told apart by keys.
 
-    ``size`` (width, height) of the images, for files that do not state it.
-
-    Raises
-    ------
-    CalibrationError
-        Where it is none of them.
+    ``size`` (width, height) of the images, for files that do not state it. Raises CalibrationError where it is none of
+    them.
     """
     if path.suffix.lower() == ".txt":
         if size is None:
@@ -73,12 +69,8 @@ def read_opencv_stereo(path: Path, *, size: tuple[int, int] | None = None) -> St
     """The rig of an OpenCV stereo file: ``R``, ``T`` map points of the first camera to the second.
 
     The lens is a fisheye where ``D1`` has exactly four coefficients and the file says ``model: fisheye`` (or names
-    no model and is of a T265), else radial-tangential. ``size`` (width, height) where the file does not say.
-
-    Raises
-    ------
-    CalibrationError
-        Where a key is missing or the rig impossible.
+    no model and is of a T265), else radial-tangential. ``size`` (width, height) where the file does not say. Raises
+    CalibrationError where a key is missing or the rig impossible.
     """
     document = read_yaml(path)
     T = np.eye(4)

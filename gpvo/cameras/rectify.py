@@ -174,12 +174,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     """(H, W) bool, True where usable, from a black and white image.
 
     Both habits are in use, white for usable and white for masked out (OpenVINS); the middle of the image tells them
-    apart, since no lens masks it.
-
-    Raises
-    ------
-    CalibrationError
-        Where the file is no image.
+    apart, since no lens masks it. Raises CalibrationError where the file is no image.
     """
     if not path.is_file():
         raise CalibrationError("no such mask image", where=path)

@@ -91,10 +91,7 @@ class StereoRig:
 def check_pose(T: object, name: str, where: object = None) -> Array:
     """``T`` as a (4, 4) pose whose rotation is a rotation, cleaned of rounding.
 
-    Raises
-    ------
-    CalibrationError
-        Where it is not 4x4, not finite, or its upper left block is not a rotation to 1e-3.
+    Raises CalibrationError where it is not 4x4, not finite, or its upper left block is not a rotation to 1e-3.
     """
     try:
         M = np.asarray(T, dtype=np.float64)
@@ -114,11 +111,8 @@ def check_pose(T: object, name: str, where: object = None) -> Array:
 def check_rig(rig: StereoRig) -> None:
     """Refuse a rig that cannot exist.
 
-    Raises
-    ------
-    CalibrationError
-        Naming the reason: baseline absent, too long, pointing the wrong way or not sideways; cameras turned apart;
-        lenses that do not belong together; intrinsics outside the image.
+    Raises CalibrationError, naming the reason: baseline absent, too long, pointing the wrong way or not sideways;
+    cameras turned apart; lenses that do not belong together; intrinsics outside the image.
     """
     for name, lens in (("left", rig.left), ("right", rig.right)):
         _check_lens(lens, name, rig.where)

@@ -53,11 +53,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; ``!!opencv-matrix`` becomes an array (rows, cols).
 
     OpenCV's first line ``%YAML:1.0`` is no YAML and is dropped; tags that would build Python objects are refused.
-
-    Raises
-    ------
-    CalibrationError
-        Where the file is missing, too large, not YAML or not a mapping.
+    Raises CalibrationError where the file is missing, too large, not YAML or not a mapping.
     """
     text = calibration_text(path)
     # A leading directive without the document marker, a byte order mark, and tabs are what these files suffer from.
@@ -77,10 +73,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def get_numbers(block: dict[str, Any], key: str, count: int | tuple[int, ...], where: object) -> list[float]:
     """``block[key]`` as a list of finite numbers of one of the given lengths.
 
-    Raises
-    ------
-    CalibrationError
-        Where the key is absent or holds something else.
+    Raises CalibrationError where the key is absent or holds something else.
     """
     allowed = (count,) if isinstance(count, int) else count
     if key not in block:

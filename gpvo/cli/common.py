@@ -82,10 +82,7 @@ _PLAIN = (str, int, float, bool, list, Path)
 def options_of_file(path: Path, name: str, command: Any) -> list[str]:
     """Options of a command and its ``name`` from its table in a TOML file, as words of a command line.
 
-    Raises
-    ------
-    GpvoError
-        One line for what is no table of a command, no option of it, or no value for it.
+    Raises GpvoError: one line for what is no table of a command, no option of it, or no value for it.
     """
     from gpvo.io.toml import read_toml
 

@@ -14,12 +14,8 @@ from gpvo.geometry.se3 import path_length_m
 def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
     """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known of it.
 
-    ``kind`` takes the path as a sequence of that format, ``options`` go to its source.
-
-    Raises
-    ------
-    GpvoError
-        Where the path is nothing gpvo knows, or damaged.
+    ``kind`` takes the path as a sequence of that format, ``options`` go to its source. Raises GpvoError where the path
+    is nothing gpvo knows, or damaged.
     """
     if not path.exists():
         raise SourceError("no such file or folder", where=path)

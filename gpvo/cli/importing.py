@@ -56,12 +56,8 @@ def import_log(
     ``frame``: whose poses these are, ``cam`` or ``body``. ``align``: the fixed transform to fit between log and truth,
     ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None to estimate it.
     ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: what slips are told by, any by
-    default. ``overwrite``: also in place of a finished run.
-
-    Raises
-    ------
-    SourceError
-        One line that names the file, the place and the cure.
+    default. ``overwrite``: also in place of a finished run. Raises SourceError: one line that names the file, the place
+    and the cure.
     """
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
     log, given, carrier = log.seen_from(place), None, vehicle or Vehicle()

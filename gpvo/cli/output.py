@@ -102,10 +102,7 @@ def one_of(option: str, value: str, choices: Iterable[str]) -> str:
 def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), least: float = -math.inf) -> list[float]:
     """The numbers of an option, separated by commas: finite, at least ``least``, of one of the ``counts`` if given.
 
-    Raises
-    ------
-    GpvoError
-        With the ``cure``, where the text is something else.
+    Raises GpvoError with the ``cure``, where the text is something else.
     """
     try:
         found = [float(part) for part in text.split(",")]

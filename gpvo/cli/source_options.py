@@ -40,10 +40,7 @@ MaxTurn = Annotated[float | None, typer.Option(help="The same of its angular acc
 def vehicle_of(kind: str, max_acceleration: float | None, max_turn: float | None) -> Vehicle:
     """The bounds of a kind of vehicle, or those given in their place.
 
-    Raises
-    ------
-    GpvoError
-        Where the kind is unknown or a bound is not above 0.
+    Raises GpvoError where the kind is unknown or a bound is not above 0.
     """
     known = VEHICLES[one_of("--vehicle", kind, tuple(VEHICLES))]
     bounds = (max_acceleration or known.max_acceleration_mps2, max_turn or known.max_turn_radps2)
@@ -56,10 +53,7 @@ def vehicle_of(kind: str, max_acceleration: float | None, max_turn: float | None
 def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:
     """Options for :func:`gpvo.io.open_source` from the flags; those that were not given are left out.
 
-    Raises
-    ------
-    GpvoError
-        Where ``size`` is not WIDTHxHEIGHT.
+    Raises GpvoError where ``size`` is not WIDTHxHEIGHT.
     """
     options = {name: value for name, value in given.items() if value is not None}
     if size is not None:

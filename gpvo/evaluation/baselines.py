@@ -54,12 +54,8 @@ def rtabmap_covariance(log: VoLog, tracks: StereoTracks) -> Array:
 
     One variance for translation and one for rotation: 2.1981 times the lower quartile of the squared distances, and of
     the squared angles, between the inliers' points as seen and as the motion carries them, and 1e-6 besides. It is the
-    scatter of the points, and does not shrink with their number.
-
-    Raises
-    ------
-    ValueError
-        Where the log does not know its camera.
+    scatter of the points, and does not shrink with their number. Raises ValueError where the log does not know its
+    camera.
     """
     if log.camera is None:
         raise ValueError("the points of an unknown camera cannot be triangulated")

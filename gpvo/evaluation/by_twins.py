@@ -27,10 +27,7 @@ def ratios(run: Run, twins: Sequence[Run]) -> Array:
     """(2, 6) root of the mean squared error over its variance, by :data:`SPANS` and axis, of a run with truth, as a
     model of its twins alone predicts it, the truth's own noise counted in; NaN where the run is too short.
 
-    Raises
-    ------
-    SourceError
-        Where the run has no truth.
+    Raises SourceError where the run has no truth.
     """
     if run.truth is None:
         raise SourceError("has no ground truth to compare twins with", where=run.path, cure="leave out --against")

@@ -100,12 +100,8 @@ def evaluate_run(
     """Evaluate a run against its truth; with a predictor, predictions are made as in flight, else those of the run
     are used. A motion that either says is lost counts as lost for every method. ``further``: methods of elsewhere.
 
-    Raises
-    ------
-    SourceError
-        If the run has no truth, or none at the times of its frames.
-    ModelError
-        If the model predicts something else than the error of a motion.
+    Raises SourceError if the run has no truth, or none at the times of its frames; ModelError if the model predicts
+    something else than the error of a motion.
     """
     options = options or EvaluateOptions()
     truth, offset_s = _truth(run, options)

@@ -63,12 +63,8 @@ def read_plan(path: str | Path, dt_s: float, frame: str = "cam") -> Plan:
     """A TUM file of poses at any spacing, resampled every ``dt_s``.
 
     ``frame``: ``cam``, poses of the left camera (x right, y down, z forward), or ``body`` (FLU), whose camera then
-    looks forward from the body's origin.
-
-    Raises
-    ------
-    SourceError
-        Where the file cannot be read, or the plan is too short or too long.
+    looks forward from the body's origin. Raises SourceError where the file cannot be read, or the plan is too short or
+    too long.
     """
     if frame not in ("cam", "body"):
         raise GpvoError(f"unknown frame '{frame}'", cure="cam or body")
@@ -149,10 +145,8 @@ class Forecast:
 def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int = 0) -> Forecast:
     """Fly the plan ``draws`` times in the conditions of training flights.
 
-    Raises
-    ------
-    ModelError
-        If the model predicts something else than the error of a motion, or keeps no sample of its training rows.
+    Raises ModelError if the model predicts something else than the error of a motion, or keeps no sample of its
+    training rows.
     """
     predictor.require_motions()
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))

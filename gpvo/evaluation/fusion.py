@@ -42,10 +42,7 @@ def load_predictor(path: str | Path) -> Predictor:
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
     """A run as the filters take it, with the model's predictions, else those stored in the run.
 
-    Raises
-    ------
-    GpvoError
-        Where there is an IMU but nobody says how it sits to the camera, or the run is empty.
+    Raises GpvoError where there is an IMU but nobody says how it sits to the camera, or the run is empty.
     """
     if len(run.log) < 2:
         raise GpvoError(f"holds {len(run.log)} records: nothing to fuse", where=run.path)

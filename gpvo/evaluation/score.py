@@ -55,10 +55,7 @@ class SequenceScore:
 def score(files: Sequence[tuple[Path, Path]], options: EvaluateOptions | None = None) -> dict[str, Any]:
     """Scores of pairs (stated, truth), per ``sequences`` and ``pooled`` with 95 % intervals over the sequences.
 
-    Raises
-    ------
-    SourceError
-        Where a file is malformed, or states nothing while its truth lasts.
+    Raises SourceError where a file is malformed, or states nothing while its truth lasts.
     """
     scores = [score_sequence(stated, truth, options) for stated, truth in files]
     pooled = {name: sequence_bootstrap(np.array([getattr(s, name) for s in scores])).document() for name in POOLED}
@@ -111,10 +108,7 @@ def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[s
     """Scores of every ``METHOD/SEQUENCE.txt`` (or ``.csv``) of a folder against its ``truth/SEQUENCE.txt``, by method,
     the likeliest first.
 
-    Raises
-    ------
-    SourceError
-        Where there is no truth, or a method leaves a sequence out: then the means could not be compared.
+    Raises SourceError where there is no truth, or a method leaves a sequence out: then the means could not be compared.
     """
     truths = sorted((folder / "truth").glob("*.txt"))
     if not truths:

@@ -20,10 +20,7 @@ _NAN = float("nan")
 def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
     """An evaluation without errors: no frame is covered by truth, and no method has a score.
 
-    Raises
-    ------
-    ModelError
-        If the model predicts something else than the error of a motion.
+    Raises ModelError if the model predicts something else than the error of a motion.
     """
     predictions = predictions_by_stamp(run, predictor)
     run = replace(run, log=judged(run.log, predictions))

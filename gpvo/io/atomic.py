@@ -20,12 +20,8 @@ except ImportError:  # Windows: two writers there are not told of one another.
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; at the end of the block it takes its place.
 
-    If the block fails, what was written is removed, and ``path`` is as it was. No two writers share a name.
-
-    Raises
-    ------
-    SourceError
-        Naming ``path``, where the block or the replacement raises OSError: no folder, no right, no space.
+    If the block fails, what was written is removed, and ``path`` is as it was. No two writers share a name. Raises
+    SourceError, naming ``path``, where the block or the replacement raises OSError: no folder, no right, no space.
     """
     temporary: Path | None = None
     try:
@@ -59,12 +55,8 @@ def _umask() -> int:
 class FolderLock:
     """Held from its making to :meth:`release`, or to the end of the process, however that comes.
 
-    ``path``: the folder, or with ``create`` a file that stands for ``where``.
-
-    Raises
-    ------
-    SourceError
-        Where another process, or another writer of this one, holds it.
+    ``path``: the folder, or with ``create`` a file that stands for ``where``. Raises SourceError where another process,
+    or another writer of this one, holds it.
     """
 
     def __init__(self, path: Path, *, create: bool = False, where: Path | None = None) -> None:

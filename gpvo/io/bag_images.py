@@ -101,10 +101,7 @@ def pair_streams(
 ) -> Iterator[tuple[int, Any, Any]]:
     """(left stamp, left message, right message) of a whole recording: :class:`PairQueue`.
 
-    Raises
-    ------
-    SourceError
-        At the end, where no message found a partner.
+    Raises SourceError at the end, where no message found a partner.
     """
     queue = PairQueue(left, tolerance_ns, report)
     for topic, message in stream:

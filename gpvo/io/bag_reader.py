@@ -43,10 +43,7 @@ def is_bag(path: Path) -> bool:
 def open_bag(path: Path) -> Iterator[Any]:
     """An open ``rosbags`` reader.
 
-    Raises
-    ------
-    SourceError
-        Where the bag cannot be read, at opening or later inside the block; one line in any case.
+    Raises SourceError where the bag cannot be read, at opening or later inside the block; one line in any case.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -99,10 +96,7 @@ def pose_of(message: Any) -> Array:
 def read_poses(path: Path, topic: str) -> tuple[np.ndarray, Array, list[Any]]:
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
-    Raises
-    ------
-    SourceError
-        Where the topic has no poses, or one that is not finite.
+    Raises SourceError where the topic has no poses, or one that is not finite.
     """
     stamps, rows, kept = [], [], []
     with open_bag(path) as reader:

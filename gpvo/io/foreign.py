@@ -67,10 +67,7 @@ class ForeignLog:
 def guess_format(path: Path) -> str:
     """``tum``, ``kitti``, ``csv`` or ``bag`` by ending and first line.
 
-    Raises
-    ------
-    SourceError
-        Where the path is missing or like none of them.
+    Raises SourceError where the path is missing or like none of them.
     """
     if not path.exists():
         raise SourceError("no such file", where=path)

@@ -53,12 +53,8 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     """Read a CSV with a header line (comma, semicolon, tab or blanks between).
 
     ``mapping`` gives column name -> target (one of :data:`TARGETS`) and goes before what the names suggest. A stamp is
-    in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds.
-
-    Raises
-    ------
-    SourceError
-        Naming file and line, or the column that is wanted.
+    in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds. Raises
+    SourceError, naming file and line, or the column that is wanted.
     """
     lines = _lines(path)
     try:

@@ -270,10 +270,7 @@ def first_size(pairs: Sequence[PairFiles], side: str) -> tuple[Path, tuple[int, 
 def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
     """Refuse a calibration for another resolution, judged by the first readable image of each camera.
 
-    Raises
-    ------
-    CalibrationError
-        Naming both resolutions.
+    Raises CalibrationError, naming both resolutions.
     """
     for side, lens in (("left", rig.left), ("right", rig.right)):
         path, (width, height) = first_size(pairs, side) or (None, (lens.width, lens.height))

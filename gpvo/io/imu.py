@@ -22,12 +22,7 @@ def read_imu_csv(
     """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order.
 
     ``shift_s``: ``t_imu = t_cam + shift``, taken off so that the stamps are of the camera's clock. Lines that repeat
-    or go back in time are dropped, which ``remark`` is told.
-
-    Raises
-    ------
-    SourceError
-        Naming file and line.
+    or go back in time are dropped, which ``remark`` is told. Raises SourceError, naming file and line.
     """
     stamps: list[int] = []
     rows: list[list[float]] = []

@@ -52,13 +52,7 @@ def _whole(text: str) -> int:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a document.
-
-    Raises
-    ------
-    SourceError
-        Where the file is missing, too large, or not a JSON object.
-    """
+    """Read a document. Raises SourceError where the file is missing, too large, or not a JSON object."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError("is larger than 50 MB", where=path)

@@ -31,13 +31,7 @@ class OrderCheck:
         self._swapped = 0
 
     def see(self, frame: StereoFrame) -> None:
-        """Take the next rectified frame.
-
-        Raises
-        ------
-        SourceError
-            At the second frame whose points lie behind the cameras.
-        """
+        """Take the next rectified frame. Raises SourceError at the second frame whose points lie behind the cameras."""
         if self._left == 0:
             return
         self._left -= 1

@@ -58,10 +58,7 @@ class RowGroup:
 def write_table(path: Path, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> RowGroup:
     """Write columns of one length in place of what was there, or not at all. None and NaN become null.
 
-    Raises
-    ------
-    SourceError
-        Naming ``path``, where it cannot be written.
+    Raises SourceError, naming ``path``, where it cannot be written.
     """
     rows = len(next(iter(columns.values()), ()))
     pages = [_page(values, KIND_OF.get(name, "float64")) for name, values in columns.items()]
@@ -200,10 +197,7 @@ def _varint(value: int) -> bytes:
 def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """Columns as arrays (nulls of numbers as NaN) and the file's metadata.
 
-    Raises
-    ------
-    SourceError
-        Where the file is missing, damaged or implausibly large.
+    Raises SourceError where the file is missing, damaged or implausibly large.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -67,10 +67,7 @@ def is_run(path: str | Path) -> bool:
 def read_run(path: str | Path) -> Run:
     """Read a run folder; of a killed run what its complete chunks hold.
 
-    Raises
-    ------
-    SourceError
-        Where it is not a run folder, is newer than this version, or a file in it is damaged.
+    Raises SourceError where it is not a run folder, is newer than this version, or a file in it is damaged.
     """
     p = Path(path)
     if not p.is_dir():
@@ -96,13 +93,7 @@ def read_run(path: str | Path) -> Run:
 
 
 def read_predictions(path: str | Path) -> list[Prediction]:
-    """Predictions of a Parquet file.
-
-    Raises
-    ------
-    SourceError
-        Where it is damaged or holds something else.
-    """
+    """Predictions of a Parquet file. Raises SourceError where it is damaged or holds something else."""
     p = Path(path)
     columns, _ = read_columns(p)
     predictions: list[Prediction] = _guarded(p, lambda: run_table.predictions_from(columns))
@@ -122,10 +113,7 @@ def read_predictions(path: str | Path) -> list[Prediction]:
 def read_tracks(path: str | Path) -> StereoTracks:
     """What odometry saw during a run, in order of time.
 
-    Raises
-    ------
-    SourceError
-        Where the run folder holds no tracks, or they are damaged.
+    Raises SourceError where the run folder holds no tracks, or they are damaged.
     """
     p = Path(path)
     parts = _parts(p, "tracks.parquet", "tracks")

@@ -117,10 +117,7 @@ def record_columns(records: Sequence[VoRecord]) -> Columns:
 def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
     """Records of :func:`record_columns`; nulls come as NaN in float columns.
 
-    Raises
-    ------
-    KeyError, ValueError
-        Where a column is absent or a status unknown.
+    Raises KeyError or ValueError where a column is absent or a status unknown.
     """
     T = poses_from(columns)
     n = len(T)
@@ -188,11 +185,7 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     """Predictions of :func:`prediction_columns`.
 
     A bias without a time constant counts as white. The root of what persists is that of its covariance, to rounding.
-
-    Raises
-    ------
-    KeyError, ValueError
-        Where a column is absent or a status unknown.
+    Raises KeyError or ValueError where a column is absent or a status unknown.
     """
     n = len(columns["t_ns"])
     mean = np.stack([columns[f"mean_{a}"] for a in _SIGMA6], axis=-1)

@@ -115,10 +115,7 @@ def source_kinds() -> dict[str, Callable[[], Any]]:
 def guess(path: str | Path) -> str:
     """Name of the source that recognises a path.
 
-    Raises
-    ------
-    SourceError
-        Where the path does not exist, is empty, or nothing recognises it.
+    Raises SourceError where the path does not exist, is empty, or nothing recognises it.
     """
     p = Path(path)
     if not p.exists():
@@ -143,12 +140,8 @@ def open_source(path: str | Path, kind: str | None = None, **options: Any) -> So
 
     Options of all image sources: ``hfov_deg`` and ``size`` of the rectified view, ``mask_left``, ``mask_right``
     (image files), ``calibration`` (a file in place of the one found), ``bits`` (depth of 16-bit images' samples),
-    ``prefetch`` (decode ahead in a thread).
-
-    Raises
-    ------
-    SourceError, CalibrationError
-        One line that names the file and the cure.
+    ``prefetch`` (decode ahead in a thread). Raises SourceError or CalibrationError: one line that names the file and
+    the cure.
     """
     kinds = source_kinds()
     if kind is not None and kind not in kinds:

@@ -28,10 +28,8 @@ _SHORTEST_NS, _LONGEST_NS = 1e5, 1e12
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbers from 1 and text of the lines of a file, without blanks around them; empty ones are left out.
 
-    Raises
-    ------
-    SourceError
-        Where the file cannot be read, is larger than 2 GB, or has a line of more than a million characters.
+    Raises SourceError where the file cannot be read, is larger than 2 GB, or has a line of more than a million
+    characters.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -56,10 +54,7 @@ def seconds_text_to_ns(text: str) -> int:
 def text_to_ns(text: str, unit: str) -> int:
     """A decimal number of ``unit`` (of :data:`UNITS_NS`) to whole nanoseconds without passing through a float.
 
-    Raises
-    ------
-    ValueError
-        Where the text is no finite number, or not of the years 0 to 2262.
+    Raises ValueError where the text is no finite number, or not of the years 0 to 2262.
     """
     try:
         value = Decimal(text)
@@ -74,10 +69,7 @@ def text_to_ns(text: str, unit: str) -> int:
 def integer_ns(text: str) -> int:
     """A whole number of nanoseconds.
 
-    Raises
-    ------
-    ValueError
-        Where the text is something else, or not of the years 0 to 2262.
+    Raises ValueError where the text is something else, or not of the years 0 to 2262.
     """
     # Some exporters write stamps like 1.4036365e+18; those digits are lost for good.
     if not text.lstrip("-").isdigit():
@@ -164,10 +156,7 @@ def usual_interval(t_ns: Iterable[int]) -> float | None:
 def check_interval(t_ns: Iterable[int], where: object, cure: str) -> None:
     """Refuse stamps whose usual interval no odometry has, because they are in another unit than they were read in.
 
-    Raises
-    ------
-    SourceError
-        Naming the interval, the likely unit and the ``cure``.
+    Raises SourceError, naming the interval, the likely unit and the ``cure``.
     """
     usual_ns = usual_interval(t_ns)
     if usual_ns is None or _SHORTEST_NS <= usual_ns <= _LONGEST_NS:
@@ -184,12 +173,8 @@ def match_nearest(
 ) -> list[tuple[int, str, str]]:
     """(left stamp, left name, right name) of images each other's nearest and at most ``tolerance_ns`` apart.
 
-    In order of time. Images that stay alone are counted as missing, repeated stamps as duplicate.
-
-    Raises
-    ------
-    SourceError
-        Where no image has a partner.
+    In order of time. Images that stay alone are counted as missing, repeated stamps as duplicate. Raises SourceError
+    where no image has a partner.
     """
     names = [_by_stamp(images, side, report) for images, side in ((left, "left"), (right, "right"))]
     t_left, t_right = (np.array(sorted(n), dtype=np.int64) for n in names)

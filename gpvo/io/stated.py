@@ -44,10 +44,8 @@ def write_stated(path: Path, log: VoLog, T_world_cam: Array, covariance: Array) 
 def read_stated(path: Path) -> VoLog:
     """The file's motions as records, their covariance under ``imported``; those without one are ``lost``.
 
-    Raises
-    ------
-    SourceError
-        Naming file and line: another format, a wrong number of columns, a covariance that is not positive definite.
+    Raises SourceError, naming file and line: another format, a wrong number of columns, a covariance that is not
+    positive definite.
     """
     lines = (text for _, text in text_lines(path))
     if not next(lines, "").startswith(HEADER):

@@ -187,10 +187,7 @@ class TracksSource:
 def load_arrays(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
     """Those arrays of an ``.npz`` that are asked for, sizes checked before anything is unpacked, nothing unpickled.
 
-    Raises
-    ------
-    SourceError
-        Where the file is damaged, too large, or lacks a required array.
+    Raises SourceError where the file is damaged, too large, or lacks a required array.
     """
     try:
         with zipfile.ZipFile(path) as archive:

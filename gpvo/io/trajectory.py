@@ -34,10 +34,8 @@ class Trajectory:
 def read_tum(path: str | Path) -> Trajectory:
     """TUM lines ``t[s] tx ty tz qx qy qz qw``; ``#`` starts a comment.
 
-    Raises
-    ------
-    SourceError
-        Naming file and line: wrong number of fields, NaN, stamps that do not grow, quaternions that are not unit.
+    Raises SourceError, naming file and line: wrong number of fields, NaN, stamps that do not grow, quaternions that are
+    not unit.
     """
     p = Path(path)
     rows = _rows(p, None, exactly=8, stamp=seconds_text_to_ns, what="t tx ty tz qx qy qz qw")
@@ -47,10 +45,7 @@ def read_tum(path: str | Path) -> Trajectory:
 def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
     """TUM lines with ``more`` words behind the pose: the trajectory, and those words line by line.
 
-    Raises
-    ------
-    SourceError
-        As :func:`read_tum`.
+    Raises SourceError as :func:`read_tum`.
     """
     behind: list[list[str]] = []
     what = f"t tx ty tz qx qy qz qw and {more} more"
@@ -61,10 +56,7 @@ def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
 def read_euroc_csv(path: str | Path) -> Trajectory:
     """EuRoC ground truth ``t[ns], p xyz, q wxyz, ...`` of at least 8 columns.
 
-    Raises
-    ------
-    SourceError
-        As :func:`read_tum`.
+    Raises SourceError as :func:`read_tum`.
     """
     p = Path(path)
     rows = _rows(p, ",", at_least=8, stamp=integer_ns, what="t[ns],px,py,pz,qw,qx,qy,qz")
@@ -72,13 +64,7 @@ def read_euroc_csv(path: str | Path) -> Trajectory:
 
 
 def read_kitti_poses(path: str | Path) -> Array:
-    """KITTI poses, 12 numbers a line, as (N, 4, 4).
-
-    Raises
-    ------
-    SourceError
-        Naming file and line.
-    """
+    """KITTI poses, 12 numbers a line, as (N, 4, 4). Raises SourceError, naming file and line."""
     p = Path(path)
     out = []
     for number, fields in _fields(p, None):
@@ -100,10 +86,7 @@ def read_kitti_poses(path: str | Path) -> Array:
 def read_times(path: str | Path) -> NDArray[np.int64]:
     """KITTI's ``times.txt`` (seconds) as (N,) nanoseconds, in the order of the file.
 
-    Raises
-    ------
-    SourceError
-        Naming file and line.
+    Raises SourceError, naming file and line.
     """
     p = Path(path)
     stamps = []
@@ -257,10 +240,7 @@ def carry(trajectory: Trajectory, T_body_cam: Array, noise: TruthNoise) -> Truth
 def check_overlap(truth: TruthLog, t_ns: NDArray[np.int64], path: Path) -> None:
     """Refuse a truth that does not overlap the frames in time.
 
-    Raises
-    ------
-    SourceError
-        Naming both intervals and how far they are apart.
+    Raises SourceError, naming both intervals and how far they are apart.
     """
     if len(t_ns) == 0 or len(truth.t_ns) == 0:
         return

@@ -77,12 +77,8 @@ class Published:
 def publish_run(path: Path, settings: PublishSettings) -> Published:
     """Publish one run folder.
 
-    With ``check`` and neither ``to``, ``out`` nor ``link`` nothing is written.
-
-    Raises
-    ------
-    GpvoError
-        Where the run lacks a covariance, the target cannot be written, or an option is unknown.
+    With ``check`` and neither ``to``, ``out`` nor ``link`` nothing is written. Raises GpvoError where the run lacks a
+    covariance, the target cannot be written, or an option is unknown.
     """
     settings = replace(settings, to=_target(settings))
     _require(settings)

@@ -102,10 +102,7 @@ class OdometryBuilder:
     def step(self, record: VoRecord, prediction: Prediction | None = None) -> Odometry:
         """The message of one frame.
 
-        Raises
-        ------
-        GpvoError
-            Where neither a prediction nor the chosen geometric method gives a usable covariance.
+        Raises GpvoError where neither a prediction nor the chosen geometric method gives a usable covariance.
         """
         base = self._chain.get(record.t_prev_ns)
         if base is None:

@@ -20,12 +20,7 @@ def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str
     """Every experiment of the list; stages that ``out`` holds are not done again.
 
     Writes ``results.json`` (the returned document, schema 1), ``tables.md``, ``tables.csv``, ``figures/*.png`` and
-    ``report.html`` into ``out``.
-
-    Raises
-    ------
-    GpvoError
-        Where the folder cannot be written, or the folder of data is missing.
+    ``report.html`` into ``out``. Raises GpvoError where the folder cannot be written, or the folder of data is missing.
     """
     with only_user(out):
         result = _computed(plan, out, workers or Workers())

@@ -95,10 +95,7 @@ class Workers:
 def only_user(root: Path) -> Iterator[None]:
     """Hold the folder, so that two reproductions never fill one; the hold falls when the process dies.
 
-    Raises
-    ------
-    GpvoError
-        Where another process has it.
+    Raises GpvoError where another process has it.
     """
     folder = Store(root).folder(".")
     try:

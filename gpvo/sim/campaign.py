@@ -36,12 +36,7 @@ def fly_campaign(
 ) -> list[Flight]:
     """Simulate every seed into ``out/seed_N`` (``out/seed_N.npz`` for points); one failure does not stop the others.
 
-    Raises
-    ------
-    GpvoError
-        For an unknown backend.
-    MissingExtraError
-        For ``dask`` without the extra.
+    Raises GpvoError for an unknown backend; MissingExtraError for ``dask`` without the extra.
     """
     if backend not in ("joblib", "dask"):
         raise GpvoError(f"unknown backend '{backend}'", cure="choose joblib or dask")

@@ -28,12 +28,7 @@ _HIDDEN = 0.01
 class Eye:
     """Draws what a rig sees on a motion.
 
-    Raises
-    ------
-    GpvoError
-        For an unknown value of the scenario's ``sensor``.
-    MissingExtraError
-        Without numba.
+    Raises GpvoError for an unknown value of the scenario's ``sensor``; MissingExtraError without numba.
     """
 
     def __init__(

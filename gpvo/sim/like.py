@@ -26,12 +26,8 @@ def like(path: Path) -> dict[str, Any]:
 
     ``camera`` and ``trajectory`` name the run's folder: its rectified camera, and its path as odometry found it.
     Counts, ends and outliers of tracks, the depth that 95 % of the inliers lie within, and the pixel noise, white and
-    kept by a point while it is followed, are taken over all its motions.
-
-    Raises
-    ------
-    SourceError
-        Where the run holds no tracks or no camera, or too few motions to tell the noise.
+    kept by a point while it is followed, are taken over all its motions. Raises SourceError where the run holds no
+    tracks or no camera, or too few motions to tell the noise.
     """
     run, tracks = read_run(path), read_tracks(path)
     camera, log = run.log.camera, run.log

@@ -150,10 +150,7 @@ def hover(at: Array, yaw_rad: float, duration_s: float) -> Path3:
 def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float = 3.0) -> Path3:
     """Flight through points (N, 3) [m] on a cubic spline, the nose along it; it slows down and hovers at the last.
 
-    Raises
-    ------
-    GpvoError
-        For fewer than two points, or two equal ones in a row.
+    Raises GpvoError for fewer than two points, or two equal ones in a row.
     """
     corners = np.asarray(points, float).reshape(-1, 3)
     chord = path_length_m(corners)

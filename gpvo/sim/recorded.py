@@ -69,12 +69,8 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
     Of a file, ``.csv`` in EuRoC's layout, else TUM lines, or of a run folder, whose first camera pose is taken as
     level.
 
-    Laser and motion capture jitter by millimetres: the motion is smoothed over a tenth of a second.
-
-    Raises
-    ------
-    SourceError
-        Where the file is no trajectory, or is shorter than the flight.
+    Laser and motion capture jitter by millimetres: the motion is smoothed over a tenth of a second. Raises SourceError
+    where the file is no trajectory, or is shorter than the flight.
     """
     clock, T_world_body = _read(file)
     needed = float(smooth_start(np.array([duration_s]), rest_s)[0])

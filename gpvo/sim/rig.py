@@ -51,10 +51,7 @@ def camera_rig(name: str) -> StereoRig:
     camera_info, or KITTI's ``calib.txt``, which states no size: then the principal point is in the middle; or the
     rectified one of a run folder.
 
-    Raises
-    ------
-    GpvoError
-        For any other name, or a file that is no calibration.
+    Raises GpvoError for any other name, or a file that is no calibration.
     """
     if name in _PRESETS:
         return _PRESETS[name]()
@@ -110,10 +107,7 @@ class RigError:
 def true_rig(written: StereoRig, error: RigError) -> StereoRig:
     """The rig that draws the pictures, given what its calibration says.
 
-    Raises
-    ------
-    CalibrationError
-        Where the error makes a rig that cannot exist.
+    Raises CalibrationError where the error makes a rig that cannot exist.
     """
     T = written.T_right_left.copy()
     T[:3, 3] *= 1 + error.baseline

@@ -42,10 +42,7 @@ def world_parameters(scenario: Scenario) -> dict[str, object]:
 def plan_path(scenario: Scenario, world: World, rng: np.random.Generator) -> Path3:
     """The path that the vehicle is asked to follow, clear of all surfaces.
 
-    Raises
-    ------
-    GpvoError
-        Where the path leaves the world, or none that was drawn is clear.
+    Raises GpvoError where the path leaves the world, or none that was drawn is clear.
     """
     duration, speed, rest = scenario.duration_s, scenario.speed_mps, scenario.rest_s
     if scenario.needs_trajectory and not scenario.trajectory:
@@ -74,10 +71,7 @@ def plan_path(scenario: Scenario, world: World, rng: np.random.Generator) -> Pat
 def refuse_outside(world: World, position_m: Array, t_s: Array, flat: bool = False) -> None:
     """Refuse places (N, 3) outside the box in which the world's paths may run; ``flat`` leaves out the height.
 
-    Raises
-    ------
-    GpvoError
-        Naming time and place.
+    Raises GpvoError, naming time and place.
     """
     axes = slice(0, 2) if flat else slice(0, 3)
     p, low, high = position_m[:, axes], world.bounds[0, axes], world.bounds[1, axes]

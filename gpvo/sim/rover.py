@@ -81,12 +81,8 @@ class Rover:
 def drive(path: Path3, ground: HeightGrid, vehicle: Rover | None = None) -> Motion:
     """Drive a path, whose height does not matter, beginning settled on its springs.
 
-    Raises
-    ------
-    MissingExtraError
-        Without MuJoCo (extra ``sim``).
-    GpvoError
-        Where the rover tips over, or loses its path by more than 2 m.
+    Raises MissingExtraError without MuJoCo (extra ``sim``); GpvoError where the rover tips over, or loses its path by
+    more than 2 m.
     """
     try:
         import mujoco

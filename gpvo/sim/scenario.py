@@ -99,10 +99,7 @@ def names() -> tuple[str, ...]:
 def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """A scenario by its name or TOML file, with some values replaced; dots reach into tables (``points.sigma_px``).
 
-    Raises
-    ------
-    GpvoError
-        For an unknown name or value, with the nearest one that is known.
+    Raises GpvoError for an unknown name or value, with the nearest one that is known.
     """
     if name.endswith(".toml"):
         table, where = read_toml(Path(name)), name

@@ -87,12 +87,7 @@ class SensorModel:
 
         ``darkness``: factor on all light, 1 is as drawn. ``dust``: extinction of the air [1/m], which needs ``depth``:
         that of the left camera, or of both. ``noise_sigma``: additional white noise on the 0..1 scale of the grey
-        values.
-
-        Raises
-        ------
-        GpvoError
-            For dust without depth, or a negative amount of anything.
+        values. Raises GpvoError for dust without depth, or a negative amount of anything.
         """
         if min(darkness, dust, noise_sigma) < 0:
             raise GpvoError("darkness, dust and noise_sigma cannot be negative")

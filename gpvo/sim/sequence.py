@@ -59,14 +59,8 @@ def simulate(
     """Write a sequence folder; a finished one with the same scenario and seed is left as it is.
 
     The folder appears under its name when it is complete. Equal seeds give equal bytes, on any number of threads.
-
-    Raises
-    ------
-    GpvoError
-        For a scenario of landmarks alone; where the flight crashes or leaves its world, the disk is full, or the folder
-        holds something else.
-    MissingExtraError
-        Without the extra ``sim``.
+    Raises GpvoError for a scenario of landmarks alone; where the flight crashes or leaves its world, the disk is full,
+    or the folder holds something else. Raises MissingExtraError without the extra ``sim``.
     """
     require_pictures(scenario)
     target = Path(out)

@@ -45,10 +45,7 @@ def gravity_mps2(scenario: Scenario) -> float:
 def move(scenario: Scenario, path: Path3, world: World) -> Motion:
     """The vehicle's motion at 1 kHz.
 
-    Raises
-    ------
-    GpvoError
-        Where the vehicle cannot follow the path, or there is no ground for its wheels.
+    Raises GpvoError where the vehicle cannot follow the path, or there is no ground for its wheels.
     """
     if scenario.vehicle == "quadrotor":
         return vehicles.fly(path)
@@ -60,13 +57,7 @@ def move(scenario: Scenario, path: Path3, world: World) -> Motion:
 
 
 def check_motion(scenario: Scenario, world: World, motion: Motion) -> None:
-    """Refuse a flight that leaves the world or touches it.
-
-    Raises
-    ------
-    GpvoError
-        Naming time and place.
-    """
+    """Refuse a flight that leaves the world or touches it. Raises GpvoError, naming time and place."""
     some = motion.thinned(round(vehicles.RATE_HZ / _CHECK_HZ))
     refuse_outside(world, some.position_m, some.t_s)
     clearance = world.clearance(some.position_m)

@@ -68,12 +68,8 @@ class Quadrotor:
 def fly(path: Path3, vehicle: Quadrotor | None = None) -> Motion:
     """Fly a path with the quadrotor, beginning in steady hover at its start.
 
-    Raises
-    ------
-    MissingExtraError
-        Without MuJoCo (extra ``sim``).
-    GpvoError
-        Where the flight cannot be followed: the vehicle loses its path by more than 2 m.
+    Raises MissingExtraError without MuJoCo (extra ``sim``); GpvoError where the flight cannot be followed: the vehicle
+    loses its path by more than 2 m.
     """
     try:
         import mujoco

@@ -57,7 +57,7 @@ def test_seeds(text, seeds):
 
 @pytest.mark.parametrize("text", ["", "a", "3..1", "-1", "0..999999999"])
 def test_seeds_that_are_none(text):
-    with pytest.raises(GpvoError, match="no list of seeds"):
+    with pytest.raises(GpvoError, match="is not a list of seeds"):
         command._seeds(text)
 
 

@@ -49,10 +49,7 @@ class Scene:
     def of(cls, world: World) -> Scene:
         """Cut and pack a world.
 
-        Raises
-        ------
-        GpvoError
-            Where the textures differ in size or are not squares of a power of two.
+        Raises GpvoError where the textures differ in size or are not squares of a power of two.
         """
         mesh = world.mesh
         order, cluster = _clusters(mesh)
