@@ -9,8 +9,8 @@ import time
 import numpy as np
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.sim.eye import SensorModel
 from gpvo.sim.render import StereoRenderer
-from gpvo.sim.sensor import SensorModel
 from gpvo.sim.worlds import build_world
 
 _CORES = 2

@@ -15,7 +15,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from gpvo.cameras.tolerance import Tolerance
+from gpvo.cameras.rig import Tolerance
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.errors import motion_errors
 from gpvo.dataset.odd import odd_stretches

@@ -174,7 +174,7 @@ def _evaluate(
 ) -> list[Evaluation]:
     """``unjudged``: runs without truth are shown and not refused."""
     from gpvo.evaluation.evaluate import evaluate_run
-    from gpvo.evaluation.unjudged import unjudged_run
+    from gpvo.evaluation.report import unjudged_run
 
     loaded, predictor = _loaded(runs, model, truth)
     if predictor is not None and model is not None:

@@ -35,7 +35,7 @@ def reproduce(
 
     Example: gpvo reproduce -o out/thesis --quick
     """
-    from gpvo.reproduce.plan import Plan
+    from gpvo.reproduce.experiments import Plan
     from gpvo.reproduce.run import reproduce as run
     from gpvo.reproduce.stages import Workers
 

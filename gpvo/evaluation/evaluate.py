@@ -20,9 +20,14 @@ from gpvo.dataset.rest import without_wandering_truth
 from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m, velocity_path
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon, consistency
-from gpvo.evaluation.poses import PoseConsistency, pose_consistency, pose_document
 from gpvo.evaluation.statements import Statement, statements
-from gpvo.evaluation.trajectory import TrajectoryErrors, trajectory_errors
+from gpvo.evaluation.trajectory import (
+    PoseConsistency,
+    TrajectoryErrors,
+    pose_consistency,
+    pose_document,
+    trajectory_errors,
+)
 from gpvo.evaluation.verdict import verdict
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
@@ -203,7 +208,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``odd_stretches``: motions, in words, in which odometry and truth differ as nowhere else; they are scored.
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
-      states (see :mod:`gpvo.evaluation.poses`); None where it states none.
+      states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
     * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers come to, in words.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,

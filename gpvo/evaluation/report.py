@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
+from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation import curves, panels
-from gpvo.evaluation.evaluate import Evaluation, document
+from gpvo.evaluation.evaluate import Evaluation, document, judged, predictions_by_stamp
 from gpvo.evaluation.matches import MatchPicture
+from gpvo.evaluation.statements import statements
+from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors
 from gpvo.evaluation.verdict import TRUE
+from gpvo.geometry import se3
 from gpvo.io.atomic import write_text
+from gpvo.io.run import Run
+from gpvo.online.predictor import Predictor
 from gpvo.types import Array
 
 _MAX_POINTS = 600
@@ -131,3 +138,33 @@ def _tone(nees: float | None) -> str:
 
 def _number(value: float | None) -> str:
     return "–" if value is None or not np.isfinite(value) else f"{value:.3g}"
+
+
+_NAN = float("nan")
+
+
+def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
+    """An evaluation without errors: no frame is covered by truth, and no method has a score.
+
+    Raises ModelError if the model predicts something else than the error of a motion.
+    """
+    predictions = predictions_by_stamp(run, predictor)
+    run = replace(run, log=judged(run.log, predictions))
+    T_est, noiseless = run.log.trajectory(), np.zeros(6)
+    none = np.zeros((0, 4, 4))
+    of_none = RelativeError(Statistics.of(np.zeros(0)), Statistics.of(np.zeros(0)))
+    length = float(se3.path_length_m(T_est[:, :3, 3])[-1])
+    return Evaluation(
+        run=run,
+        errors=MotionErrors(np.zeros(0, np.int64), np.zeros((0, 6)), none, none, np.zeros(0)),
+        trajectory=TrajectoryErrors(length, _NAN, _NAN, _NAN, of_none, of_none, of_none, ()),
+        statements=tuple(statements(run.log, predictions, predictor)),
+        consistency={},
+        covered=np.zeros(len(run.log), bool),
+        T_est=T_est,
+        T_true=np.full_like(T_est, _NAN),
+        truth_sigma=noiseless,
+        truth_sigma_stated=noiseless,
+        time_offset_s=0.0,
+        in_domain=float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None,
+    )

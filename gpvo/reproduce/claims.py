@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from gpvo.reproduce.bounds import BoundMethod, Bounds, BoundsJob, load_bounds
-from gpvo.reproduce.experiments import WAYS, Way
+from gpvo.reproduce.experiments import WAYS, Mode, Way
 from gpvo.reproduce.flights import Flights
-from gpvo.reproduce.plan import Mode
+from gpvo.reproduce.models import OTHER, SAME, Studies
 from gpvo.reproduce.rows import Cell
 from gpvo.reproduce.scores import Interval, pooled, squared_ends
 from gpvo.reproduce.stages import Store, Workers
-from gpvo.reproduce.studies import OTHER, SAME, Studies
 from gpvo.reproduce.tables import MODES, number, with_interval
 from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.types import Array

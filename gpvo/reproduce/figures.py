@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from gpvo.io.atomic import replacing
 from gpvo.reproduce.bounds import Bounds
+from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
 from gpvo.reproduce.stages import Store
-from gpvo.reproduce.studies import Studies
 from gpvo.reproduce.tables import MODES
 from gpvo.types import Array
 

@@ -14,8 +14,7 @@ from gpvo.errors import GpvoError
 from gpvo.io import open_source
 from gpvo.io.jsonfile import read_json
 from gpvo.io.trajectory import read_euroc_csv, read_tum, tum_line
-from gpvo.reproduce.experiments import FLIGHTS, FlightSet, sigma_pairs
-from gpvo.reproduce.plan import Mode, Plan
+from gpvo.reproduce.experiments import FLIGHTS, FlightSet, Mode, Plan, sigma_pairs
 from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file, write_text
 from gpvo.sim.campaign import fly as simulate
 from gpvo.sim.scenario import Scenario, load_scenario

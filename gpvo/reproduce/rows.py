@@ -18,9 +18,8 @@ from gpvo.io.foreign import read_foreign, to_records
 from gpvo.io.run import write_run
 from gpvo.io.trajectory import check_overlap
 from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method_of
-from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Way, printed
+from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Mode, Plan, Way, printed
 from gpvo.reproduce.flights import Flights, is_complete
-from gpvo.reproduce.plan import Mode, Plan
 from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file
 from gpvo.types import TruthLog, VoLog
 from gpvo.vo.config import make_config

@@ -8,11 +8,10 @@ from typing import Any
 
 from gpvo import __version__
 from gpvo.io.jsonfile import plain, write_json
-from gpvo.reproduce import figures, rows, scores, studies, tables
+from gpvo.reproduce import figures, models, rows, scores, tables
 from gpvo.reproduce.claims import claims
-from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS
+from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS, Plan
 from gpvo.reproduce.flights import fly_all
-from gpvo.reproduce.plan import Plan
 from gpvo.reproduce.stages import Store, Workers, only_user, write_text
 
 
@@ -43,7 +42,7 @@ def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
         real, refused = rows.real_cells(plan.data, plan.real_frames, store, workers)
     simulated = rows.simulated_cells(plan, flights)
     rows.compute([*simulated, *real], store, workers)
-    studied = studies.run_studies(plan, flights, store, workers)
+    studied = models.run_studies(plan, flights, store, workers)
     claimed = [] if plan.only else claims(simulated, flights, studied, store, workers)
     main = scores.rows([c for c in simulated if c.experiment.table != "sensitivity"], store)
     if not (plan.recordings("test") and plan.recordings("training")):
@@ -60,7 +59,7 @@ def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
         "real": scores.rows(real, store),
         "targets": scores.targets(main),
         "claims": claimed,
-        "studies": studies.document(studied),
+        "studies": models.studies_document(studied),
         "errata": list(ERRATA),
         "out_of_scope": list(OUT_OF_SCOPE),
         "failed": [*flights.failed, *refused],

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.tolerance import RIG_ERRORS, Tolerance, TrueRig
+from gpvo.cameras.rig import RIG_ERRORS, Tolerance, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL

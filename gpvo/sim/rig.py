@@ -11,8 +11,7 @@ import numpy as np
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.cameras.projections import read_projections
 from gpvo.cameras.readers import read_stereo_yaml
-from gpvo.cameras.rig import StereoRig
-from gpvo.cameras.tolerance import Tolerance
+from gpvo.cameras.rig import StereoRig, Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from gpvo.cameras.tolerance import Tolerance
+from gpvo.cameras.rig import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.io.toml import read_toml
 from gpvo.sim.points import SCENARIOS, PointsScenario

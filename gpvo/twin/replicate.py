@@ -12,7 +12,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from gpvo.cameras.tolerance import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
+from gpvo.cameras.rig import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.source import SourceReport

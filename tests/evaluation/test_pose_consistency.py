@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
-from gpvo.evaluation.poses import pose_consistency
 from gpvo.evaluation.statements import statements
+from gpvo.evaluation.trajectory import pose_consistency
 from gpvo.filters.metrics import umeyama
 from gpvo.geometry import se3
 from gpvo.stats.consistency import nees

@@ -32,7 +32,7 @@ GPVO = [sys.executable, "-m", "gpvo.cli"]
 REPRODUCE = """
 import sys
 from pathlib import Path
-from gpvo.reproduce.plan import Plan
+from gpvo.reproduce.experiments import Plan
 from gpvo.reproduce.run import reproduce
 training = {"images": 0, "points": 2}
 reproduce(Plan(seeds=0, points_seeds=2, training=training, duration_s=5.0, only=("4.3",)), Path(sys.argv[1]))

@@ -15,8 +15,8 @@ import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError
 from gpvo.reproduce import tables
+from gpvo.reproduce.experiments import Plan
 from gpvo.reproduce.flights import flights_of, fly
-from gpvo.reproduce.plan import Plan
 from gpvo.reproduce.run import reproduce
 from gpvo.reproduce.stages import Store, only_user
 from typer.testing import CliRunner
@@ -25,7 +25,7 @@ SMALL = {"seeds": 0, "points_seeds": 2, "training": {"images": 0, "points": 2}, 
 SCRIPT = f"""
 import sys
 from pathlib import Path
-from gpvo.reproduce.plan import Plan
+from gpvo.reproduce.experiments import Plan
 from gpvo.reproduce.run import reproduce
 reproduce(Plan(**{SMALL!r}), Path(sys.argv[1]))
 """

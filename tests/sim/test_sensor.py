@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.sim.sensor import SensorModel, SensorParams, through_dust
+from gpvo.sim.eye import SensorModel, SensorParams, through_dust
 
 
 def _ramp(seed: int = 0) -> np.ndarray:

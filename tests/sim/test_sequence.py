@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gpvo.cameras.tolerance import Tolerance
+from gpvo.cameras.rig import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io import open_source

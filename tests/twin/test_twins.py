@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from gpvo.cameras.tolerance import TOLERANCES, Tolerance, TrueRig
+from gpvo.cameras.rig import TOLERANCES, Tolerance, TrueRig
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.by_twins import ratios

@@ -8,9 +8,9 @@ import numpy as np
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.sim.eye import SensorModel, SensorParams
 from gpvo.sim.paths import wandering
 from gpvo.sim.render import StereoRenderer
-from gpvo.sim.sensor import SensorModel, SensorParams
 from gpvo.sim.worlds import build_world
 from gpvo.types import Array, StereoCamera, StereoFrame
 
