@@ -79,21 +79,22 @@ def _legend(ax: Axes, columns: int = 1) -> None:
 
 
 FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
-    name: partial(picture, **how)
-    for name, how in {
-        "trajectory": {"of": panels.views, "title": "top and side view, 3-sigma ellipses of {method}", "size": (9, 9)},
-        "errors": {
-            "of": panels.errors, "title": "error per motion and 3-sigma bound of {method}", "size": (10, 7),
-            "columns": 2, "shared": True,
-        },
-        "reliability": {"of": panels.reliability, "title": "stated probability, and share inside", "size": (5.5, 5)},
-        "memory": {"of": panels.memory, "title": "how the error remembers", "size": (10, 4), "columns": 2},
-        "nees": {"of": panels.nees, "title": "1 is right, above is overconfident", "size": (10, 3.5)},
-        "inputs": {
-            "of": panels.inputs, "title": "what odometry saw; amber is degraded, red is lost", "size": (10, 5.5),
-            "shared": True,
-        },
-    }.items()
+    "trajectory": partial(
+        picture, of=panels.views, title="top and side view, 3-sigma ellipses of {method}", size=(9, 9)
+    ),
+    "errors": partial(
+        picture, of=panels.errors, title="error per motion and 3-sigma bound of {method}", size=(10, 7), columns=2,
+        shared=True,
+    ),
+    "reliability": partial(
+        picture, of=panels.reliability, title="stated probability, and share inside", size=(5.5, 5)
+    ),
+    "memory": partial(picture, of=panels.memory, title="how the error remembers", size=(10, 4), columns=2),
+    "nees": partial(picture, of=panels.nees, title="1 is right, above is overconfident", size=(10, 3.5)),
+    "inputs": partial(
+        picture, of=panels.inputs, title="what odometry saw; amber is degraded, red is lost", size=(10, 5.5),
+        shared=True,
+    ),
 }  # fmt: skip
 
 

@@ -56,41 +56,35 @@ def _flat(covariance: np.ndarray) -> np.ndarray:
 
 def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:
     """Write a ROS 1 bag; returns the number of messages."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-
-    def fill(temporary: Path) -> int:
-        count = 0
-        with Ros1Writer(temporary) as writer:
-            connection = writer.add_connection(topic, _TYPE, typestore=store)
-            for item in odometry:
-                if item.twist_body is not None:
-                    message = odometry_message(item, store.types, seq=count)
-                    writer.write(connection, item.t_ns, store.serialize_ros1(message, _TYPE))
-                    count += 1
-        return count
-
-    return _replacing(Path(path), fill)
+    return _replacing(Path(path), lambda temporary: _fill(Ros1Writer(temporary), odometry, topic, Stores.ROS1_NOETIC))
 
 
 def write_ros2(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, *, mcap: bool = False) -> int:
     """Write a ROS 2 bag folder, sqlite3 or MCAP; returns the number of messages."""
     if Path(path).is_file():
         raise GpvoError("is a file, and a ROS 2 bag is a folder", where=path, cure="choose another -o")
-    store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
 
     def fill(temporary: Path) -> int:
-        count = 0
-        with Ros2Writer(temporary, version=9, storage_plugin=plugin) as writer:
-            connection = writer.add_connection(topic, _TYPE, typestore=store)
-            for item in odometry:
-                if item.twist_body is not None:
-                    message = odometry_message(item, store.types)
-                    writer.write(connection, item.t_ns, store.serialize_cdr(message, _TYPE))
-                    count += 1
-        return count
+        writer = Ros2Writer(temporary, version=9, storage_plugin=plugin)
+        return _fill(writer, odometry, topic, Stores.ROS2_HUMBLE)
 
     return _replacing(Path(path), fill)
+
+
+def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -> int:
+    """Open a writer of bags of a kind, and write every frame that has a motion."""
+    store, count = get_typestore(kind), 0
+    ros1 = kind is Stores.ROS1_NOETIC
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    with closed as writer:
+        connection = writer.add_connection(topic, _TYPE, typestore=store)
+        for item in odometry:
+            if item.twist_body is not None:
+                message = odometry_message(item, store.types, seq=count if ros1 else None)
+                writer.write(connection, item.t_ns, serialize(message, _TYPE))
+                count += 1
+    return count
 
 
 def _replacing(path: Path, fill: Any) -> int:

@@ -3,25 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from gpvo.errors import GpvoError
 from gpvo.geometry.se3 import path_length_m
 from gpvo.learning.parallel import map_jobs
-from gpvo.sim.scenario import Scenario, points_scenario
-
-
-@dataclass(frozen=True)
-class Flight:
-    """One task's outcome. ``error``: one line where it failed, else empty."""
-
-    seed: int
-    path: Path
-    frames: int = 0
-    distance_m: float = 0.0
-    redone: bool = True
-    error: str = ""
+from gpvo.sim.scenario import Flight, Scenario, points_scenario
 
 
 def fly_campaign(
@@ -64,8 +51,7 @@ def fly(
         return fly_points(scenario, seed, out)
     from gpvo.sim.sequence import simulate
 
-    info = simulate(scenario, seed, out, threads=threads, on_frame=on_frame)
-    return Flight(seed, out, info.frames, info.distance_m, info.redone)
+    return simulate(scenario, seed, out, threads=threads, on_frame=on_frame)
 
 
 def fly_points(scenario: Scenario, seed: int, out: Path) -> Flight:

@@ -22,6 +22,7 @@ from gpvo.sim.worlds import World
 from gpvo.types import Array
 
 Image = NDArray[np.float32]
+Grey = NDArray[np.uint8]
 
 _BARE_SIGMA_PX = 16.0
 # A point further away than what the next picture shows there, by this share, is hidden in it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -88,6 +88,21 @@ class Scenario(BaseModel):
     def offset(self) -> Tolerance:
         """Fixed part of the calibration's error."""
         return Tolerance(**self.calibration_offset)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What came of a scenario and a seed. ``redone`` is False where ``path`` already held this very flight.
+
+    ``error``: one line where it failed, else empty.
+    """
+
+    seed: int
+    path: Path
+    frames: int = 0
+    distance_m: float = 0.0
+    redone: bool = True
+    error: str = ""
 
 
 def names() -> tuple[str, ...]:

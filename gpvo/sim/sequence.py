@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from gpvo.sim.episodes import Episode
 from gpvo.sim.eye import Eye, optical_flow
 from gpvo.sim.imu import Motion
 from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
-from gpvo.sim.scenario import Scenario, require_pictures
+from gpvo.sim.scenario import Flight, Scenario, require_pictures
 from gpvo.sim.sequence_plan import FramePlan
 from gpvo.sim.worlds import build_world
 
@@ -36,18 +36,6 @@ _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _AHEAD = 16
 
 
-@dataclass(frozen=True)
-class SequenceInfo:
-    """What was written. ``redone`` is False where the folder already held this very sequence."""
-
-    path: Path
-    scenario: str
-    seed: int
-    frames: int
-    distance_m: float
-    redone: bool
-
-
 def simulate(
     scenario: Scenario,
     seed: int,
@@ -55,7 +43,7 @@ def simulate(
     *,
     threads: int = 2,
     on_frame: Callable[[], None] | None = None,
-) -> SequenceInfo:
+) -> Flight:
     """Write a sequence folder; a finished one with the same scenario and seed is left as it is.
 
     The folder appears under its name when it is complete. Equal seeds give equal bytes, on any number of threads.
@@ -69,7 +57,7 @@ def simulate(
         if _is_finished(target, resolved):
             poses = np.loadtxt(_truth_file(target), delimiter=",", usecols=(1, 2, 3), ndmin=2)
             frames = sum(1 for _ in (target / "mav0" / "cam0" / "data.csv").open()) - 1
-            return SequenceInfo(target, scenario.name, seed, frames, float(path_length_m(poses)[-1]), False)
+            return Flight(seed, target, frames, float(path_length_m(poses)[-1]), redone=False)
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
         try:
@@ -86,7 +74,7 @@ def simulate(
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
-    return SequenceInfo(target, scenario.name, seed, frames, distance, True)
+    return Flight(seed, target, frames, distance)
 
 
 @contextmanager
