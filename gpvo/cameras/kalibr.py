@@ -123,7 +123,9 @@ def _lens(block: dict[str, Any], where: str) -> CameraModel:
     distortion = []
     distortion_model = str(block.get("distortion_model", "none"))
     if distortion_model != "none":
-        distortion = get_numbers(block, "distortion_coeffs", (4, 5), where)
+        # As EuRoC spells it, or as Kalibr does.
+        key = "distortion_coefficients" if "distortion_coefficients" in block else "distortion_coeffs"
+        distortion = get_numbers(block, key, (4, 5), where)
     intrinsics = get_numbers(block, "intrinsics", 4, where)
     return make_lens(model, distortion_model, intrinsics, distortion, (int(width), int(height)), where)
 
@@ -196,21 +198,7 @@ def read_sensor_pose(path: Path) -> Array:
 
 def read_sensor_lens(path: Path) -> CameraModel:
     """The lens of one camera."""
-    document = read_yaml(path)
-    width, height = get_numbers(document, "resolution", 2, path)
-    distortion_model = str(document.get("distortion_model", "none"))
-    distortion: list[float] = []
-    if distortion_model != "none":
-        key = "distortion_coefficients" if "distortion_coefficients" in document else "distortion_coeffs"
-        distortion = get_numbers(document, key, (4, 5), path)
-    return make_lens(
-        str(document.get("camera_model", "pinhole")),
-        distortion_model,
-        get_numbers(document, "intrinsics", 4, path),
-        distortion,
-        (int(width), int(height)),
-        path,
-    )
+    return _lens(read_yaml(path), str(path))
 
 
 def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_is_flu: bool = False) -> StereoRig:

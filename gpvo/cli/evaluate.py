@@ -225,7 +225,6 @@ def _with_twins(
 
 
 def _print(d: dict[str, Any]) -> None:
-
     if about := d.get("simulated_truth"):
         say(
             f"{d['run']} has no ground truth: means over {about['twins']} twins, whose truth is simulated"
@@ -260,7 +259,6 @@ def _print(d: dict[str, Any]) -> None:
 
 
 def _print_methods(d: dict[str, Any]) -> None:
-
     sigma = d["truth_sigma"]
     noisy = bool(sigma["translation_m"] or sigma["rotation_rad"])
     given = ("+truth", "1 s", "coverage", "NLL", "stated")
@@ -291,7 +289,6 @@ def _print_methods(d: dict[str, Any]) -> None:
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
-
     table = new_table("method", "NLL", "interval", "NEES", "interval")
     for method, scores in pooled.items():
         cells = []

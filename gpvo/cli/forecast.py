@@ -93,7 +93,6 @@ def _row(f: Forecast, k: int) -> dict[str, float]:
 
 
 def _print(f: Forecast, path: Path) -> None:
-
     p = f.plan
     say(f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m, {len(p.t_s) - 1} motions at {1 / p.step_s:.3g} Hz")
     say(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")

@@ -58,7 +58,6 @@ def score(
 
 
 def _print_board(columns: dict[str, list[Any]]) -> None:
-
     table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     for row in zip(*columns.values()):
         table.add_row(*map(cell, row))
@@ -68,7 +67,6 @@ def _print_board(columns: dict[str, list[Any]]) -> None:
 
 
 def _print(found: dict[str, Any]) -> None:
-
     table = new_table("sequence", "motions", "lost", "energy [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])

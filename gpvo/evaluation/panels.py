@@ -91,7 +91,7 @@ def views(e: Evaluation) -> list[Panel]:
     statement = curves.best_statement(e)
     stated = None if statement is None else statement.pose_covariance(e.run.log)
     bounds = np.zeros((0, 6, 6)) if stated is None else stated
-    keep, panels = _spread(len(p)), []
+    keep, panels = spread(len(p)), []
     told = {name: _rounded(values[keep]) for name, values in _along(e, stated).items()}
     for i, j in ((0, 1), (0, 2)):
         lines = []
@@ -131,7 +131,7 @@ def errors(e: Evaluation) -> list[Panel]:
         if statement is not None:
             mean = 1e3 * statement.mean[e.errors.index, k]
             reach = 3e3 * np.sqrt(statement.covariance[e.errors.index, k, k])
-            keep = _spread(len(t))
+            keep = spread(len(t))
             low, high = (mean - reach)[keep], (mean + reach)[keep]
             bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
@@ -153,7 +153,7 @@ def stated(e: Evaluation) -> list[Panel]:
     lines: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
     for s in (s for s in e.statements if s.errors is not None):
         for of_kind, sigma in zip(lines, curves.stated_sigma(s)):
-            keep = _spread(len(t))
+            keep = spread(len(t))
             of_kind.append(_line(t[keep], 1e3 * sigma[keep], s.method, colour(s.method), _width(e, s.method)))
     names = ("translation [mm]", "rotation [mrad]")
     return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
@@ -249,9 +249,9 @@ def _ring(C: Array) -> Array:
     return 3 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
-def _spread(n: int) -> NDArray[np.int64]:
-    """At most ``MAX_POINTS`` indices, evenly spread."""
-    return np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS)).astype(np.int64)) if n else np.empty(0, np.int64)
+def spread(n: int, most: int = MAX_POINTS) -> NDArray[np.int64]:
+    """At most so many of n indices, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.int64)) if n else np.empty(0, np.int64)
 
 
 def _thin(x: Array, y: Array) -> tuple[Array, Array]:

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo import __version__
 from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation import curves, panels
 from gpvo.evaluation.evaluate import Evaluation, document, judged, predictions_by_stamp
 from gpvo.evaluation.matches import MatchPicture
+from gpvo.evaluation.panels import spread
 from gpvo.evaluation.statements import statements
 from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors
 from gpvo.evaluation.verdict import TRUE
@@ -71,8 +71,8 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
 def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
     to_plane, _ = panels.level(e)
-    keep, covered = _spread(len(e.T_est)), np.flatnonzero(e.covered)
-    shown = covered[_spread(len(covered))]
+    keep, covered = spread(len(e.T_est), _MAX_POINTS), np.flatnonzero(e.covered)
+    shown = covered[spread(len(covered), _MAX_POINTS)]
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T
     path = true if len(true) else est
     centre = (path.max(0) + path.min(0)) / 2
@@ -88,11 +88,6 @@ def scene(e: Evaluation) -> dict[str, Any]:
     half = max(float(np.abs(path - centre).max()), 1e-6)
     size = max(half, min(max(map(float, reach), default=0.0), 3.0 * half))
     return {"est": _rounded(est - centre), "true": _rounded(true - centre), "ellipsoids": ellipsoids, "size": size}
-
-
-def _spread(n: int) -> NDArray[np.int64]:
-    """At most ``_MAX_POINTS`` of n indices, evenly spread."""
-    return np.unique(np.linspace(0, n - 1, _MAX_POINTS).astype(np.int64)) if n else np.zeros(0, np.int64)
 
 
 def _worded(found: dict[str, Any], judged: bool) -> dict[str, Any]:

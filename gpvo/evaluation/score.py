@@ -17,6 +17,7 @@ from gpvo.dataset.rest import wandering_waits
 from gpvo.dataset.splits import leave_one_out
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
+from gpvo.evaluation.statements import corrected
 from gpvo.geometry import se3
 from gpvo.io.foreign import read_foreign, to_records
 from gpvo.io.jsonfile import write_json
@@ -211,12 +212,3 @@ def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str
         write_stated(path, log, T, C)
         written.append(path)
     return written
-
-
-def corrected(log: VoLog, mean: Array) -> Array:
-    """(N, 4, 4) poses of the log with the predicted ``mean`` (N, 6) taken off each motion."""
-    T, parent = log.T_prev_cur @ se3.exp(-mean), log.parent
-    out = np.empty_like(T)
-    for k in range(len(T)):
-        out[k] = T[k] if parent[k] < 0 else out[parent[k]] @ T[k]
-    return out

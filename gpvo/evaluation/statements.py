@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.accumulation import along
+from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.features import FeatureStream
 from gpvo.online.thesis import ThesisModel
@@ -133,3 +134,9 @@ def _predicted(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -
             last = replace(last, status=record.status)
         errors.append(replace(last, dt_s=record.dt_s or last.dt_s))
     return Statement(method, mean, covariance, errors)
+
+
+def corrected(log: VoLog, mean: Array) -> Array:
+    """(N, 4, 4) ``T_first_cam`` of the log with the predicted ``mean`` (N, 6) taken off each motion."""
+    moved = zip(log, log.T_prev_cur @ se3.exp(-mean), strict=True)
+    return VoLog([replace(record, T_prev_cur=T) for record, T in moved]).trajectory()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from gpvo.errors import SourceError
 
@@ -44,6 +47,13 @@ def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
     """Write a text file whole or not at all; lines end as in ``text``. Raises as :func:`replacing`."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding=encoding)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write named arrays as a packed ``.npz`` whole or not at all, in a folder made on the way."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
 
 def _umask() -> int:

@@ -17,8 +17,9 @@ from gpvo.accumulation import along
 from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import TrainingSet, build_run, observe
 from gpvo.evaluation.evaluate import predictions_by_stamp
-from gpvo.evaluation.statements import statements
+from gpvo.evaluation.statements import corrected, statements
 from gpvo.geometry import se3
+from gpvo.io.atomic import write_arrays
 from gpvo.io.run import Run, read_run
 from gpvo.learning import methods
 from gpvo.online.features import THESIS
@@ -26,7 +27,7 @@ from gpvo.online.position import PositionPredictor
 from gpvo.online.predictor import Predictor
 from gpvo.reproduce.experiments import Experiment, Way, printed
 from gpvo.reproduce.models import ModelJob, sets_of
-from gpvo.reproduce.stages import Store, digest_of, write_arrays
+from gpvo.reproduce.stages import Store, digest_of
 from gpvo.types import Array, MotionError, Status, VoLog
 from gpvo.vo.config import pair_method
 
@@ -96,9 +97,7 @@ def compounded(log: VoLog, errors: Sequence[MotionError]) -> Array:
 
 def mean_shift(log: VoLog, mean: Array) -> Array:
     """(N, 3) [m] by how much positions are expected to be off, given the mean error (N, 6) of every motion."""
-    moved = zip(log, log.T_prev_cur @ se3.exp(-mean), strict=True)
-    corrected = VoLog([replace(record, T_prev_cur=T) for record, T in moved])
-    return log.trajectory()[:, :3, 3] - corrected.trajectory()[:, :3, 3]
+    return log.trajectory()[:, :3, 3] - corrected(log, mean)[:, :3, 3]
 
 
 def as_arrays(bounds: Sequence[Bounds]) -> dict[str, NDArray[Any]]:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpvo.dataset.build import TrainingSet, build_run
+from gpvo.io.atomic import write_arrays
 from gpvo.io.run import read_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.position import train_position
@@ -20,7 +21,7 @@ from gpvo.online.features import resolve
 from gpvo.online.predictor import Predictor
 from gpvo.reproduce.experiments import Mode, Plan
 from gpvo.reproduce.flights import Flights
-from gpvo.reproduce.stages import Store, Workers, digest_of, write_arrays
+from gpvo.reproduce.stages import Store, Workers, digest_of
 from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.stats.consistency import nll_per_dim
 from gpvo.types import Array

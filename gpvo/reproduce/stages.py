@@ -10,9 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io import atomic
 from gpvo.io.atomic import FolderLock
@@ -112,10 +109,3 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, text)
-
-
-def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write an ``.npz`` whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic.replacing(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)

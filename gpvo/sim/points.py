@@ -17,7 +17,7 @@ from gpvo.cameras.rig import RIG_ERRORS, Tolerance, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.frames import R_FLU_OPTICAL
-from gpvo.io.atomic import replacing
+from gpvo.io.atomic import write_arrays
 from gpvo.sim import clouds, imu, movers
 from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3
@@ -133,9 +133,7 @@ class PointsFlight:
                                    noise.gyro_walk_radps2_sqrthz, noise.acc_walk_mps3_sqrthz]),
             "episodes_s": np.array([[e.begin_s, e.end_s] for e in self.episodes]).reshape(-1, 2),
         }  # fmt: skip
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+        write_arrays(target, arrays)
         return target
 
 
