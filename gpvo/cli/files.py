@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpvo.cli import source_options as options
+from gpvo.cli import common as options
 from gpvo.cli.output import Json, numbers, one_of, print_json
 from gpvo.errors import GpvoError
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gpvo.cli import source_options as flags
+from gpvo.cli import common as flags
 from gpvo.cli.output import one_of, print_json
 from gpvo.errors import GpvoError, printable
 

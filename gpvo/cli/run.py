@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpvo.cli import source_options as flags
+from gpvo.cli import common as flags
 from gpvo.cli.output import Json, note, print_json, progress
 
 if TYPE_CHECKING:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
+from gpvo.io.atomic import write_arrays
 from gpvo.reproduce.bounds import as_arrays, bounds_of, compounded, load_bounds, mean_shift, summed_v_t
-from gpvo.reproduce.stages import write_arrays
 from gpvo.types import MotionError, Status, TruthLog, VoLog, VoRecord
 
 V_T = np.diag([1e-4, 2e-4, 9e-4])
