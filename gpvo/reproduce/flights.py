@@ -12,7 +12,7 @@ import numpy as np
 from gpvo import __version__, runner
 from gpvo.errors import GpvoError
 from gpvo.io import open_source
-from gpvo.io.jsonfile import read_json
+from gpvo.io.run import is_finished
 from gpvo.io.trajectory import read_euroc_csv, read_tum, tum_line
 from gpvo.reproduce.experiments import FLIGHTS, FlightSet, Mode, Plan, sigma_pairs
 from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file, write_text
@@ -94,7 +94,7 @@ def fly(flight: Flight, store: Store) -> Flown:
     """Simulate and run odometry, as far as that is not done yet. What goes wrong comes back as ``error``."""
     pairs = {preset: sigma_pairs(flight.set_name, preset) for preset in flight.presets}
     runs = {p: store.folder("runs") / f"{flight.name}-{p}-{digest_of(pairs[p])[:4]}" for p in flight.presets}
-    missing = {preset: path for preset, path in runs.items() if not is_complete(path)}
+    missing = {preset: path for preset, path in runs.items() if not is_finished(path)}
     sequence = store.folder("flights") / (flight.name + (".npz" if flight.mode == "points" else ""))
     try:
         if missing:
@@ -108,11 +108,6 @@ def fly(flight: Flight, store: Store) -> Flown:
         shutil.rmtree(sequence, ignore_errors=True)
     sequence.unlink(missing_ok=True)
     return Flown(flight, runs)
-
-
-def is_complete(run: Path) -> bool:
-    """Whether a run folder holds a run that was finished."""
-    return (run / "run.json").is_file() and bool(read_json(run / "run.json").get("complete"))
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from gpvo import __version__, runner
 from gpvo.errors import GpvoError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign, to_records
-from gpvo.io.run import write_run
+from gpvo.io.run import is_finished, write_run
 from gpvo.io.trajectory import check_overlap
 from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method_of
 from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Mode, Plan, Way, printed
-from gpvo.reproduce.flights import Flights, is_complete
+from gpvo.reproduce.flights import Flights
 from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file
 from gpvo.types import TruthLog, VoLog
 from gpvo.vo.config import make_config
@@ -100,7 +100,7 @@ def attempt(run: RealRun, store: Store) -> str:
     """Make the run, unless it is there; one line where the data are not what they look like."""
     path = run.path(store)
     try:
-        if not is_complete(path):
+        if not is_finished(path):
             run.make(path, store)
     except GpvoError as error:
         return str(error)
