@@ -98,7 +98,7 @@ def test_headers_that_yaml_refuses(write, head):
         ("cam0: !!python/object/apply:os.system ['echo']\n", "not readable as YAML"),
         ("nothing: 1\n", "neither a Kalibr"),
         ("cam0: {}\n", "no block 'cam1'"),
-        (camchain(chain=None), "does not say how 'cam1' sits"),
+        (camchain(chain=None), "does not say where 'cam1' sits"),
         (camchain().replace("equidistant", "fov"), "'fov' is not supported"),
         (camchain().replace("camera_model: pinhole", "camera_model: omni"), "'omni' is not supported"),
         (camchain().replace("[190.0, 191.0, 255.0, 256.0]", "[190.0, 191.0, 255.0]"), "'intrinsics' holds 3 numbers"),

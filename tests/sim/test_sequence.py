@@ -58,7 +58,7 @@ def test_finished_is_kept_interrupted_is_redone(quick, tmp_path):
         sequence.simulate(quick(), 2, out)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("precious")
-    with pytest.raises(GpvoError, match="no simulated sequence"):
+    with pytest.raises(GpvoError, match="not a simulated sequence"):
         sequence.simulate(quick(), 1, tmp_path / "mine")
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "precious"
 
