@@ -223,10 +223,10 @@ def test_rendered_sequence_and_odometry(tmp_path):
     from gpvo import runner
     from gpvo.vo.config import make_config
 
-    scenario = load_scenario("tunnel-clean", {"duration_s": 4.0})
+    scenario = load_scenario("tunnel-clean", {"duration_s": 10.0})
     sequence.simulate(scenario, 0, tmp_path / "seq")
     source = open_source(tmp_path / "seq")
     summary = runner.run(source, tmp_path / "run", make_config())
-    assert summary.frames == 81
+    assert summary.frames == 201
     assert summary.status.get("lost", 0) == 0
     assert summary.path_length_m == pytest.approx(sequence.simulate(scenario, 0, tmp_path / "seq").distance_m, rel=0.02)
