@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.types import Array
 
-_LARGEST = 1e100  # No element of a covariance is larger, no variance as small as its inverse: squares stay finite.
+LARGEST = 1e100  # No element of a covariance is larger, no variance as small as its inverse: squares stay finite.
 
 
 def symmetrise(C: Array) -> Array:
@@ -22,7 +22,9 @@ def is_positive_definite(C: Array) -> bool:
     size = np.abs(C)
     largest = size.max()
     # Comparisons with NaN are false.
-    if not largest < _LARGEST or not (np.abs(C - C.T) <= 1e-8 * size + 1e-12 * largest).all():
+    if not (largest < LARGEST and np.diagonal(C).min() > 1 / LARGEST):
+        return False
+    if not (np.abs(C - C.T) <= 1e-8 * size + 1e-12 * largest).all():
         return False
     try:
         np.linalg.cholesky(C)
@@ -37,8 +39,8 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     C = np.asarray(C, dtype=np.float64)
     variance: Array = np.diagonal(C, axis1=1, axis2=2)
     with np.errstate(all="ignore"):
-        positive = (variance >= 0) if semi else (variance > 1 / _LARGEST)
-        good: NDArray[np.bool_] = np.asarray((np.abs(C) < _LARGEST).all(axis=(1, 2)) & positive.all(axis=1))
+        positive = (variance >= 0) if semi else (variance > 1 / LARGEST)
+        good: NDArray[np.bool_] = np.asarray((np.abs(C) < LARGEST).all(axis=(1, 2)) & positive.all(axis=1))
         sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
         R = C / sigma[:, :, None] / sigma[:, None, :]
     good &= np.isfinite(R).all(axis=(1, 2))

@@ -17,7 +17,7 @@ from gpvo.types import Array, TruthLog
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
-_FARTHEST_M = 1e9
+FARTHEST_M = 1e9
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _floats(path: Path, number: int, fields: list[str]) -> Array:
         values = np.array([float(f) for f in fields])
     except ValueError:
         raise SourceError(f"line {number} holds something that is not a number", where=path) from None
-    if (np.abs(values) > _FARTHEST_M).any() and np.isfinite(values).all():
+    if (np.abs(values) > FARTHEST_M).any() and np.isfinite(values).all():
         raise SourceError(f"line {number} holds {np.abs(values).max():.3g}: no position on Earth", where=path)
     if not np.isfinite(values).all():
         raise SourceError(

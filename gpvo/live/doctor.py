@@ -133,7 +133,14 @@ def _poses(s: Stated) -> list[Finding]:
     out = []
     bad = ~np.isfinite(s.T).all(axis=(1, 2))
     if bad.any():
-        out.append(Finding("pose-not-finite", "poses hold NaN", "robot_localization drops them", float(bad.mean())))
+        out.append(
+            Finding(
+                "pose-not-finite",
+                "poses hold NaN, or numbers beyond measure",
+                "robot_localization drops them",
+                float(bad.mean()),
+            )
+        )
     off = np.abs(s.quaternion_norm - 1.0) > 1e-2
     if (off & ~bad).any():
         text = "robot_localization normalises with a warning, PX4 refuses the attitude"

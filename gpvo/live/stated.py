@@ -10,7 +10,9 @@ import numpy as np
 
 from gpvo.errors import GpvoError, printable
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import LARGEST
 from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.trajectory import FARTHEST_M
 from gpvo.types import Array
 
 ENOUGH = 10
@@ -53,7 +55,8 @@ class Stated:
             raise GpvoError(f"{len(kept)} messages are too few to judge", where=where, cure=f"record at least {ENOUGH}")
         rows = np.array([pose_of(m) for m in kept])
         norm = np.linalg.norm(rows[:, 3:], axis=1)
-        good = np.isfinite(rows).all(axis=1) & (norm > 1e-6)
+        near = np.abs(rows[:, :3]).max(axis=1) < FARTHEST_M  # false for NaN
+        good = near & np.isfinite(rows).all(axis=1) & (norm > 1e-6)
         T = np.tile(np.full((4, 4), np.nan), (len(rows), 1, 1))
         T[good] = se3.from_quaternion(rows[good, :3], rows[good, 3:] / norm[good, None])
         pairs = ((m.header.frame_id, getattr(m, "child_frame_id", "-")) for m in kept)
@@ -72,4 +75,7 @@ def _twist(message: Any) -> list[float]:
 def _covariances(messages: Sequence[Any], name: str) -> Array | None:
     if not hasattr(getattr(messages[0], name, None), "covariance"):
         return None
-    return np.array([getattr(m, name).covariance for m in messages], dtype=np.float64).reshape(-1, 6, 6)
+    C = np.array([getattr(m, name).covariance for m in messages], dtype=np.float64).reshape(-1, 6, 6)
+    # What is beyond all measure is as good as infinite, and squares of the rest stay finite.
+    C[np.abs(C) >= LARGEST] = np.inf
+    return C

@@ -74,6 +74,7 @@ def test_accumulate_is_repeated_compounding_and_follows_parents():
         (np.array([[1.0, 0.5], [0.4, 1.0]]), False),
         (np.full((3, 3), np.nan), False),
         (np.diag([np.inf, 1.0]), False),
+        (np.diag([1e-300, 1.0]), False),  # its whitened errors have no finite squares
     ],
 )
 def test_is_positive_definite(C, expected):

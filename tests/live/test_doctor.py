@@ -164,3 +164,15 @@ def test_what_is_no_bag_and_no_topic_is_one_line() -> None:
     result = CliRunner().invoke(app, ["doctor", "no/such.bag"])
     assert result.exit_code != 0
     assert "--zenoh" in str(result.exception)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("absurd", [1e200, 1e300])
+def test_what_is_beyond_all_measure_is_found_and_overflows_nothing(absurd: float, good: list[Odometry]) -> None:
+    maker = BagMaker(ros1=False)
+    last = len(good) - 1
+    for k, o in enumerate(good):
+        wild = replace(o, T_odom_body=_moved(o.T_odom_body, absurd), pose_covariance=o.pose_covariance * absurd)
+        maker.add(TOPIC, odometry_message(wild if k in (0, 70, last) else o, maker.store.types), o.t_ns)
+    codes = {f.code for f in examine(Stated.of(m for _, _, m in maker.messages))}
+    assert "pose-not-finite" in codes
