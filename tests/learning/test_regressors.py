@@ -131,7 +131,7 @@ def test_choice_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert get_regressor("auto", n_rows=2000).name == "exact"
     assert get_regressor("auto", n_rows=2001).name == "sparse"
     assert {"exact", "sparse", "svgp", "sklearn"} <= set(regressor_names())
-    with pytest.raises(GpvoError, match=r"no regressor 'magic'.*exact, sparse"):
+    with pytest.raises(GpvoError, match=r"unknown regressor 'magic'.*exact, sparse"):
         get_regressor("magic")
 
 

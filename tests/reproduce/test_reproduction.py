@@ -137,7 +137,7 @@ def test_recorded_paths_of_training_and_test_differ(tmp_path):
 def test_wrong_wishes_are_one_line():
     with pytest.raises(GpvoError, match="no flight was asked for"):
         Plan(seeds=0, points_seeds=0)
-    with pytest.raises(GpvoError, match="no experiment '9.9'"):
+    with pytest.raises(GpvoError, match="unknown experiment '9.9'"):
         Plan(only=("9.9",))
     with pytest.raises(GpvoError, match="--data"):
         Plan(data=Path("/no/such"))

@@ -33,7 +33,7 @@ def test_the_others_fly_without_images_too(name):
         ({"camera": "gopro"}, "camera"),
         ({"calibration.focl": 0.1}, "calibration"),
         ({"late": 0.1, "late_s": 0.2}, "late_s"),
-        ({"name.x": 1}, "no table"),
+        ({"name.x": 1}, "not a table"),
     ],
 )
 def test_mistakes_are_named(overrides, message):
