@@ -256,7 +256,7 @@ def test_a_model_of_twins_says_so(blind, tmp_path):
     trained = gpvo("train", blind, "--twins", "--replicates", 3, "-o", tmp_path / "m.gpvo", "--features", "thesis")
     assert trained.exit_code == 0, trained.output
     card = next(tmp_path.glob("m*.md")).read_text()
-    assert "Truth was simulated" in card
+    assert "The truth was simulated" in card
     assert "3 twins of `blind`" in card
 
 
