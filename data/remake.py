@@ -1,6 +1,6 @@
 """Remake the small simulated logs of this folder: ``python data/remake.py [FOLDER]``.
 
-Five flights of 20 s down a mine tunnel (stereo tracks and IMU, no pictures), run through the odometry. In each, over a
+Five flights of 20 s down a mine tunnel (stereo tracks and IMU, no images), run through the odometry. In each, over a
 fifth of the time, something hits seeing hard. ``tunnel-1`` to ``tunnel-4`` are for training, ``unseen`` for judging; it
 also keeps what odometry saw, for twins.
 """

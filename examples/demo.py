@@ -26,7 +26,7 @@ def gpvo(*arguments: object) -> None:
 def main() -> None:
     """Five flights down a tunnel in which seeing goes wrong now and then; the last one is the test."""
     began = time.monotonic()
-    print("simulating five flights of 40 s (stereo tracks and IMU, no pictures)", flush=True)
+    print("simulating five flights of 40 s (stereo tracks and IMU, no images)", flush=True)
     for seed in (*TRAINING, UNSEEN):
         simulate_points("tunnel-bursts", seed, duration_s=40.0, rate_hz=10.0).save(OUT / f"flight{seed}.npz")
     for seed in TRAINING:

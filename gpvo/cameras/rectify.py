@@ -1,4 +1,4 @@
-"""From two raw lenses to a virtual pinhole pair with aligned rows; and masks of the pixels that show a picture."""
+"""From two raw lenses to a virtual pinhole pair with aligned rows; and masks of the pixels that show anything."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Rectifier:
     Attributes
     ----------
     camera : StereoCamera of the rectified pair.
-    mask : (H, W) bool, True where the rectified left image holds a picture; None where it does everywhere.
+    mask : (H, W) bool, True where the rectified left image holds pixels of the raw one; None where it does everywhere.
     mask_right : the same of the right image.
     R_rect_left : (3, 3), left camera axes to rectified axes.
     mounting : where the rectified left camera sits.
@@ -146,7 +146,7 @@ class Rectifier:
 
     def _mask_or_none(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         if mask is not None and mask.mean() < 0.02:
-            raise CalibrationError("almost nothing of the rectified image shows a picture", where=self.rig.where)
+            raise CalibrationError("almost no raw pixel falls into the rectified images", where=self.rig.where)
         return None if mask is None or mask.all() else mask
 
 

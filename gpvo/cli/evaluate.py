@@ -58,7 +58,7 @@ def evaluate(
 ) -> None:
     """Score the trajectory and every stated covariance.
 
-    Example: gpvo evaluate runs/mh01 --plots pictures
+    Example: gpvo evaluate runs/mh01 --plots figures
     """
     from gpvo.evaluation.evaluate import distinct, document
 

@@ -1,4 +1,4 @@
-"""``gpvo live``: pictures or anyone's odometry in, covariance out; ``gpvo doctor``: a linter of it."""
+"""``gpvo live``: images or anyone's odometry in, covariance out; ``gpvo doctor``: a linter of it."""
 
 from __future__ import annotations
 

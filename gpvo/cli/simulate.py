@@ -51,7 +51,7 @@ def simulate(
     threads: Annotated[int, typer.Option(min=1, help="Threads per flight; they do not change the result.")] = 2,
     backend: Annotated[str, typer.Option(help="joblib, or dask.")] = "joblib",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
-    preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the pictures (PNG).")] = None,
+    preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the images (PNG).")] = None,
     list_: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
     set_: Annotated[
         list[str] | None,
@@ -69,7 +69,7 @@ def simulate(
     if scenario is None or (out is None and preview is None):
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
     if points and preview:
-        raise GpvoError("--points draws no pictures to preview", cure="leave out one of --points, --preview")
+        raise GpvoError("--points draws no images to preview", cure="leave out one of --points, --preview")
     from gpvo.sim.scenario import load_scenario, stated_seed
 
     given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,
@@ -98,7 +98,7 @@ def _like(run: Path | None, points: bool) -> dict[str, Any]:
     if run is None:
         return {}
     if not points:
-        raise GpvoError("--like knows no pictures", cure="add --points: landmark tracks instead of images")
+        raise GpvoError("--like knows no images", cure="add --points: landmark tracks instead of images")
     from gpvo.sim.like import like
 
     return like(run)

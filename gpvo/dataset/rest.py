@@ -1,7 +1,7 @@
 """Where a vehicle stands and its truth does not: what the truth then says of odometry's error is the truth's own.
 
 Satellite positions wander by decimetres while a car waits at a light, and odometry, which sees that nothing moves,
-would be charged with it. Whether the vehicle stands is said by picture and IMU together: odometry that is blind to a
+would be charged with it. Whether the vehicle stands is said by image and IMU together: odometry that is blind to a
 motion does not deceive a gyroscope.
 """
 
@@ -20,7 +20,7 @@ from gpvo.vo.imu_moments import ImuMoments
 STILL_S = 1.0
 """So long a vehicle must stand at least for a wait."""
 STILL_PX, TRUTH_PX = 1.0, 2.0
-"""Image motion up to which a picture is at rest, and that a truth must claim to contradict it."""
+"""Image motion up to which an image is at rest, and that a truth must claim to contradict it."""
 GYRO_STD_RADPS, ACC_STD_MPS2 = 0.005, 0.5
 """Spread up to which an IMU is at rest. Small gyroscopes have 0.0015 to 0.0035 rad/s of noise at 200 Hz; on the road,
 cars are seldom below 0.007 rad/s for a second (KITTI). The limit on accelerations lets an engine idle."""
@@ -29,7 +29,7 @@ cars are seldom below 0.007 rad/s for a second (KITTI). The limit on acceleratio
 def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     """(W, 2) times [ns] of the first and the last frame of waits during which the truth moves.
 
-    Over a wait, odometry moves by less than ``STILL_PX`` of the picture and the IMU is still; the truth moves where
+    Over a wait, odometry moves by less than ``STILL_PX`` of the image and the IMU is still; the truth moves where
     its motion would be more than ``TRUTH_PX``. Without a camera, or an IMU in the log, nothing is called a wait.
     """
     if log.camera is None:

@@ -1,4 +1,4 @@
-"""Curves of one run that both the pictures and the page draw."""
+"""Curves of one run that both the figures and the page draw."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of ``gpvo fuse``: path, errors and innovations."""
+"""The figure of ``gpvo fuse``: path, errors and innovations."""
 
 from __future__ import annotations
 

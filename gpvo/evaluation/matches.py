@@ -1,4 +1,4 @@
-"""The points behind single motions of a run, as pictures: what odometry saw, and what it made of it.
+"""The points behind single motions of a run, as figures: what odometry saw, and what it made of it.
 
 A run folder holds no images, so the sequence is opened again and odometry repeated with the run's own settings.
 """
@@ -31,7 +31,7 @@ class MatchPicture:
 
 
 def match_pictures(source: Source, config: VoConfig, frames: Sequence[int]) -> list[MatchPicture]:
-    """Pictures of the frames of these indices. Raises GpvoError for a frame that the sequence does not have."""
+    """Figures of the frames of these indices. Raises GpvoError for a frame that the sequence does not have."""
     if min(frames) < 0:
         raise GpvoError(f"there is no frame {min(frames)}", where=source.path, cure="frames are numbered from 0")
     wanted, last, found = set(frames), max(frames), []

@@ -1,4 +1,4 @@
-"""What is drawn of a run, on the page and in pictures: plain numbers for each panel, thinned to what a screen can show.
+"""What is drawn of a run, on the page and in figures: plain numbers for each panel, thinned to what a screen can show.
 
 A panel is ``{"title", "x": label, "y": label, "lines", "bands", "shades"}`` with optional ``log`` ("x", "y" or "xy"),
 ``equal`` axes, ``limit`` (low, high) of y, ``level``, a reference line, and ``along``, what is told of each point of a
@@ -30,7 +30,7 @@ _COLOURS = {
 
 
 def colour(method: str) -> str:
-    """One colour per method, the same in every picture."""
+    """One colour per method, the same in every figure."""
     return _COLOURS.get(method, "#9467bd")
 
 
@@ -98,7 +98,7 @@ def views(e: Evaluation) -> list[Panel]:
         for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
             R = to_plane @ e.T_est[k, :3, :3]
             ring = _ring((R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]) + p[k, [i, j]]
-            # Whole ellipses lie inside the picture, unless they are far larger than the path.
+            # Whole ellipses lie inside the plot, unless they are far larger than the path.
             far = bool(np.ptp(ring, axis=0).max() > 2 * np.ptp(p, axis=0).max())
             lines.append({**_line(ring[:, 0], ring[:, 1], "", _GREEN, 0.8), "aside": far})
         if len(q):
@@ -136,7 +136,7 @@ def errors(e: Evaluation) -> list[Panel]:
             bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
         if bands:
-            # The bound's usual edges are always in the picture; its peaks unless the error would be a flat line.
+            # The bound's usual edges are always in the plot; its peaks unless the error would be a flat line.
             edge = np.abs(np.concatenate([low, high]))
             edge = edge[np.isfinite(edge)]
             if len(edge):

@@ -1,4 +1,4 @@
-"""Pictures of one run, of the panels that the page draws by itself; and of a forecast."""
+"""Figures of one run: of the panels that the page draws by itself; and of a forecast."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecor
 # Truth whose vertical is further than this from +z [rad] is taken to be in another frame, and gravity is measured.
 _LEVEL_RAD = 0.17
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
-_IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the pictures is usual
+_IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
 
 
 @dataclass(frozen=True)

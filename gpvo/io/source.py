@@ -60,7 +60,7 @@ class Source(Protocol):
     """A stereo sequence, rectified, or stereo tracks.
 
     ``kind``: ``"images"`` yields :class:`StereoFrame` (8 bit, rectified), ``"tracks"`` yields :class:`TrackFrame`.
-    ``mask`` (H, W) is True where the rectified left image holds a picture, None for everywhere. ``truth`` is of the
+    ``mask`` (H, W) is True where the rectified left image shows something, None for everywhere. ``truth`` is of the
     rectified left camera. ``calibration`` describes the raw rig, for the run folder. ``span_ns``: first and last stamp
     expected. ``len`` is the number of pairs expected, exact unless frames turn out to be bad.
     """

@@ -1,1 +1,1 @@
-"""A process that runs: pictures or anyone's odometry in, odometry with its covariance out, on the wire."""
+"""A process that runs: images or anyone's odometry in, odometry with its covariance out, on the wire."""

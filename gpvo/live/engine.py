@@ -225,7 +225,7 @@ class Engine:
         """What does not fit between source and model, looked at once a second."""
         out = []
         if self.stage.camera is not None and self.predictor.camera is None:
-            out.append("the model was trained on another odometry's poses, not on pictures")
+            out.append("the model was trained on another odometry's poses, not on images")
         out += camera_problems(self.predictor.camera, self.stage.camera)
         if len(self._steps_s) >= 20:
             out += rate_problems(self.predictor, self._steps_s)
@@ -233,7 +233,7 @@ class Engine:
             share = 100 * float(np.mean(self._inside))
             out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain")
         if self.stage.counts["uncalibrated"]:
-            out += [] if self.stage.camera else ["pictures come, but no calibration: no CameraInfo beside them"]
+            out += [] if self.stage.camera else ["images come, but no calibration: no CameraInfo beside them"]
         return out
 
     def _is_bad(self, problems: list[str]) -> bool:

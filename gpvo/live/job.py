@@ -93,7 +93,7 @@ def serve(
 
 
 def make_stage(settings: LiveSettings) -> Stage:
-    """The stage that was asked for: pictures where topics of pictures are named, else poses."""
+    """The stage that was asked for: images where topics of images are named, else poses."""
     if settings.stereo is not None:
         if settings.odometry is not None:
             raise GpvoError("--stereo and --odometry exclude each other", cure="choose one")

@@ -1,4 +1,4 @@
-"""From messages to VO records: somebody's poses, or pairs of pictures through gpvo's own odometry."""
+"""From messages to VO records: somebody's poses, or pairs of images through gpvo's own odometry."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Taken:
 
 
 class Stage(Protocol):
-    """``camera``: of the pictures, None for poses. ``method``: the covariance that stands in for a prediction."""
+    """``camera``: of the images, None for poses. ``method``: the covariance that stands in for a prediction."""
 
     counts: Counter[str]
     camera: StereoCamera | None
@@ -166,7 +166,7 @@ def _matrix(holder: Any) -> Array | None:
 
 
 class StereoStage:
-    """Pairs of pictures through :class:`gpvo.vo.odometry.StereoOdometry`, with an IMU where one is named.
+    """Pairs of images through :class:`gpvo.vo.odometry.StereoOdometry`, with an IMU where one is named.
 
     ``rig``: the calibration; without it pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits
     for the first IMU sample after it, or for the next pair.

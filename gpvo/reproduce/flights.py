@@ -1,4 +1,4 @@
-"""The flights of a plan, and the first two stages: simulation and odometry. Pictures go when odometry has seen them."""
+"""The flights of a plan, and the first two stages: simulation and odometry. Images go when odometry has seen them."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def _notes(plan: Plan) -> list[str]:
     notes = [
         "The thesis' flights are not available; ours stand in for them. Compare ratios, not metres.",
         f"Flights of {length}, {plan.rate_hz:g} Hz. Seeds with images: {plan.seeds}; further seeds in "
-        f"points-only mode: {plan.points_seeds} (landmark tracks without pictures), in rows of their own. "
+        f"points-only mode: {plan.points_seeds} (landmark tracks without images), in rows of their own. "
         f"Each trains apart: on {plan.training['images']} flights with images, on {plan.training['points']} without.",
         "RMSE, final and predicted final error are roots of mean squares over the seeds; brackets are 95 % intervals "
         "of a bootstrap by seed. Predicted: root of the expected squared error, 1 sigma.",
@@ -84,7 +84,7 @@ def _notes(plan: Plan) -> list[str]:
     if all(half):
         names = [", ".join(p.stem for p in files) for files in half]
         notes.append(
-            "Tables 4.5, 4.6: no T265 flight under motion capture is at hand. Pictures of a T265-like fisheye pair are "
+            "Tables 4.5, 4.6: no T265 flight under motion capture is at hand. Images of a T265-like fisheye pair are "
             f"drawn along recorded paths, the calibration off by a draw from the datasheet's tolerance in every "
             f"flight; test paths: {names[0]}; training paths and draws are others: {names[1]}. Points-only rows see "
             "such paths through a rectified pair of the T265's baseline, without a lens."

@@ -84,7 +84,7 @@ def as_markdown(document: Mapping[str, Any]) -> str:
 
 
 def as_page(document: Mapping[str, Any], folder: Path) -> str:
-    """All tables and figures of the document as HTML; pictures are read from ``folder``."""
+    """All tables and figures of the document as HTML; images are read from ``folder``."""
     from jinja2 import ChoiceLoader, Environment, PackageLoader, select_autoescape
 
     # The style sheet is that of the other pages.

@@ -11,7 +11,7 @@ import numpy as np
 @dataclass(frozen=True)
 class Episode:
     """From ``begin_s`` to ``end_s``. The factors say what the cause does to pixel noise, number of tracks and outliers
-    where no pictures are drawn: together they raise the standard deviation of VO's error about tenfold."""
+    where no images are drawn: together they raise the standard deviation of VO's error about tenfold."""
 
     begin_s: float
     end_s: float

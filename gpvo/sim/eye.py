@@ -1,5 +1,5 @@
-"""World to pictures, by the renderer and the sensor of one flight's true rig; what a camera makes of light: optics,
-exposure, noise and 8 bits; and the flow between two pictures."""
+"""World to images, by the renderer and the sensor of one flight's true rig; what a camera makes of light: optics,
+exposure, noise and 8 bits; and the flow between two images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Image = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
 _BARE_SIGMA_PX = 16.0
-# A point further away than what the next picture shows there, by this share, is hidden in it.
+# A point further away than what the next image shows there, by this share, is hidden in it.
 _HIDDEN = 0.01
 
 
@@ -51,7 +51,7 @@ class Eye:
         self.depth_m: NDArray[np.float32] | None = None
 
     def see(self, index: int, plan: sequence_plan.FramePlan) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Left and right picture (H, W). ``depth_m`` then holds the left camera's depth, NaN where there is nothing;
+        """Left and right image (H, W). ``depth_m`` then holds the left camera's depth, NaN where there is nothing;
         ``T_world_cam`` its pose."""
         pose, blur = sequence_plan.camera_poses(self._motion, plan.step, plan.exposure_s, self._T_body_left)
         left, right, depth = self._renderer.render(pose, motion=blur)
@@ -78,10 +78,10 @@ def without_texture(linear: NDArray[np.float32], share: float) -> NDArray[np.flo
 def optical_flow(
     model: CameraModel, depth_m: Image, depth_next_m: Image, T_world_cam: Array, T_world_next: Array
 ) -> Image:
-    """Where each pixel is in the next picture, less where it is now: (H, W, 2) [px].
+    """Where each pixel is in the next image, less where it is now: (H, W, 2) [px].
 
     ``depth_m``, ``depth_next_m`` (H, W): along the optical axis, NaN where there is nothing; poses (4, 4) of the two
-    pictures. NaN where nothing is seen, where it leaves the picture, and where something nearer hides it.
+    images. NaN where nothing is seen, where it leaves the image, and where something nearer hides it.
     """
     height, width = depth_m.shape
     v, u = np.mgrid[:height, :width]
@@ -170,7 +170,7 @@ class SensorModel:
         dust: float = 0.0,
         noise_sigma: float = 0.0,
     ) -> tuple[Grey, Grey]:
-        """Two (H, W) uint8 pictures from linear radiance.
+        """Two (H, W) uint8 images from linear radiance.
 
         ``darkness``: factor on all light, 1 is as drawn. ``dust``: extinction of the air [1/m], which needs ``depth``:
         that of the left camera, or of both. ``noise_sigma``: additional white noise on the 0..1 scale of the grey
@@ -183,7 +183,7 @@ class SensorModel:
             images = [image * np.float32(darkness) for image in images]
         if dust > 0:
             if depth is None:
-                raise GpvoError("dust needs the depth of the picture", cure="pass depth=")
+                raise GpvoError("dust needs the depth of the image", cure="pass depth=")
             both = [depth, depth] if isinstance(depth, np.ndarray) else list(depth)
             images = [through_dust(image, d, dust) for image, d in zip(images, both, strict=True)]
         self._adjust(images[0])
@@ -241,7 +241,7 @@ def through_dust(linear: Image, depth: Image, extinction_per_m: float) -> Image:
     """Radiance seen through air with dust, which dims what is behind it and glows itself.
 
     H. Koschmieder, "Theorie der horizontalen Sichtweite" (1924): ``L exp(-b d) + A (1 - exp(-b d))``. The airlight A
-    is the median radiance of the picture. NaN depth counts as infinitely far.
+    is the median radiance of the image. NaN depth counts as infinitely far.
     """
     transmission = np.exp(-np.float32(extinction_per_m) * np.nan_to_num(np.abs(depth), nan=1e4))
     seen = linear[linear > 0]

@@ -1,6 +1,6 @@
 """Flights without images: landmarks seen as stereo pixel tracks, with noise, outliers and bad episodes.
 
-A thousand times faster than drawing pictures, for Monte Carlo and for training by the hundred. The vehicle follows
+A thousand times faster than drawing images, for Monte Carlo and for training by the hundred. The vehicle follows
 its path exactly (no flight dynamics); the IMU is that of the path. Each frame's pixel noise belongs to the frame, so
 the two motions that share a frame share its noise, as in reality.
 """
@@ -49,7 +49,7 @@ class PointsScenario:
     noise_every: int = 0  # every n-th frame is noisy by noise_px
     noise_px: float = 0.0
     dark: tuple[float, float] | None = None  # no tracks from, to
-    frozen: tuple[float, float] | None = None  # the same picture from, to
+    frozen: tuple[float, float] | None = None  # the same image from, to
     cars: int = 0  # that drive beside, before or towards the camera, for 5 to 20 s each
     smoke: float = 0.0  # share of the time with a plume that drifts along
     dust: float = 0.0  # share of the time with dust that turns about the vehicle

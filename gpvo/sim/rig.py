@@ -1,4 +1,4 @@
-"""Stereo rigs by name, and what separates the rig that draws the pictures from the calibration that is written."""
+"""Stereo rigs by name, and what separates the rig that draws the images from the calibration that is written."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class RigError:
 
 
 def true_rig(written: StereoRig, error: RigError) -> StereoRig:
-    """The rig that draws the pictures, given what its calibration says.
+    """The rig that draws the images, given what its calibration says.
 
     Raises CalibrationError where the error makes a rig that cannot exist.
     """

@@ -2,7 +2,7 @@
 
 The wheels carry the chassis on sprung and damped legs, push by friction, and slip; steering turns one side faster than
 the other. Contacts chatter at the simulation's step, far above what a chassis and its mast pass on: the poses are
-smoothed over 10 ms, and that smoothed motion is what truth, pictures and IMU all hold.
+smoothed over 10 ms, and that smoothed motion is what truth, images and IMU all hold.
 """
 
 from __future__ import annotations

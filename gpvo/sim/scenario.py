@@ -32,8 +32,8 @@ class Scenario(BaseModel):
     the flight in which seeing goes wrong, by one of the ``causes`` each time. ``dark``: from, to. ``dropped, frozen,
     late, black``: shares of the frames; a late one is stamped ``late_s`` after it was taken. ``camera_pitch_deg``: how
     far the cameras look down. ``right_light``: light of the right camera over that of the left. ``depth``: write the
-    left camera's depth too; ``flow``: and where each of its pixels is in the next picture. ``calibration``: standard
-    deviations of how the rig that draws the pictures differs from the written one; ``calibration_offset``: the fixed
+    left camera's depth too; ``flow``: and where each of its pixels is in the next image. ``calibration``: standard
+    deviations of how the rig that draws the images differs from the written one; ``calibration_offset``: the fixed
     part of that difference. ``points``: values for flights without images alone.
     """
 
@@ -167,7 +167,7 @@ def require_pictures(scenario: Scenario) -> None:
     """Raise GpvoError for a scenario that exists as landmarks alone: a street, and what moves beside the camera."""
     flown = points_scenario(scenario)
     if scenario.world == "street" or flown.cars or flown.smoke or flown.dust:
-        raise GpvoError(f"'{scenario.name}' has no pictures", cure="add --points: landmark tracks instead of images")
+        raise GpvoError(f"'{scenario.name}' has no images", cure="add --points: landmark tracks instead of images")
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:

@@ -1,4 +1,4 @@
-"""Simulate a sequence: world, motion, pictures, IMU and truth in EuRoC's layout, whole or not at all."""
+"""Simulate a sequence: world, motion, images, IMU and truth in EuRoC's layout, whole or not at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of a sequence in EuRoC's layout, with Kalibr's calibration; and a contact sheet of its pictures."""
+"""The files of a sequence in EuRoC's layout, with Kalibr's calibration; and a contact sheet of its images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpvo.geometry import se3
 from gpvo.sim.imu import Motion
 from gpvo.types import Array, ImuLog, ImuNoise
 
-_WIDTH_PX = 320  # of a picture on the contact sheet
+_WIDTH_PX = 320  # of an image on the contact sheet
 _CAMERA_HEAD = "#timestamp [ns],filename"
 _IMU_HEAD = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -131,7 +131,7 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
     mav = Path(sequence) / "mav0"
     files = [sorted((mav / camera / "data").glob("*.png")) for camera in ("cam0", "cam1")]
     if not files[0]:
-        raise GpvoError("holds no pictures", where=sequence)
+        raise GpvoError("holds no images", where=sequence)
     tiles = []
     for k in np.linspace(0, len(files[0]) - 1, rows * columns).astype(int):
         pair = [_read(side[k]) for side in files]

@@ -1,4 +1,4 @@
-"""What happens in a sequence before any picture is drawn: the motion, its check, and the fate of each frame."""
+"""What happens in a sequence before any image is drawn: the motion, its check, and the fate of each frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BARE, _RAMP_S = 0.92, 0.5  # share of the fine texture that a bare wall lacks; 
 @dataclass(frozen=True)
 class FramePlan:
     """``step``: index into the 1 kHz motion. ``fate``: shown, dropped, frozen, late or black. The rest goes to the
-    picture: noise on a 0..1 scale, share of the light that is left, dust as extinction [1/m], exposure [s], share of
+    image: noise on a 0..1 scale, share of the light that is left, dust as extinction [1/m], exposure [s], share of
     the fine texture that is gone."""
 
     step: int

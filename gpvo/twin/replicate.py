@@ -86,7 +86,7 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
 
 def rig_errors(settings: TwinSettings) -> Array:
     """(replicates, 8) how wrong the rig of each twin is, in sigma: baseline, focal length, and what turns the right
-    picture, the largest effects first.
+    image, the largest effects first.
 
     Drawn at random; then the first five are made uncorrelated and of unit size over the replicates (moment matching),
     as a handful of draws would show a covariance of five numbers wrongly by chance; of five or fewer that cannot be.
@@ -102,7 +102,7 @@ def rig_errors(settings: TwinSettings) -> Array:
 def _projected(original: Original, settings: TwinSettings, replicate: int) -> tuple[Array, Array]:
     """Left and right pixels (M, 2) of the landmarks in the rig of a twin, without noise.
 
-    Baseline and focal length are drawn from the tolerance; what displaces the right picture from what odometry found of
+    Baseline and focal length are drawn from the tolerance; what displaces the right image from what odometry found of
     its rig, mean and covariance; where it looked for nothing (without self-calibration), as a turn from the tolerance.
     """
     seen, s, known = original.seen, original.structure, original.rig
@@ -191,7 +191,7 @@ def _is_small(value: object) -> bool:
 
 
 class _Conditions:
-    """What points alone cannot show, as the run saw it: statistics of its pictures, and points without a match."""
+    """What points alone cannot show, as the run saw it: statistics of its images, and points without a match."""
 
     _PICTURE = ("n_detected", "n_stereo", "brightness", "contrast", "sharpness", "noise_level")
 

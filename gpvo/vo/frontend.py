@@ -18,8 +18,8 @@ from gpvo.vo.rig_error import RigError
 class Observation:
     """What is known of a frame before any motion.
 
-    ``repeated``, ``right_repeated``: the pair, or its right picture alone, is that of the frame before bit by bit.
-    ``right_light``: how many times brighter or fuller of contrast the right picture is; 1 where they are alike.
+    ``repeated``, ``right_repeated``: the pair, or its right image alone, is that of the frame before bit by bit.
+    ``right_light``: how many times brighter or fuller of contrast the right image is; 1 where they are alike.
     """
 
     stats: ImageStats | None
@@ -30,11 +30,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class RightSearch:
-    """How points of the left picture fared in the right one, while both could still be compared.
+    """How points of the left image fared in the right one, while both could still be compared.
 
     Of ``sought`` points ``found`` gave a measurement, ``behind`` lie behind the cameras and ``off_row`` in another row.
     ``row_error_px`` (n,): right row less left row, of points followed from the frame before; ``row_motion_px`` (n,): by
-    how much these moved down the left picture.
+    how much these moved down the left image.
     """
 
     sought: int
@@ -51,7 +51,7 @@ class Matches:
 
     ``row_error`` (N,): row in the right image less that in the left one, in the current frame [px]. ``n_tracked``:
     points found again in the left image, with or without a right one. ``spare`` (N,) marks weaker points where the
-    strong ones leave the picture empty: they do not decide the motion, but may speak against it; None for none.
+    strong ones leave the image empty: they do not decide the motion, but may speak against it; None for none.
     ``right``: how the search in the right image went. ``sought_uvd`` (M, 3): all points of the reference.
     """
 

@@ -62,7 +62,7 @@ class Light:
     def ratio(self, other: Light) -> float:
         """How many times brighter or fuller of contrast the other is; below 1 where it is darker or flatter.
 
-        1 where the two are as alike as two cameras are, or where one holds no picture.
+        1 where the two are as alike as two cameras are, or where one holds no image.
         """
         if min(self.std, other.std) < _NO_PICTURE:
             return 1.0

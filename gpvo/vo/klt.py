@@ -33,7 +33,7 @@ class _View:
     half_left: Image
     half_right: Image
     light_left: Light
-    right_as_left: Image  # the right picture in the left's light
+    right_as_left: Image  # the right image in the left's light
     survey: Future[tuple[Points, NDArray[np.float32]]]  # corners (N, 2) of the half image, disparity of a quarter one
     uvd: Array  # (N, 3) points usable as reference
     left_uv: Points  # (N, 2) their positions in the left image, the templates' centres

@@ -39,7 +39,7 @@ class StereoOdometry:
         none.
 
     Frames must be rectified and of the camera's size, in time order. ``last``: the points behind the last motion, for
-    drawing. ``pair``: what is wrong with the pairs of pictures; ``rig_error``: with the calibration.
+    drawing. ``pair``: what is wrong with the pairs of images; ``rig_error``: with the calibration.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class StereoOdometry:
         if second is not None and covered[1] > 0:
             self._state.rival = motion.inliers | second.inliers
             motions.append(second)
-            doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the picture")
+            doubts.append(f"two motions, over {covered[0]} and {covered[1]} parts of the image")
         elif self._state.rivalry > 1.5:
             doubts.append("two motions in the frames before")
         chosen = choose(motions, covered, self._state.expected(t_ns, guess, self.config.max_acceleration_mps2))
@@ -271,7 +271,7 @@ class StereoOdometry:
             state.t_last_ns = record.t_ns
             if "frozen" in record.reason:
                 return False, (matches.n_tracked, matches.n_tracked)
-            # A good picture that fits nothing known is a new beginning; a bad one leaves the old reference standing
+            # A good image that fits nothing known is a new beginning; a bad one leaves the old reference standing
             # while it may be found again.
             keep = state.is_fresh(record.t_ns, config.weak_inliers)
             enough = config.weak_inliers if keep else config.min_inliers

@@ -1,4 +1,4 @@
-"""Do the two pictures of a pair belong together? What is wrong with the right camera, and the cure."""
+"""Do the two images of a pair belong together? What is wrong with the right camera, and the cure."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _NAMED_FROM = 0.05  # share of the frames
 _DARKER = 1.25
 
 _CURES = {
-    "frozen": "the right picture repeats itself while the left one changes; look at the right camera's driver",
+    "frozen": "the right image repeats itself while the left one changes; look at the right camera's driver",
     "late": "left and right are a frame apart; pair them by time stamp, or trigger both cameras together",
     "swapped": "most points lie behind the cameras; exchange left and right",
     "rows": "most points are in another row on the right; calibrate the pair again",
-    "few": "most points are not found in the right picture; look at its exposure, focus and lens",
-    "light": "the right picture has other light than the left one; give both cameras the same exposure and gain",
-    "size": "the calibration is of pictures twice as large; scale it, or use pictures of full size",
+    "few": "most points are not found in the right image; look at its exposure, focus and lens",
+    "light": "the right image has other light than the left one; give both cameras the same exposure and gain",
+    "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
 
 
@@ -28,7 +28,7 @@ class PairWatch:
     """Watches the pairs of a run: :meth:`step` says what is doubtful in one, :meth:`findings` what is in the run."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        # A principal point in the lower right corner is the centre of a picture of twice the size.
+        # A principal point in the lower right corner is the centre of an image of twice the size.
         doubled = 2 * np.array([camera.cx_px, camera.cy_px]) / [camera.width, camera.height]
         self._half_size = bool((np.abs(doubled - 2.0) < 0.4).all())
         self._rows = np.zeros(4)
@@ -43,17 +43,17 @@ class PairWatch:
         doubts = []
         if self._half_size:
             self._seen["size"] += 1
-            doubts.append("the principal point lies in the corner of the picture")
+            doubts.append("the principal point lies in the corner of the image")
         if right is None:
             return doubts
         if abs(late := self._lateness(right)) > 0.25:
             self._seen["late"] += 1
-            doubts.append(f"the {'right' if late > 0 else 'left'} picture is {abs(late):.1f} frames late")
+            doubts.append(f"the {'right' if late > 0 else 'left'} image is {abs(late):.1f} frames late")
         if right.sought > 0 and right.found < 0.6 * right.sought:
             lost = right.sought - right.found
             cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
             self._seen[cause] += 1
-            doubts.append(f"only {right.found} of {right.sought} points are found in the right picture")
+            doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
         return doubts
 
     def findings(self) -> list[str]:
@@ -62,7 +62,7 @@ class PairWatch:
         return [f"{_CURES[cause]} ({n} of {self._frames} pairs)" for n, cause in sorted(often, reverse=True)]
 
     def _lateness(self, right: RightSearch) -> float:
-        """By how many frames the right picture is older than the left one; 0 where nothing speaks for it.
+        """By how many frames the right image is older than the left one; 0 where nothing speaks for it.
 
         Then a point's right row is where the left one was: the error of rows is the motion of rows, with a minus.
         """

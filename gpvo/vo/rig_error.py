@@ -1,13 +1,13 @@
 """What the calibration has wrong between the cameras, found from the residuals of odometry itself.
 
-Where the right picture is displaced by (dx, dy) in normalised coordinates, measured disparity is too small by ``fx dx``
-and the row in the right picture too large by ``fy dy``. To first order a rotation (wx, wy, wz) of the right camera, a
+Where the right image is displaced by (dx, dy) in normalised coordinates, measured disparity is too small by ``fx dx``
+and the row in the right image too large by ``fy dy``. To first order a rotation (wx, wy, wz) of the right camera, a
 relative error s of its focal length and a shift (c, e) of its centre displace a point at (x, y) by
 
     dx = -xy wx + (1 + x^2) wy - y wz + x s + c,    dy = -(1 + y^2) wx + xy wy + x wz + y s + e
 
 (H. Longuet-Higgins, K. Prazdny, "The interpretation of a moving retinal image", 1980, eq. 2.12). Lenses add to each
-term, and terms of higher order: a centre shifted under distortion of second and fourth order displaces the picture by
+term, and terms of higher order: a centre shifted under distortion of second and fourth order displaces the image by
 polynomials of that order (D. Brown, "Decentering distortion of lenses", 1966). So the coefficients of both fourth-order
 polynomials are free, and a turn is a part of their prior covariance. A Kalman filter of constant state estimates them:
 dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
@@ -36,7 +36,7 @@ POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)
 ORDER = POWERS.sum(axis=1)
 N_TERMS = len(POWERS)
 _DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
-# Standard deviations of the prior. Terms beyond the constant are given at half the width of the picture.
+# Standard deviations of the prior. Terms beyond the constant are given at half the width of the image.
 _DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
 _ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
 _TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
@@ -76,7 +76,7 @@ def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 
 
 
 def principal_errors(state: RigState, camera: StereoCamera) -> Array:
-    """(15, 15) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the picture
+    """(15, 15) columns whose sum, each times a standard normal number, is a draw of dx; those that displace the image
     most come first."""
     values, vectors = np.linalg.eigh(state.covariance[_DX, _DX])
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -227,7 +227,7 @@ class RigError:
         return mean, covariance
 
     def _terms(self, uvd: Array) -> Array:
-        """(15, N) the terms at the place in the right picture."""
+        """(15, N) the terms at the place in the right image."""
         c = self._camera
         return terms((uvd[:, 0] - uvd[:, 2] - c.cx_px) / c.fx_px, (uvd[:, 1] - c.cy_px) / c.fy_px)
 

@@ -18,7 +18,7 @@ from gpvo.types import StereoCamera
 from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 
 STATE_FILE = "calibration_state.json"
-_WORTH_PX = 0.2  # at half the width of the picture; below, no one would calibrate anew
+_WORTH_PX = 0.2  # at half the width of the image; below, no one would calibrate anew
 _SIGMAS = 4.0
 
 
@@ -49,7 +49,7 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
     if shown(row, fy):
         side = "higher" if c[row] < 0 else "lower"
         lines.append(
-            f"the right picture sits {abs(c[row]) * fy:.1f} px {side} than the left: consistent with a rotation of"
+            f"the right image sits {abs(c[row]) * fy:.1f} px {side} than the left: consistent with a rotation of"
             f" {degrees[row]:.2f} deg between the cameras about the horizontal axis"
         )
     if shown(roll, fy * half):
@@ -69,7 +69,7 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
         at_border = (np.abs(c[:N_TERMS]) * reach_px)[1:]
         if any(shown(k, reach_px[k]) for k in range(1, N_TERMS)):
             worst = _TERMS[1 + int(np.argmax(at_border))]
-            lines.append(f"disparities bend over the picture by up to {max(at_border):.1f} px, most in {worst}")
+            lines.append(f"disparities bend over the image by up to {max(at_border):.1f} px, most in {worst}")
     return lines
 
 

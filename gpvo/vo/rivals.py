@@ -1,7 +1,7 @@
-"""Several motions in one picture: does something else than the scene move with the points that agree?
+"""Several motions in one image: does something else than the scene move with the points that agree?
 
 A lorry alongside, smoke, or a texture that travels with the camera may hold more corners than what stands still. Counts
-of corners then say nothing; a scene shows itself by the share of the picture that its motion explains, and by going on
+of corners then say nothing; a scene shows itself by the share of the image that its motion explains, and by going on
 as a vehicle goes on. Which motion is the scene's is never sure: the covariance is that of the mixture.
 """
 
@@ -21,13 +21,13 @@ from gpvo.vo.frontend import Matches
 from gpvo.vo.motion import Motion, transfer
 from gpvo.vo.quality import worst_translation_sigma_m
 
-_CELLS = 96  # of the whole picture
+_CELLS = 96  # of the whole image
 _EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
 _LEAST = 8  # points: a motion through any three is found by chance, a tight one through eight is not
 _SHARE = 1 / 8  # of the other's cells: a motion seen over less is that of an object
 _NOISE = 9.0  # standard deviations of odometry's own noise that are no change of velocity
 _AREA = 0.5  # power of the parts covered in the odds of being the scene, frame by frame: neighbours tell the same
-_UNSEEN = -0.2  # log odds of the expected motion that nothing in the picture makes
+_UNSEEN = -0.2  # log odds of the expected motion that nothing in the image makes
 _SUREST = 3.0  # log odds at most: whoever is surer could not be put right
 _LONGEST_DOUBT_NS = 30 * 10**9
 _REGAINED = 0.3  # log odds, with each frame in which nothing speaks against the motion
@@ -61,7 +61,7 @@ class Choice:
 class Leaps:
     """Remembers a velocity from which the next one leapt as no vehicle does, as it does on to traffic and off it again.
 
-    One of the two is not the scene's, and as long as the picture holds one motion alone nothing tells which. So the
+    One of the two is not the scene's, and as long as the image holds one motion alone nothing tells which. So the
     later one is in doubt for as long as the earlier had lasted, or until a leap leads back to where the vehicle can
     have come from the earlier one meanwhile.
     """
@@ -88,7 +88,7 @@ class Leaps:
 
 
 def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected | None) -> Choice:
-    """The likeliest of the motions to be the scene's: the one that goes on as expected, until the parts of the picture
+    """The likeliest of the motions to be the scene's: the one that goes on as expected, until the parts of the image
     have spoken long enough for another. Where none goes on, what was expected is a candidate of its own.
 
     Moments of the mixture: ``sum p_i d_i d_i^T``, with d_i from the chosen motion to another.
@@ -127,7 +127,7 @@ def cells(uv: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.int
 
 
 def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> NDArray[np.bool_] | None:
-    """(N,) the points, spare ones too, that moved otherwise; None where the motion explains most of the picture.
+    """(N,) the points, spare ones too, that moved otherwise; None where the motion explains most of the image.
 
     That is the share of the cells with points of the reference, but for those that the motion puts out of sight, in
     which one agrees.

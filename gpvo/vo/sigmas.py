@@ -18,7 +18,7 @@ from gpvo.vo.motion import (
 from gpvo.vo.points import triangulation_pixel_covariance
 
 _MEMORY = 0.97  # of the running mean: about thirty frames
-_PARTS = 4, 2  # columns and rows of the picture: finer ones see less of what neighbours share, coarser ones the same
+_PARTS = 4, 2  # columns and rows of the image: finer ones see less of what neighbours share, coarser ones the same
 _S_UNIT = triangulation_pixel_covariance(1.0)
 # Of squares with one degree of freedom, cut off at four; of means of two, at 6.6 medians.
 _CUT_ALONG, _LEFT_ALONG = 4.0, 0.9195
@@ -105,7 +105,7 @@ class DesignEffect:
 
     L. Kish, "Survey sampling", 1965; clusters of a regression: K.-Y. Liang, S. Zeger, 1986. Points near each other are
     wrong alike: on one surface, or moving thing. The motion's score, summed over each of :data:`_PARTS` parts of the
-    picture, then scatters more than its information says.
+    image, then scatters more than its information says.
     """
 
     def __init__(self) -> None:
@@ -165,5 +165,5 @@ class PersistentNoise:
         excess, information, variance = self._sums
         if excess <= 2.0 * variance**0.5:
             return 0.0
-        # Between pictures of nearly the same place hardly anything tells: then the prior does.
+        # Between images of nearly the same place hardly anything tells: then the prior does.
         return float((excess - 4.0 * variance / excess) * information / (information**2 + variance / _USUAL_RATIO**2))

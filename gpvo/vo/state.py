@@ -43,7 +43,7 @@ class State:
     def frozen(self, seen: Observation) -> str:
         """What repeats itself although the camera was moving; empty for nothing."""
         if seen.right_repeated:
-            return "frozen right picture"
+            return "frozen right image"
         return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
 
     def is_fresh(self, t_ns: int, many: int) -> bool:

@@ -78,7 +78,7 @@ def without_imu(r):
 
 
 def test_odometry_that_sees_no_motion_needs_the_gyroscope_for_a_witness(flight):
-    """A lorry ahead that fills the picture: odometry stands still, truth moves, and so does the gyroscope."""
+    """A lorry ahead that fills the image: odometry stands still, truth moves, and so does the gyroscope."""
     log, truth = flight
     moved = wandering(truth, 0.2, 0.3, AT_REST_S)
     rng = np.random.default_rng(0)

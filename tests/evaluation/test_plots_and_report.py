@@ -1,4 +1,4 @@
-"""Pictures have the axes they say, the report stands alone and shows the numbers of ``--json``."""
+"""Figures have the axes they say, the report stands alone and shows the numbers of ``--json``."""
 
 from __future__ import annotations
 

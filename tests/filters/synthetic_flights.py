@@ -36,7 +36,7 @@ class ErrorLaw:
 
 @dataclass(frozen=True)
 class Events:
-    """Accidents of a flight [s from its start]: darkness (frames lost) and frozen pictures, (begin, end) each."""
+    """Accidents of a flight [s from its start]: darkness (frames lost) and frozen images, (begin, end) each."""
 
     dark: tuple[float, float] | None = None
     frozen: tuple[float, float] | None = None

@@ -1,4 +1,4 @@
-"""``gpvo fuse`` and ``gpvo publish`` from run folders to tables, JSON, pictures and bags."""
+"""``gpvo fuse`` and ``gpvo publish`` from run folders to tables, JSON, figures and bags."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ KILLS = int(os.environ.get("GPVO_KILLS", "24"))
 TABLES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "config.toml",
           "predictions.parquet", "tracks.parquet", "calibration_state.json")  # fmt: skip
 GPVO = [sys.executable, "-m", "gpvo.cli"]
-# A reproduction of one row, without pictures.
+# A reproduction of one row, without images.
 REPRODUCE = """
 import sys
 from pathlib import Path
@@ -154,7 +154,7 @@ def test_trainings(flights: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "share"), [("sequence", 0.1), ("campaign of two workers", 0.2)])
 def test_simulations(kind: str, share: float, tmp_path: Path) -> None:
-    pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+    pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
     scene = ["tunnel-clean", "--duration", "4", "--rate", "5", "--set", "speed_mps=0.5"]
     many = ["--seeds", "0..1", "--jobs", "2"] if "campaign" in kind else []
     finish(*GPVO, "simulate", *scene, *many, "-o", tmp_path / "warm")  # the world is built once, into the cache

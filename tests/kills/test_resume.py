@@ -28,7 +28,7 @@ TIMES = ("started", "finished", "wall_s", "stage_ms_mean", "digests", "name")
 
 def pictures(folder: Path, kind: str) -> Path:
     """A folder of image pairs, a dark one and a frozen one among them."""
-    pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+    pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
     from gpvo.cameras.models import KannalaBrandt, PinholeRadtan
     from gpvo.sim.render import StereoRenderer
     from gpvo.sim.worlds import build_world

@@ -1,4 +1,4 @@
-"""Pictures by live messages give the records that the same pictures give from a bag."""
+"""Images by live messages give the records that the same images give from a bag."""
 
 from __future__ import annotations
 

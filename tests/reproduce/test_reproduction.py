@@ -1,4 +1,4 @@
-"""A small reproduction without pictures, end to end: what it writes, what it keeps, how it goes on when killed."""
+"""A small reproduction without images, end to end: what it writes, what it keeps, how it goes on when killed."""
 
 import csv
 import json

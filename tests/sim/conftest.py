@@ -1,4 +1,4 @@
-"""A world and an eye that cost nothing, for tests of what surrounds the pictures."""
+"""A world and an eye that cost nothing, for tests of what surrounds the images."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ SHORT = {"duration_s": 4.0, "rate_hz": 5.0, "rest_s": 2.0, "speed_mps": 0.5}
 
 @pytest.fixture
 def quick(monkeypatch):
-    """A maker of scenarios in a hall of air where pictures are noise of the seed: all but rendering is as it is."""
+    """A maker of scenarios in a hall of air where images are noise of the seed: all but rendering is as it is."""
     world = SimpleNamespace(
         bounds=np.array([[-5.0, -5.0, 0.0], [5.0, 5.0, 4.0]]),
         clearance=lambda p: np.minimum(5.0 - np.abs(p[:, 0]), 5.0 - np.abs(p[:, 1])),

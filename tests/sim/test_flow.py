@@ -1,4 +1,4 @@
-"""Flow is exact: pictures warped by it agree with the picture before, for pinhole and fisheye."""
+"""Flow is exact: images warped by it agree with the image before, for pinhole and fisheye."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gpvo.sim.eye import optical_flow
 from gpvo.sim.scenario import load_scenario
 from gpvo.sim.sequence import simulate
 
-pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
 
 
 def test_a_point_of_a_plane_moves_by_the_pinhole_equation():
@@ -22,7 +22,7 @@ def test_a_point_of_a_plane_moves_by_the_pinhole_equation():
     aside[0, 3] = 0.08
     flow = optical_flow(model, depth, np.full((48, 64), 4.0, np.float32), np.eye(4), aside)
     assert np.isnan(flow[10, 10]).all()
-    assert np.isnan(flow[:, :2]).all()  # two pixels leave the picture
+    assert np.isnan(flow[:, :2]).all()  # two pixels leave the image
     inside = np.delete(flow[:, 2:].reshape(-1, 2), 10 * 62 + 8, axis=0)
     np.testing.assert_allclose(inside, np.tile([-2.0, 0.0], (len(inside), 1)), atol=1e-5)
     nearer = np.full((48, 64), 2.0, np.float32)

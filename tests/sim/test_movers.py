@@ -1,4 +1,4 @@
-"""What moves beside the camera: in the picture, hiding what is behind, and without moving the camera's own path."""
+"""What moves beside the camera: in the image, hiding what is behind, and without moving the camera's own path."""
 
 import numpy as np
 import pytest

@@ -81,6 +81,6 @@ def test_a_calibration_file_is_a_camera(tmp_path):
 
 @pytest.mark.parametrize("name", ["street", "street-traffic", "tunnel-smoke", "lunar-dust"])
 def test_what_has_no_pictures_says_so(name):
-    with pytest.raises(GpvoError, match="has no pictures"):
+    with pytest.raises(GpvoError, match="has no images"):
         sc.require_pictures(sc.load_scenario(name))
     sc.require_pictures(sc.load_scenario("tunnel"))

@@ -199,7 +199,7 @@ def test_episodes_reach_the_frames():
 
 @pytest.mark.slow
 def test_a_write_that_fails_is_one_line_and_leaves_nothing(tmp_path, tmp_path_factory):
-    """The kernel refuses files above 100 kB: the first long table or picture cannot be written whole."""
+    """The kernel refuses files above 100 kB: the first long table or image cannot be written whole."""
     pytest.importorskip("numba")
     resource = pytest.importorskip("resource")
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Pictures with a known cause of error give that error: a small version of the simulator's experiment."""
+"""Images with a known cause of error give that error: a small version of the simulator's experiment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
 pytest.importorskip("mujoco", reason="flights need the extra gpvo[sim]")
 from bench import simulator_experiment as experiment
 

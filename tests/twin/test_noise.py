@@ -19,7 +19,7 @@ def flight(rng: np.random.Generator, length_px: float) -> tuple[Observations, St
     begin = rng.integers(0, N_FRAMES - LIFE, N_TRACKS)
     error = rng.standard_normal((N_TRACKS, 3))
     if length_px > 0:
-        # White noise of the picture, of each span of frames its own, smoothed by its neighbours.
+        # White noise of the image, of each span of frames its own, smoothed by its neighbours.
         off = np.linalg.norm(at[:, None] - at[None], axis=2)
         near = np.exp(-0.5 * (off / length_px) ** 2) * (np.abs(begin[:, None] - begin[None]) < LIFE)
         error = near @ error / np.sqrt((near**2).sum(axis=1))[:, None]

@@ -109,7 +109,7 @@ def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(flown):
     fx = original.seen.camera.fx_px
     n = 2 * N_TERMS
     mean, covariance = np.zeros(n), np.zeros((n, n))
-    mean[[0, N_TERMS]], covariance[0, 0] = (2e-3, 1e-3), 3e-4**2  # the right picture too far right, and too low
+    mean[[0, N_TERMS]], covariance[0, 0] = (2e-3, 1e-3), 3e-4**2  # the right image too far right, and too low
 
     def right(rig, k):
         frames = twin_source(replace(original, rig=rig), TwinSettings(), k).frames

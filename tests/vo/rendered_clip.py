@@ -1,4 +1,4 @@
-"""A short rendered clip in memory: for tests and benchmarks that need pictures, not files."""
+"""A short rendered clip in memory: for tests and benchmarks that need images, not files."""
 
 from __future__ import annotations
 

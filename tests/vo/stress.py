@@ -1,4 +1,4 @@
-"""Faults of a stereo camera, each a function on a sequence of pictures, and the count of frames that fail in silence.
+"""Faults of a stereo camera, each a function on a sequence of images, and the count of frames that fail in silence.
 
 A frame fails in silence where its motion is called ``ok``, is wrong by more than a tenth and 3 cm, and lies outside the
 99.9 % ellipsoid of its triangulation covariance.
@@ -79,7 +79,7 @@ def _both(frame: StereoFrame, change: Callable[[np.ndarray], np.ndarray]) -> Ste
 
 
 def darker_right(k: int, f: StereoFrame) -> StereoFrame:
-    """The right picture at 59 % of the left's light."""
+    """The right image at 59 % of the left's light."""
     return replace(f, right=_table(f.right, lambda g: 0.59 * g))
 
 
@@ -108,7 +108,7 @@ def black(k: int, f: StereoFrame) -> StereoFrame:
 
 
 def right_black(k: int, f: StereoFrame) -> StereoFrame:
-    """Two black right pictures of every twelve."""
+    """Two black right images of every twelve."""
     return replace(f, right=np.zeros_like(f.right)) if _in_the_middle(k) else f
 
 
@@ -147,20 +147,20 @@ def every(stride: int) -> Callable[[Footage], Footage]:
 
 
 def late_right(footage: Footage) -> Footage:
-    """The right picture is that of the frame before."""
+    """The right image is that of the frame before."""
     f = footage.frames
     frames = [replace(now, right=before.right) for before, now in pairwise(f)]
     return Footage(footage.camera, frames, footage.T_world_cam[1:])
 
 
 def frozen_right(footage: Footage) -> Footage:
-    """The right picture stands still for ten frames of every twenty."""
+    """The right image stands still for ten frames of every twenty."""
     f = footage.frames
     return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
 
 
 def half_size(footage: Footage) -> Footage:
-    """Pictures of half the size with the calibration of the full one."""
+    """Images of half the size with the calibration of the full one."""
     c = footage.camera
 
     def halve(image: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ def half_size(footage: Footage) -> Footage:
 
 
 def moving_patch(u_per_frame: float, disparity_px: float = 20.0, share: float = 0.3) -> Callable[[Footage], Footage]:
-    """A strong texture over ``share`` of the picture that moves ``u_per_frame`` px a frame: 0 moves with the camera."""
+    """A strong texture over ``share`` of the image that moves ``u_per_frame`` px a frame: 0 moves with the camera."""
 
     def paint(footage: Footage) -> Footage:
         c = footage.camera

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
 from rendered_clip import pinhole, render_clip, wander
 
 FRAMES = int(os.environ.get("GPVO_LONG_FRAMES", "4000"))

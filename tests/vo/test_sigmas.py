@@ -55,7 +55,7 @@ def test_sigmas_of_few_points(count: int) -> None:
 
 @pytest.mark.parametrize(("shared_px", "least", "most"), [(0.0, 0.85, 1.15), (0.15, 2.5, 8.0)])
 def test_points_that_err_alike_count_as_fewer(shared_px: float, least: float, most: float) -> None:
-    """Noise of 0.15 px by point, and noise common to each eighth of the picture; NEES/dof stays near one by it."""
+    """Noise of 0.15 px by point, and noise common to each eighth of the image; NEES/dof stays near one by it."""
     rng = np.random.default_rng(0)
     design, sigmas, scores = DesignEffect(), SigmaEstimator(None, None), []
     for k in range(120):

@@ -1,4 +1,4 @@
-"""The odometry on rendered pictures: precise where seeing is good, honest where it is not."""
+"""The odometry on rendered images: precise where seeing is good, honest where it is not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpvo.types import ImuLog, Status, StereoFrame, TrackFrame, VoLog, VoRecord
 from gpvo.vo.config import make_config, read_settings
 from gpvo.vo.odometry import StereoOdometry
 
-pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
 from rendered_clip import Clip, pinhole, render_clip, wander
 
 
@@ -90,7 +90,7 @@ def test_a_frozen_picture_is_no_standstill(clip: Clip) -> None:
 
 
 def test_standing_still_does_not_drift(clip: Clip) -> None:
-    """Sixty noisy pictures from one place: pose and stated sigma stay where they were."""
+    """Sixty noisy images from one place: pose and stated sigma stay where they were."""
     still = render_clip(clip.camera, np.repeat(clip.T_world_cam[:1], 60, axis=0), noise_sigma=0.01)
     records = run(still)
     assert all(r.status is Status.OK for r in records[1:])
@@ -221,7 +221,7 @@ def test_a_scene_of_few_landmarks_recovers() -> None:
 
 
 def test_sigmas_follow_the_residuals(clip: Clip) -> None:
-    """With sigma_p and sigma_m left open, the stated covariance follows the pictures' noise."""
+    """With sigma_p and sigma_m left open, the stated covariance follows the images' noise."""
     noisy = render_clip(clip.camera, clip.T_world_cam, noise_sigma=0.05)
     sizes = []
     for source in (clip, noisy):

@@ -20,7 +20,7 @@ from gpvo.vo.pairwatch import PairWatch
 from gpvo.vo.rivals import areas, unexplained
 from stereo_points import CAMERA, scene
 
-pytest.importorskip("numba", reason="pictures need the extra gpvo[sim]")
+pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
 import stress
 from rendered_clip import pinhole, render_clip, wander
 
@@ -52,8 +52,8 @@ def test_a_table_undoes_gain_and_gamma_and_leaves_like_pictures_alone(footage: s
 
 FATAL = {
     "half size": "principal point",
-    "swapped": "found in the right picture",
-    "frozen right": "frozen right picture",
+    "swapped": "found in the right image",
+    "frozen right": "frozen right image",
 }
 
 
@@ -87,18 +87,18 @@ def test_the_cause_is_named_with_its_cure(footage: stress.Footage) -> None:
 
 
 def test_rows_that_lag_behind_are_a_delay() -> None:
-    """Rows of the right picture where the left ones were 0.8 frames ago, with noise and mismatches."""
+    """Rows of the right image where the left ones were 0.8 frames ago, with noise and mismatches."""
     rng = np.random.default_rng(0)
     motion = rng.normal(0, 4, 200)
     error = -0.8 * motion + rng.normal(0, 0.2, 200) + 1.0
     watch, good = PairWatch(pinhole(480, 360)), Observation(None, False)
-    assert watch.step(good, RightSearch(200, 200, 0, 0, error, motion)) == ["the right picture is 0.8 frames late"]
+    assert watch.step(good, RightSearch(200, 200, 0, 0, error, motion)) == ["the right image is 0.8 frames late"]
     watch = PairWatch(pinhole(480, 360))
     assert watch.step(good, RightSearch(200, 200, 0, 0, rng.normal(0, 0.2, 200), motion)) == []
 
 
 def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
-    """Two hundred points that move as one in a third of the picture, forty of the scene all over it."""
+    """Two hundred points that move as one in a third of the image, forty of the scene all over it."""
     rng = np.random.default_rng(0)
     T_scene, before, after = scene(rng, 40, (5, 50))
     T_patch, patch, patch_after = scene(rng, 200, (20, 25))
@@ -123,7 +123,7 @@ def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
 def test_the_stress_list() -> None:
     """Sixty frames at 1.6 m/s; every fault but three kinds that remain, in part, unseen.
 
-    A texture that holds nearly all corners of a small picture leaves no points to speak against it; a right camera that
+    A texture that holds nearly all corners of a small image leaves no points to speak against it; a right camera that
     is late shows only where rows move, not in a turn about the vertical; noise of 25 grey levels shortens all motions,
     and one frame lies just outside (23.7, for the 22.5 of the 99.9 % ellipsoid).
     """

@@ -1,4 +1,4 @@
-"""One camera's pictures: working memory and the order in which the kernels run."""
+"""One camera's images: working memory and the order in which the kernels run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST_TAPS = 3
 class Drawer:
     """Draws a scene through one lens, in horizontal bands that may run in different threads.
 
-    ``radiance`` and ``depth`` (H, W) float32 hold the last picture.
+    ``radiance`` and ``depth`` (H, W) float32 hold the last image.
     """
 
     def __init__(self, scene: Scene, table: RayTable, far_m: float, bands: int) -> None:

@@ -29,7 +29,7 @@ class StereoRenderer:
     T_right_left
         (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
     threads
-        Number of threads; the pictures are the same to the bit for any number.
+        Number of threads; the images are the same to the bit for any number.
     head_lamp
         Radiant intensity of a lamp at each camera; by default that of the world.
     max_angle_rad
@@ -74,7 +74,7 @@ class StereoRenderer:
     ) -> tuple[Image, Image, Image]:
         """Linear radiance of both cameras and the depth of the left one, (H, W) float32 each, yours to keep.
 
-        ``motion``: (k, 4, 4) poses ``T_world_left`` spread over the exposure, whose pictures are averaged; depth is
+        ``motion``: (k, 4, 4) poses ``T_world_left`` spread over the exposure, whose images are averaged; depth is
         always that of ``T_world_left``. Depth runs along the optical axis [m], NaN where there is nothing; that of the
         right camera is kept in ``depth_right`` until the next call.
         """
