@@ -24,7 +24,6 @@ from gpvo.learning.logvariance import fit_log_variance  # noqa: E402
 from gpvo.learning.regressors import get_regressor  # noqa: E402
 from gpvo.online import modelfile  # noqa: E402
 from gpvo.online.projected import NoisyGP, ProjectedGP  # noqa: E402
-from gpvo.online.rowplan import RowPlan  # noqa: E402
 from synthetic_errors import Problem, gaussian_nll, make_problem  # noqa: E402
 
 Results = dict[str, dict[str, Any]]
@@ -76,7 +75,7 @@ def microseconds(call: Callable[[np.ndarray], Any], rows: np.ndarray, *, repeats
 
 def prediction(fit: Fit, rows: np.ndarray) -> Results:
     """One row: mean, aleatoric and epistemic variance of six outputs; mean and standard deviation by the peers."""
-    ours = microseconds(RowPlan((fit.mean, fit.log_noise)), rows, repeats=5000, warm_up=500)
+    ours = microseconds(lambda x: fit.predict(x[None]), rows, repeats=5000, warm_up=500)
     few = make_problem(N, 1)
     from_sklearn = microseconds(sklearn_predictor(few), rows, repeats=100, warm_up=5)
     from_gpytorch = microseconds(gpytorch_predictor(few), rows, repeats=100, warm_up=20)

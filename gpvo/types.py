@@ -395,6 +395,12 @@ class MotionError:
         """(..., 6) standard deviation per axis [m, m, m, rad, rad, rad]."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
+    def extended(self, cls: type[_Error], **more: Any) -> _Error:
+        """The same statement as a class with ``more`` fields; what was worked out of it is kept."""
+        out = object.__new__(cls)
+        out.__dict__.update(vars(self), **more)
+        return out
+
     def row(self: _Error, k: Any) -> _Error:
         """Row k, or the rows that an index chooses, of a batch along its first axis; by ``None`` a batch of one."""
         chosen = object.__new__(type(self))

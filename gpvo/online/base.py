@@ -58,20 +58,20 @@ class BaseVariance:
 
     def __call__(self, columns: Array, dt_s: Array) -> Array:
         """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,)."""
-        return np.einsum("jc,njc->nj", self.theta, parts(columns, dt_s))
+        return np.asarray((parts(columns, dt_s) * self.theta).sum(-1))
 
     def both(self, columns: Array, dt_s: Array) -> tuple[Array, Array]:
         """The same, and the plain variance, (n, 6) each."""
         terms = parts(columns, dt_s)
-        return np.einsum("jc,njc->nj", self.theta, terms), np.einsum("jc,njc->nj", self.plain, terms)
+        return (terms * self.theta).sum(-1), (terms * self.plain).sum(-1)
 
 
 def parts(columns: Array, dt_s: Array) -> Array:
     """(n, 6, 5) geometry, one, squared translation [m^2], squared rotation [rad^2], geometry at r."""
     out = np.ones((len(columns), 6, N_PARTS))
     out[:, :, 0] = np.exp(columns[:, 6:12]) if columns.shape[1] >= 12 else 0.0
-    out[:, :, 2] = ((columns[:, :3] * dt_s[:, None]) ** 2).sum(1)[:, None]
-    out[:, :, 3] = ((columns[:, 3:6] * dt_s[:, None]) ** 2).sum(1)[:, None]
+    square = (columns[:, :6] * dt_s[:, None]) ** 2
+    out[:, :, 2:4] = square.reshape(-1, 2, 3).sum(-1)[:, None]
     out[:, :, 4] = out[:, :, 0] * np.exp(2.0 * columns[:, 12:13]) if columns.shape[1] > 12 else 0.0
     return out
 

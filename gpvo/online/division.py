@@ -88,13 +88,14 @@ class Division:
 
     def _correlations(self, n: int, geometry: Array | None) -> Array:
         """(n, 2, 6, 6) of jitter and white."""
-        out = np.repeat(self.correlation[None, :2], n, axis=0)
-        w = float(self.geometry_weight[0])
-        if geometry is not None and w > 0:
-            R = _correlations(geometry)
-            known = np.isfinite(R).all(axis=(1, 2))
-            out[known] = w * R[known, None] + (1.0 - w) * self.correlation[:2]
-        return _regular(out)
+        own, w = self.correlation[:2], float(self.geometry_weight[0])
+        if geometry is None or w == 0.0:
+            return np.broadcast_to(_regular(own), (n, 2, 6, 6))
+        mixed = w * _correlations(geometry)[:, None] + (1.0 - w) * own
+        unknown = np.isnan(mixed[:, 0, 0, 0])
+        if unknown.any():
+            mixed[unknown] = own
+        return _regular(mixed)
 
     @cached_property
     def _calibrated(self) -> bool:
@@ -158,7 +159,9 @@ def _correlations(geometry: Array) -> Array:
         R = symmetrise(correlation_of(geometry))
     ridge = R + _RIDGE
     try:
-        np.linalg.cholesky(ridge)
+        good = np.isfinite(np.linalg.cholesky(ridge)).all()
     except np.linalg.LinAlgError:
+        good = np.False_
+    if not good:
         R[[not is_positive_definite(C) for C in ridge]] = np.nan
     return R

@@ -113,12 +113,8 @@ class ErrorModel:
         _, ln_det = np.linalg.slogdet(stated.covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
-        return Prediction(
-            mean=stated.mean,
-            jitter=stated.jitter,
-            white=stated.white,
-            persistent_root=stated.persistent_root,
-            persistent_tau_s=stated.persistent_tau_s,
+        return stated.extended(
+            Prediction,
             dt_s=v.dt_s,
             nu=self.degrees_of_freedom,
             epistemic=variance * (1.0 - v.known / v.total),

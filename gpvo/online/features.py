@@ -15,17 +15,11 @@ from importlib.metadata import entry_points
 import numpy as np
 
 from gpvo.errors import GpvoError
-from gpvo.geometry import se3
+from gpvo.online.lately import Agility, Trend, log_of, twist
 from gpvo.types import IMPORTED, Array, StereoCamera, VoRecord
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 GEOMETRIC_METHODS = ("pointing_matching", "triangulation")
-TREND_S = 1.0
-"""Time constant of the running means that the trends are measured against [s]."""
-
-AGILITY_S = 0.5
-"""Time constant of the running mean of the squared jerk [s]."""
-_STILL = 1e-3
 
 Step = Callable[[VoRecord], Sequence[float] | Array]
 
@@ -42,33 +36,24 @@ class Feature:
 class FeatureGroup:
     """Columns computed together. ``start(camera)`` gives a step function with its own, empty memory.
 
-    The step function is called once per record, in time order, and returns one number per column.
+    The step function is called once per record, in time order, and returns one number per column. ``parts``: groups
+    that it is made of, where a few of its columns are not worth the time of all.
     """
 
     name: str
     columns: tuple[Feature, ...]
     start: Callable[[StereoCamera | None], Step]
+    parts: tuple[FeatureGroup, ...] = ()
 
+    @classmethod
+    def of_parts(cls, name: str, *parts: FeatureGroup) -> FeatureGroup:
+        """The parts' columns in their order, each worked out only where one of its own is wanted."""
 
-def twist(record: VoRecord) -> Array:
-    """(6,) velocity of the camera over the motion [m/s, rad/s]; NaN where there is no motion."""
-    global _latest
-    latest = _latest
-    if latest is not None and latest[0] is record:
-        return latest[1]
-    moves = record.usable and record.dt_s > 0
-    out = se3.log(record.T_prev_cur) / record.dt_s if moves else np.full(6, np.nan)
-    out.setflags(write=False)
-    _latest = (record, out)
-    return out
+        def start(camera: StereoCamera | None) -> Step:
+            steps = [part.start(camera) for part in parts]
+            return lambda record: [value for step in steps for value in step(record)]
 
-
-# Several groups and the slip detector ask for the twist of one record in turn.
-_latest: tuple[VoRecord, Array] | None = None
-
-
-def _ln(value: float) -> float:
-    return math.log(value) if value > 0 else math.nan
+        return cls(name, tuple(column for part in parts for column in part.columns), start, parts)
 
 
 def _count(value: int) -> float:
@@ -89,19 +74,33 @@ def _counts(r: VoRecord, _: float) -> Sequence[float]:
     return (*(_count(n) for n in (r.n_detected, r.n_stereo, r.n_tracked, r.n_inliers)), r.inlier_ratio)
 
 
-def _geometry(r: VoRecord, focal: float) -> Sequence[float]:
-    disparities = [_ln(d / focal) for d in (r.disparity_p10_px, r.disparity_p50_px, r.disparity_p90_px)]
-    out = [*disparities, r.spread_u, r.spread_v, _ln(r.reproj_rms_px / focal), r.log10_condition]
-    return [*out, *(value for method in GEOMETRIC_METHODS for value in _stated(r, method))]
+def _seen(r: VoRecord, focal: float) -> Sequence[float]:
+    disparities = [log_of(d / focal) for d in (r.disparity_p10_px, r.disparity_p50_px, r.disparity_p90_px)]
+    return [*disparities, r.spread_u, r.spread_v, log_of(r.reproj_rms_px / focal), r.log10_condition]
 
 
-def _stated(r: VoRecord, method: str) -> list[float]:
-    """Logs of the variances by a method and of their covariance's determinant."""
+def _stated(method: str) -> tuple[FeatureGroup, FeatureGroup]:
+    """Logs of the variances that a record states by a method, and of the covariance's determinant."""
+
+    def variances(r: VoRecord, _: float) -> Sequence[float]:
+        C = _finite(r, method)
+        return (math.nan,) * 6 if C is None else [log_of(c) for c in C.diagonal().tolist()]
+
+    def determinant(r: VoRecord, _: float) -> Sequence[float]:
+        C = _finite(r, method)
+        sign, log_det = (0.0, 0.0) if C is None else np.linalg.slogdet(C)
+        return (float(log_det) if sign > 0 else math.nan,)
+
+    units = ", ".join(f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES)
+    return (
+        FeatureGroup(method, _columns(units), _stateless(variances)),
+        FeatureGroup(method, _columns(f"ln_det_{method} [ln]"), _stateless(determinant)),
+    )
+
+
+def _finite(r: VoRecord, method: str) -> Array | None:
     C = r.covariances.get(method)
-    if C is None or not np.isfinite(C).all():
-        return [math.nan] * 7
-    sign, log_det = np.linalg.slogdet(C)
-    return [*(_ln(c) for c in np.diagonal(C)), float(log_det) if sign > 0 else math.nan]
+    return C if C is not None and np.isfinite(C).all() else None
 
 
 def _image(r: VoRecord, _: float) -> Sequence[float]:
@@ -109,7 +108,7 @@ def _image(r: VoRecord, _: float) -> Sequence[float]:
 
 
 def _norm(v: Array | None) -> float:
-    return math.nan if v is None else float(np.linalg.norm(v))
+    return math.nan if v is None else math.hypot(*v)
 
 
 def _imu(r: VoRecord, _: float) -> Sequence[float]:
@@ -124,64 +123,6 @@ def _imu_axes(r: VoRecord, _: float) -> Sequence[float]:
     return (*(nothing if acc is None else acc), *(nothing if gyro is None else gyro))
 
 
-class _Trend:
-    """Change against the motion before and against running means of the last second."""
-
-    def __init__(self, _: StereoCamera | None) -> None:
-        self._twist: Array | None = None
-        self._t_ns = 0
-        self._mean: Array | None = None
-
-    def __call__(self, r: VoRecord) -> Sequence[float]:
-        if not r.usable:
-            return (math.nan,) * 5
-        now = twist(r)
-        level = np.array([_ln(r.n_inliers), _ln(r.reproj_rms_px), r.brightness])
-        change, acceleration = np.full(3, np.nan), np.full(2, np.nan)
-        if self._twist is not None and self._mean is not None:
-            # A clock may be set back: a trend then begins anew.
-            step_s = max((r.t_ns - self._t_ns) * 1e-9, 1e-6)
-            delta = (now - self._twist) / step_s
-            acceleration = np.array([np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])])
-            change = level - self._mean
-            gain = -math.expm1(-step_s / TREND_S)
-            level = np.where(np.isnan(change), level, self._mean + gain * change)
-        self._twist, self._t_ns, self._mean = now, r.t_ns, level
-        return (*acceleration, *change)
-
-
-class _Agility:
-    """Logs of how fast the vehicle moves and turns, and of how its velocity jerks: now, and lately on average.
-
-    A vehicle moves smoothly from frame to frame, so that most of a jerk is VO's own noise.
-    """
-
-    def __init__(self, _: StereoCamera | None) -> None:
-        self._before: list[Array] = []
-        self._square = np.full(2, np.nan)
-
-    def __call__(self, r: VoRecord) -> Sequence[float]:
-        if not r.usable or r.dt_s <= 0:
-            self._before = []
-            return (math.nan,) * 6
-        now = twist(r)
-        velocity, jerk = _lengths(now), np.full(2, np.nan)
-        if len(self._before) == 2:
-            jerk = _lengths(now - 2.0 * self._before[1] + self._before[0]) / r.dt_s**2
-            gain = -math.expm1(-r.dt_s / AGILITY_S)
-            last = np.where(np.isnan(self._square), jerk**2, self._square)
-            self._square = last + gain * (jerk**2 - last)
-        self._before = [*self._before[-1:], now]
-        values = np.concatenate([velocity, jerk, np.sqrt(self._square)])
-        out: list[float] = np.log(values + _STILL).tolist()
-        return out
-
-
-def _lengths(rate: Array) -> Array:
-    """(2,) of the translation's and the rotation's half of a twist or its derivative."""
-    return np.sqrt(np.array([rate[:3] @ rate[:3], rate[3:] @ rate[3:]]))
-
-
 def _columns(listed: str) -> tuple[Feature, ...]:
     """Of ``"name [unit], name [unit]"``."""
     return tuple(Feature(*pair.rstrip("]").split(" [")) for pair in listed.split(", "))
@@ -192,28 +133,26 @@ def _of_axes(name: str, unit: str) -> str:
     return ", ".join(f"{name.replace('*', axis)} [{unit}]" for axis in "xyz")
 
 
-def _stated_columns(method: str) -> str:
-    variances = (f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES)
-    return ", ".join([*variances, f"ln_det_{method} [ln]"])
-
-
 BUILT_IN = (
-    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), lambda c: lambda r: twist(r)[:3]),
-    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), lambda c: lambda r: twist(r)[3:]),
+    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), lambda c: lambda r: twist(r).tolist()[:3]),
+    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), lambda c: lambda r: twist(r).tolist()[3:]),
     FeatureGroup(
         "counts",
         _columns("n_detected [1], n_stereo [1], n_tracked [1], n_inliers [1], inlier_ratio [1]"),
         _stateless(_counts),
     ),
-    FeatureGroup(
+    FeatureGroup.of_parts(
         "geometry",
-        _columns(
-            "ln_disparity_p10 [ln focal lengths], ln_disparity_p50 [ln focal lengths], "
-            "ln_disparity_p90 [ln focal lengths], spread_u [focal lengths], spread_v [focal lengths], "
-            "ln_reproj_rms [ln focal lengths], log10_condition [log10], "
-            + ", ".join(_stated_columns(method) for method in GEOMETRIC_METHODS)
+        FeatureGroup(
+            "seen",
+            _columns(
+                "ln_disparity_p10 [ln focal lengths], ln_disparity_p50 [ln focal lengths], "
+                "ln_disparity_p90 [ln focal lengths], spread_u [focal lengths], spread_v [focal lengths], "
+                "ln_reproj_rms [ln focal lengths], log10_condition [log10]"
+            ),
+            _stateless(_seen),
         ),
-        _stateless(_geometry),
+        *(part for method in GEOMETRIC_METHODS for part in _stated(method)),
     ),
     FeatureGroup(
         "image",
@@ -226,7 +165,7 @@ BUILT_IN = (
             "acceleration_mps2 [m/s^2], angular_acceleration_radps2 [rad/s^2], "
             "ln_inliers_change [ln], ln_reproj_rms_change [ln], brightness_change [0..1]"
         ),
-        _Trend,
+        lambda _: Trend(),
     ),
     FeatureGroup(
         "agility",
@@ -234,11 +173,11 @@ BUILT_IN = (
             "ln_speed [ln m/s], ln_turn_rate [ln rad/s], ln_jerk [ln m/s^3], ln_angular_jerk [ln rad/s^3], "
             "ln_jerk_lately [ln m/s^3], ln_angular_jerk_lately [ln rad/s^3]"
         ),
-        _Agility,
+        lambda _: Agility(),
     ),
-    FeatureGroup(IMPORTED, _columns(_stated_columns(IMPORTED)), _stateless(lambda r, _: _stated(r, IMPORTED))),
+    FeatureGroup.of_parts(IMPORTED, *_stated(IMPORTED)),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
-    FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (_ln(r.reproj_rms_px),))),
+    FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (log_of(r.reproj_rms_px),))),
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.
     FeatureGroup(
         "imu",
@@ -319,10 +258,10 @@ class FeatureStream:
         self.names = tuple(names)
         self._pick: list[tuple[Step, list[tuple[int, int]]]] = []
         place = {name: i for i, name in enumerate(self.names)}
-        for group in groups().values():
-            picked = [(place[c.name], j) for j, c in enumerate(group.columns) if c.name in place]
+        for part in (part for group in groups().values() for part in group.parts or (group,)):
+            picked = [(place[c.name], j) for j, c in enumerate(part.columns) if c.name in place]
             if picked:
-                self._pick.append((group.start(camera), picked))
+                self._pick.append((part.start(camera), picked))
         unknown = set(self.names) - known_columns().keys()
         if unknown:
             raise GpvoError(
@@ -331,9 +270,9 @@ class FeatureStream:
 
     def step(self, record: VoRecord) -> Array:
         """(d,) features of the record's motion. Call once per record, in time order."""
-        out = np.empty(len(self.names))
+        out = [0.0] * len(self.names)
         for step, picked in self._pick:
             values = step(record)
             for i, j in picked:
                 out[i] = values[j]
-        return out
+        return np.array(out, dtype=np.float64)

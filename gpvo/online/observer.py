@@ -122,11 +122,18 @@ def follows(before_ns: int, t_ns: int) -> bool:
 
 def _is_motion(T: Array) -> bool:
     """Whether T is a rigid transform (4, 4) of a credible length."""
-    # Comparisons with NaN are false.
-    if T.shape != (4, 4) or not np.abs(T).max() < _FARTHEST_M:
+    if T.shape != (4, 4):
         return False
-    R = T[:3, :3]
-    return bool(np.abs(R.T @ R - _EYE[:3, :3]).max() < _NOT_RIGID)
+    rows = T.tolist()
+    # Comparisons with NaN are false.
+    if not all(-_FARTHEST_M < value < _FARTHEST_M for row in rows for value in row):
+        return False
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = rows
+    from_rigid = (
+        a * a + d * d + g * g - 1.0, b * b + e * e + h * h - 1.0, c * c + f * f + i * i - 1.0,
+        a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i,
+    )  # fmt: skip
+    return all(-_NOT_RIGID < value < _NOT_RIGID for value in from_rigid)
 
 
 class Window:

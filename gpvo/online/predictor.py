@@ -157,7 +157,7 @@ class Predictor:
                 f"features have shape {X.shape}, the model takes {len(self.features)}: {', '.join(self.features)}"
             )
         G = None if geometry is None else np.asarray(geometry, dtype=np.float64).reshape(-1, 6, 6)
-        dt = None if dt_s is None else np.broadcast_to(np.asarray(dt_s, dtype=np.float64), (len(rows),))
+        dt = None if dt_s is None else np.full(len(rows), dt_s, dtype=np.float64)
         out = self.model.estimate(rows, G, dt)
         return out.row(0) if X.ndim == 1 else out
 

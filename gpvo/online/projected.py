@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,19 +73,23 @@ class ProjectedGP:
         """(n, m) unit kernel between the rows of X (n, d) and the points."""
         u = (np.asarray(X, dtype=np.float64) - self.centre) / self.lengthscale
         e = u @ self.points.T
-        e -= 0.5 * (self.points**2).sum(1)
-        e -= 0.5 * (u**2).sum(1)[:, None]
-        return np.exp(np.minimum(e, 0.0))
+        e -= self._half_square
+        e -= 0.5 * (u * u).sum(1)[:, None]
+        return np.exp(np.minimum(e, 0.0, out=e), out=e)
+
+    @cached_property
+    def _half_square(self) -> Array:
+        return 0.5 * (self.points**2).sum(1)
 
     def evaluate(self, X: ArrayLike) -> tuple[Array, Array]:
         """Mean and latent variance (no noise) of rows X (n, d): (n, D) and (n, D)."""
         X = np.asarray(X, dtype=np.float64)
-        mean, var = np.empty((len(X), self.n_outputs)), np.empty((len(X), self.n_outputs))
-        for i in range(0, len(X), _CHUNK_ROWS):
-            rows = slice(i, i + _CHUNK_ROWS)
-            z = self.kernel(X[rows]) @ self.projection.T
-            mean[rows], var[rows] = z @ self.weights.T, (z * z) @ self.reduction.T
-        return mean + self.offset, np.maximum(self.signal_var - var, 0.0)
+        if len(X) > _CHUNK_ROWS:
+            parts = [self.evaluate(X[i : i + _CHUNK_ROWS]) for i in range(0, len(X), _CHUNK_ROWS)]
+            mean, var = (np.concatenate(of_parts) for of_parts in zip(*parts))
+            return mean, var
+        z = self.kernel(X) @ self.projection.T
+        return z @ self.weights.T + self.offset, np.maximum(self.signal_var - (z * z) @ self.reduction.T, 0.0)
 
     def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
         """Named arrays for a model file; :meth:`from_arrays` is the inverse."""

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpvo.online.features import twist
+from gpvo.online.lately import lengths, twist
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, Status, Vehicle, VoLog, VoRecord
 
 FALSE_FLAG_RATE = 1e-6
@@ -102,7 +102,7 @@ class SlipDetector:
     def _problem(self, record: VoRecord, change: tuple[float, float], disagreement: float | None) -> str:
         acc = record.imu_acc_mean_mps2
         # Whatever the attitude, a camera accelerates by no more than specific force plus gravity.
-        felt = 0.0 if acc is None or not np.isfinite(acc).all() else STANDARD_GRAVITY_MPS2 + float(np.linalg.norm(acc))
+        felt = 0.0 if acc is None or not all(map(math.isfinite, acc)) else STANDARD_GRAVITY_MPS2 + math.hypot(*acc)
         if change[0] > felt and _is_beyond(change[0], self._linear, self._vehicle.max_acceleration_mps2):
             return f"acceleration of {change[0]:.3g} m/s^2"
         if disagreement is not None:
@@ -114,9 +114,10 @@ class SlipDetector:
 
     @staticmethod
     def _gyro_disagreement(record: VoRecord, now: Array) -> float | None:
-        if record.imu_gyro_mean_radps is None or not np.isfinite(record.imu_gyro_mean_radps).all():
+        gyro = record.imu_gyro_mean_radps
+        if gyro is None or not all(map(math.isfinite, gyro)):
             return None
-        return abs(float(np.linalg.norm(now[3:]) - np.linalg.norm(record.imu_gyro_mean_radps)))
+        return abs(math.hypot(*now[3:]) - math.hypot(*gyro))
 
 
 def _unflagged(record: VoRecord) -> VoRecord:
@@ -130,8 +131,7 @@ def _unflagged(record: VoRecord) -> VoRecord:
 def _rates(middle_s: float, now: Array, before: tuple[float, Array]) -> tuple[float, float]:
     """Linear and angular acceleration implied by two velocities and the times they belong to."""
     step_s = max(middle_s - before[0], 1e-6)
-    delta = (now - before[1]) / step_s
-    return float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
+    return lengths(((now - before[1]) / step_s).tolist())
 
 
 def flag_slips(log: VoLog) -> VoLog:
