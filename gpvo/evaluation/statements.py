@@ -65,9 +65,8 @@ def statements(
         if scale is not None:
             out.append(plain_statement(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
         out.append(_translation_only(log, method))
-    thesis = ThesisModel.from_arrays(arrays)
-    if thesis is not None and len(thesis.axes) == 6 and predictor is not None and predictor.target == "frame":
-        out.append(_thesis(log, thesis))
+    if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
+        out.append(_thesis(log, ThesisModel.from_arrays(arrays)))
     if predictions and predictor is not None:
         out.append(_predicted("base", log, predictor.base().replay(log)))
     if predictions:

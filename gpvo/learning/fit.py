@@ -24,7 +24,7 @@ from gpvo.online.base import BaseVariance, base_columns
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import Domain
 from gpvo.online.projected import ProjectedGP
-from gpvo.online.variants import different_arrays
+from gpvo.online.stored import different_arrays
 from gpvo.stats.student_t import negative_log_likelihood
 from gpvo.types import Array
 

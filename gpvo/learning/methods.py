@@ -30,7 +30,6 @@ METHODS = (
     "base",
     "learned",
 )
-_THESIS_ROWS = 1500
 
 
 def constant_covariance(sets: Sequence[TrainingSet]) -> Array:
@@ -113,18 +112,26 @@ def thesis_statement(model: ThesisModel) -> Statement:
     return lambda s: model.predict(s.select(model.columns))
 
 
-def fit_thesis(sets: Sequence[TrainingSet], *, seed: int = 0) -> ThesisModel:
-    """The thesis' model: GP of each axis of the error on velocity and inlier count (velocity alone where the log has no
-    counts), one isotropic RBF kernel, constant noise."""
-    names = supported_columns(sets, THESIS) or THESIS[:3]
-    X = np.concatenate([s.select(names) for s in sets])
-    Y = np.concatenate([s.Y for s in sets])
-    keep = np.isfinite(X).all(axis=1)
-    X, Y = X[keep], Y[keep]
+def fit_thesis(
+    sets: Sequence[TrainingSet],
+    columns: Sequence[str] = THESIS,
+    regressor: str = "sparse",
+    *,
+    shared: bool = False,
+    seed: int = 0,
+    inducing: int = 128,
+) -> ThesisModel:
+    """GPs of the errors on ``columns``, by default velocity and inlier count (velocity alone where the log has no
+    counts): one isotropic RBF kernel for each axis, or ``shared`` by all, and constant noise."""
+    names = supported_columns(sets, columns) or THESIS[:3]
+    X, Y = np.concatenate([s.select(names) for s in sets]), np.concatenate([s.Y for s in sets])
+    known = np.isfinite(X).all(axis=1)
+    X, Y = X[known], Y[known]
     centre, spread = X.mean(axis=0), np.maximum(X.std(axis=0), 1e-9)
-    U, scale = (X - centre) / spread, np.maximum(Y.std(axis=0), 1e-12)
-    axes = []
-    for j in range(Y.shape[1]):
-        fit = get_regressor("sparse", isotropic=True, inducing=128).fit(U, Y[:, [j]] / scale[j], seed=seed)
-        axes.append(NoisyGP(fit.gp, np.log(fit.hyper.noise_var)))
-    return ThesisModel(tuple(names), centre, spread, scale, tuple(axes))
+    scale = np.maximum(Y.std(axis=0), 1e-12)
+    points = {} if regressor in ("exact", "sklearn") else {"inducing": inducing}
+    gps = []
+    for y in [Y / scale] if shared else np.split(Y / scale, len(scale), axis=1):
+        fit = get_regressor(regressor, n_rows=len(X), isotropic=True, **points).fit((X - centre) / spread, y, seed=seed)
+        gps.append(NoisyGP(fit.gp, np.log(fit.hyper.noise_var)))
+    return ThesisModel(tuple(names), centre, spread, scale, tuple(gps))

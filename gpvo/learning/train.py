@@ -249,18 +249,30 @@ def training_digest(sets: Sequence[TrainingSet]) -> str:
     return hashlib.sha256("".join(sorted(s.digest() for s in sets)).encode()).hexdigest()
 
 
+def header_of_sets(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
+    """What the header of every kind of model says of its training."""
+    cameras = [s.camera for s in sets if s.camera is not None]
+    return {
+        "model_schema": 1,
+        "target": config.target,
+        "camera": asdict(cameras[0]) if cameras else None,
+        "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
+        "versions": versions(),
+        "training_digest": training_digest(sets),
+        "config": config.settings(),
+    }
+
+
 def _header(
     sets: Sequence[TrainingSet], config: TrainConfig, learned: Learned, table: Mapping[str, Any]
 ) -> dict[str, Any]:
     model = learned.model
     low, high = model.domain.reach
-    cameras = [s.camera for s in sets if s.camera is not None]
     step = model.dt_s
     return {
-        "model_schema": 1,
+        **header_of_sets(sets, config),
         "frame": "cam",
         "tangent": "translation then rotation, right perturbation, m and rad",
-        "target": config.target,
         "horizon": "one motion" if config.target == "frame" else config.target,
         "features": list(model.columns),
         "units": list(units(model.columns)),
@@ -269,14 +281,9 @@ def _header(
         "training_domain": {n: [lo, hi] for n, lo, hi in zip(model.columns, low.tolist(), high.tolist())},
         "dt_s": step,
         "rate_hz": 1.0 / step,
-        "camera": asdict(cameras[0]) if cameras else None,
         "choices": learned.choices,
         "calibration": learned.calibration,
         "by_few_sequences": len(sets) < MIN_SEQUENCES,
-        "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
         "scores": {f["held_out"]: f["methods"] for f in table.get("folds", [])},
         "comparison": table.get("comparison"),
-        "versions": versions(),
-        "training_digest": training_digest(sets),
-        "config": config.settings(),
     }

@@ -12,14 +12,13 @@ Coefficients are not negative, so it never shrinks when a part grows. The GP lea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.online.features import AXES
+from gpvo.online.stored import Stored
 from gpvo.types import Array
 
 TWIST_COLUMNS = ("v_x_mps", "v_y_mps", "v_z_mps", "w_x_radps", "w_y_radps", "w_z_radps")
@@ -37,17 +36,17 @@ def base_columns(method: str | None, residual: bool = False) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class BaseVariance:
+class BaseVariance(Stored):
     """``theta`` (6, 5): coefficients of geometry, floor, squared translation and rotation of the motion, and geometry
     at the residuals' noise.
 
-    ``plain`` (6, 5): the same fitted to the motion alone, as what odometry says of itself means what it meant in
+    ``theta_plain`` (6, 5): the same fitted to the motion alone, as what odometry says of itself means what it meant in
     training only where the surroundings are alike. ``method``: name of that covariance, None without one (its
     coefficients are then 0). ``residual``: whether it looks at the residuals.
     """
 
     theta: Array
-    plain: Array
+    theta_plain: Array
     method: str | None
     residual: bool = False
 
@@ -63,7 +62,7 @@ class BaseVariance:
     def both(self, columns: Array, dt_s: Array) -> tuple[Array, Array]:
         """The same, and the plain variance, (n, 6) each."""
         terms = parts(columns, dt_s)
-        return (terms * self.theta).sum(-1), (terms * self.plain).sum(-1)
+        return (terms * self.theta).sum(-1), (terms * self.theta_plain).sum(-1)
 
 
 def parts(columns: Array, dt_s: Array) -> Array:
@@ -106,24 +105,12 @@ def feature_noise(carry: tuple[Array, Array], variance: Array, dt_s: Array) -> A
 
 
 @dataclass(frozen=True)
-class Velocities:
+class Velocities(Stored):
     """``usual_rate_var`` (6,): mean square velocity in training [m^2/s^2, rad^2/s^2]. ``rate_change_var`` (K, 6): of
     the true one's changes over :data:`COASTED` motions."""
 
     usual_rate_var: Array
     rate_change_var: Array
-
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file."""
-        return dict(vars(self))
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Velocities:
-        """The inverse of :meth:`to_arrays`. Raises KeyError where the velocities are missing."""
-        usual = arrays["usual_rate_var"]
-        # Velocities that have nothing to do with each other, where an older file does not say.
-        unrelated = np.tile(2.0 * usual, (len(COASTED), 1))
-        return cls(usual, arrays.get("rate_change_var", unrelated))
 
     def largest_error_var(self, rate: Array, duration_s: Array) -> Array:
         """(n, 6) as wrong as a motion of velocity (n, 6) and duration (n,) can be: VO's motion less the true one is no

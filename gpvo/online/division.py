@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gpvo.geometry.covariance import correlation as correlation_of
 from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise
-from gpvo.types import Array, MotionError, field_names
+from gpvo.online.stored import Stored
+from gpvo.types import Array, MotionError
 
 PARTS = ("jitter", "white", "bias")
 LN_FASTEST = float(np.log(20.0))
-NO_CALIBRATION: Mapping[str, Array] = {
-    "calibration_patterns": np.zeros((6, 6, 6)),
-    "calibration_tau_s": np.ones(6),
-}
-"""Arrays of a model without a part of its own for errors of calibration."""
 _RIDGE = 1e-6 * np.eye(6)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Division:
+class Division(Stored):
     """What has to be known to tell the parts of an error from its variance; axes in the order of the tangent vector.
 
     ``share`` (3, 6): how the variance divides among jitter, white and bias at the log variance ``level`` (6,) and the
@@ -42,17 +36,8 @@ class Division:
     correlation: Array
     geometry_weight: Array
     bias_tau_s: Array
-    calibration_patterns: Array = field(default_factory=lambda: NO_CALIBRATION["calibration_patterns"])
-    calibration_tau_s: Array = field(default_factory=lambda: NO_CALIBRATION["calibration_tau_s"])
-
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file."""
-        return {name: getattr(self, name) for name in field_names(Division)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Division:
-        """The inverse of :meth:`to_arrays`. Raises KeyError where one is missing."""
-        return cls(**{name: {**NO_CALIBRATION, **arrays}[name] for name in field_names(cls)})
+    calibration_patterns: Array = field(default_factory=lambda: np.zeros((6, 6, 6)))
+    calibration_tau_s: Array = field(default_factory=lambda: np.ones(6))
 
     @cached_property
     def persistent_tau_s(self) -> Array:

@@ -15,7 +15,7 @@ from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, Velocities, feature_
 from gpvo.online.division import Division
 from gpvo.online.guard import Domain, DomainCheck, growth
 from gpvo.online.projected import ProjectedGP
-from gpvo.online.validation import LARGEST, check_arrays, check_related
+from gpvo.online.stored import LARGEST, Stored, check_arrays, check_related
 from gpvo.types import Array, MotionError, Prediction
 
 LN_LARGEST = 60.0
@@ -24,8 +24,6 @@ LEAST_VAR = 1e-24
 """No motion is known better [m^2, rad^2]."""
 DURATIONS_S = (1e-6, 1e4)
 """A motion whose stated duration lies outside has the usual one."""
-
-_OWN = ("inputs", "factor", "outside_power", "high", "typical_ln_det", "nu")
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class Variances:
 
 
 @dataclass(frozen=True)
-class ErrorModel:
+class ErrorModel(Stored):
     """Everything the arithmetic needs; axes in the order of the tangent vector.
 
     ``columns``: all features, in order; ``inputs``: positions of those that the ``gp`` sees, which gives the log of the
@@ -65,39 +63,36 @@ class ErrorModel:
     nu: Array
     dt_s: float
 
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file."""
-        return {
-            **{name: np.asarray(getattr(self, name)) for name in _OWN},
-            **self.division.to_arrays(),
-            **self.velocities.to_arrays(),
-            "theta": self.base.theta,
-            "theta_plain": self.base.plain,
-            **self.gp.to_arrays("gp."),
-            **self.domain.to_arrays("domain."),
-        }
+    def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file, those of its parts among them."""
+        out = super().to_arrays(prefix)
+        for name, part in (("", self.division), ("", self.velocities), ("", self.base), ("gp.", self.gp)):
+            out |= part.to_arrays(prefix + name)
+        return out | self.domain.to_arrays(f"{prefix}domain.")
 
     @classmethod
-    def from_arrays(
+    def of_file(
         cls, arrays: Mapping[str, NDArray[Any]], columns: tuple[str, ...], method: str | None, dt_s: float
     ) -> ErrorModel:
-        """The inverse of :meth:`to_arrays`. Raises ModelError where something is missing or is not what the schema of
-        :mod:`gpvo.online.validation` says."""
+        """From the arrays of a file. Raises ModelError where something is missing or is not what the schema of
+        :mod:`gpvo.online.stored` says."""
         check_arrays(arrays, len(columns))
-        try:
-            arrays = {"nu": np.zeros(1), **arrays}
-            own = {name: arrays[name] for name in _OWN}
-            division, velocities = Division.from_arrays(arrays), Velocities.from_arrays(arrays)
-            base = BaseVariance(arrays["theta"], arrays["theta_plain"], method, RESIDUAL_COLUMN in columns)
-        except KeyError as missing:
-            raise ModelError(f"the model file lacks the array {missing}") from None
+        model = cls.from_arrays(
+            arrays,
+            columns=columns,
+            gp=ProjectedGP.from_arrays(arrays, "gp."),
+            domain=Domain.from_arrays(arrays, "domain."),
+            base=BaseVariance.from_arrays(arrays, method=method, residual=RESIDUAL_COLUMN in columns),
+            division=Division.from_arrays(arrays),
+            velocities=Velocities.from_arrays(arrays),
+            dt_s=dt_s,
+        )
         check_related(arrays, len(columns))
-        if unknown := set(base.columns) - set(columns):
+        if unknown := set(model.base.columns) - set(columns):
             raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")
-        domain, gp = Domain.from_arrays(arrays, "domain."), ProjectedGP.from_arrays(arrays, "gp.")
-        if gp.n_inputs != len(own["inputs"]) or gp.n_outputs != 6:
+        if (model.gp.n_inputs, model.gp.n_outputs) != (len(model.inputs), 6):
             raise ModelError("the model file's GP does not fit its inputs and the six axes")
-        return cls(columns, gp, domain, base, division, velocities, **own, dt_s=dt_s)
+        return model
 
     def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Prediction:
         """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown.

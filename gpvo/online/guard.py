@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import ModelError
 from gpvo.online.slip import SlipDetector, flag_slips
+from gpvo.online.stored import Stored
 from gpvo.types import Array, StereoCamera
 
 __all__ = ["Domain", "DomainCheck", "SlipDetector", "camera_problems", "flag_slips"]
@@ -35,7 +33,7 @@ class DomainCheck:
 
 
 @dataclass(frozen=True)
-class Domain:
+class Domain(Stored):
     """Where the training data lay, per feature and jointly.
 
     ``centre``, ``scale`` (d,): robust, in the features' units. ``low``, ``high`` (d,): range of the standardised
@@ -113,19 +111,6 @@ class Domain:
     def reach(self) -> tuple[Array, Array]:
         """Least and most (d,) of the training, in the features' units."""
         return self.centre + self.scale * self.least, self.centre + self.scale * self.most
-
-    def to_arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
-        return {prefix + f.name: getattr(self, f.name) for f in fields(self)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str) -> Domain:
-        """The domain from named arrays. Raises ModelError where one is missing; older files have one range alone."""
-        try:
-            older = {prefix + "least": arrays[prefix + "low"], prefix + "most": arrays[prefix + "high"]}
-            return cls(**{f.name: {**older, **arrays}[prefix + f.name] for f in fields(cls)})
-        except KeyError as missing:
-            raise ModelError(f"the model file lacks the array {missing}") from None
 
 
 def growth(distance: Array, power: Array | float) -> Array:

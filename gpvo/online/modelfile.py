@@ -4,22 +4,20 @@ Layout: as any safetensors file, with the single metadata entry ``gpvo``: a JSON
 ``digest`` and ``header`` (the caller's). ``digest`` is the SHA-256 of the canonical header and of every array's name,
 type, shape and bytes. Equal content gives equal bytes.
 
-Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers ignore what they do not know, and older
-files lack what is marked optional:
+Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers ignore what they do not know:
 
 * ``gp.*``: the GP of the log variance, see :class:`gpvo.online.projected.ProjectedGP`;
 * ``domain.*``: the training domain, see :class:`gpvo.online.guard.Domain`;
 * ``theta``, ``theta_plain`` (6, 5): the base variance, see :class:`gpvo.online.base.BaseVariance`;
-* ``inputs``, ``factor``, ``outside_power``, ``high``, ``correlation``, ``geometry_weight``, ``share``, ``growth``,
-  ``level``, ``ln_speed``, ``bias_tau_s``, ``typical_ln_det``, ``usual_rate_var``: see
+* ``usual_rate_var``, ``rate_change_var`` (6, 6): see :class:`gpvo.online.base.Velocities`;
+* ``correlation``, ``geometry_weight``, ``share``, ``growth``, ``level``, ``ln_speed``, ``bias_tau_s``,
+  ``calibration_patterns``, ``calibration_tau_s``: see :class:`gpvo.online.division.Division`;
+* ``inputs``, ``factor``, ``outside_power``, ``high``, ``typical_ln_det``, ``nu``: see
   :class:`gpvo.online.estimate.ErrorModel`;
-* ``rate_change_var`` (6, 6), ``calibration_patterns`` (6, 6, 6), ``calibration_tau_s`` (6,), ``nu`` (1,) (all
-  optional): the same class;
 * ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
-* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`;
-* ``basis.*``, ``for_filter.*``: of older files, see :func:`gpvo.online.variants.upgraded`; of a model of positions,
-  its GP, see :class:`gpvo.online.position.PositionPredictor`;
+* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`; all there is in a model of
+  positions;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.online.sample.TrainingSample`.
 """
 
@@ -31,7 +29,8 @@ import math
 import os
 import struct
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -42,15 +41,11 @@ from safetensors.numpy import load as _load_tensors
 from safetensors.numpy import save as _save_tensors
 
 from gpvo.errors import ModelError, printable
-from gpvo.online.validation import check_header
 
 SCHEMA = 1
 KIND = "gpvo-error-model"
 MAX_FILE_BYTES = 1 << 30
-MAX_HEADER_BYTES = 1 << 24
-
-_DTYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BOOL": "|b1"}
-_KNOWN = set(_DTYPES.values())
+_KNOWN = {"<f8", "<f4", "<i8", "<i4", "|u1", "|b1"}
 
 
 def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]) -> str:
@@ -82,50 +77,29 @@ def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], heade
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Arrays and header of a model file; ModelError (one line) if it is missing, damaged, truncated or too new."""
     path = Path(path)
-    document, size = _read_document(path)
-    _check_document(document, path)
     try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ModelError(f"is larger than {MAX_FILE_BYTES} bytes: not a model file", where=path)
         blob = path.read_bytes()
-        if len(blob) != size:
-            raise ModelError("changed while it was being read", where=path)
+    except OSError as problem:
+        raise ModelError(f"cannot be opened: {problem.strerror}", where=path) from None
+    try:
+        # Whatever the header declares is held against the bytes there are.
         arrays = _load_tensors(blob)
-    except (OSError, SafetensorError, KeyError, ValueError) as problem:
-        raise ModelError(f"cannot be read as a model file: {problem}", where=path) from None
+        (n_header,) = struct.unpack("<Q", blob[:8])
+        text = json.loads(blob[8 : 8 + n_header])["__metadata__"]["gpvo"]
+        document = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        raise ModelError("is not a gpvo model file, or is truncated or damaged", where=path) from None
+    _check_document(document, path)
     if _digest(arrays, document["header"]) != document["digest"]:
         raise ModelError("the content does not match its digest", where=path, cure="copy or train the model again")
     return arrays, document["printable"]
 
 
 def read_header(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The header alone, without reading the arrays (their digest is therefore not checked)."""
-    document, _ = _read_document(Path(path))
-    _check_document(document, Path(path))
-    return dict(document["printable"])
-
-
-def _read_document(path: Path) -> tuple[dict[str, Any], int]:
-    """The ``gpvo`` document and the file's size, after every declared size was held against the bytes there are."""
-    try:
-        with path.open("rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            if not 8 <= size <= MAX_FILE_BYTES:
-                raise ModelError(f"is {size} bytes long: not a model file", where=path)
-            (n_header,) = struct.unpack("<Q", stream.read(8))
-            if n_header > min(MAX_HEADER_BYTES, size - 8):
-                raise ModelError("is truncated or not a model file", where=path)
-            raw = stream.read(n_header)
-    except OSError as problem:
-        raise ModelError(f"cannot be opened: {problem.strerror}", where=path) from None
-    try:
-        tensors = json.loads(raw)
-        metadata = tensors.pop("__metadata__")
-        _check_sizes(tensors, size - 8 - n_header, path)
-        document = json.loads(metadata["gpvo"], parse_constant=_refuse, parse_float=_finite)
-    except ModelError:
-        raise
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        raise ModelError("is not a gpvo model file, or its header is damaged", where=path) from None
-    return document, size
+    """The header alone."""
+    return load(path)[1]
 
 
 def _refuse(constant: str) -> NoReturn:
@@ -135,20 +109,6 @@ def _refuse(constant: str) -> NoReturn:
 def _finite(number: str) -> float:
     value = float(number)
     return value if math.isfinite(value) else _refuse(number)
-
-
-def _check_sizes(tensors: dict[str, Any], n_bytes: int, path: Path) -> None:
-    end = 0
-    for name, entry in tensors.items():
-        if entry["dtype"] not in _DTYPES:
-            raise ModelError(f"array '{name}' has the unknown type {entry['dtype']}", where=path)
-        first, last = entry["data_offsets"]
-        count = math.prod(int(n) for n in entry["shape"])
-        if count * np.dtype(_DTYPES[entry["dtype"]]).itemsize != last - first or not 0 <= first <= last <= n_bytes:
-            raise ModelError(f"is truncated or damaged at array '{name}'", where=path)
-        end = max(end, last)
-    if end != n_bytes:
-        raise ModelError("is truncated or has trailing bytes", where=path)
 
 
 def _check_document(document: Any, path: Path) -> None:
@@ -164,9 +124,64 @@ def _check_document(document: Any, path: Path) -> None:
         raise ModelError("has a damaged header", where=path)
     document["printable"] = _printable(document["header"])
     try:
-        check_header(document["header"])
+        _check_header(document["header"])
     except ModelError as problem:
         raise ModelError(problem.what, where=path) from None
+
+
+@dataclass(frozen=True)
+class _Key:
+    """One key of a header: what it must be, in words and as a test; absent keys are for the reader to miss."""
+
+    words: str
+    holds: Callable[[Any], bool] = field(repr=False)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(v, str) for v in value)
+
+
+def _are_objects(values: Any) -> bool:
+    return all(isinstance(v, dict) for v in values)
+
+
+_MAPPING = _Key("an object", lambda v: isinstance(v, dict))
+_TEXT = _Key("text", lambda v: isinstance(v, str))
+_HEADER: dict[str, _Key] = {
+    "features": _Key(
+        "a list of different names", lambda v: _are_texts(v) and 0 < len(v) <= 1000 and len(set(v)) == len(v)
+    ),
+    "units": _Key("a list of texts", _are_texts),
+    "dt_s": _Key("a number of seconds from 1e-6 to 1e4", lambda v: _is_number(v) and 1e-6 <= v <= 1e4),
+    "rate_hz": _Key("a positive number", lambda v: _is_number(v) and v > 0),
+    "target": _TEXT,
+    "frame": _TEXT,
+    "base_method": _TEXT,
+    "camera": _MAPPING,
+    "scores": _Key("an object of objects", lambda v: isinstance(v, dict) and _are_objects(v.values())),
+    "calibration": _MAPPING,
+    "config": _MAPPING,
+    "versions": _MAPPING,
+    "sequences": _Key(
+        "a list of named sequences",
+        lambda v: isinstance(v, list) and _are_objects(v) and _are_texts([s.get("name") for s in v]),
+    ),
+}
+
+
+def _check_header(header: Mapping[str, Any]) -> None:
+    """Raise ModelError, one line, for the first key of a header that is not what its readers take; null is unknown."""
+    for name, key in _HEADER.items():
+        value = header.get(name)
+        if value is not None and not key.holds(value):
+            raise ModelError(f"its header's '{name}' is not {key.words}")
+    features, units = header.get("features"), header.get("units")
+    if features and units and len(features) != len(units):
+        raise ModelError(f"its header names {len(units)} units of {len(features)} features")
 
 
 def _printable(value: Any) -> Any:

@@ -23,7 +23,7 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW, camera_problems
 from gpvo.online.observer import Observer
-from gpvo.online.variants import arrays_of_base, upgraded
+from gpvo.online.stored import arrays_of_base
 from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord
 
 MODEL_SCHEMA = 1
@@ -77,10 +77,9 @@ class Predictor:
         if header.get("target") == "position":
             raise ModelError(
                 "this model predicts the residual of a position, not the error of a motion",
-                cure="use PositionPredictor, or train with --target frame",
+                cure="use ThesisModel.of_positions, or train with --target frame",
             )
-        arrays = upgraded(arrays)
-        self.header, self.digest, self.arrays = dict(header), digest, arrays
+        self.header, self.digest, self.arrays = dict(header), digest, dict(arrays)
         try:
             self.features = tuple(header["features"])
             method, target = header["base_method"], header["target"]
@@ -89,7 +88,7 @@ class Predictor:
         except (KeyError, TypeError, ValueError) as problem:
             raise ModelError(f"the model's header is incomplete: {problem}") from None
         _check_known(self.features)
-        self.model = ErrorModel.from_arrays(arrays, self.features, method, dt_s)
+        self.model = ErrorModel.of_file(arrays, self.features, method, dt_s)
         self.target = str(target)
         self.reset()
 

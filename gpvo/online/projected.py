@@ -23,13 +23,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import ModelError
-from gpvo.types import Array, field_names
+from gpvo.online.stored import Stored
+from gpvo.types import Array
 
 _CHUNK_ROWS = 4096
 
 
 @dataclass(frozen=True)
-class ProjectedGP:
+class ProjectedGP(Stored):
     """Posterior of a GP with d inputs and D outputs on m points and r directions, all arrays float64.
 
     ``centre``, ``lengthscale`` (d,): inputs are taken as ``u = (x - centre) / lengthscale``, in the inputs' units.
@@ -45,13 +46,6 @@ class ProjectedGP:
     reduction: Array
     signal_var: Array
     offset: Array
-
-    def __post_init__(self) -> None:
-        (m, d), (D, r) = self.points.shape, self.weights.shape
-        shapes = {"projection": (r, m), "reduction": (D, r), "signal_var": (D,), "offset": (D,)}
-        for name, wanted in {**shapes, "centre": (d,), "lengthscale": (d,)}.items():
-            if getattr(self, name).shape != wanted:
-                raise ModelError(f"GP array '{name}' has shape {getattr(self, name).shape}, expected {wanted}")
 
     @classmethod
     def constant(cls, offset: Array) -> ProjectedGP:
@@ -91,20 +85,6 @@ class ProjectedGP:
         z = self.kernel(X) @ self.projection.T
         return z @ self.weights.T + self.offset, np.maximum(self.signal_var - (z * z) @ self.reduction.T, 0.0)
 
-    def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
-        return {prefix + name: getattr(self, name) for name in field_names(ProjectedGP)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> ProjectedGP:
-        """The GP from named arrays. Raises ModelError where one is missing or of the wrong shape."""
-        try:
-            return cls(**{n: np.asarray(arrays[prefix + n], np.float64) for n in field_names(cls)})
-        except KeyError as missing:
-            raise ModelError(f"the model file lacks the array {missing}") from None
-        except ValueError as wrong:
-            raise ModelError(f"the model file's GP arrays do not fit together: {wrong}") from None
-
 
 @dataclass(frozen=True)
 class NoisyGP:
@@ -124,9 +104,9 @@ class NoisyGP:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str) -> NoisyGP:
-        """The GP from named arrays. Raises ModelError where one is missing or of the wrong shape."""
-        latent = ProjectedGP.from_arrays(arrays, f"{prefix}mean.")
-        log_noise = arrays.get(f"{prefix}log_noise_offset")
-        if log_noise is None or log_noise.shape != (latent.n_outputs,):
-            raise ModelError(f"the model file's array '{prefix}log_noise_offset' is missing or of the wrong shape")
-        return cls(latent, np.asarray(log_noise, np.float64))
+        """The GP from named arrays. Raises ModelError where one is missing."""
+        try:
+            noise = np.asarray(arrays[f"{prefix}log_noise_offset"], np.float64)
+        except KeyError as missing:
+            raise ModelError(f"the model file lacks the array {missing}") from None
+        return cls(ProjectedGP.from_arrays(arrays, f"{prefix}mean."), noise)

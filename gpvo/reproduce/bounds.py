@@ -23,8 +23,8 @@ from gpvo.io.atomic import write_arrays
 from gpvo.io.run import Run, read_run
 from gpvo.learning import methods
 from gpvo.online.features import THESIS
-from gpvo.online.position import PositionPredictor
 from gpvo.online.predictor import Predictor
+from gpvo.online.thesis import ThesisModel
 from gpvo.reproduce.experiments import Experiment, Way, printed
 from gpvo.reproduce.models import ModelJob, sets_of
 from gpvo.reproduce.stages import Store, digest_of
@@ -177,7 +177,7 @@ class BoundsJob:
             assert self.model is not None
             model = self.model.path(store)
             if kind == "position":
-                positions = PositionPredictor.load(model)
+                positions = ThesisModel.of_positions(model)
                 found = [_position(r, positions) for r in runs]
             else:
                 found = [_learned(r, Predictor.load(model)) for r in runs]
@@ -209,10 +209,9 @@ def _joint(run: Run, method: str) -> Bounds:
     return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, errors))
 
 
-def _position(run: Run, predictor: PositionPredictor) -> Bounds:
-    _, X = observe(run.log, predictor.features, "position")
-    mean, sigma = predictor.predict(X)
-    return bounds_of(run, mean, sigma[:, :, None] ** 2 * np.eye(3))
+def _position(run: Run, model: ThesisModel) -> Bounds:
+    _, X = observe(run.log, model.columns, "position")
+    return bounds_of(run, *model.predict(X))
 
 
 def _motion(run: Run, gp: methods.Statement) -> Bounds:

@@ -17,7 +17,7 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.learning.export import export_model
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
-from gpvo.online.validation import spec_of
+from gpvo.online.stored import spec_of
 from small_model import small_model
 from typer.testing import CliRunner
 
@@ -100,6 +100,15 @@ def test_arrays_against_the_schema_are_refused(case: str, parts, tmp_path: Path)
     with pytest.raises(ModelError, match=r"evil\.gpvo: ") as refusal:
         Predictor.load(tmp_path / "evil.gpvo")
     assert "\n" not in str(refusal.value)
+
+
+def test_a_file_of_an_older_version_is_refused_with_a_cure(parts, tmp_path: Path) -> None:
+    arrays, header = parts
+    renamed = {n.replace("gp.", "basis.noise.") if n.startswith("gp.") else n: a for n, a in arrays.items()}
+    for older in (renamed, {n: a for n, a in arrays.items() if n != "nu"}):
+        modelfile.save(tmp_path / "old.gpvo", older, header)
+        with pytest.raises(ModelError, match=r"old\.gpvo: lacks the array.*older gpvo.*train the model again"):
+            Predictor.load(tmp_path / "old.gpvo")
 
 
 HEADERS: dict[str, dict[str, Any]] = {

@@ -356,7 +356,7 @@ def test_window_target():
 def test_position_target_has_its_own_type(tmp_path):
     from gpvo.dataset.build import build
     from gpvo.learning.position import train_position
-    from gpvo.online.position import PositionPredictor
+    from gpvo.online.thesis import ThesisModel
 
     sets = [build(*make_run(k, n=100), name=str(k), target="position") for k in range(3)]
     trained = train_position(sets, TrainConfig(target="position"))
@@ -364,8 +364,10 @@ def test_position_target_has_its_own_type(tmp_path):
     save_model(trained, tmp_path / "p.gpvo")
     with pytest.raises(ModelError, match="residual of a position.*--target frame"):
         Predictor.load(tmp_path / "p.gpvo")
-    said = [PositionPredictor.load(tmp_path / "p.gpvo").step(r) for r in make_run(50, n=5)[0]]
-    assert said[-1].mean.shape == (3,)
+    model = ThesisModel.of_positions(tmp_path / "p.gpvo")
+    mean, covariance = model.predict(sets[0].select(model.columns))
+    assert mean.shape == (100, 3)
+    assert covariance.shape == (100, 3, 3)
 
 
 def test_best_scale_is_best():

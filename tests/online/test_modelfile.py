@@ -88,7 +88,7 @@ def test_every_flipped_byte_is_refused(model: Path) -> None:
 
 def test_trailing_bytes_other_files_and_no_file_are_refused(model: Path, tmp_path: Path) -> None:
     model.write_bytes(model.read_bytes() + b"x")
-    with pytest.raises(ModelError, match="trailing"):
+    with pytest.raises(ModelError, match="truncated or damaged"):
         modelfile.load(model)
     other = tmp_path / "notes.txt"
     other.write_text("just some text that is long enough")
@@ -120,7 +120,7 @@ def test_newer_schema_is_refused_with_a_cure(model: Path) -> None:
 
 def test_a_lying_shape_is_refused_before_it_allocates(model: Path) -> None:
     rewrite(model, lambda tensors, document: tensors["b"].update(shape=[1 << 40, 1 << 10]))
-    with pytest.raises(ModelError, match="damaged at array 'b'"):
+    with pytest.raises(ModelError, match="damaged"):
         modelfile.load(model)
 
 

@@ -1,4 +1,4 @@
-"""The projected GP: batch and single row agree, arrays survive, wrong shapes are refused."""
+"""The projected GP: the textbook's variance, arrays survive, wrong shapes are refused."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gpvo.errors import ModelError
 from gpvo.online.projected import NoisyGP, ProjectedGP
+from gpvo.online.stored import check_arrays
 
 
 def some_gp(rng: np.random.Generator, d: int = 8, D: int = 6, m: int = 40) -> ProjectedGP:
@@ -73,12 +74,14 @@ def test_arrays_round_trip() -> None:
 
 
 def test_missing_or_misshapen_arrays_are_refused() -> None:
-    arrays = NoisyGP(some_gp(np.random.default_rng(0)), np.zeros(6)).to_arrays("")
-    with pytest.raises(ModelError, match=r"lacks the array 'mean\.points'"):
-        NoisyGP.from_arrays({k: v for k, v in arrays.items() if k != "mean.points"}, "")
-    with pytest.raises(ModelError, match="projection"):
-        NoisyGP.from_arrays(arrays | {"mean.projection": np.zeros((3, 4))}, "")
-    with pytest.raises(ModelError, match="do not fit together"):
-        NoisyGP.from_arrays(arrays | {"mean.points": np.zeros(3)}, "")
-    with pytest.raises(ModelError, match="log_noise_offset"):
-        NoisyGP.from_arrays(arrays | {"log_noise_offset": np.zeros(2)}, "")
+    arrays = NoisyGP(some_gp(np.random.default_rng(0)), np.zeros(6)).to_arrays("thesis.0.")
+    check_arrays(arrays)
+    with pytest.raises(ModelError, match=r"lacks the array 'thesis\.0\.mean\.points'"):
+        NoisyGP.from_arrays({k: v for k, v in arrays.items() if k != "thesis.0.mean.points"}, "thesis.0.")
+    for name, values in (
+        ("mean.projection", np.zeros((3, 4))),
+        ("mean.points", np.zeros(3)),
+        ("log_noise_offset", np.zeros(2)),
+    ):
+        with pytest.raises(ModelError, match=r"'thesis\.0\..*' has shape"):
+            check_arrays(arrays | {f"thesis.0.{name}": values})

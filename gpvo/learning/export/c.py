@@ -14,7 +14,7 @@ from gpvo.errors import GpvoError
 from gpvo.io.atomic import write_text
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
-from gpvo.online.validation import LARGEST
+from gpvo.online.stored import LARGEST
 
 PREFIX = "gpvo"
 """Of every symbol, unless another is asked for."""
@@ -120,7 +120,7 @@ def _constants(model: ErrorModel) -> list[str]:
         *_array("by_velocity", by_velocity),
         *_array("by_acceleration", by_acceleration),
         *_array("theta", model.base.theta),
-        *_array("theta_plain", model.base.plain),
+        *_array("theta_plain", model.base.theta_plain),
         *_array("usual_rate_var", model.velocities.usual_rate_var),
         *_array("factor", model.factor),
         *_array("high", model.high),

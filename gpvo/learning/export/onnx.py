@@ -14,7 +14,7 @@ from gpvo.io.atomic import replacing
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.division import LN_FASTEST, PARTS
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
-from gpvo.online.validation import LARGEST
+from gpvo.online.stored import LARGEST
 from gpvo.types import Array
 
 OPSET = 17
@@ -108,7 +108,7 @@ class _Graph:
 def _predict(g: _Graph, model: ErrorModel) -> None:
     """The whole graph; line by line ``ErrorModel.estimate``."""
     g.dt = g("Where", g("And", *(g(op, "dt_s", s) for op, s in _USUAL_DURATIONS)), "dt_s", model.dt_s)
-    base, plain = (g("Max", _base(g, model, theta), LEAST_VAR) for theta in (model.base.theta, model.base.plain))
+    base, plain = (g("Max", _base(g, model, theta), LEAST_VAR) for theta in (model.base.theta, model.base.theta_plain))
     inside, distance, in_domain = _locate(g, model, base)
     log_ratio, spread = _log_ratio(g, model, g.take(inside, model.inputs, axis=1))
     log_noise = g("Max", g("Min", g("Add", log_ratio, g("Mul", spread, 0.5)), LN_LARGEST), -LN_LARGEST)

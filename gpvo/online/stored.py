@@ -1,0 +1,200 @@
+"""What a model file holds: classes whose arrays go in and out by their names, and one schema that all arrays must fit.
+
+The schema is checked once, where a model is loaded; what has passed may be believed by the arithmetic. A new array gets
+a line in ``_ARRAYS``; arrays that are in no line are left alone, as readers ignore what they do not know. A file holds
+two models: the one that predicts and, where its arrays differ, its base with the GP held at its mean function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.errors import ModelError
+from gpvo.geometry.covariance import is_positive_definite
+from gpvo.types import field_names
+
+LARGEST = 1e12
+"""No number of a model is larger, nor is a feature: a value beyond counts as missing, as its powers would overflow."""
+BASE = "base."
+"""Prefix of the arrays in which the model with its GP held at the mean function, the base variance, differs."""
+_NARROWEST = 1e-12  # No standard deviation or length scale is smaller.
+_Arrays = Mapping[str, NDArray[Any]]
+_Stored = TypeVar("_Stored", bound="Stored")
+
+
+class Stored:
+    """A dataclass whose arrays stand in a model file by the names of its fields, after a prefix."""
+
+    def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
+        own = {name: getattr(self, name) for name in field_names(type(self))}
+        return {prefix + name: a for name, a in own.items() if isinstance(a, np.ndarray)}
+
+    @classmethod
+    def from_arrays(cls: type[_Stored], arrays: _Arrays, prefix: str = "", **others: Any) -> _Stored:
+        """From arrays that fit the schema, and ``others`` that are none. Raises ModelError where one is missing."""
+        try:
+            own = {name: arrays[prefix + name] for name in field_names(cls) if name not in others}
+        except KeyError as missing:
+            raise ModelError(f"lacks the array {missing}: an older gpvo wrote the file, or it is damaged") from None
+        return cls(**{n: np.asarray(a, np.float64) if a.dtype.kind == "f" else a for n, a in own.items()}, **others)
+
+
+def arrays_of_base(arrays: _Arrays) -> dict[str, NDArray[Any]]:
+    """The arrays of a model file with those of its base in their place: the base variance, and a calibration of its
+    own. The same as the model where the GP is not at work."""
+    kept = {name: a for name, a in arrays.items() if not name.startswith(BASE)}
+    return kept | {name.removeprefix(BASE): a for name, a in arrays.items() if name.startswith(BASE)}
+
+
+def different_arrays(own: _Arrays, others: _Arrays) -> dict[str, NDArray[Any]]:
+    """The arrays of a base ``own`` that differ from ``others``, by their names in a file."""
+    return {BASE + name: a for name, a in own.items() if name not in others or not np.array_equal(a, others[name])}
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """What one array must be.
+
+    ``shape``: a length per axis, or a letter for one that all arrays of a group have in common; ``"features"`` that of
+    the features. ``low``, ``high``: range of its values. ``kind``: NumPy's kinds that it may have. ``semidefinite``:
+    its last two axes hold symmetric positive semidefinite matrices; ``unit_diagonal``: with ones on the diagonal.
+    ``gaps``: NaN may stand for unknown values.
+    """
+
+    shape: tuple[int | str, ...]
+    low: float = -LARGEST
+    high: float = LARGEST
+    kind: str = "f"
+    semidefinite: bool = False
+    unit_diagonal: bool = False
+    gaps: bool = False
+
+    def problem(self, array: NDArray[Any], sizes: dict[str, int]) -> str:
+        """What is wrong with the array, empty where nothing is; ``sizes``: of the letters, which it adds to."""
+        if array.dtype.kind not in self.kind:
+            return f"holds {array.dtype}"
+        wanted = [w if isinstance(w, int) else sizes.setdefault(w, n) for w, n in zip(self.shape, array.shape)]
+        if array.ndim != len(self.shape) or list(array.shape) != wanted:
+            return f"has shape {array.shape}, expected {tuple(sizes.get(str(w), w) for w in self.shape)}"
+        if array.size == 0:
+            return "is empty"
+        if array.dtype.kind == "f" and not self.gaps and not np.isfinite(array).all():
+            return "holds a number that is not finite"
+        with np.errstate(invalid="ignore"):
+            if (array < self.low).any() or (array > self.high).any():
+                return (
+                    f"goes from {np.nanmin(array):.3g} to {np.nanmax(array):.3g}, outside {self.low:g} to {self.high:g}"
+                )
+        if self.semidefinite and not all(_is_semidefinite(C) for C in array.reshape(-1, *array.shape[-2:])):
+            return "is not symmetric positive semidefinite"
+        if self.unit_diagonal and np.abs(np.diagonal(array, axis1=-2, axis2=-1) - 1.0).max() > 1e-6:
+            return "is not a correlation: its diagonal is not one"
+        return ""
+
+
+def _is_semidefinite(C: NDArray[Any]) -> bool:
+    """Up to rounding: a millionth of the diagonal makes it positive definite."""
+    diagonal = np.diagonal(C)
+    return bool((diagonal >= 0).all()) and is_positive_definite(C + np.diag(1e-6 * diagonal + 1e-30))
+
+
+def _positive(*shape: int | str) -> ArraySpec:
+    return ArraySpec(shape, low=_NARROWEST)
+
+
+def _not_negative(*shape: int | str) -> ArraySpec:
+    return ArraySpec(shape, low=0.0)
+
+
+def _ln(*shape: int | str) -> ArraySpec:
+    return ArraySpec(shape, low=-60.0, high=60.0)
+
+
+_ARRAYS: dict[str, ArraySpec] = {
+    "inputs": ArraySpec(("inputs",), low=0, kind="iu"),
+    "factor": _positive(6),
+    "outside_power": ArraySpec((1,), low=0.0, high=10.0),
+    "high": _ln(6),
+    "correlation": ArraySpec((3, 6, 6), semidefinite=True, unit_diagonal=True),
+    "geometry_weight": ArraySpec((1,), low=0.0, high=1.0),
+    "share": ArraySpec((3, 6), low=0.0, high=1.0),
+    "growth": _ln(2, 6),
+    "level": ArraySpec((6,), low=-1e3, high=1e3),
+    "ln_speed": _ln(1),
+    "bias_tau_s": _not_negative(6),
+    "typical_ln_det": ArraySpec((1,), low=-1e4, high=1e4),
+    "usual_rate_var": ArraySpec((6,), low=1e-24),
+    "rate_change_var": _not_negative(6, 6),
+    "calibration_patterns": ArraySpec((6, 6, 6), low=-1e6, high=1e6),
+    "calibration_tau_s": _positive(6),
+    "nu": ArraySpec((1,), low=0.0, high=1e6),
+    "theta": _not_negative(6, 5),
+    "theta_plain": _not_negative(6, 5),
+    "domain.scale": _positive("features"),
+    "domain.whitening": ArraySpec(("features", "features")),
+    "domain.radius": _not_negative(1),
+    "domain.may_miss": ArraySpec(("features",), kind="b"),
+    "domain.*": ArraySpec(("features",)),
+    "thesis.columns": ArraySpec(("d",), low=0, high=3, kind="iu"),
+    "thesis.spread": _positive("d"),
+    "thesis.scale": _not_negative("D"),
+    "thesis.centre": ArraySpec(("d",)),
+    "method.constant": ArraySpec((6, 6), semidefinite=True),
+    "method.*.scale": _not_negative(6),
+    "sample.X": ArraySpec(("n", "features"), gaps=True),
+    "sample.sequence": ArraySpec(("n",), low=0, kind="iu"),
+    "sample.dt_s": ArraySpec(("n",), low=1e-9),
+    "sample.geometry": ArraySpec(("n", 21), gaps=True),
+    # Gaussian processes, wherever they stand.
+    "*.lengthscale": _positive("d"),
+    "*.points": ArraySpec(("m", "d")),
+    "*.weights": ArraySpec(("D", "r")),
+    "*.reduction": ArraySpec(("D", "r"), low=-1e-3),
+    "*.signal_var": _not_negative("D"),
+    "*.projection": ArraySpec(("r", "m")),
+    "*.centre": ArraySpec(("d",)),
+    "*.offset": ArraySpec(("D",)),
+    "*.log_noise_offset": _ln("D"),
+}
+
+
+@cache
+def spec_of(name: str) -> ArraySpec | None:
+    """The specification of an array, None where nothing is known of it; the first line that fits its name counts."""
+    name = name.removeprefix(BASE)
+    return _ARRAYS.get(name) or next((spec for key, spec in _ARRAYS.items() if fnmatchcase(name, key)), None)
+
+
+def check_arrays(arrays: _Arrays, n_features: int | None = None) -> None:
+    """Raise ModelError, one line, for the first array that is not what the schema says.
+
+    ``n_features``: of the header, where it is known.
+    """
+    groups: dict[str, dict[str, int]] = {}
+    for name in sorted(arrays):
+        group = name.rpartition(".")[0].removesuffix(".mean")
+        sizes = groups.setdefault(group, {} if n_features is None else {"features": n_features})
+        spec = spec_of(name)
+        if spec is not None and (problem := spec.problem(arrays[name], sizes)):
+            raise ModelError(f"the array '{name}' {problem}")
+
+
+def check_related(arrays: _Arrays, n_features: int) -> None:
+    """Raise ModelError where arrays of an error model, each right by itself, contradict one another."""
+    for low, high in (("domain.low", "domain.high"), ("domain.least", "domain.most")):
+        if (arrays[low] > arrays[high]).any():
+            raise ModelError("the training domain ends before it begins")
+    if arrays["inputs"].max() >= n_features:
+        raise ModelError(f"input {arrays['inputs'].max()} is none of the {n_features} features")
+    if (arrays["share"].sum(axis=0) < 1e-6).any():
+        raise ModelError("jitter, white and bias have no share of the variance")
+    if (arrays["theta"].sum(axis=1) <= 0).any():
+        raise ModelError("the base variance 'theta' of an axis is zero")
