@@ -48,7 +48,7 @@ def like(path: Path) -> dict[str, Any]:
         "camera": str(path),
         "trajectory": str(path),
         "vehicle": "path",
-        "duration_s": longest_flight_s(path),
+        "duration_s": longest_flight_s((log.t_ns[-1] - log.t_ns[0]) * 1e-9),
         "rate_hz": rate_hz,
         # A whole number of samples between frames.
         "imu_rate_hz": rate_hz * round(_IMU_HZ / rate_hz),

@@ -75,11 +75,10 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
     clock, T_world_body = _read(file)
     needed = float(smooth_start(np.array([duration_s]), rest_s)[0])
     if clock[-1] < needed:
-        longest = clock[-1] + duration_s - needed
         raise SourceError(
             f"lasts {clock[-1]:.1f} s, the flight needs {needed:.1f} s of it",
             where=file,
-            cure=f"a duration of at most {np.floor(longest * 10) / 10:g} s",
+            cure=f"a duration of at most {longest_flight_s(clock[-1], rest_s):g} s",
         )
     grid = np.arange(0.0, needed + 0.3, _STEP_S)
     poses = _resample(clock, T_world_body, np.minimum(grid, clock[-1]))
@@ -102,10 +101,9 @@ def _read(path: Path) -> tuple[Array, Array]:
     return (recorded.t_ns - recorded.t_ns[0]) * 1e-9, recorded.T_world_body
 
 
-def longest_flight_s(path: Path, rest_s: float = 3.0) -> float:
-    """Duration [s] of the longest flight that the trajectory allows, in tenths."""
-    length = float(_read(path)[0][-1])
-    return float(np.floor(10 * (length + rest_s + RAMP_S / 2)) / 10)
+def longest_flight_s(length_s: float, rest_s: float = 3.0) -> float:
+    """Duration [s] of the longest flight that a trajectory of a length in time allows, in tenths."""
+    return float(np.floor(10 * (length_s + rest_s + RAMP_S / 2)) / 10)
 
 
 def _about_z(angle_rad: float) -> Array:

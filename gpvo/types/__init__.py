@@ -1,0 +1,59 @@
+"""The nouns that travel between the stages: frozen, NumPy only, SI units.
+
+Frame of every motion, covariance, error and feature: the rectified left optical frame ``cam``
+(x right, y down, z forward). Tangent order: translation xyz [m], rotation xyz [rad], right perturbation.
+"""
+
+from gpvo.types.records import (
+    COUNT_FIELDS,
+    FLOAT_FIELDS,
+    IMPORTED,
+    IMPORTED_POSE,
+    IMU_FIELDS,
+    MotionError,
+    Prediction,
+    Status,
+    VoLog,
+    VoRecord,
+)
+from gpvo.types.sensors import (
+    STANDARD_GRAVITY_MPS2,
+    VEHICLES,
+    Array,
+    ImuLog,
+    ImuNoise,
+    Mounting,
+    StereoCamera,
+    StereoFrame,
+    StereoTracks,
+    TrackFrame,
+    TruthLog,
+    Vehicle,
+    field_names,
+)
+
+__all__ = [
+    "COUNT_FIELDS",
+    "FLOAT_FIELDS",
+    "IMPORTED",
+    "IMPORTED_POSE",
+    "IMU_FIELDS",
+    "STANDARD_GRAVITY_MPS2",
+    "VEHICLES",
+    "Array",
+    "ImuLog",
+    "ImuNoise",
+    "MotionError",
+    "Mounting",
+    "Prediction",
+    "Status",
+    "StereoCamera",
+    "StereoFrame",
+    "StereoTracks",
+    "TrackFrame",
+    "TruthLog",
+    "Vehicle",
+    "VoLog",
+    "VoRecord",
+    "field_names",
+]
