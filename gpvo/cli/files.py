@@ -61,7 +61,10 @@ def import_(
     frame: Annotated[str, typer.Option(help="Frame of the poses: cam (left optical frame) or body (FLU).")] = "cam",
     align: Annotated[
         str,
-        typer.Option(help="Fit a fixed transform between log and truth: rotation, transform (with lever arm) or none."),
+        typer.Option(
+            help="Fit a fixed transform between log and truth: rotation, transform (with lever arm, and the truth's "
+            "attitudes against its positions) or none."
+        ),
     ] = "none",
     time_offset: Annotated[str, typer.Option(help="Seconds to add to the stamps of the log, or auto.")] = "0",
     truth_sigma: Annotated[str | None, typer.Option(help="White noise of the truth per pose, METRES,RADIANS.")] = None,

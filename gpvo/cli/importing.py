@@ -11,7 +11,6 @@ from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import SourceError
-from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, to_records
 from gpvo.io.run import write_run
 from gpvo.io.trajectory import check_overlap
@@ -20,7 +19,8 @@ from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """What came of an import. ``rotation_deg``, ``lever_m``: the fitted fixed transform, None without one."""
+    """What came of an import. ``rotation_deg``, ``lever_m``: the fitted fixed transform, and ``worlds_deg`` the angle
+    between the worlds of the truth's attitudes and positions; None where it was not fitted."""
 
     frames: int
     methods: list[str]
@@ -28,6 +28,7 @@ class ImportSummary:
     time_offset_s: float
     rotation_deg: float | None
     lever_m: float | None
+    worlds_deg: float | None
     notes: list[str]
 
     def __str__(self) -> str:
@@ -36,6 +37,7 @@ class ImportSummary:
         parts += [f"stamps moved by {self.time_offset_s:+.4f} s"] if self.time_offset_s else []
         parts += [f"truth turned by {self.rotation_deg:.2f} deg"] if self.rotation_deg is not None else []
         parts += [f"moved by {1e3 * self.lever_m:.0f} mm"] if self.lever_m else []
+        parts += [f"its attitudes by {self.worlds_deg:.2f} deg against its positions"] if self.worlds_deg else []
         return "\n  ".join([", ".join(parts), *self.notes])
 
 
@@ -74,9 +76,10 @@ def import_log(
     if given is not None and truth is not None:
         check_overlap(given, log.t_ns, truth.path)
         if align != "none":
-            motions = windowed_motions(VoLog(records), given)
-            fixed = fit_fixed_transform(*motions, lever_arm=align == "transform")
-            given = replace(given, T_world_cam=given.T_world_cam @ se3.inverse(fixed.T_log_truth))
+            A, B, attitudes = windowed_motions(VoLog(records), given)
+            whole = align == "transform"
+            fixed = fit_fixed_transform(A, B, attitudes if whole else None, lever_arm=whole)
+            given = replace(given, T_world_cam=fixed.in_log_frame(given.T_world_cam))
     write_run(
         out,
         VoLog(records),
@@ -99,5 +102,6 @@ def import_log(
         time_offset_s=time_offset_s,
         rotation_deg=None if fixed is None else fixed.angle_deg,
         lever_m=None if fixed is None else fixed.lever_m,
+        worlds_deg=None if fixed is None else fixed.worlds_deg,
         notes=notes,
     )

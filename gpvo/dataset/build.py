@@ -200,8 +200,8 @@ def build_run(
 
 def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:
     """Truth turned by the fixed rotation between its camera and the log's, so that motions of a second agree best."""
-    motions = windowed_motions(flag_slips(log), truth)
-    fixed = fit_fixed_transform(*motions, lever_arm=False)
+    A, B, _ = windowed_motions(flag_slips(log), truth)
+    fixed = fit_fixed_transform(A, B, lever_arm=False)
     return replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))
 
 

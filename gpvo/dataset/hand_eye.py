@@ -3,11 +3,15 @@
 Both describe one rigid body, so their motions A (log) and B (truth) over the same times satisfy ``A X = X B`` with the
 unknown ``X = T_log_truth`` (Y. Shiu, S. Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
 transform equations of the form AX = XB", 1989).
+
+A truth may err by a constant itself: where its positions and its attitudes come from different instruments, as in
+motion capture, each may have a world of its own, turned against the other. No X mends that: the turns ask for one, the
+directions of travel for another. The rotation between the two worlds is then fitted as well.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,18 +24,25 @@ from gpvo.types import Array, TruthLog, VoLog
 WINDOW_S = 1.0
 # What a lever arm is believed to be before the motions speak: an axis about which nothing turns stays near zero.
 PRIOR_LEVER_M = 1.0
+# And by how much attitudes and positions of a truth are turned against each other.
+PRIOR_WORLDS_RAD = 0.03
 _MIN_MOTIONS = 10
 _ITERATIONS = 30
 
 
 @dataclass(frozen=True)
 class FixedTransform:
-    """``T_log_truth`` (4, 4) and the robust spread of what it leaves, per axis: ``residual_m``, ``residual_rad``."""
+    """``T_log_truth`` (4, 4) and the robust spread of what it leaves, per axis: ``residual_m``, ``residual_rad``.
+
+    ``R_position_attitude`` (3, 3): from the world of the truth's attitudes to that of its positions, the identity where
+    it was not fitted.
+    """
 
     T_log_truth: Array
     residual_m: float
     residual_rad: float
     motions: int
+    R_position_attitude: Array = field(default_factory=lambda: np.eye(3))
 
     @property
     def angle_deg(self) -> float:
@@ -43,9 +54,21 @@ class FixedTransform:
         """Distance of the two origins [m]."""
         return float(np.linalg.norm(self.T_log_truth[:3, 3]))
 
+    @property
+    def worlds_deg(self) -> float:
+        """Angle between the worlds of the truth's attitudes and positions [deg]."""
+        return float(np.rad2deg(np.linalg.norm(se3.so3_log(self.R_position_attitude))))
 
-def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) -> tuple[Array, Array]:
-    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of ``window_s``, by half-windows.
+    def in_log_frame(self, T_world_truth: Array) -> Array:
+        """Poses of the truth (N, 4, 4) as those of the log's frame, in the world of its positions."""
+        T = np.array(T_world_truth)
+        T[:, :3, :3] = self.R_position_attitude @ T[:, :3, :3]
+        return T @ se3.inverse(self.T_log_truth)
+
+
+def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) -> tuple[Array, Array, Array]:
+    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of ``window_s``, by half-windows; and the
+    truth's attitudes (M, 3, 3) at their ends.
 
     Windows that hold a lost frame or lack truth at an end are left out.
     """
@@ -59,15 +82,20 @@ def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) ->
     T_world, known = interpolate_truth(truth, t)
     keep = whole & known[start] & known[end]
     start, end = start[keep], end[keep]
-    return se3.inverse(T[start]) @ T[end], se3.inverse(T_world[start]) @ T_world[end]
+    motions = se3.inverse(T[start]) @ T[end], se3.inverse(T_world[start]) @ T_world[end]
+    return *motions, T_world[end, :3, :3]
 
 
-def fit_fixed_transform(A: Array, B: Array, *, lever_arm: bool = True) -> FixedTransform:
+def fit_fixed_transform(
+    A: Array, B: Array, attitudes: Array | None = None, *, lever_arm: bool = True
+) -> FixedTransform:
     """``X`` with ``A X ~ X B``, robust against slips of the log.
 
     Parameters
     ----------
     A, B : (M, 4, 4) motions of the log and of the truth over the same times.
+    attitudes : (M, 3, 3) of the truth at their ends, to fit the rotation between the worlds of its attitudes and of its
+        positions as well.
     lever_arm : estimate the translation as well; else both origins are taken as one.
 
     Raises
@@ -80,22 +108,22 @@ def fit_fixed_transform(A: Array, B: Array, *, lever_arm: bool = True) -> FixedT
             f"only {len(A)} windows of {WINDOW_S:g} s have truth at both ends and no lost frame, too few to align",
             cure="give a longer log, check the stamps, or leave --align out",
         )
-    X = _start(A, B)
-    free = 6 if lever_arm else 3
-    scale = np.array([1.0, 1.0])
+    X, R, scale = _start(A, B), np.eye(3), np.array([1.0, 1.0])
+    free = np.repeat([lever_arm, True, attitudes is not None], 3)
+    ends = B[:, :3, :3] if attitudes is None else attitudes
     for _ in range(_ITERATIONS):
-        r, J = _residuals(A, B, X)
+        r, J = _residuals(A, _in_one_world(B, ends, R), X)
+        J = np.concatenate([J, _by_worlds(B, ends, R)], axis=2)
         scale = np.array([_spread(r[:, :3]), _spread(r[:, 3:])])
-        H, g = _normal_equations(r, J, scale, X)
-        H, g = (H, g) if lever_arm else (H[3:, 3:], g[3:])
-        step = np.zeros(6)
-        step[6 - free :] = -np.linalg.solve(H, g)
-        X = X @ se3.exp(step)
+        H, g = _normal_equations(r, J, scale, X, R)
+        step = np.zeros(9)
+        step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+        X, R = X @ se3.exp(step[:6]), R @ se3.so3_exp(step[6:])
         if not lever_arm:
             X[:3, 3] = 0.0
         if np.abs(step).max() < 1e-10:
             break
-    return FixedTransform(se3.orthonormalise(X), float(scale[0]), float(scale[1]), len(A))
+    return FixedTransform(se3.orthonormalise(X), float(scale[0]), float(scale[1]), len(A), R)
 
 
 @dataclass(frozen=True)
@@ -114,7 +142,7 @@ MATTERS = -0.1
 
 def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
     """A fixed rotation between truth and odometry; None where none shows or it does not matter."""
-    A, B = windowed_motions(log, truth)
+    A, B, _ = windowed_motions(log, truth)
     half = len(A) // 2
     parts = slice(None, half), slice(half, None)
     try:
@@ -169,8 +197,30 @@ def _spread(r: Array) -> float:
     return max(1.4826 * float(np.median(np.abs(r))), 1e-9)
 
 
-def _normal_equations(r: Array, J: Array, scale: Array, X: Array) -> tuple[Array, Array]:
-    """Weighted by the spread of each kind, each motion by Cauchy's function, and the lever arm's prior."""
+def _in_one_world(B: Array, attitudes: Array, R: Array) -> Array:
+    """The truth's motions (M, 4, 4), its positions told in the world of its attitudes, which ``R`` takes to theirs."""
+    start = attitudes @ np.swapaxes(B[:, :3, :3], 1, 2)
+    out = B.copy()
+    out[:, :3, 3] = np.einsum("mji,kj,mkl,ml->mi", start, R, start, B[:, :3, 3], optimize=True)
+    return out
+
+
+def _by_worlds(B: Array, attitudes: Array, R: Array) -> Array:
+    """(M, 6, 3) derivative of the residuals by the right perturbation of R.
+
+    Over a window, positions move by p in the world of attitudes; ``R Exp(d)`` turns that to ``p + [p]x d``, and at the
+    window's end the residual is less by it.
+    """
+    start = attitudes @ np.swapaxes(B[:, :3, :3], 1, 2)
+    p = np.einsum("kj,mkl,ml->mj", R, start, B[:, :3, 3], optimize=True)
+    out = np.zeros((len(B), 6, 3))
+    out[:, :3] = -np.swapaxes(attitudes, 1, 2) @ se3.skew(p)
+    return out
+
+
+def _normal_equations(r: Array, J: Array, scale: Array, X: Array, R_worlds: Array) -> tuple[Array, Array]:
+    """Weighted by the spread of each kind, each motion by Cauchy's function; and the priors, of the lever arm and of
+    the rotation between the truth's worlds."""
     w = np.repeat(1.0 / scale**2, 3)
     q = (r**2 * w).sum(1) / 6.0
     weight = 1.0 / (1.0 + q / 4.0)
@@ -180,4 +230,6 @@ def _normal_equations(r: Array, J: Array, scale: Array, X: Array) -> tuple[Array
     R, t = X[:3, :3], X[:3, 3]
     H[:3, :3] += np.eye(3) / PRIOR_LEVER_M**2
     g[:3] += R.T @ t / PRIOR_LEVER_M**2
+    H[6:, 6:] += np.eye(3) / PRIOR_WORLDS_RAD**2
+    g[6:] += se3.so3_log(R_worlds) / PRIOR_WORLDS_RAD**2
     return H, g

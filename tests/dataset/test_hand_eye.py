@@ -77,9 +77,10 @@ def test_windows_skip_lost_frames_and_gaps():
     status = [Status.START, *[Status.OK] * (n - 1)]
     status[50] = Status.LOST
     records = [VoRecord(int(t[k]), int(t[max(k - 1, 0)]), status[k], motions[k]) for k in range(n)]
-    A, B = windowed_motions(VoLog(records), TruthLog(t, poses))
+    A, B, attitudes = windowed_motions(VoLog(records), TruthLog(t, poses))
     assert len(A) == 6
     np.testing.assert_allclose(A, B, atol=1e-9)
+    assert attitudes.shape == (6, 3, 3)
     late = TruthLog(t[40:], poses[40:])
     assert len(windowed_motions(VoLog(records), late)[0]) == 3
 
@@ -94,3 +95,40 @@ def test_what_cannot_be_aligned():
     straight = se3.exp(np.tile([0, 0, 1.0, 0, 0, 0], (30, 1)))
     with pytest.raises(GpvoError, match="turns as well"):
         fit_fixed_transform(straight, straight)
+
+
+def _flight(rng: np.random.Generator, n: int = 600) -> np.ndarray:
+    """Poses (n, 4, 4) of a flight that goes and turns all ways, ten a second."""
+    phase = np.linspace(0, 60, n)[:, None] * rng.uniform(0.3, 0.8, 6) + rng.uniform(0, 6, 6)
+    poses = se3.exp(np.concatenate([np.zeros((n, 3)), np.sin(phase[:, 3:]) * [0.2, 0.2, 2.5]], axis=1))
+    poses[:, :3, 3] = 2.0 * np.sin(phase[:, :3])
+    return poses
+
+
+def test_attitudes_in_another_world_than_the_positions():
+    rng = np.random.default_rng(5)
+    poses, t = _flight(rng), np.arange(600) * 100_000_000
+    motions = np.concatenate([np.eye(4)[None], se3.inverse(poses[:-1]) @ poses[1:]])
+    motions[1:] = motions[1:] @ se3.exp(1e-4 * rng.normal(size=(599, 6)))
+    records = [VoRecord(int(t[k]), int(t[max(k - 1, 0)]), Status.OK, motions[k]) for k in range(600)]
+    worlds = se3.so3_exp(np.deg2rad([0.2, -0.3, 5.0]))
+    told = poses @ X
+    told[:, :3, :3] = worlds.T @ told[:, :3, :3]
+    found = windowed_motions(VoLog(records), TruthLog(t, told))
+    fit = fit_fixed_transform(*found)
+    assert fit.worlds_deg == pytest.approx(5.01, abs=0.2)
+    np.testing.assert_allclose(fit.R_position_attitude, worlds, atol=3e-3)
+    np.testing.assert_allclose(fit.in_log_frame(told), poses, atol=2e-2)
+    rigid = fit_fixed_transform(*found[:2])
+    assert fit.residual_m < 0.2 * rigid.residual_m
+    np.testing.assert_array_equal(rigid.R_position_attitude, np.eye(3))
+
+
+def test_a_truth_of_one_world_is_left_in_one():
+    rng = np.random.default_rng(6)
+    poses, t = _flight(rng), np.arange(600) * 100_000_000
+    motions = np.concatenate([np.eye(4)[None], se3.inverse(poses[:-1]) @ poses[1:]])
+    motions[1:] = motions[1:] @ se3.exp(1e-4 * rng.normal(size=(599, 6)))
+    records = [VoRecord(int(t[k]), int(t[max(k - 1, 0)]), Status.OK, motions[k]) for k in range(600)]
+    fit = fit_fixed_transform(*windowed_motions(VoLog(records), TruthLog(t, poses @ X)))
+    assert fit.worlds_deg < 0.1
