@@ -44,7 +44,8 @@ class RunSummary:
     calibration: list[str] = field(default_factory=list)  # what it has wrong
 
     def __str__(self) -> str:
-        parts = ", ".join(f"{n} {s}" for s, n in self.status.items() if s != Status.START.value)
+        named = ((s.value, self.status.get(s.value, 0)) for s in Status if s is not Status.START)
+        parts = ", ".join(f"{n} {name}" for name, n in named if n)
         return f"{self.frames} frames ({parts}), {self.path_length_m:.1f} m, {self.frames_per_s:.0f} frames/s"
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.rest import wandering_waits
+from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.dataset.splits import leave_one_out
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
@@ -198,8 +198,11 @@ def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str
     log, name = evaluation.run.log, f"{name}.txt"
     truth, known = folder / "truth" / name, evaluation.covered
     if waits == "drop" and evaluation.unscored and evaluation.run.truth is not None:
-        for first, last in wandering_waits(log, evaluation.run.truth):
+        waiting = wandering_waits(log, evaluation.run.truth)
+        for first, last in waiting:
             known = known & ~((log.t_ns > first) & (log.t_ns < last))
+        # A motion over the whole wait still has truth at both ends.
+        known = known & ~(in_waits(log.records, waiting) & known[log.parent])
     truth.parent.mkdir(parents=True, exist_ok=True)
     write_tum(truth, log.t_ns[known], evaluation.T_true[known])
     written = [truth]

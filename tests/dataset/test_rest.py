@@ -11,6 +11,7 @@ from gpvo.evaluation.evaluate import EvaluateOptions, document, evaluate_run
 from gpvo.evaluation.score import score_sequence, write_statements
 from gpvo.io import open_source
 from gpvo.io.run import read_run
+from gpvo.io.trajectory import read_tum
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import fit_model
 from gpvo.learning.train import estimate_set
@@ -135,6 +136,20 @@ def test_consistency_is_not_judged_by_such_a_truth_but_the_path_is(tmp_path):
     write_statements(evaluations[1], tmp_path / "stated", "flight")
     of_files = score_sequence(*(tmp_path / "stated" / of / "flight.txt" for of in ("triangulation", "truth")))
     assert of_files.nees_dof == pytest.approx(nees[1], rel=1e-3)
+
+
+def test_a_motion_over_the_whole_wait_is_not_scored_by_its_file_either(tmp_path):
+    source = open_source(simulate_points("tunnel-clean", 3, duration_s=8.0).save(tmp_path / "flight.npz"))
+    run(source, tmp_path / "run")
+    flown = read_run(tmp_path / "run")
+    truth = wandering(flown.truth, 0.2, 0.3, AT_REST_S)
+    ((first, last),) = wandering_waits(flown.log, truth)
+    records = [replace(r, t_prev_ns=int(first)) if r.t_ns == last else r for r in flown.log.records]
+    evaluation = evaluate_run(replace(flown, log=replace(flown.log, records=records), truth=truth))
+    write_statements(evaluation, tmp_path / "stated", "flight")
+    T_true = read_tum(tmp_path / "stated" / "truth" / "flight.txt")
+    assert first in T_true.t_ns
+    assert last not in T_true.t_ns
 
 
 @pytest.mark.slow
