@@ -18,7 +18,9 @@ html_theme_options = {
     "page_width": "1080px",
     "sidebar_width": "240px",
 }
+html_static_path = ["_static"]  # custom.css
 html_copy_source = False
+html_show_copyright = False
 autodoc_default_options = {"members": True, "member-order": "bysource", "undoc-members": False}
 autodoc_typehints = "signature"
 autodoc_class_signature = "mixed"
