@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,18 +90,21 @@ def run(
     odometry = StereoOdometry(source.camera, config, source.mask, calibration_state)
     of_model = "" if predictor is None else predictor.digest
     key = None if resume is None else digest_of(resume, of_model, keep_tracks, odometry, *_content(source))
-    with RunWriter(
-        out,
-        overwrite=overwrite,
-        camera=source.camera,
-        mounting=source.mounting,
-        truth=source.truth,
-        imu=source.imu,
-        config=asdict(config),
-        meta=known,
-        calibration=source.calibration,
-        resume=key,
-    ) as writer:
+    with (
+        RunWriter(
+            out,
+            overwrite=overwrite,
+            camera=source.camera,
+            mounting=source.mounting,
+            truth=source.truth,
+            imu=source.imu,
+            config=asdict(config),
+            meta=known,
+            calibration=source.calibration,
+            resume=key,
+        ) as writer,
+        _gone_on_with(writer),
+    ):
         done = [] if writer.kept is None else writer.kept.records
         if writer.kept is not None:
             odometry, recorder = writer.kept.state
@@ -123,6 +127,19 @@ def run(
         summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report), wrong)
         writer.note(source_report=source.report.as_dict(), summary=asdict(summary))
     return summary
+
+
+@contextmanager
+def _gone_on_with(writer: RunWriter) -> Iterator[None]:
+    """What fails after the state of an interrupted run was taken up may be that state's fault: it is a file as any."""
+    try:
+        yield
+    except Exception as error:
+        if writer.kept is None or isinstance(error, (GpvoError, OSError)):
+            raise
+        reason = f"{type(error).__name__}: {error}"
+        cure = "remove the folder to start afresh"
+        raise SourceError(f"cannot be gone on with: {reason}", where=writer.path, cure=cure) from error
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from gpvo.types import Array
 
 # Below this angle the closed forms lose more digits to cancellation than the series drop.
 _SMALL_ANGLE_RAD = 1e-4
+_NOT_RIGID = 1e-3
 
 
 def skew(v: Array) -> Array:
@@ -225,6 +226,21 @@ def interpolate(T_a: Array, T_b: Array, fraction: Array) -> Array:
     R = R_a @ so3_exp(fraction[..., None] * phi)
     t = T_a[..., :3, 3] + fraction[..., None] * (T_b[..., :3, 3] - T_a[..., :3, 3])
     return from_rt(R, t)
+
+
+def is_rigid(T: Array, farthest_m: float) -> bool:
+    """Whether one matrix (4, 4) is finite, a rotation to a thousandth, and no translation longer than that."""
+    rows = T.tolist()
+    # Comparisons with NaN are false.
+    if not all(-farthest_m < value < farthest_m for row in rows for value in row):
+        return False
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = rows
+    # R^T R less the identity.
+    deviation = (
+        a * a + d * d + g * g - 1.0, b * b + e * e + h * h - 1.0, c * c + f * f + i * i - 1.0,
+        a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i,
+    )  # fmt: skip
+    return all(-_NOT_RIGID < value < _NOT_RIGID for value in deviation)
 
 
 def orthonormalise(T: Array) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import covariance as transport
+from gpvo.geometry import se3
 from gpvo.online.features import FeatureStream
 from gpvo.online.slip import SlipDetector
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, IMU_FIELDS, Array, Status, StereoCamera, Vehicle, VoRecord
@@ -24,7 +25,6 @@ LONGEST_STEP_S = 60.0
 """A record that comes later than this after the one before is believed when the next one confirms its clock."""
 _LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 _FARTHEST_M = 1e5  # No motion between two frames is longer.
-_NOT_RIGID = 1e-3  # Deviation of R^T R from the identity.
 _EYE = np.eye(4)
 _EYE.setflags(write=False)
 T = TypeVar("T")
@@ -94,7 +94,7 @@ class Intake:
     def step(self, record: VoRecord) -> VoRecord:
         """The record, ``lost`` with the reason where it cannot be. Call once per record."""
         problem = self._clock(record)
-        if not _is_motion(record.T_prev_cur):
+        if record.T_prev_cur.shape != (4, 4) or not se3.is_rigid(record.T_prev_cur, _FARTHEST_M):
             record = replace(record, T_prev_cur=_EYE)
             problem = problem or "the motion is not finite and rigid"
         return record.with_status(Status.LOST, problem) if problem else record
@@ -118,22 +118,6 @@ class Intake:
 def follows(before_ns: int, t_ns: int) -> bool:
     """Whether a stamp comes after the one before, and not too long after."""
     return 0 < t_ns - before_ns <= _LONGEST_STEP_NS
-
-
-def _is_motion(T: Array) -> bool:
-    """Whether T is a rigid transform (4, 4) of a credible length."""
-    if T.shape != (4, 4):
-        return False
-    rows = T.tolist()
-    # Comparisons with NaN are false.
-    if not all(-_FARTHEST_M < value < _FARTHEST_M for row in rows for value in row):
-        return False
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = rows
-    from_rigid = (
-        a * a + d * d + g * g - 1.0, b * b + e * e + h * h - 1.0, c * c + f * f + i * i - 1.0,
-        a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i,
-    )  # fmt: skip
-    return all(-_NOT_RIGID < value < _NOT_RIGID for value in from_rigid)
 
 
 class Window:

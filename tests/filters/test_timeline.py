@@ -65,6 +65,21 @@ def test_out_of_order_records_end_in_the_same_state(flight: Flight, swap: tuple[
     assert shuffled.counts["reordered"] == 1
 
 
+def test_a_record_far_ahead_is_left_out_until_the_next_agrees(flight: Flight) -> None:
+    """Used, it would be taken back by every later one, and the time up to it gone through anew."""
+    usual, hurt = _timeline(flight), _timeline(flight)
+    for timeline in (usual, hurt):
+        _feed_imu(timeline, flight)
+        _feed(timeline, flight, list(range(40)))
+    ahead = replace(flight.records[40], t_ns=flight.records[40].t_ns + 10**12)
+    assert hurt.add_vo(ahead) == []
+    for timeline in (usual, hurt):
+        _feed(timeline, flight, list(range(40, 60)))
+    _same(usual.filter, hurt.filter)
+    assert hurt.counts["stamp_ahead"] == 1
+    assert hurt.counts["reordered"] == 0
+
+
 def test_repeated_and_too_late_records_are_counted_and_change_nothing(flight: Flight) -> None:
     timeline = _timeline(flight, history_s=1.0)
     _feed_imu(timeline, flight)

@@ -16,11 +16,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace as Named
 from typing import Any
 
 import numpy as np
 from gpvo.types import StereoCamera
-from mutators import ANY_BYTES, Rng, odd_model, odd_table, odd_tracks
+from mutators import ANY_BYTES, Rng, odd_kept, odd_model, odd_table, odd_tracks
 
 SECONDS, MEGABYTES = 10, 1000
 
@@ -162,10 +163,35 @@ def read_stated_motions(path: Path) -> None:
 
 
 def read_live_state(path: Path) -> None:
+    """A live session that goes on from it, with three poses of somebody's odometry."""
+    from gpvo.geometry.covariance import is_positive_definite
     from gpvo.live.engine import Engine, EngineSettings
+    from gpvo.live.intake import Arrival
     from gpvo.live.stages import PoseStage
 
-    Engine(PoseStage("/odom"), flying_model(), [], EngineSettings(state=path))
+    live = Engine(PoseStage("/odom"), flying_model(), [], EngineSettings(state=path))
+    for k in range(3):
+        for said in live.take(Arrival("/odom", _pose_message(k), k * 10**8)):
+            assert np.isfinite(said.T_odom_body).all(), "a pose that is none"
+            assert is_positive_definite(said.pose_covariance), "a covariance that is none"
+    assert not live.counts["failed"], "a state that cannot be gone on with"
+
+
+def _pose_message(k: int) -> Any:
+    position, stamp = Named(x=0.1 * k, y=0.0, z=0.0), Named(sec=1_700_000_000, nanosec=k * 10**8)
+    pose = Named(position=position, orientation=Named(x=0.0, y=0.0, z=0.0, w=1.0))
+    header, covariance = Named(stamp=stamp, frame_id="odom"), np.eye(6).ravel() * 1e-4 * (k + 1)
+    return Named(header=header, child_frame_id="base_link", pose=Named(pose=pose, covariance=covariance))
+
+
+def read_broken_run(path: Path) -> None:
+    """A run that broke off, gone on with from the state of its last chunk."""
+    from gpvo import runner
+    from gpvo.io import open_source
+    from gpvo.io.run import read_run
+
+    runner.run(open_source(path / "source.npz"), path / "run", keep_tracks=True, overwrite=False, resume="")
+    assert np.isfinite(read_run(path / "run").log.trajectory()).all(), "a trajectory that is none"
 
 
 READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Rng], None] | None]] = {
@@ -186,6 +212,7 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Rng], None] | N
     "options": (read_options, None),
     "stated": (read_stated_motions, None),
     "live state": (read_live_state, None),
+    "broken run": (read_broken_run, odd_kept),
 }
 
 

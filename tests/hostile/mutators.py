@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,6 +93,36 @@ def odd_tracks(path: Path, rng: Rng) -> None:
     name = sorted(data)[int(rng.integers(len(data)))]
     data[name] = odd_array(data[name], rng)
     np.savez_compressed(path, **data)
+
+
+def odd_kept(path: Path, rng: Rng) -> None:
+    """A file of a run that broke off: its tables, its source, or the state of what made it."""
+    if path.suffix == ".parquet":
+        odd_table(path, rng)
+    elif path.name != "state.npz":
+        odd_tracks(path, rng)
+    else:
+        with np.load(path) as file:
+            tree, data = json.loads(file["tree"].tobytes()), odd_array(file["data"], rng)
+        if rng.random() < 0.8:
+            with np.load(path) as file:
+                data = file["data"]
+            odd_tree(tree["state"], rng)
+        np.savez(path, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), data=data)
+
+
+def odd_tree(tree: Any, rng: Rng) -> None:
+    """One node of a document becomes another of its nodes, or a value that cannot be."""
+    places: list[tuple[Any, Any]] = []
+    left = [tree]
+    while left:
+        node = left.pop()
+        keys = node.keys() if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+        places += [(node, key) for key in keys]
+        left += [node[key] for key in keys]
+    (holder, key), (other, at) = (places[int(k)] for k in rng.integers(0, len(places), 2))
+    odd = (None, -1, 0, [], {}, "x", [1.0], 1e300, True, 2**40, float("nan"))
+    holder[key] = copy.deepcopy(other[at]) if rng.random() < 0.4 else odd[int(rng.integers(len(odd)))]
 
 
 def odd_model(path: Path, rng: Rng) -> None:

@@ -6,6 +6,7 @@ import json
 import resource
 import struct
 import time
+import tracemalloc
 import zipfile
 import zlib
 from pathlib import Path
@@ -39,13 +40,14 @@ def _peak_mb() -> float:
     "a: &a [1,1,1,1,1,1,1,1,1,1]\n"
     + "".join(f"{y}: &{y} [{','.join(['*' + x] * 10)}]\n" for x, y in zip("abcdefgh", "bcdefghi")) + "T: *i\n",
     "".join(f"k{i}: 1\n" for i in range(350_000)),
-    "resolution: [.inf, 480]\n", "image_width: null\nimage_height: 3\nR: 1\n", f"T: [{'9' * 400}, 0, 0]\n",
+    "resolution: [.inf, 480]\n", "image_width: null\nimage_height: 3\n", f"T: [{'9' * 400}, 0, 0]\n",
     "x: " + "[" * 5000,
 ], ids=["aliases", "many keys", "infinite", "null", "400 digits", "deep"])  # fmt: skip
 def test_yaml_bombs_are_refused_at_once(text: str, tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
     rest = "R: [1,0,0,0,1,0,0,0,1]\nK1: [300,0,1,0,300,1,0,0,1]\nK2: [300,0,1,0,300,1,0,0,1]\nD1: [0,0,0,0,0]\n"
-    path.write_text(text if "image_width" not in text and "T:" not in text else text + rest)
+    rest += "D2: [0,0,0,0,0]\n" + ("" if "T: [9" in text else "T: [-0.1,0,0]\n")
+    path.write_text(text + rest if any(key in text for key in ("image_width", "resolution", "T: [9")) else text)
     start = time.monotonic()
     with pytest.raises(CalibrationError, match=r"camchain\.yaml") as refusal:
         read_stereo_yaml(path)
@@ -144,10 +146,12 @@ def test_an_array_that_nobody_needs_is_not_unpacked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("changed", [
-    {"uv_left": np.zeros((20_000_000, 2))}, {"width": np.array([640, 480])}, {"width": np.nan}, {"height": "480"},
+    {"width": np.array([640, 480])}, {"width": np.nan}, {"height": "480"},
     {"sigma_translation_m": "much", "sigma_rotation_rad": 0.1}, {"t_s": np.arange(3) + 1e12}, {"t_s": np.zeros(0)},
     {"track": np.full(12, 1e300)}, {"uv_left": np.full((12, 2), 1e200)}, {"fx": "x"}, {"baseline_m": -0.1},
     {"imu_t_ns": np.full(3, 2**63, np.uint64), "imu_gyro_radps": np.zeros((3, 3)), "imu_acc_mps2": np.zeros((3, 3))},
+    {"imu_t_ns": np.array(["x"] * 3), "imu_gyro_radps": np.zeros((3, 3)), "imu_acc_mps2": np.zeros((3, 3))},
+    {"frame": np.zeros(0), "track": np.zeros(0), "uv_left": np.zeros((0, 2)), "uv_right": np.zeros((0, 2))},
 ], ids=str)  # fmt: skip
 def test_tracks_that_cannot_be_are_refused(changed: dict, tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     with pytest.raises(GpvoError, match=r"t\.npz: ") as refusal:
@@ -170,8 +174,14 @@ def test_damaged_array_headers_are_refused(head: bytes, tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in parts.items():
             archive.writestr(name, data)
-    with pytest.raises(SourceError, match=r"t\.npz: not readable"):
+    with pytest.raises(SourceError, match=r"t\.npz: not readable") as refusal:
         TracksSource(path)
+    assert ("does not fit its" in str(refusal.value)) == (b"(1000000000000,)" in head or b"'|O'" in head)
+
+
+def test_an_array_that_is_needed_is_not_unpacked_beyond_all_tracks(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"t\.npz: unpacks to more than tracks do"):
+        TracksSource(_tracks(tmp_path / "t.npz", uv_left=np.zeros((4_000_000, 2))))
 
 
 def test_a_table_of_run_lengths_is_refused(tmp_path: Path) -> None:
@@ -192,8 +202,12 @@ def test_a_line_without_end_is_not_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_text("1 " * 5_000_000)
     for kind in (None, "tum", "csv"):
+        tracemalloc.start()
         with pytest.raises(SourceError, match=r"log\.txt: line 1 is longer than a million"):
             read_foreign(path, kind)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 8_000_000
 
 
 @pytest.mark.parametrize("rate_hz", [1e-300, 1e300, -1.0, 0.0, float("nan"), float("inf")])

@@ -32,7 +32,7 @@ FINDINGS = {
         " an_image_that_claims_a_quarter_of_a_gigapixel_is_not_decoded,"
         " a_chunk_that_claims_gigabytes_is_not_made_room_for,"
         " a_sequence_of_such_images_is_refused_by_its_calibration, an_array_that_nobody_needs_is_not_unpacked,"
-        " a_table_of_run_lengths_is_refused",
+        " an_array_that_is_needed_is_not_unpacked_beyond_all_tracks, a_table_of_run_lengths_is_refused",
     ),
     "5 faults of the IMU": (
         "test_imu_faults: a_momentary_fault_costs_little, the_filter_stays_consistent_after_a_fault,"
@@ -48,7 +48,9 @@ FINDINGS = {
     ),
     "8 terminal escapes": (
         "test_runs: nothing_of_a_file_reaches_the_terminal_as_a_command,"
-        " names_inside_a_bag_reach_neither_terminal_nor_run_raw, a_file_named_to_fool_the_terminal_is_refused",
+        " names_inside_a_bag_reach_neither_terminal_nor_run_raw,"
+        " a_warning_reaches_the_terminal_as_text, a_file_named_to_fool_the_terminal_is_refused",
+        "test_model_files: no_text_of_a_model_is_obeyed_by_a_terminal",
     ),
     "9 a finished run is lost": (
         "test_runs: a_finished_run_stays_until_the_new_one_is_whole, what_a_broken_run_left_is_replaced_without_asking,"
@@ -66,10 +68,15 @@ FINDINGS = {
         "test_runs: a_full_disk_names_the_file_and_leaves_nothing_half_written, two_writers_do_not_mix",
         "test_imu_faults: a_flight_that_goes_nowhere_has_no_drift_per_distance,"
         " a_record_far_ahead_is_left_out_and_the_next_is_used",
+        "../filters/test_timeline: a_record_far_ahead_is_left_out_until_the_next_agrees",
         "test_records: a_camera_that_cannot_be_is_refused, another_camera_than_that_of_training_is_told,"
         " a_picture_that_is_none_of_the_camera_is_refused_by_its_shape",
     ),
     "a killed run begins anew": ("../kills/test_resume: the_same_bytes_after_breaking_off_twice",),
+    "what is kept of a run or a session": (
+        "../kills/test_resume: a_state_that_cannot_be_is_refused_in_one_line",
+        "../live/test_engine: a_state_that_cannot_be_is_refused_in_one_line",
+    ),
 }
 
 

@@ -46,6 +46,16 @@ def test_no_text_of_a_model_becomes_c_code(parts, tmp_path: Path) -> None:
     assert subprocess.run([tmp_path / "main"]).returncode == 0
 
 
+def test_no_text_of_a_model_is_obeyed_by_a_terminal(parts, tmp_path: Path) -> None:
+    arrays, header = parts
+    header["versions"] = {"gpvo\x1b[2J": "1\x1b]0;owned\x07"}
+    header["sequences"] = [{"name": "a\x1bb"}]
+    modelfile.save(tmp_path / "evil.gpvo", arrays, header)
+    loaded = modelfile.load(tmp_path / "evil.gpvo")[1]
+    assert "\\x1b" not in repr(loaded)
+    assert "gpvo?[2J" in loaded["versions"]
+
+
 @pytest.mark.parametrize("prefix", ["int", "while", "class", "_x", "9a", "a-b", "a b", "é", "", 'x"', "a\n#define b"])
 def test_a_prefix_is_a_c_identifier_and_no_keyword(prefix: str, tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="no C identifier"):

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from gpvo import runner
 from gpvo.cli import app
 from gpvo.io import open_source
 from gpvo.io.jsonfile import write_json
-from gpvo.io.run import write_run
+from gpvo.io.run import RunWriter, write_run
 from gpvo.io.stated import write_stated
 from gpvo.io.trajectory import write_tum
 from gpvo.online.predictor import Predictor
@@ -90,9 +91,26 @@ def _newer(root: Path, log: VoLog, truth: TruthLog) -> None:
     covariance = np.array([r.covariances.get("pointing_matching", np.full((6, 6), np.nan)) for r in log])
     write_stated(stated / "stated.txt", log, log.trajectory(), covariance)
     write_tum(stated / "truth.txt", truth.t_ns, truth.T_world_cam)
-    write_json(
-        root / "live state" / "state.json", {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6)}
-    )
+    state = {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6), "scale": np.ones(6)}
+    write_json(root / "live state" / "state.json", state)
+    _broken(root / "broken run" / "folder")
+
+
+def _broken(path: Path) -> None:
+    """A run that broke off at the eleventh of its frames, in the third chunk."""
+    path.mkdir()
+    source = simulate_points("tunnel-bursts", 1, duration_s=1.2, rate_hz=10.0).save(path / "source.npz")
+    left = iter(range(11))
+
+    def stop(*_: object) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(open_source(source), path / "run", on_frame=stop, keep_tracks=True, resume="")
+    assert (path / "run" / "chunks" / "state.npz").is_file()
 
 
 def _euroc(path: Path, picture: np.ndarray) -> None:
@@ -138,9 +156,10 @@ def fly(seeds: Path, first: int, end: int, workers: int = 2) -> None:
         assert not out, out[:4000]
 
 
-def test_every_seed_is_read_as_it_is(seeds: Path) -> None:
+def test_every_seed_is_read_as_it_is(seeds: Path, tmp_path: Path) -> None:
+    copied = shutil.copytree(seeds, tmp_path / "seeds")
     for kind, (read, _) in READERS.items():
-        for path in (seeds / kind).iterdir():
+        for path in (copied / kind).iterdir():
             read(path)
 
 

@@ -158,6 +158,7 @@ def test_nothing_of_a_file_reaches_the_terminal_as_a_command(log: VoLog, tmp_pat
     name = f"a{ESC}b"
     (tmp_path / "est.csv").write_text(f"t_s,p_x,p_y,p_z,q_x,q_y,q_z,q_w,{ESC}\n0,0,0,0,0,0,0,1,0\n1,0,0,0,0,0,0,1,0\n")
     write_run(tmp_path / "run", log, meta={"name": name, "source": name})
+    assert read_run(tmp_path / "run").name.isprintable()
     for words in (("info", "run"), ("info", "est.csv"), ("evaluate", "run"), ("info", f"no{ESC}such")):
         done = gpvo(*words, cwd=tmp_path)
         assert "\x1b" not in done.stdout + done.stderr, words
@@ -172,12 +173,23 @@ def test_names_inside_a_bag_reach_neither_terminal_nor_run_raw(tmp_path: Path) -
         T = np.eye(4)
         T[0, 3] = k
         maker.odometry(f"/odom{ESC}", 10**18 + k * 10**8, T, np.eye(6), np.eye(6))
+        maker.messages[-1][2].header.frame_id = f"base{ESC}"
+        maker.messages[-1][2].child_frame_id = f"base{ESC}"
     maker.write(tmp_path / "evil.bag")
     for words in (("info", "evil.bag"), ("doctor", "evil.bag"), ("run", "evil.bag", "-o", "run")):
         done = gpvo(*words, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         assert "odom" in done.stdout + done.stderr
         assert "\x1b" not in done.stdout + done.stderr, words
+
+
+def test_a_warning_reaches_the_terminal_as_text() -> None:
+    code = (
+        "import contextlib, sys, warnings\nfrom gpvo.cli import main\nsys.argv = ['gpvo', 'info', 'none']\n"
+        "with contextlib.suppress(SystemExit):\n    main()\nwarnings.warn('odd\\x1b[2J')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert "gpvo: odd?[2J" in done.stderr
 
 
 def test_a_file_named_to_fool_the_terminal_is_refused(tmp_path: Path) -> None:

@@ -154,3 +154,24 @@ def test_a_source_that_changed_is_told(tmp_path: Path, monkeypatch: pytest.Monke
     shifted = [type(r)(r.t_ns + 1, r.t_prev_ns + 1, r.status, r.T_prev_cur) for r in done]
     with pytest.raises(SourceError, match="not the source of the interrupted run"):
         list(runner.steps(source, runner.VoConfig(), done=shifted))
+
+
+def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
+    path, state = tracks(tmp_path), tmp_path / "run" / "chunks" / "state.npz"
+    left = iter(range(13))
+
+    def stop(*_: object) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(open_source(path), tmp_path / "run", on_frame=stop, resume="")
+    with np.load(state) as file:
+        tree, data = json.loads(file["tree"].tobytes()), file["data"]
+    _, made_by = tree["state"]["tuple"]
+    made_by["tuple"][0]["fields"]["_state"]["fields"]["t_last_ns"] = "x"
+    np.savez(state, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), data=data)
+    with pytest.raises(SourceError, match=r"run: cannot be gone on with: [A-Z]") as refusal:
+        runner.run(open_source(path), tmp_path / "run", resume="")
+    assert "\n" not in str(refusal.value)

@@ -12,6 +12,7 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign, to_records
+from gpvo.io.jsonfile import write_json
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
@@ -97,6 +98,19 @@ def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
     (tmp_path / "state.json").write_text("[]")
     with pytest.raises(GpvoError, match="not a state file of gpvo live"):
         engine(settings)
+
+
+@pytest.mark.parametrize("changed", [
+    {"T_odom_body": 2.0 * np.eye(4)}, {"T_odom_body": np.diag([1.0, 1.0, 1.0, np.nan])},
+    {"pose_covariance": -np.eye(6)}, {"pose_covariance": np.eye(6) + 2.0 * np.eye(6)[::-1]},
+    {"pose_covariance": np.full((6, 6), 1e300)}, {"scale": np.zeros(6)}, {"scale": "x"},
+], ids=str)  # fmt: skip
+def test_a_state_that_cannot_be_is_refused_in_one_line(changed: dict, tmp_path: Path) -> None:
+    good = {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6), "scale": np.ones(6)}
+    write_json(tmp_path / "state.json", {**good, **changed})
+    with pytest.raises(GpvoError, match=r"state\.json: is not a state file of gpvo live") as refusal:
+        engine(EngineSettings(state=tmp_path / "state.json"))
+    assert "\n" not in str(refusal.value)
 
 
 def test_a_model_of_another_camera_is_called_out_at_once_and_every_ten_seconds() -> None:
