@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpvo.cli.output import Json, one_of, print_json
+from gpvo.cli.output import Json, one_of, print_json, say
 
 if TYPE_CHECKING:
     from gpvo.filters.study import Comparison
@@ -79,10 +79,12 @@ def fuse(
     print(table(report.study))
     if LEARNED in report.study.scores:
         print()
-        for other in (p for p in report.study.scores if p != LEARNED):
-            compared = report.study.compare(LEARNED, other)
-            if compared.gain_percent == compared.gain_percent:
-                print(_line(compared))
+        against = [report.study.compare(LEARNED, p) for p in report.study.scores if p != LEARNED]
+        known = [compared for compared in against if compared.gain_percent == compared.gain_percent]
+        for compared in known:
+            say(_line(compared))
+        if not all(_has_interval(compared) for compared in known):
+            say("Fewer than three runs give no interval.")
 
 
 def publish(
@@ -133,16 +135,20 @@ def publish(
     if json_:
         print_json(result.document())
     else:
-        print(result)
+        for line in str(result).splitlines():
+            say(line)
+
+
+def _has_interval(compared: Comparison) -> bool:
+    return compared.difference_m.high < float("inf")
 
 
 def _line(compared: Comparison) -> str:
     """A comparison in words; over fewer than three runs it has no interval."""
-    difference = compared.difference_m
-    if difference.high < float("inf"):
+    if _has_interval(compared):
         return str(compared)
-    change = f"ATE {difference.mean:+.4f} m, gain {compared.gain_percent:.1f} %"
-    return f"{compared.policy} less {compared.against}: {change} (too few runs for an interval)"
+    change = f"ATE {compared.difference_m.mean:+.4f} m, gain {compared.gain_percent:.1f} %"
+    return f"{compared.policy} less {compared.against}: {change}"
 
 
 def _teller() -> Callable[[str], None] | None:

@@ -199,7 +199,7 @@ def fuse_runs(
         name: tuple(score or unscored.get((flight.name, name)) for flight, score in zip(flights, row, strict=True))
         for name, row in result.scores.items()
     }
-    failed = [f"{name}: {_why_not(name, constants)}" for name, row in rows.items() if not any(row)]
+    failed = [f"{name} is left out: {_why_not(name, constants)}" for name, row in rows.items() if not any(row)]
     if len(failed) == len(rows):
         raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
     return FusionReport(replace(result, scores=rows), tuple(traces), tuple(warnings + failed))

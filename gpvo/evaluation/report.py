@@ -18,7 +18,7 @@ from gpvo.evaluation.matches import MatchPicture
 from gpvo.evaluation.panels import spread
 from gpvo.evaluation.statements import statements
 from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors
-from gpvo.evaluation.verdict import TRUE
+from gpvo.evaluation.verdict import HONEST
 from gpvo.geometry import se3
 from gpvo.io.atomic import write_text
 from gpvo.io.run import Run
@@ -91,7 +91,7 @@ def scene(e: Evaluation) -> dict[str, Any]:
 
 
 def _worded(found: dict[str, Any], judged: bool) -> dict[str, Any]:
-    words = {"green": "true", "amber": "partly true", "red": "not true"}
+    words = {"green": "honest", "amber": "partly honest", "red": "not honest"}
     told = (word for word in ("overconfident", "too cautious") if word in found["headline"])
     return {**found, "word": next(told, words[found["colour"]]) if judged else "not judged"}
 
@@ -128,7 +128,7 @@ def _tone(nees: float | None) -> str:
     """Colour of a NEES per degree of freedom, as in the verdict."""
     if nees is None or not np.isfinite(nees):
         return ""
-    return "red" if nees > TRUE[1] else "amber" if nees < TRUE[0] else "green"
+    return "red" if nees > HONEST[1] else "amber" if nees < HONEST[0] else "green"
 
 
 def _number(value: float | None) -> str:

@@ -1,4 +1,4 @@
-"""What an evaluation comes to, in words: which stated covariance is true, over which distances, and what to do."""
+"""What an evaluation comes to, in words: which stated covariance is honest, over which distances, and what to do."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gpvo.types import Array
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import Evaluation
 
-TRUE = (0.5, 2.0)
-"""NEES per degree of freedom that counts as true: sigma right within a factor of 1.4."""
+HONEST = (0.5, 2.0)
+"""NEES per degree of freedom that counts as honest: sigma right within a factor of 1.4."""
 _FEW_WINDOWS = 5
 
 Colour = Literal["green", "amber", "red"]
@@ -35,7 +35,7 @@ def verdict(e: Evaluation) -> Verdict:
     judged = {m: c for m, c in e.consistency.items() if c.nll_per_dim is not None}
     if not judged and e.poses is not None:
         joint = e.poses.nees_dof["joint"].mean
-        colour: Colour = "green" if _word(joint) == "true" else "red" if joint > TRUE[1] else "amber"
+        colour: Colour = "green" if _word(joint) == "honest" else "red" if joint > HONEST[1] else "amber"
         line = f"NEES/dof {joint:.3g} over {e.poses.count} poses, median {e.poses.nees_dof_median['joint']:.3g}."
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
     if not e.covered.any():
@@ -54,14 +54,14 @@ def verdict(e: Evaluation) -> Verdict:
     shown = dict.fromkeys((told, best, *(m for m in judged if m in _ALWAYS)))
     lines = [*_conditions(e), *(_line(m, judged[m]) for m in shown)]
     if not wrong and not outside:
-        return Verdict("green", f"The {told} covariance is true here, per motion and over distance.", tuple(lines))
+        return Verdict("green", f"The {told} covariance is honest here, per motion and over distance.", tuple(lines))
     if told != best and not _wrong(judged[best]):
-        lines.append(f"Use {best} here: it is true, and its likelihood is the best of all.")
+        lines.append(f"Use {best} here: it is honest, and its likelihood is the best of all.")
     if outside:
         lines.append("Train on runs of this camera and these conditions, with truth or with twins.")
     per_motion = _word(_nees(judged[told]))
     headline = f"The {told} covariance is {per_motion} per motion"
-    if wrong and per_motion == "true":
+    if wrong and per_motion == "honest":
         headline += f", but not over {' and '.join(wrong)}"
     if outside:
         headline += "; the model does not know these conditions"
@@ -77,10 +77,10 @@ def _nees(c: Consistency) -> float:
 
 
 def _word(nees: float, chance: float = 0.0) -> str:
-    """``chance``: relative standard deviation that the mean of so few windows has even where the statement is true."""
-    if nees > TRUE[1] * (1 + 2 * chance):
+    """``chance``: relative standard deviation that the mean of so few windows has even where the statement is honest."""
+    if nees > HONEST[1] * (1 + 2 * chance):
         return "overconfident"
-    return "too cautious" if nees < TRUE[0] * (1 - 2 * chance) else "true"
+    return "too cautious" if nees < HONEST[0] * (1 - 2 * chance) else "honest"
 
 
 def _spans(c: Consistency) -> Iterator[tuple[str, Horizon]]:
@@ -92,18 +92,18 @@ def _spans(c: Consistency) -> Iterator[tuple[str, Horizon]]:
 
 def _wrong(c: Consistency) -> list[str]:
     """Over what the statement is wrong, beyond chance."""
-    out = [] if _word(_nees(c)) == "true" else ["one motion"]
+    out = [] if _word(_nees(c)) == "honest" else ["one motion"]
     # Windows overlap by half, so half of them are independent: the mean of n chi-squared of 6 dof.
     chances = ((name, h, math.sqrt(2 / (6 * h.count / 2))) for name, h in _spans(c))
-    return out + [name for name, h, chance in chances if _word(h.nees_dof_truth_noise, chance) != "true"]
+    return out + [name for name, h, chance in chances if _word(h.nees_dof_truth_noise, chance) != "honest"]
 
 
 def _line(method: str, c: Consistency) -> str:
     nees = _nees(c)
     off = max(nees, 1.0 / nees) ** 0.5 if nees > 0 else float("inf")
-    by = "" if _word(nees) == "true" else f" by a factor of {off:.1f} in sigma"
+    by = "" if _word(nees) == "honest" else f" by a factor of {off:.1f} in sigma"
     wrong = [w for w in _wrong(c) if w != "one motion"]
-    then = f", not true over {', '.join(wrong)}" if wrong else ""
+    then = f", not honest over {', '.join(wrong)}" if wrong else ""
     over = "".join(f", {h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
     return f"{method}: {_word(nees)}{by} per motion{then}; NEES/dof {nees:.2f}{over}."
 

@@ -190,7 +190,7 @@ def has_noise(flight: Flight, policy: Policy) -> bool:
 
 
 def table(study: Study) -> str:
-    """Mean of every policy that could run and, below, its ATE on every run; at most 80 columns for six runs."""
+    """Mean of every policy that could run and, of several runs, its ATE on each; at most 80 columns for six runs."""
     names = [name for name, scores in study.scores.items() if any(scores)]
     columns = (
         ("ATE m", "ate_rmse_m", 4, 7),
@@ -207,6 +207,8 @@ def table(study: Study) -> str:
         diverged = study.diverged(name)
         lines.append(f"{name:<20}{values}{'-' if diverged is None else diverged:>9}")
     lines.append("NEES p, a: of position and attitude, per degree of freedom; 1 is right.")
+    if len(study.runs) == 1:
+        return "\n".join(lines)
     runs = ", ".join(f"{i + 1}: {run}" for i, run in enumerate(study.runs))
     lines += ["", f"ATE m on {runs}", " " * 20 + "".join(f"{i + 1:>10}" for i in range(len(study.runs)))]
     for name in names:

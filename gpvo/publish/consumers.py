@@ -179,5 +179,5 @@ def _verdict(
             return Verdict(quantity, name, value, hidden, (low, middle, high), unit)
         advice = f"Set {name} to {max(wanted, minimum):.2g}"
         if wanted < minimum:
-            advice += f", the least it accepts; a sigma of {wanted:.2g} {unit} stays hidden"
+            advice += f", the smallest it accepts; a sigma of {wanted:.2g} {unit} stays hidden"
     return Verdict(quantity, name, value, hidden, (low, middle, high), unit, advice)

@@ -26,7 +26,7 @@ def evaluated(factors: dict[str, float]) -> Evaluation:
 
 
 @pytest.mark.parametrize(
-    "factor,colour,word", [(1.0, "green", "is true"), (0.1, "red", "overconfident"), (10.0, "amber", "too cautious")]
+    "factor,colour,word", [(1.0, "green", "is honest"), (0.1, "red", "overconfident"), (10.0, "amber", "too cautious")]
 )
 def test_one_method(factor: float, colour: str, word: str) -> None:
     found = verdict(evaluated({"triangulation": factor}))

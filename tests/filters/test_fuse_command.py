@@ -153,7 +153,7 @@ def test_a_run_without_truth_shows_what_it_can(tmp_path: Path) -> None:
     out = json.loads(_run(*command, "--json"))
     assert out["warnings"] == [
         "still: no ground truth: nothing to score",
-        "constant_best: it is tuned on training runs; give --train RUN",
+        "constant_best is left out: it is tuned on training runs; give --train RUN",
     ]
     scores = out["runs"][0]["policies"]["triangulation"]
     assert scores["nis_dof"] == out["mean"]["triangulation"]["nis_dof"] == pytest.approx(1.0, abs=0.3)
@@ -167,13 +167,13 @@ def test_a_run_without_truth_shows_what_it_can(tmp_path: Path) -> None:
 
 def test_one_run_has_no_interval(runs: list[Path]) -> None:
     out = _run("fuse", runs[0], "--policies", "pointing_matching,learned")
-    assert "% (too few runs for an interval)" in out
+    assert "Fewer than three runs give no interval." in out
     assert "inf" not in out
 
 
 @pytest.mark.parametrize("policy, words", [("constant", "--train RUN"), ("triangulation", "--methods triangulation")])
 def test_nothing_to_fuse_with_is_an_error(runs: list[Path], policy: str, words: str) -> None:
-    with pytest.raises(GpvoError, match=f"nothing to fuse with: {policy}: .*{words}"):
+    with pytest.raises(GpvoError, match=f"nothing to fuse with: {policy} is left out: .*{words}"):
         _run("fuse", runs[0], "--policies", policy)
 
 

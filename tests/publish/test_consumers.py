@@ -87,7 +87,7 @@ def test_check_names_the_parameter_that_hides_the_prediction(odometry: list[Odom
     assert not velocity.advice
     tiny = [replace(o, twist_covariance=np.eye(6) * 1e-3**2) for o in odometry]
     velocity = next(v for v in consumers.check(tiny, "px4") if v.quantity == "velocity")
-    assert "Set EKF2_EVV_NOISE to 0.01, the least it accepts" in velocity.advice
+    assert "Set EKF2_EVV_NOISE to 0.01, the smallest it accepts" in velocity.advice
 
 
 def test_check_of_the_others(odometry: list[Odometry]) -> None:
