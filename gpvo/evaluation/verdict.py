@@ -77,7 +77,7 @@ def _nees(c: Consistency) -> float:
 
 
 def _word(nees: float, chance: float = 0.0) -> str:
-    """``chance``: relative standard deviation that the mean of so few windows has even where the statement is honest."""
+    """``chance``: relative standard deviation of the mean of so few windows even where the statement is honest."""
     if nees > HONEST[1] * (1 + 2 * chance):
         return "overconfident"
     return "too cautious" if nees < HONEST[0] * (1 - 2 * chance) else "honest"
