@@ -14,7 +14,7 @@ from gpvo.io.run import Run, read_run, read_tracks
 from gpvo.sim.recorded import longest_flight_s
 from gpvo.types import Array, StereoCamera, StereoTracks
 from gpvo.vo.motion import refine, transfer
-from gpvo.vo.sigmas import PersistentNoise
+from gpvo.vo.sigmas import NoiseEstimator
 
 _IMU_HZ = 200.0
 _MIN_POINTS = 12
@@ -73,7 +73,7 @@ class _Tracking:
     """What the tracks of a run are like, motion by motion."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        self._camera, self._persistent = camera, PersistentNoise()
+        self._camera, self._noise = camera, NoiseEstimator()
         self.sigma_px: list[float] = []
         self._count: list[int] = []
         self._ended: list[float] = []
@@ -88,10 +88,10 @@ class _Tracking:
         if good.sum() < _MIN_POINTS:
             return
         uvd, uvd_now = before[1][i][good], now[1][j][good]
-        motion = refine(T_prev_cur, uvd, uvd_now, camera, persistent=self._persistent.ratio)
+        motion = refine(T_prev_cur, uvd, uvd_now, camera, noise=self._noise.value)
         if motion is None:
             return
-        self._persistent.update(motion.residuals, transfer(motion.T_prev_cur, motion.uvd_prev, camera).G)
+        self._noise.update(motion, transfer(motion.T_prev_cur, motion.uvd_prev, camera).G)
         expected = transfer(T_prev_cur, before[1], camera)
         u, v, _ = expected.uvd
         stays = expected.in_front & (u > 0) & (v > 0) & (u < camera.width) & (v < camera.height)
@@ -110,7 +110,7 @@ class _Tracking:
             "drop": float(np.median(self._ended)),
             "outliers": float(np.mean(self._outliers)),
             "sigma_px": sigma_px,
-            "persistent_px": sigma_px * self._persistent.ratio**0.5,
+            "persistent_px": sigma_px * self._noise.value.persistent**0.5,
             "blur_px": 0.0,
             "reach_m": float(np.quantile(np.concatenate(self._depths), 0.95)),
         }

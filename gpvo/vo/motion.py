@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.points import triangulation_pixel_covariance
+from gpvo.vo.points import PointNoise
 
 # Quantiles of chi-square with 3 degrees of freedom.
 _CHI2_3_MEDIAN = 2.366
@@ -123,7 +123,7 @@ class Motion:
     ``T_prev_cur`` (4, 4); ``inliers`` (N,); ``scale_px``: robust standard deviation of one image coordinate;
     ``residuals`` (M, 3) of (u, v, d) [px] of the inliers; ``uvd_prev`` (M, 3) their measurements in the reference
     frame, smoothed by those in the current one; ``information`` (6, 6) at unit pixel noise; ``converged``,
-    ``iterations``; ``persistent`` as given to :func:`refine`.
+    ``iterations``; ``noise`` as given to :func:`refine`.
     """
 
     T_prev_cur: Array
@@ -134,7 +134,7 @@ class Motion:
     information: Array
     converged: bool
     iterations: int
-    persistent: float
+    noise: PointNoise
 
     def __str__(self) -> str:
         t = np.linalg.norm(self.T_prev_cur[:3, 3])
@@ -158,13 +158,13 @@ class Whitened:
 def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
     """The residuals behind a motion, whitened as they were to find it."""
     moved = transfer(motion.T_prev_cur, motion.uvd_prev, camera)
-    W = whitener(residual_covariance(moved.G, _S_UNIT, _S_UNIT, motion.persistent))
+    W = whitener(residual_covariance(moved.G, motion.noise.S, motion.noise.S, motion.noise.persistent))
     return Whitened(moved, W, apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H))
 
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 4
-_S_UNIT = triangulation_pixel_covariance(1.0)
+_PLAIN = PointNoise()
 
 
 def refine(
@@ -175,24 +175,23 @@ def refine(
     *,
     max_iterations: int = 12,
     robust: bool = True,
-    S_uvd: Array | None = None,
-    persistent: float = 0.0,
+    noise: PointNoise = _PLAIN,
 ) -> Motion | None:
     """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
 
-    Each point's stacked residual is weighted with the full inverse of its covariance at unit pixel noise, or with
-    ``S_uvd``. ``persistent``: variance of the error of disparity that a point keeps while it is followed, over that of
-    an image coordinate: a patch that looks different on the right is misplaced by the same in each frame. The
-    derivatives are taken at the points as smoothed by both frames, not as measured in the first: else
-    the noise of far points, entering the derivative, biases the motion (errors in variables; B. Triggs et al., "Bundle
-    adjustment, a modern synthesis", 2000, section 6.1: this is the two-frame problem with the points eliminated).
+    Each point's stacked residual is weighted with the full inverse of its covariance at unit pixel noise of the form
+    ``noise``, which may hold an error of disparity that a point keeps while it is followed: a patch that looks
+    different on the right is misplaced by the same in each frame. The derivatives are taken at the points as smoothed
+    by both frames, not as measured in the first: else the noise of far points, entering the derivative, biases the
+    motion (errors in variables; B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000, section 6.1: this is
+    the two-frame problem with the points eliminated).
 
     If ``robust``, the noise scale is taken from the median residual, points beyond its 99.9 % ellipsoid are left out,
     and the rest are weighted by Huber's rule.
 
     Returns None where the geometry leaves the motion undetermined.
     """
-    S = _S_UNIT if S_uvd is None else S_uvd
+    S, persistent = noise.S, noise.persistent
     T, smoothed, converged = T_start, uvd_prev, False
     for iteration in range(1, max_iterations + 1):
         moved = transfer(T, smoothed, camera)
@@ -217,7 +216,7 @@ def refine(
         if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
             converged = True
             break
-    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, iteration, persistent)
+    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, iteration, noise)
 
 
 def _solve_step(A: Array, z: Array, weight: Array) -> tuple[Array, Array | None]:

@@ -21,7 +21,7 @@ from gpvo.vo.points import triangulate
 from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained
-from gpvo.vo.sigmas import PersistentNoise, ResidualMoments, SigmaEstimator
+from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
 from gpvo.vo.state import State
 
 _RIVAL_STAYS = 0.85  # per frame
@@ -58,7 +58,7 @@ class StereoOdometry:
             self.rig_error = RigError(camera, known or RigState.exact(), learn=False)
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
-        self._persistent = PersistentNoise()
+        self._noise = NoiseEstimator()
         self._state: State | None = None
         self._imu = ImuMoments.of(None)  # since the reference
         self.pair = PairWatch(camera)
@@ -204,7 +204,7 @@ class StereoOdometry:
         if close.sum() < config.min_inliers:
             return None
         uvd_prev, uvd_cur = matches.uvd_prev[close], matches.uvd_cur[close]
-        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, persistent=self._persistent.ratio)
+        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=self._noise.value)
         if motion is None:
             return None
         inliers = np.zeros(len(close), bool)
@@ -232,7 +232,7 @@ class StereoOdometry:
                 v_t=dict.fromkeys(config.stated, C[:3, :3]),
             )
         if self.config.persistent_noise:
-            self._persistent.update(motion.residuals, white.moved.G)
+            self._noise.update(motion, white.moved.G)
         self._sigmas.update(moments)
         if self._sigmas.estimates:
             self._sigmas.design.update(motion, white, self.camera)

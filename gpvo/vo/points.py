@@ -10,6 +10,8 @@ sigma_p and sigma_m.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gpvo.types import Array, StereoCamera
@@ -51,6 +53,25 @@ def triangulation_pixel_covariance(sigma_px: float = 1.0, pixel_covariance: Arra
     if S.shape != (4, 4):
         raise ValueError(f"pixel_covariance must be (4, 4) for (uL, vL, uR, vR), got {S.shape}")
     return _PIXELS_TO_UVD @ S @ _PIXELS_TO_UVD.T
+
+
+@dataclass(frozen=True)
+class PointNoise:
+    """Form of the noise of a measurement (u, v, d), for unit noise of an image coordinate.
+
+    ``shared``: covariance of u and d, 1 where the left coordinate is one and the same in both. Where patches are
+    matched it is less: the left image's noise displaces a patch by one amount when the patch is followed and by another
+    when it is sought on the right, since each search weighs the pixels by the gradients of its own template.
+    ``persistent``: variance of an error of disparity that a point keeps from frame to frame.
+    """
+
+    shared: float = 1.0
+    persistent: float = 0.0
+
+    @property
+    def S(self) -> Array:
+        """(3, 3) covariance of (u, v, d) without what persists."""
+        return np.array([[1.0, 0.0, self.shared], [0.0, 0.5, 0.0], [self.shared, 0.0, 2.0]])
 
 
 def pointing_matching_pixel_covariance(sigma_p_px: float, sigma_m_px: float) -> Array:

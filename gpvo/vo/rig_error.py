@@ -172,7 +172,7 @@ class RigError:
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
         if self._learn:
-            sigma_px = motion.scale_px * np.sqrt(1.0 + motion.persistent)
+            sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px, 3)
             if near.sum() >= 3 * 8:
                 self._learn_from(A[near], B[near], phi * self._camera.fy_px, row_error)

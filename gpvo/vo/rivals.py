@@ -94,7 +94,8 @@ def choose(motions: Sequence[Motion], covered: Sequence[int], expected: Expected
     Moments of the mixture: ``sum p_i d_i d_i^T``, with d_i from the chosen motion to another.
     """
     candidates = [m.T_prev_cur for m in motions]
-    weight = _AREA * np.log(np.array(covered[: len(motions)], np.float64))
+    # Half a cell for one that explains none better than the other does.
+    weight = _AREA * np.log(np.maximum(covered[: len(motions)], 0.5))
     goes_on, tells = np.ones(len(motions), bool), np.ones(len(motions), bool)
     if expected is not None:
         off_m = np.array([np.linalg.norm((se3.inverse(expected.T_prev_cur) @ T)[:3, 3]) for T in candidates])

@@ -15,11 +15,12 @@ from gpvo.vo.motion import (
     residual_covariance,
     whitener,
 )
-from gpvo.vo.points import triangulation_pixel_covariance
+from gpvo.vo.points import PointNoise
 
 _MEMORY = 0.97  # of the running mean: about thirty frames
 _PARTS = 4, 2  # columns and rows of the image: finer ones see less of what neighbours share, coarser ones the same
-_S_UNIT = triangulation_pixel_covariance(1.0)
+_CUT = 12.0  # squares of three degrees of freedom: against outliers
+_TEXTBOOK = 100.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])  # prior of equal variance and covariance, worth 300 points
 # Of squares with one degree of freedom, cut off at four; of means of two, at 6.6 medians.
 _CUT_ALONG, _LEFT_ALONG = 4.0, 0.9195
 _CUT_ACROSS, _LEFT_ACROSS = 6.644, 0.99
@@ -132,20 +133,47 @@ class DesignEffect:
         return self._scatter / self._expected
 
 
-class PersistentNoise:
-    """Running estimate of the error of disparity that points keep while they are followed.
+class NoiseEstimator:
+    """Running estimate of the form of the points' noise, :class:`gpvo.vo.points.PointNoise`.
 
-    Such an error shows as the flow that it predicts wrongly: more scatter along ``g``, the residual's derivative by it,
-    than across. ``ratio`` is its variance over that of an image coordinate, 0 while it is not beyond chance, and drawn
-    towards 0 by a prior.
+    ``shared`` solves two equations, those of u and d, for the variance of an image coordinate and the covariance of the
+    two. What persists shows as the flow that it predicts wrongly: more scatter along ``g``, the residual's derivative
+    by it, than across; it is 0 while it is not beyond chance, and drawn towards 0 by a prior.
     """
 
     def __init__(self) -> None:
+        self._normal: Array = np.zeros((2, 2))
+        self._moments: Array = np.zeros(2)
         self._sums: Array = np.zeros(3)
+        self.value = PointNoise()
 
-    def update(self, residuals: Array, G: Array) -> None:
-        """Take in the residuals (M, 3) of one motion and their derivatives (3, 3, M) by the reference measurement."""
-        W = whitener(residual_covariance(G, _S_UNIT, _S_UNIT))
+    def update(self, motion: Motion, G: Array) -> None:
+        """Take in a motion, with the derivatives (3, 3, M) of its residuals by the reference measurement."""
+        self.value = PointNoise(self._shared(motion, G), self.value.persistent)
+        self.value = PointNoise(self.value.shared, self._persistent(motion.residuals, G))
+
+    def _shared(self, motion: Motion, G: Array) -> float:
+        """Least squares over the products ``r_u^2``, ``r_d^2`` and ``r_u r_d`` of all points."""
+        C = residual_covariance(G, self.value.S, self.value.S, self.value.persistent)
+        alone = residual_covariance(G, PointNoise(0.0).S, PointNoise(0.0).S, self.value.persistent)
+        r = motion.residuals.T / motion.scale_px
+        z2 = (apply_whitener(whitener(C), r) ** 2).sum(0)
+        r = r * np.sqrt(np.minimum(1.0, _CUT / np.maximum(z2, 1e-9)))
+        normal, moments = np.zeros((2, 2)), np.zeros(2)
+        for i, j in ((0, 0), (2, 2), (0, 2)):
+            both = G[i, 0] * G[j, 2] + G[i, 2] * G[j, 0] + float(i != j)
+            weight = 1.0 / (C[i, i] * C[j, j] + C[i, j] ** 2)
+            X = np.stack([alone[i, j], both])
+            normal += (X * weight) @ X.T
+            moments += (X * weight) @ (r[i] * r[j])
+        self._normal, self._moments = _MEMORY * self._normal + normal, _MEMORY * self._moments + moments
+        variance, covariance = np.linalg.solve(self._normal + _TEXTBOOK, self._moments)
+        return float(np.clip(covariance / max(variance, 1e-9), 0.0, 1.0))
+
+    def _persistent(self, residuals: Array, G: Array) -> float:
+        """Variance over that of an image coordinate, shrunk by its own uncertainty."""
+        ratio = self.value.persistent
+        W = whitener(residual_covariance(G, self.value.S, self.value.S))
         z, g = apply_whitener(W, residuals.T), apply_whitener(W, persistent_direction(G))
         g2 = (g * g).sum(0)
         along2 = (g * z).sum(0) ** 2 / np.maximum(g2, 1e-12)
@@ -153,15 +181,11 @@ class PersistentNoise:
         # Squares are cut off against outliers; the divisors are what a Gaussian has left of its variance.
         limit = _CUT_ACROSS * float(np.median(across2))
         sigma2 = max(float(np.minimum(across2, limit).mean()) / _LEFT_ACROSS, 1e-6)
-        expected = 1.0 + self.ratio * g2
+        expected = 1.0 + ratio * g2
         along2 = np.minimum(along2 / sigma2, _CUT_ALONG * expected) / _LEFT_ALONG
         weight = g2 / expected**2
         now = np.array([weight @ (along2 - 1.0), weight @ g2, 3.0 * weight @ weight])
         self._sums = _MEMORY * self._sums + now
-
-    @property
-    def ratio(self) -> float:
-        """Variance over that of an image coordinate, shrunk by its own uncertainty."""
         excess, information, variance = self._sums
         if excess <= 2.0 * variance**0.5:
             return 0.0

@@ -4,7 +4,7 @@ from gpvo.geometry import se3
 from gpvo.types import StereoCamera
 from gpvo.vo.covariance import motion_covariance
 from gpvo.vo.motion import refine, residual_covariance, transfer, whitener
-from gpvo.vo.points import triangulate, triangulation_pixel_covariance
+from gpvo.vo.points import PointNoise, triangulate, triangulation_pixel_covariance
 from stereo_points import CAMERA, noisy, scene
 
 
@@ -82,7 +82,7 @@ def test_persistent_errors_are_part_of_the_weights() -> None:
         before, after = noisy(rng, before, 0.1) + shared, noisy(rng, after, 0.1) + shared
         errors = []
         for persistent in (25.0, 0.0):
-            motion = refine(T, before, after, CAMERA, robust=False, persistent=persistent)
+            motion = refine(T, before, after, CAMERA, robust=False, noise=PointNoise(persistent=persistent))
             assert motion is not None
             errors.append(se3.log(se3.inverse(T) @ motion.T_prev_cur))
             if persistent:

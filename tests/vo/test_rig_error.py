@@ -15,7 +15,7 @@ from gpvo.types import Array, StereoCamera
 from gpvo.vo.motion import refine, whitened
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance
 from gpvo.vo.rig_findings import camchain, corrected, document, findings, read_state, rig_of
-from gpvo.vo.sigmas import PersistentNoise
+from gpvo.vo.sigmas import NoiseEstimator
 
 CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
 
@@ -25,7 +25,7 @@ def _fly(
 ) -> RigError:
     """A rig wrong by ``coefficients`` (30,) over motions with fresh points and fresh noise, white and persistent."""
     rng = np.random.default_rng(seed)
-    noise = PersistentNoise()
+    noise = NoiseEstimator()
     rig = RigError(CAMERA)
     truth = RigError(CAMERA, RigState(coefficients, 1e-12 * np.eye(2 * N_TERMS), 1.0), learn=False)
     for _ in range(frames):
@@ -41,10 +41,10 @@ def _fly(
             row_error = row + right[:, 1] - left[:, 1]
             u, v = uvd[:, 0] + left[:, 0], uvd[:, 1] + left[:, 1] + 0.5 * row_error
             seen.append(np.column_stack([u, v, uvd[:, 2] + d_error + shared + left[:, 0] - right[:, 0]]))
-        motion = refine(T, rig.correct(seen[0]), rig.correct(seen[1]), CAMERA, persistent=noise.ratio)
+        motion = refine(T, rig.correct(seen[0]), rig.correct(seen[1]), CAMERA, noise=noise.value)
         assert motion is not None
         white = whitened(motion, CAMERA)
-        noise.update(motion.residuals, white.moved.G)
+        noise.update(motion, white.moved.G)
         rig.update(motion, white, row_error[motion.inliers], 0.5)
     return rig
 

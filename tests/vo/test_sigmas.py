@@ -7,8 +7,8 @@ import pytest
 from gpvo.geometry import se3
 from gpvo.vo.covariance import motion_covariance
 from gpvo.vo.motion import refine, transfer, whitened
-from gpvo.vo.points import pointing_matching_pixel_covariance
-from gpvo.vo.sigmas import DesignEffect, PersistentNoise, ResidualMoments, SigmaEstimator
+from gpvo.vo.points import PointNoise, pointing_matching_pixel_covariance
+from gpvo.vo.sigmas import DesignEffect, NoiseEstimator, ResidualMoments, SigmaEstimator
 from stereo_points import CAMERA, noisy, scene
 
 
@@ -16,16 +16,33 @@ from stereo_points import CAMERA, noisy, scene
 def test_persistent_noise_is_found(persistent_px: float) -> None:
     """Forty motions of 100 points with white noise of 0.15 px, and three outliers in each."""
     rng = np.random.default_rng(0)
-    noise = PersistentNoise()
+    noise = NoiseEstimator()
     for _ in range(40):
         T, before, after = scene(rng, 100, (8.0, 60.0))
         shared = np.array([0.0, 0.0, 1.0]) * rng.normal(0.0, persistent_px, (100, 1))
         before, after = noisy(rng, before, 0.15) + shared, noisy(rng, after, 0.15) + shared
         after[:3] += rng.uniform(-3, 3, (3, 3))
-        motion = refine(T, before, after, CAMERA, persistent=noise.ratio)
+        motion = refine(T, before, after, CAMERA, noise=noise.value)
         assert motion is not None
-        noise.update(motion.residuals, transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA).G)
-    assert 0.15 * np.sqrt(noise.ratio) == pytest.approx(persistent_px, rel=0.25, abs=0.03)
+        noise.update(motion, transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA).G)
+    assert 0.15 * np.sqrt(noise.value.persistent) == pytest.approx(persistent_px, rel=0.25, abs=0.03)
+
+
+@pytest.mark.parametrize("shared", [1.0, 0.6])
+def test_what_left_column_and_disparity_share_is_found(shared: float) -> None:
+    """Forty motions of 100 points, with three outliers in each; nothing persists, and nothing is found to."""
+    rng = np.random.default_rng(1)
+    noise = NoiseEstimator()
+    L = 0.2 * np.linalg.cholesky(PointNoise(shared).S)
+    for _ in range(40):
+        T, before, after = scene(rng, 100, (8.0, 60.0))
+        before, after = (uvd + rng.standard_normal((100, 3)) @ L.T for uvd in (before, after))
+        after[:3] += rng.uniform(-3, 3, (3, 3))
+        motion = refine(T, before, after, CAMERA, noise=noise.value)
+        assert motion is not None
+        noise.update(motion, transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA).G)
+    assert noise.value.shared == pytest.approx(shared, abs=0.08)
+    assert noise.value.persistent < 0.5
 
 
 @pytest.mark.parametrize("count", [4, 6, 20])

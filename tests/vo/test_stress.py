@@ -121,17 +121,15 @@ def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
 
 @pytest.mark.slow
 def test_the_stress_list() -> None:
-    """Sixty frames at 1.6 m/s; every fault but three kinds that remain, in part, unseen.
+    """Sixty frames at 1.6 m/s; every fault but two kinds that remain, in part, unseen.
 
     A texture that holds nearly all corners of a small image leaves no points to speak against it; a right camera that
-    is late shows only where rows move, not in a turn about the vertical; noise of 25 grey levels shortens all motions,
-    and one frame lies just outside (23.7, for the 22.5 of the 99.9 % ellipsoid).
+    is late shows only where rows move, not in a turn about the vertical.
     """
     clip = render_clip(pinhole(640, 480), wander(60, speed_mps=1.6, seed=5))
     whole = stress.Footage(clip.camera, clip.frames, clip.T_world_cam)
     silent = {fault: stress.run(change(whole)).silent for fault, change in stress.FAULTS.items()}
     print(silent)
-    assert len(silent.pop("noise 25")) <= 1
     assert sum(len(frames) for fault, frames in silent.items() if not ("patch" in fault or "late" in fault)) == 0
 
 
