@@ -13,6 +13,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from enum import Enum
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -62,6 +63,7 @@ def digest_of(*state: Any) -> str:
     return hashlib.sha256(json.dumps([tree, code_digest()]).encode() + data).hexdigest()
 
 
+@cache
 def code_digest() -> str:
     """SHA-256 of the package's files and what they run on: what other code has kept is not taken up."""
     sha = hashlib.sha256(f"{platform.python_version()} {np.__version__}".encode())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -98,6 +98,7 @@ def _load(target: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
+@cache
 def source_kinds() -> dict[str, Callable[[], Any]]:
     """Names of all sources with a loader of each class, those of other packages after the built-in ones.
 

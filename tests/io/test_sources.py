@@ -470,4 +470,4 @@ def test_sources_of_other_packages(monkeypatch):
             return dict
 
     monkeypatch.setattr("gpvo.io.source.entry_points", lambda group: [Entry] if group == "gpvo.sources" else [])
-    assert source_kinds()["mine"]() is dict
+    assert source_kinds.__wrapped__()["mine"]() is dict

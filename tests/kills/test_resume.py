@@ -41,7 +41,7 @@ def pictures(folder: Path, kind: str) -> Path:
     renderer = StereoRenderer(build_world("room", 0), lens, lens, T_right_left)
     for side in ("left", "right"):
         (folder / side).mkdir(parents=True)
-    for k, T in enumerate(wander(34, seed=2)):
+    for k, T in enumerate(wander(29, seed=2)):
         pair = renderer.render(T)[:2] if k != 21 else pair  # noqa: F821 (the one before)
         for side, image in zip(("left", "right"), pair):
             image = np.asarray(image if k != 12 else 0 * image)
