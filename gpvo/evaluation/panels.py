@@ -53,20 +53,20 @@ def groups(e: Evaluation) -> list[dict[str, Any]]:
         },
         {
             "title": "What each method states",
-            "note": "One standard deviation per axis of each motion.",
+            "note": "The standard deviation of each motion, per axis.",
             "panels": stated(e),
         },
         {
             "title": "Is it honest?",
-            "note": "Overconfident: below the diagonal; in NEES over time (mean over 0.5 s), above 1.",
+            "note": "Overconfident where the curve is below the diagonal, and where NEES (mean over 0.5 s) is above 1.",
             "panels": [*reliability(e), *nees(e)] if len(e.errors.index) else [],
         },
         {
             "title": "How errors are correlated in time",
-            "note": "A dip at the first lag is shared pixel noise. A flat or rising Allan deviation is a bias.",
+            "note": "A dip at the first lag shows shared pixel noise; a flat or rising Allan deviation shows a bias.",
             "panels": memory(e),
         },
-        {"title": "What odometry saw", "note": "Amber: degraded. Red: lost.", "panels": inputs(e)},
+        {"title": "What odometry saw", "note": "Amber: degraded frames. Red: lost frames.", "panels": inputs(e)},
     ]
 
 

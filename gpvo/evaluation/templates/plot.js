@@ -14,8 +14,11 @@
     if (key === "y" && finite(panel.level) && (!log || panel.level > 0)) all.push(panel.level);
     let low = all.reduce((a, b) => Math.min(a, b), Infinity), high = all.reduce((a, b) => Math.max(a, b), -Infinity);
     if (!(low <= high)) [low, high] = log ? [0.1, 10] : [0, 1];
-    // So wide that 1, 2 or 5 lies within.
-    if (log) return high / low < 2 ? [low / 1.6, high * 1.6] : [low / 1.2, high * 1.2];
+    if (log) {
+      // So wide that two numbers of the series 1, 2, 5 lie within: one alone shows no scale.
+      const slack = Math.max(1.2, Math.sqrt(5.1 * low / high));
+      return [low / slack, high * slack];
+    }
     const pad = (high - low || Math.abs(high) || 1) * (key === "x" && !panel.equal ? 0.01 : 0.06);
     return [low - pad, high + pad];
   };
