@@ -104,6 +104,14 @@ def live(
 def doctor(
     source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
     topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: NEES of what a bag states.")
+    ] = None,
+    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
+    align: Annotated[
+        str,
+        typer.Option(help="Fit a fixed transform between bag and truth, as gpvo import does."),
+    ] = "none",
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Listen over Zenoh.")] = False,
     dds: Annotated[bool, typer.Option("--dds", help="Listen over DDS.")] = False,
     ros2: Annotated[bool, typer.Option("--ros2", help="Listen through rclpy.")] = False,
@@ -116,25 +124,38 @@ def doctor(
 ) -> None:
     """Check anyone's covariance, and what each filter would do with it.
 
-    Example: gpvo doctor flight.mcap
+    Example: gpvo doctor flight.mcap --truth mocap.tum
     """
     from gpvo.live.examination import examine_bag, examine_topic
     from gpvo.live.job import POSE_TYPE_NAMES
 
     wire = _one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1)
+    one_of("--align", align, ("none", "rotation", "transform"))
+    if truth is not None and wire is not None:
+        raise GpvoError("--truth judges a bag, not a running topic", cure="record it, or gpvo live --truth TOPIC")
+    judged = {}
     if wire is None:
         found = examine_bag(Path(source), topic)
+        if truth is not None:
+            from gpvo.cli.judging import lines, nees_of_bag
+
+            judged = {t: nees_of_bag(Path(source), t, truth, truth_topic, align) for t in found if t != truth_topic}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
         found = {source: examine_topic(wire, source, kind, seconds, address, domain)}
     if json_:
-        rows = [{"topic": t, "findings": [f.__dict__ for f in findings]} for t, findings in found.items()]
+        rows = [
+            {"topic": t, "findings": [f.__dict__ for f in findings], "nees": judged.get(t)}
+            for t, findings in found.items()
+        ]
         print_json({"schema": 1, "source": source, "topics": rows})
         return
     for name, findings in found.items():
         print(f"{printable(name)}: {len(findings) or 'nothing'} found")
         for finding in findings:
             print(f"  {finding}")
+        for line in lines(judged[name]) if name in judged else ():
+            print(f"  {line}")
 
 
 def _one_wire(**given: bool) -> str | None:

@@ -12,11 +12,14 @@ import pytest
 from bag_maker import BagMaker
 from gpvo.cli import app
 from gpvo.geometry import se3
+from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.io.trajectory import write_tum
 from gpvo.live.doctor import examine
 from gpvo.live.stated import Stated
 from gpvo.publish.odometry import Odometry
 from gpvo.publish.ros import odometry_message
 from shim_bags import engine, flight, flown
+from synthetic_runs import make_run
 from typer.testing import CliRunner
 
 TOPIC = "/vo/odometry"
@@ -130,6 +133,42 @@ def test_a_seeded_fault_is_found(code: str, good: list[Odometry], tmp_path: Path
     found = {f["code"]: f for f in topic["findings"]}
     assert code in found
     assert found[code]["consequence"]
+
+
+def _truth_of(seed: int, path: Path) -> Path:
+    """Of the body, in a world of its own."""
+    stamps, _ = flight(seed=seed, n=N)
+    _, truth = make_run(seed, n=N, rate_hz=20.0, geometry=False)
+    T = T_FLU_OPTICAL @ truth.T_world_cam @ se3.inverse(T_FLU_OPTICAL)
+    write_tum(path, stamps, T)
+    return path
+
+
+def test_with_truth_it_says_how_sure_the_topic_is(tmp_path: Path) -> None:
+    """A fifth of the honest standard deviation has 25 times its NEES."""
+    truth, joint = _truth_of(11, tmp_path / "truth.tum"), {}
+    for name, part in (("honest", 1.0), ("sure", 0.2)):
+        frames = [replace(o, twist_covariance=o.twist_covariance * part**2) for o in good_flight(11)]
+        bag = bag_of(frames, tmp_path / name)
+        result = CliRunner().invoke(app, ["doctor", str(bag), "--truth", str(truth), "--json"], catch_exceptions=False)
+        [topic] = json.loads(result.stdout)["topics"]
+        joint[name] = topic["nees"]["motions"]["joint"]["nees_dof"]
+        assert topic["nees"]["poses"] is topic["nees"]["problem"] is None
+    assert 0.4 < joint["honest"] < 2.0
+    assert joint["sure"] == pytest.approx(25 * joint["honest"], rel=0.02)
+    said = CliRunner().invoke(app, ["doctor", str(tmp_path / "sure"), "--truth", str(truth)]).stdout
+    assert f"motions: {joint['sure']:.3g}" in said
+    assert "too sure" in said
+
+
+def test_a_truth_of_another_time_is_told_beside_the_findings(good: list[Odometry], tmp_path: Path) -> None:
+    stamps, T = flight(seed=11, n=N)
+    write_tum(tmp_path / "late.tum", stamps + 10**12, T)
+    result = CliRunner().invoke(
+        app, ["doctor", str(bag_of(good, tmp_path / "bag")), "--truth", str(tmp_path / "late.tum")]
+    )
+    assert result.exit_code == 0
+    assert "NEES: not known" in result.stdout
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13, 14, 15])
