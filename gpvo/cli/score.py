@@ -57,31 +57,36 @@ def score(
         _print(found)
 
 
+_LEGEND = "E: energy score, lower is better. NEES: of a motion, then over 1 s, 10 m and 100 m; 1 is right."
+
+
 def _print_board(columns: dict[str, list[Any]]) -> None:
     table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     for row in zip(*columns.values()):
         table.add_row(*map(cell, row))
     show(table)
-    print("E: energy score, lower is better. NEES: of a motion, then over 1 s, 10 m and 100 m; 1 is right.")
-    print("easy, hard: share within 1 sigma (0.68 is right) in the calmest and the worst quarter.")
+    say(_LEGEND)
+    say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
 
 
 def _print(found: dict[str, Any]) -> None:
-    table = new_table("sequence", "motions", "lost", "energy [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
+    table = new_table("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
         over = (s["nees_dof_over"][name] for name in ("1s", "10m", "100m"))
         numbers = (*energy, s["nll_per_dim"], s["nees_dof"], *over)
         table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers))
     show(table)
+    say(_LEGEND)
     pooled = found["pooled"]
+    if pooled["nees_dof"]["low"] is None:
+        say("Fewer than three sequences give no mean with an interval.")
+        return
     for name, unit, factor in (
-        ("energy_translation_m", "mm", 1e3),
-        ("nll_per_dim", "nats", 1.0),
+        ("energy_translation_m", " mm", 1e3),
+        ("nll_per_dim", " nats", 1.0),
         ("nees_dof", "", 1.0),
     ):
         i = pooled[name]
-        told = "(too few sequences for an interval)"
-        if i["low"] is not None:
-            told = f"[{factor * i['low']:.4g}, {factor * i['high']:.4g}] (95 %, by whole sequences)"
-        say(f"{name}: {factor * i['mean']:.4g} {unit} {told}")
+        interval = f"[{factor * i['low']:.4g}, {factor * i['high']:.4g}]"
+        say(f"{name}: {factor * i['mean']:.4g}{unit} {interval} (95 %, by whole sequences)")

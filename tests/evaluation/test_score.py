@@ -90,7 +90,7 @@ def test_somebody_elses_file_of_29_columns(tmp_path: Path, capsys) -> None:
     assert found["pooled"]["motions"] == 2 * 59
     assert found["pooled"]["nees_dof"]["mean"] < 1e-3
     cli.app(["score", *words], standalone_mode=False)
-    assert "too few sequences for an interval" in capsys.readouterr().out
+    assert "Fewer than three sequences give no mean" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
