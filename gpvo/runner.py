@@ -108,6 +108,8 @@ def run(
         done = [] if writer.kept is None else writer.kept.records
         if writer.kept is not None:
             odometry, recorder = writer.kept.state
+            if (odometry.config, odometry.camera) != (config, source.camera):
+                raise ValueError("its state is of other settings")
         for k, step in enumerate(steps(source, config, odometry, done)):
             record = as_stored(step.record if amend is None else amend(step.record))
             prediction = None if predictor is None else predictor.step(record)
