@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim.eye import SensorModel
 from gpvo.sim.render import StereoRenderer
 from gpvo.sim.worlds import build_world

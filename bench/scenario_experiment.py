@@ -17,9 +17,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import TrainingSet, build_run
-from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
 from gpvo.evaluation.evaluate import judged, predictions_by_stamp

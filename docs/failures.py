@@ -16,8 +16,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from gpvo.cameras.rig import Tolerance
-from gpvo.dataset.align import interpolate_truth
-from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.dataset.odd import odd_stretches
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run

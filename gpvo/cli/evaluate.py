@@ -60,7 +60,8 @@ def evaluate(
 
     Example: gpvo evaluate runs/mh01 --plots figures
     """
-    from gpvo.evaluation.evaluate import distinct, document
+    from gpvo.evaluation.document import document
+    from gpvo.evaluation.evaluate import distinct
 
     options = options_of(segments, truth_sigma, align, time_offset)
     if twins:
@@ -89,7 +90,7 @@ def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path 
 
         write_statements(e, stated, name)
     if tables is not None:
-        from gpvo.evaluation.tables import write_tables
+        from gpvo.evaluation.document import write_tables
 
         write_tables(e, tables, name)
     if plots is not None:
@@ -207,7 +208,7 @@ def _with_twins(
 
     from gpvo.cli.twin import make_all
     from gpvo.evaluation.by_twins import by_twins, with_twins
-    from gpvo.evaluation.evaluate import document
+    from gpvo.evaluation.document import document
     from gpvo.io.run import read_run
 
     documents, found = [], []

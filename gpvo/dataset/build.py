@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.dataset.errors import check_target, motion_targets, position_targets
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.dataset.odd import odd_stretches
 from gpvo.dataset.odd import times as odd_times
 from gpvo.dataset.rest import in_waits, wandering_waits
-from gpvo.dataset.targets import check_target, motion_targets, position_targets
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run

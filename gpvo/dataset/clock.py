@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog

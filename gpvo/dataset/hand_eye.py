@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.errors import MotionErrors, motion_errors
+from gpvo.stats.series import moving_sums
 from gpvo.types import Array, TruthLog, VoLog
 
 _SHORT, _LONG = 5, 50
@@ -48,7 +49,10 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
     errors = motion_errors(log, truth)
     if len(errors.index) < 2 * _LONG:
         return []
-    found = [*_of_share(errors, _stated_m(log, errors)), *_of_direction(errors)]
+    true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
+    length = np.linalg.norm(true, axis=1)
+    share = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
+    found = [*_of_share(share, length, _stated_m(log, errors)), *_of_direction(seen - share[:, None] * true, length)]
     spans = [(errors.index[a], errors.index[b], what) for a, b, what in found]
     return sorted(
         (Stretch(int(i), int(k), (log.records[i].t_prev_ns, log.records[k].t_ns), what) for i, k, what in spans),
@@ -56,13 +60,11 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
     )
 
 
-def _of_share(errors: MotionErrors, sigma_m: Array) -> list[tuple[int, int, str]]:
-    true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
-    length = np.linalg.norm(true, axis=1)
-    own = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
+def _of_share(own: Array, length: Array, sigma_m: Array) -> list[tuple[int, int, str]]:
+    """By each motion's share ``own`` (M,) of its true ``length`` (M,) [m]."""
     moving = length > 0.5 * np.median(length)
     usual = float(np.median(own[moving]))
-    z = _sums(np.where(moving, (own - usual) * length / sigma_m, 0.0), _SHORT)
+    z = moving_sums(np.where(moving, (own - usual) * length / sigma_m, 0.0), _SHORT)
     far = np.abs(z) > _SIGMAS * 1.4826 * np.median(np.abs(z[_moving(length, _SHORT)]))
     found = []
     for first, of_window in _runs(far):
@@ -79,12 +81,9 @@ def _of_share(errors: MotionErrors, sigma_m: Array) -> list[tuple[int, int, str]
     return found
 
 
-def _of_direction(errors: MotionErrors) -> list[tuple[int, int, str]]:
-    true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
-    length = np.linalg.norm(true, axis=1)
-    share = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
-    aside = seen - share[:, None] * true
-    turn = np.stack([_sums(a, _LONG) for a in aside.T], axis=1) / np.maximum(_sums(length, _LONG), 1e-12)[:, None]
+def _of_direction(aside: Array, length: Array) -> list[tuple[int, int, str]]:
+    """By what odometry shows ``aside`` (M, 3) of true motions of a ``length`` (M,) [m]."""
+    turn = moving_sums(aside, _LONG) / np.maximum(moving_sums(length, _LONG), 1e-12)[:, None]
     off, usual = _beyond(turn, _moving(length, _LONG), _LEAST_TURN)
     found = []
     for first, last in ((a, b + _LONG - 1) for a, b in _runs(off)):
@@ -95,14 +94,9 @@ def _of_direction(errors: MotionErrors) -> list[tuple[int, int, str]]:
     return found
 
 
-def _sums(values: Array, count: int) -> Array:
-    """(M - count + 1,) of windows."""
-    return np.convolve(values, np.ones(count), "valid")
-
-
 def _moving(length: Array, count: int) -> NDArray[np.bool_]:
     """Which windows are no slower than half the usual."""
-    path = _sums(length, count)
+    path = moving_sums(length, count)
     return np.asarray(path > max(0.5 * float(np.median(path)), 1e-9))
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
 from gpvo.vo.imu_moments import ImuMoments
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.errors import MotionErrors
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import block_bootstrap
+from gpvo.stats.series import moving_sums
 from gpvo.types import Array, TruthLog, VoLog
 
 ORDER = 3
@@ -71,7 +72,7 @@ def _high_passed(errors: MotionErrors, log: VoLog) -> tuple[Array, Array, NDArra
     told, lacks = (np.diff(x, n=steps, axis=0) for x in (se3.log(errors.T_true), -errors.xi))
     usual = np.median(errors.dt_s)
     even = (np.abs(errors.dt_s - usual) <= _EVEN_DT * usual) & (log.parent[errors.index] == errors.index - 1)
-    whole = np.convolve(even, np.ones(steps + 1), mode="valid") == steps + 1
+    whole = moving_sums(even, steps + 1) == steps + 1
     whole &= errors.index[steps:] - errors.index[: len(errors.index) - steps] == steps
     rows = np.flatnonzero(whole).astype(np.int64)
     return told[rows], lacks[rows], rows

@@ -10,7 +10,8 @@ import numpy as np
 
 from gpvo.dataset.build import build_run
 from gpvo.errors import SourceError
-from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, document, evaluate_run
+from gpvo.evaluation.document import document
+from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run
 from gpvo.evaluation.statements import Statement, plain_statement
 from gpvo.io.run import Run
 from gpvo.learning.config import TrainConfig
@@ -45,7 +46,7 @@ def with_twins(run: Run, twins: Sequence[Run], predictor: Predictor | None, opti
 def by_twins(
     run: Run, twins: Sequence[Run], predictor: Predictor | None, options: EvaluateOptions
 ) -> tuple[dict[str, Any], list[Evaluation]]:
-    """A run without truth: the document of :func:`gpvo.evaluation.evaluate.document` as a mean over its twins, and the
+    """A run without truth: the document of :func:`gpvo.evaluation.document.document` as a mean over its twins, and the
     evaluation of each. The method ``twin`` of each twin is that of the others."""
     found = []
     for k, twin in enumerate(twins):

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gpvo.dataset.align import interpolate_truth
-from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.evaluation import curves
 from gpvo.evaluation.evaluate import Evaluation
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.stats.series import allan_deviation, autocorrelation
 from gpvo.types import Array, Status
 

@@ -13,7 +13,8 @@ import numpy as np
 from gpvo import __version__
 from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation import curves, panels
-from gpvo.evaluation.evaluate import Evaluation, document, judged, predictions_by_stamp
+from gpvo.evaluation.document import document
+from gpvo.evaluation.evaluate import Evaluation, judged, predictions_by_stamp
 from gpvo.evaluation.matches import MatchPicture
 from gpvo.evaluation.panels import spread
 from gpvo.evaluation.statements import statements

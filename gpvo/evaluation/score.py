@@ -19,7 +19,8 @@ from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
 from gpvo.evaluation.statements import corrected
 from gpvo.geometry import se3
-from gpvo.io.foreign import read_foreign, to_records
+from gpvo.io.foreign import read_foreign
+from gpvo.io.foreign_records import to_records
 from gpvo.io.jsonfile import write_json
 from gpvo.io.run_read import Run
 from gpvo.io.stated import read_stated, write_stated

@@ -1,4 +1,5 @@
-"""SE(3) as 4x4 matrices, with batches in the leading axes.
+"""SE(3) as 4x4 matrices, with batches in the leading axes, and the fixed rotations between the field's frames (REP 103,
+REP 105; MAVLink's MAV_FRAME).
 
 House rules: a tangent vector is ``(translation xyz [m], rotation xyz [rad])`` and perturbs on the right,
 ``T Exp(xi)``. ``T_a_b`` maps coordinates in ``b`` to coordinates in ``a``.
@@ -255,3 +256,22 @@ def path_length_m(position_m: Array) -> Array:
     """(N,) length of a path of straight lines up to each of its points (N, d)."""
     steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+# Optical (x right, y down, z forward) to FLU body (x forward, y left, z up) of a forward-looking camera.
+R_FLU_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+# FLU to FRD and back: its own inverse.
+R_FRD_FLU: Array = np.diag([1.0, -1.0, -1.0])
+# ENU to NED and back: its own inverse.
+R_NED_ENU: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# RealSense T265 pose stream (x right, y up, z back) to FLU.
+R_FLU_T265: Array = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+for _R in (R_FLU_OPTICAL, R_FRD_FLU, R_NED_ENU, R_FLU_T265):
+    _R.setflags(write=False)
+
+
+def rotate_covariance(R_new_old: Array, covariance: Array) -> Array:
+    """6x6 covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R)."""
+    B = np.zeros((6, 6))
+    B[:3, :3] = B[3:, 3:] = R_new_old
+    return B @ covariance @ B.T

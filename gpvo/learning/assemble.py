@@ -19,12 +19,10 @@ from gpvo.learning.calibrate import (
     fit_scale,
 )
 from gpvo.learning.logvariance import log_ratio
-from gpvo.learning.partcorrelation import part_correlations
-from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts
+from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
 from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
-from gpvo.learning.rows import Rows
-from gpvo.learning.selection import significant_gain
+from gpvo.learning.rows import Rows, significant_gain
 from gpvo.learning.spans import at_most
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.division import Division, ln_faster, of_calibration

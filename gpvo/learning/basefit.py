@@ -1,69 +1,62 @@
-"""What is known before a GP learns anything, from training rows: the base variance, and how fast the vehicle is.
-
-The parts of the variance, not negative, are fitted by the likelihood of a heavy-tailed error.
-"""
+"""What is known before a GP learns anything, from training rows: the base variance, and how fast the vehicle is."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.rows import Rows
-from gpvo.online.base import COASTED, TWIST_COLUMNS, BaseVariance, Velocities, parts
-from gpvo.stats.student_t import NU
+from gpvo.online.base import COASTED, TWIST_COLUMNS, Velocities
+from gpvo.stats.student_t import NU, log_fisher, log_scale_score, negative_log_likelihood
 from gpvo.types import Array
 
-_SMALLEST = np.log(1e-6)
-_LARGEST = np.log(1e3)
+_SMALLEST, _LARGEST = 1e-6, 1e3
+"""Of a term of usual size, over the mean square."""
+_STEPS, _HALVINGS, _ENOUGH = 100, 10, 1e-10
 _LEAST_RATE_VAR = 1e-6
 
 
-def fit_base(
-    columns: Array,
-    dt_s: Array,
-    error: Array,
-    method: str | None,
-    weight: Array | None = None,
-    *,
-    residual: bool = False,
-) -> BaseVariance:
-    """Coefficients of each axis from errors (n, 6); ``columns`` as :func:`gpvo.online.base.base_columns` says.
+def fit_coefficients(terms: Array, error: Array, weight: Array) -> Array:
+    """(6, 5) factors, not negative, on the ``terms`` (n, 6, 5) of a base variance (see :func:`gpvo.online.base.parts`)
+    by which errors (n, 6) are likeliest, taken as those of a Student-t; 0 where a term is never there.
 
-    ``weight`` (n,): how much a row counts.
+    ``weight`` (n,): how much a row counts. By Fisher scoring, projected onto the bounds (D. Bertsekas, "Projected
+    Newton methods for optimization problems with simple constraints" (1982)), of all axes at a time.
     """
-    count = np.ones(len(error)) if weight is None else weight
-    theta = _fit_axes(parts(columns, dt_s), error, count)
-    plain = _fit_axes(parts(columns[:, :6], dt_s), error, count)
-    return BaseVariance(theta, plain, method, residual)
+    count, square = weight / weight.sum(), error.T**2
+    level = np.maximum(np.minimum(square, np.quantile(square, 0.99, axis=1, keepdims=True)) @ count, 1e-18)
+    unit = level[:, None] / np.maximum(np.tensordot(count, terms, 1), 1e-300)
+    X = np.ascontiguousarray((terms * unit).transpose(1, 0, 2))
+    theta = np.full(unit.shape, 1.0 / unit.shape[1])
+
+    def loss(theta: Array) -> Array:
+        return np.asarray(negative_log_likelihood(square, (X @ theta[..., None])[..., 0]) @ count)
+
+    best = loss(theta)
+    for _ in range(_STEPS):
+        step, before = _scoring_step(X, square, count, theta), best
+        for size in 0.5 ** np.arange(_HALVINGS):
+            tried = np.clip(theta + size * step, _SMALLEST, _LARGEST)
+            found = loss(tried)
+            better = (found < best)[:, None]
+            theta, step, best = np.where(better, tried, theta), np.where(better, 0.0, step), np.minimum(found, best)
+            if not step.any():
+                break
+        if (before - best).max() < _ENOUGH:
+            break
+    return np.where((terms > 0).any(axis=0), theta * unit, 0.0)
 
 
-def _fit_axes(terms: Array, error: Array, count: Array) -> Array:
-    return np.stack([_fit_axis(terms[:, j], error[:, j] ** 2, count) for j in range(6)])
-
-
-def _fit_axis(terms: Array, square: Array, count: Array) -> Array:
-    """(5,) coefficients: minimises the t's negative log-likelihood over their logs, terms scaled to the mean square."""
-    typical = np.maximum(np.average(terms, axis=0, weights=count), 1e-300)
-    level = max(float(np.average(np.minimum(square, np.quantile(square, 0.99)), weights=count)), 1e-18)
-    scaled = terms / typical * level
-    weight = count / count.sum()
-
-    def objective(p: Array) -> tuple[float, Array]:
-        theta = np.exp(p)
-        v = scaled @ theta
-        s = v * (NU - 2.0) / NU
-        value = weight @ (0.5 * np.log(s) + 0.5 * (NU + 1.0) * np.log1p(square / (NU * s)))
-        # d/dv: half of (1 - (nu + 1) y^2 / (nu s + y^2)) / v.
-        slope = 0.5 * weight * (1.0 - (NU + 1.0) * square / (NU * s + square)) / v
-        return float(value), (slope @ scaled) * theta
-
-    free = terms.max(axis=0) > 0
-    bounds = [(_SMALLEST, _LARGEST) if f else (_SMALLEST, _SMALLEST) for f in free]
-    start = np.where(free, np.log(1.0 / max(free.sum(), 1)), _SMALLEST)
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-    theta = np.where(free, np.exp(found.x), 0.0)
-    return theta / typical * level
+def _scoring_step(X: Array, square: Array, count: Array, theta: Array) -> Array:
+    """(6, 5) Fisher's step from ``theta`` within the bounds: a factor at one, which would leave it, is held there."""
+    v = (X @ theta[..., None])[..., 0]
+    R = X / v[..., None]
+    score = ((count * log_scale_score(square * (NU / (NU - 2.0)) / v, NU))[:, None] @ R)[:, 0]
+    held = (score == 0) | ((theta <= _SMALLEST) & (score < 0)) | ((theta >= _LARGEST) & (score > 0))
+    information = float(log_fisher(NU)) * np.swapaxes(R * count[:, None], 1, 2) @ R
+    information = np.where(held[:, :, None] | held[:, None], 0.0, information)
+    information += np.eye(theta.shape[1]) * np.where(held, 1.0, 1e-12)[:, None]
+    return np.asarray(np.linalg.solve(information, np.where(held, 0.0, score)[..., None])[..., 0])
 
 
 def learn_velocities(rows: Rows) -> Velocities:

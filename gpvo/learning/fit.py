@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.assemble import assemble
-from gpvo.learning.basefit import fit_base
+from gpvo.learning.basefit import fit_coefficients
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
-from gpvo.learning.rows import Rows
-from gpvo.learning.selection import group_folds, significant_gain, simplest_sufficient
-from gpvo.online.base import BaseVariance, base_columns
+from gpvo.learning.rows import Rows, group_folds, significant_gain, simplest_sufficient
+from gpvo.online.base import OF_MOTION, BaseVariance, base_columns, parts
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import Domain
 from gpvo.online.projected import ProjectedGP
@@ -120,32 +119,33 @@ def choose_inputs(
 
 def fit_variance(rows: Rows, choice: BaseChoice, inputs: tuple[str, ...]) -> VarianceModel:
     """The variance on ``inputs``, and out of fold: no row is predicted by a fit that saw its group."""
-    C, U = _base_inputs(rows, base_columns(choice.method, choice.residual)), _gp_inputs(rows, inputs)
-    base, gp = _fit(rows, choice, C, U, np.ones(len(C), dtype=bool))
+    columns = _base_inputs(rows, base_columns(choice.method, choice.residual))
+    terms, U = parts(columns, rows.dt_s), _gp_inputs(rows, inputs)
+    theta, gp, left = _fit(rows, terms, U, np.ones(len(terms), dtype=bool))
+    plain = fit_coefficients(terms * OF_MOTION, left, rows.weight)
     oof, fold = np.empty_like(rows.error), group_folds(rows.group, MOST_FOLDS)
     for f in np.unique(fold):
         out = fold == f
-        without, gp_without = _fit(rows, choice, C, U, ~out)
+        theta_without, gp_without, _ = _fit(rows, terms, U, ~out)
         lift = 0.0 if gp_without is None else log_ratio(gp_without, U[out])
-        oof[out] = without(C[out], rows.dt_s[out]) * np.exp(lift)
-    return VarianceModel(inputs, base, gp, oof)
+        oof[out] = (terms[out] * theta_without).sum(axis=-1) * np.exp(lift)
+    return VarianceModel(inputs, BaseVariance(theta, plain, choice.method, choice.residual), gp, oof)
 
 
-def _fit(
-    rows: Rows, choice: BaseChoice, C: Array, U: Array, of: NDArray[np.bool_]
-) -> tuple[BaseVariance, ProjectedGP | None]:
-    """Base and GP of the rows ``of``. The base is the GP's mean function, and is fitted once more with it.
+def _fit(rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_]) -> tuple[Array, ProjectedGP | None, Array]:
+    """Coefficients of the base, GP, and what it leaves of the errors, of the rows ``of``. The base is the GP's mean
+    function, and is fitted once more with it.
 
     Explicit basis functions: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006),
     section 2.7; here of the variance, so in turn.
     """
-    error, dt_s, weight = rows.error[of], rows.dt_s[of], rows.weight[of]
-    base = fit_base(C[of], dt_s, error, choice.method, weight, residual=choice.residual)
+    terms, error, weight = terms[of], rows.error[of], rows.weight[of]
+    theta = fit_coefficients(terms, error, weight)
     if U.shape[1] == 0:
-        return base, None
-    gp = fit_log_variance(U[of], error**2 / base(C[of], dt_s), weight, rows.group[of])
+        return theta, None, error
+    gp = fit_log_variance(U[of], error**2 / (terms * theta).sum(axis=-1), weight, rows.group[of])
     left = error * np.exp(-0.5 * log_ratio(gp, U[of]))
-    return fit_base(C[of], dt_s, left, choice.method, weight, residual=choice.residual), gp
+    return fit_coefficients(terms, left, weight), gp, left
 
 
 def _losses(rows: Rows, model: VarianceModel) -> Array:

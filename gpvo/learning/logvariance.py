@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.learning.regressors.inducing import greedy_points
+from gpvo.learning.regressors.numerics import greedy_points
 from gpvo.online.projected import ProjectedGP
 from gpvo.stats.student_t import NU, log_fisher, log_scale_score
 from gpvo.types import Array

@@ -4,7 +4,8 @@ Of a motion's variance v a share is jitter (n_k - n_(k-1), that of the frames it
 first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). Above the typical speed what
 adds up may grow with it, as it does so by landmarks that come and go along the path. The bias may grow faster than the
 noise: that of triangulated points goes with the variance of the noise, so its own variance with the square (G. Sibley,
-L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)).
+L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)). How the axes go
+together in each part is told by the correlations of the sums.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from gpvo.geometry.covariance import correlation
+from gpvo.learning.calibrate import residual_correlation
 from gpvo.learning.spans import Chains, at_most, cut, span_variances
+from gpvo.stats.series import moving_sums
 from gpvo.types import Array
 
 _TAU_FRAMES = (4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
@@ -239,3 +243,51 @@ def _solve(A: Array, square: Array, weight: Array) -> Array:
     bias = np.where(both, bias, np.where(by_jitter, 0.0, rb / bb))
     share = np.maximum([jitter, 1.0 - jitter - bias, bias], _MIN_SHARE)
     return np.asarray(share / share.sum(axis=0))
+
+
+_PRIOR = 3.0
+_LEAST_EIGENVALUE = 1e-3
+
+
+def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
+    """(S, 3) variance of the sum over m frames of jitter, white and bias of unit variance."""
+    rho = np.exp(-1.0 / tau_frames)
+    m = spans.astype(np.float64)
+    bias = m + 2.0 * (rho * (m * (1.0 - rho) - 1.0 + rho**m)) / (1.0 - rho) ** 2
+    return np.stack([np.ones_like(m), m, bias], axis=1)
+
+
+def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
+    """(3, 6, 6) correlations of jitter, white and bias, from those of the errors summed over each span.
+
+    Each sum is over its own stated deviation: among the motions that it sums the worst decide, as they do of the pose,
+    and their axes may go together more closely than those of the others.
+    Of each pair of axes three numbers are sought whose mixture, by what each part contributes to the sum, is the
+    correlation seen over every span; all are drawn towards that of single motions, as few windows show little.
+    """
+    part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
+    whole = part.sum(axis=2).T
+    measured = np.array([residual_correlation(_scaled_sums(error, sigma, m)) for m in split.spans])
+    windows = 2.0 / split.doubt
+    out = np.tile(np.eye(6), (3, 1, 1))
+    for i, j in zip(*np.triu_indices(6, 1)):
+        mixture = np.sqrt(part[i] * part[j] / (whole[:, i] * whole[:, j])[:, None])
+        weight = np.sqrt(np.minimum(windows[:, i], windows[:, j]))
+        A = np.vstack([mixture * weight[:, None], _PRIOR * np.eye(3)])
+        b = np.concatenate([measured[:, i, j] * weight, np.full(3, _PRIOR * measured[0, i, j])])
+        out[:, i, j] = out[:, j, i] = np.linalg.lstsq(A, b, rcond=None)[0]
+    return np.array([_nearest_correlation(R) for R in out])
+
+
+def _scaled_sums(error: Chains, sigma: Chains, m: int) -> Array:
+    """(w, D) sums over m motions, over their stated deviation were they independent; each axis of unit mean square."""
+    pairs = [(e, s) for es, ss in zip(error, sigma) for e, s in zip(es, ss) if len(e) >= m]
+    z = np.concatenate([moving_sums(e, m) / np.sqrt(moving_sums(s**2, m)) for e, s in pairs])
+    return np.asarray(z / np.sqrt((z**2).mean(axis=0)))
+
+
+def _nearest_correlation(R: Array) -> Array:
+    """Positive definite, with a unit diagonal."""
+    values, vectors = np.linalg.eigh(R)
+    R = (vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
+    return correlation(R)

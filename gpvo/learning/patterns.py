@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.learning.rows import Rows
-from gpvo.learning.selection import group_folds
+from gpvo.learning.rows import Rows, group_folds
 from gpvo.learning.spans import cut
 from gpvo.online.base import TWIST_COLUMNS
 from gpvo.types import Array

@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from gpvo.accumulation import adjoints_to_end, persistent_sum
 from gpvo.geometry.covariance import scaled_root
-from gpvo.learning.selection import significant_gain
+from gpvo.learning.rows import significant_gain
 from gpvo.learning.spans import SPANS, cut
 from gpvo.stats.consistency import nees
 from gpvo.types import Array

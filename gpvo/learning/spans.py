@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.stats.series import moving_sums
 from gpvo.types import Array
 
 Chains = Sequence[Sequence[NDArray[Any]]]
@@ -60,7 +61,9 @@ def span_variances(z: Chains) -> SpanVariances:
     spans, mean_square, doubt = [], [], []
     for m in SPANS:
         long = [[chain for chain in chains if len(chain) >= m] for chains in z]
-        squares = np.array([np.concatenate([sums(c, m) ** 2 for c in some]).mean(axis=0) for some in long if some])
+        squares = np.array(
+            [np.concatenate([moving_sums(c, m) ** 2 for c in some]).mean(axis=0) for some in long if some]
+        )
         windows = np.array([sum(len(c) for c in some) / m for some in long if some])
         if windows.sum() >= _MIN_WINDOWS:
             weight = windows / windows.sum()
@@ -80,12 +83,6 @@ def by_block(values: Array) -> Array:
     for start in range(0, len(out), 3):
         out[start : start + 3] = out[start : start + 3].mean()
     return out
-
-
-def sums(z: Array, m: int) -> Array:
-    """(n - m + 1, D) sums over every m consecutive rows of z (n, D)."""
-    total = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
-    return total[m:] - total[:-m]
 
 
 def chains(t_ns: NDArray[np.int64], dt_s: Array) -> list[NDArray[np.int64]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.frames import rotate_covariance
+from gpvo.geometry.se3 import rotate_covariance
 from gpvo.learning.check import rate_problems
 from gpvo.live.intake import Arrival
 from gpvo.live.kept_state import State, load_state, save_state

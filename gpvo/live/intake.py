@@ -12,7 +12,7 @@ from math import inf
 from statistics import median
 from typing import Any
 
-from gpvo.io.foreign import GAP_STEPS
+from gpvo.io.foreign_records import GAP_STEPS
 from gpvo.online.observer import Doubt
 
 BACK_S = 1.0

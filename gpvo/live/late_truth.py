@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.targets import motion_targets
+from gpvo.dataset.errors import motion_targets
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.bag_reader import pose_of, stamp_ns

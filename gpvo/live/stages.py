@@ -14,11 +14,12 @@ from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import change_body, is_positive_definite, symmetrise
-from gpvo.geometry.frames import rotate_covariance
+from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_images import PairQueue, decode_message
 from gpvo.io.bag_reader import pose_of, stamp_ns
 from gpvo.io.bags import camera_info_of, info_topic
-from gpvo.io.foreign import T_FLU_OPTICAL, UNKNOWN_RAD
+from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.io.foreign_records import UNKNOWN_RAD
 from gpvo.io.images import Image8
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S

@@ -25,6 +25,8 @@ TWIST_COLUMNS = ("v_x_mps", "v_y_mps", "v_z_mps", "w_x_radps", "w_y_radps", "w_z
 ACCELERATION_COLUMNS = ("acceleration_mps2", "angular_acceleration_radps2")
 RESIDUAL_COLUMN = "ln_residual_px"
 N_PARTS = 5
+OF_MOTION = np.array([0.0, 1.0, 1.0, 1.0, 0.0])
+"""Which parts of the base variance look at the motion alone."""
 COASTED = (1, 2, 5, 10, 20, 50)
 """Over so many usual motions training tells how much a velocity changes."""
 

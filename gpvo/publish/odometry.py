@@ -11,7 +11,7 @@ from gpvo.accumulation import PoseError, frame_jitter
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite, symmetrise
-from gpvo.geometry.frames import R_FLU_OPTICAL, rotate_covariance
+from gpvo.geometry.se3 import R_FLU_OPTICAL, rotate_covariance
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 

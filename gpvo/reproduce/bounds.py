@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
-from gpvo.dataset.align import interpolate_truth
 from gpvo.dataset.build import TrainingSet, build_run, observe
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.evaluation.evaluate import predictions_by_stamp
 from gpvo.evaluation.statements import corrected, statements
 from gpvo.geometry import se3

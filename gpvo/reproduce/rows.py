@@ -14,7 +14,8 @@ from typing import Literal
 from gpvo import __version__, runner
 from gpvo.errors import GpvoError
 from gpvo.io import open_source
-from gpvo.io.foreign import read_foreign, to_records
+from gpvo.io.foreign import read_foreign
+from gpvo.io.foreign_records import to_records
 from gpvo.io.run import is_finished, write_run
 from gpvo.io.trajectory import check_overlap
 from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method_of

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim.paths import RAMP_S, Path3, knots, smooth_start
 from gpvo.types import Array
 

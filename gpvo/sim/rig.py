@@ -14,7 +14,7 @@ from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cameras.rig import StereoRig, Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.run_read import is_run, read_run
 from gpvo.types import Array
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpvo.stats.series import moving_sums
 from gpvo.types import Array
 
 
@@ -51,8 +52,7 @@ def block_bootstrap(
     per_draw = int(np.ceil(n / block))
     rng = np.random.default_rng(seed)
     # Sum of each circular block from a running sum, so that a draw costs n / block look-ups.
-    running = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[:block]]))])
-    block_mean = (running[block : block + n] - running[:n]) / block
+    block_mean = moving_sums(np.concatenate([values, values[:block]]), block)[:n] / block
     means = block_mean[rng.integers(0, n, (draws, per_draw))].mean(axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return Interval(float(values.mean()), float(low), float(high))

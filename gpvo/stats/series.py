@@ -1,4 +1,4 @@
-"""How a series remembers: autocorrelation and Allan deviation.
+"""Series: sums over windows, and how they remember: autocorrelation and Allan deviation.
 
 D. W. Allan, "Statistics of atomic frequency standards" (1966); overlapping estimator as in IEEE Std 952-1997, annex C.
 """
@@ -8,6 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from gpvo.types import Array
+
+
+def moving_sums(values: Array, m: int) -> Array:
+    """(n - m + 1, ...) sums over every m consecutive rows of values (n, ...)."""
+    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    return np.asarray(total[m:] - total[:-m])
 
 
 def autocorrelation(values: Array, max_lag: int) -> Array:
@@ -24,14 +30,14 @@ def allan_deviation(rate: Array, dt_s: float) -> tuple[Array, Array]:
 
     White noise falls with the root of time, a bias that wanders makes it flat and then rise.
     """
-    total = np.concatenate([[0.0], np.cumsum(np.asarray(rate, dtype=np.float64))])
-    n = len(total) - 1
+    rate = np.asarray(rate, dtype=np.float64)
+    n = len(rate)
     if n < 4:
         return np.empty(0), np.empty(0)
     sizes = np.unique(np.geomspace(1, n // 3 or 1, 25).astype(int))
     deviations = []
     for m in sizes:
-        means = (total[m:] - total[:-m]) / m
+        means = moving_sums(rate, int(m)) / m
         steps = means[m:] - means[:-m]
         deviations.append(np.sqrt(0.5 * np.mean(steps**2)))
     return sizes * dt_s, np.array(deviations)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.io.run import Run, read_run, read_tracks
 from gpvo.runner import config_of
-from gpvo.twin.adjustment import Structure, adjust, without_loose_frames
-from gpvo.twin.noise import Neighbours
+from gpvo.twin.noise import Neighbours, Structure, adjust, without_loose_frames
 from gpvo.twin.observations import Observations
 from gpvo.types import Array
 from gpvo.vo.config import VoConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from synthetic_flights import ErrorLaw, Events, synthetic_flight
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.geometry import se3
 from gpvo.types import TruthLog
 

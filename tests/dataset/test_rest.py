@@ -7,7 +7,8 @@ import pytest
 from gpvo.dataset.build import build
 from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.errors import GpvoError
-from gpvo.evaluation.evaluate import EvaluateOptions, document, evaluate_run
+from gpvo.evaluation.document import document
+from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
 from gpvo.evaluation.score import score_sequence, write_statements
 from gpvo.io import open_source
 from gpvo.io.run import read_run

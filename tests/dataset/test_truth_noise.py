@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.dataset.align import interpolate_truth
-from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.dataset.hand_eye import fixed_rotation
 from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m
 from gpvo.evaluation.evaluate import evaluate_run

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
-from gpvo.dataset.align import interpolate_truth
-from gpvo.dataset.errors import motion_errors
+from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.evaluation.consistency import Consistency, consistency, truth_noise
 from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3

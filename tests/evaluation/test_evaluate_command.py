@@ -12,7 +12,8 @@ from evaluation_runs import make_run, stated_covariance
 from gpvo import cli
 from gpvo.dataset.build import build
 from gpvo.errors import ModelError
-from gpvo.evaluation.evaluate import METHODS, EvaluateOptions, document, evaluate_run
+from gpvo.evaluation.document import METHODS, document
+from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
 from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run, write_run

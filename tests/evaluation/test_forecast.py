@@ -10,7 +10,7 @@ from gpvo import cli
 from gpvo.errors import ModelError
 from gpvo.evaluation.forecast import Plan, forecast, resample
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.trajectory import Trajectory, write_tum
 from gpvo.learning.store import save_model
 from gpvo.online import modelfile

@@ -13,7 +13,8 @@ import pytest
 from evaluation_runs import make_run
 from gpvo.errors import SourceError
 from gpvo.evaluation import panels, plots
-from gpvo.evaluation.evaluate import Evaluation, document, evaluate_run
+from gpvo.evaluation.document import document
+from gpvo.evaluation.evaluate import Evaluation, evaluate_run
 from gpvo.evaluation.report import render, scene, write_report
 from gpvo.io.run import Run, read_run, write_run
 from gpvo.types import Mounting, VoLog

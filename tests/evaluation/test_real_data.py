@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gpvo import runner
-from gpvo.evaluation.evaluate import Evaluation, document, evaluate_run
+from gpvo.evaluation.document import document
+from gpvo.evaluation.evaluate import Evaluation, evaluate_run
 from gpvo.io import open_source
 from gpvo.io.run import read_run
 from gpvo.types import Status

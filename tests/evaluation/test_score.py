@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from docs.baselines import baselines, rtabmap_covariance
 from evaluation_runs import CAMERA, make_run, stated_covariance
 from gpvo import cli
 from gpvo.dataset.build import build_run
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError, SourceError
-from gpvo.evaluation.baselines import baselines, rtabmap_covariance
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.score import board, score, score_folder, score_sequence, write_statements
 from gpvo.geometry import se3

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.evaluation.evaluate import document, evaluate_run
-from gpvo.evaluation.tables import latex, write_tables
+from gpvo.evaluation.document import document, latex, write_tables
+from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.io.run import read_run
 
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,7 @@ from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy
 from gpvo.filters.run import FuseOptions, fuse_flight
-from gpvo.filters.side_by_side import fuse_side_by_side
-from gpvo.filters.study import Constants, Study, fit_scalars, has_noise, make_policies, study, table
+from gpvo.filters.study import Constants, Study, fit_scalars, fuse_side_by_side, has_noise, make_policies, study, table
 from gpvo.geometry import se3
 from gpvo.types import Status, VoRecord
 from synthetic_flights import ErrorLaw, synthetic_flight, with_geometric

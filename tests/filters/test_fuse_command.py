@@ -15,7 +15,7 @@ from gpvo.evaluation.fusion import FusionSettings, fuse_runs
 from gpvo.filters.policies import POLICIES
 from gpvo.filters.run import FuseOptions
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.run import write_run
 from gpvo.types import ImuLog, Mounting, Status, TruthLog, VoLog, VoRecord
 from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight, vertical_in_world
 from gpvo.filters.sanity import check_flight

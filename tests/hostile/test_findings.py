@@ -25,7 +25,7 @@ FINDINGS = {
         "test_records: a_row_without_its_inputs_is_no_surer_than_the_worst_of_training,"
         " a_record_of_which_nothing_is_known_is_not_ok,"
         " one_missing_input_that_training_never_missed_is_not_in_the_domain",
-        "../learning/test_export: onnx_runs_to_the_same_numbers, c_compiles_to_the_same_numbers",
+        "../publish/test_export: onnx_runs_to_the_same_numbers, c_compiles_to_the_same_numbers",
     ),
     "4 bombs of YAML, pictures, arrays": (
         "test_bombs: yaml_bombs_are_refused_at_once, the_size_is_read_from_the_header,"

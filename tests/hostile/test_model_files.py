@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError, ModelError
-from gpvo.learning.export import export_model
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from gpvo.online.stored import spec_of
+from gpvo.publish.export import export_model
 from small_model import small_model
 from typer.testing import CliRunner
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io import guess, open_source
 from gpvo.types import StereoCamera
 

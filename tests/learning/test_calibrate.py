@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.learning.basefit import fit_base
+from gpvo.learning.basefit import fit_coefficients
 from gpvo.learning.calibrate import (
     conformal_quantiles,
     fit_outside_power,
@@ -13,7 +13,8 @@ from gpvo.learning.calibrate import (
 )
 from gpvo.online.base import parts
 from gpvo.online.guard import growth
-from gpvo.stats.student_t import second_moment
+from gpvo.stats.student_t import negative_log_likelihood, second_moment
+from scipy.optimize import minimize
 
 
 def test_second_moment_of_a_gaussian_and_of_a_t():
@@ -78,7 +79,24 @@ def test_base_variance_finds_its_parts():
     terms = parts(columns, dt)
     theta = np.array([0.1, 0.0, 2.0, 0.0, 0.5])
     error = np.sqrt(terms @ theta) * rng.standard_normal((n, 6))
-    base = fit_base(columns, dt, error, "any", residual=True)
-    ratio = np.log(base(columns, dt) / (terms @ theta))
+    fitted = fit_coefficients(terms, error, np.ones(n))
+    ratio = np.log((terms * fitted).sum(axis=-1) / (terms @ theta))
     # The heavy-tailed likelihood finds the shape; its scale is set later, by calibration.
     assert np.abs(ratio - ratio.mean(axis=0)).mean() < 0.1
+
+
+def test_coefficients_are_as_likely_as_those_of_another_optimiser():
+    rng = np.random.default_rng(5)
+    n = 600
+    columns = np.hstack([rng.standard_normal((n, 6)), np.log(rng.uniform(0.5, 2.0, (n, 7)))])
+    terms, weight = parts(columns, np.full(n, 0.1)), rng.uniform(0.5, 1.5, n)
+    error = np.sqrt((terms * [0.3, 0.0, 1.0, 0.1, 0.2]).sum(axis=-1)) * rng.standard_t(5, (n, 6))
+    found = fit_coefficients(terms, error, weight)
+
+    def loss(theta, j):
+        return float(weight @ negative_log_likelihood(error[:, j] ** 2, terms[:, j] @ theta) / weight.sum())
+
+    for j in range(6):
+        start = np.maximum(found[j], 1e-4) * rng.uniform(0.5, 2.0, 5)
+        other = minimize(loss, start, (j,), method="L-BFGS-B", bounds=[(1e-9, None)] * 5, options={"ftol": 1e-12})
+        assert loss(found[j], j) < other.fun + 1e-6

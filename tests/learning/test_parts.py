@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from gpvo.accumulation import PoseError
-from gpvo.learning.partcorrelation import curves, part_correlations
-from gpvo.learning.parts import fit_parts
+from gpvo.learning.parts import curves, fit_parts, part_correlations
 from gpvo.learning.spans import SpanVariances, chains, span_variances
 from scipy.signal import lfilter
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.learning.regressors import Hyperparameters, Regressor, get_regressor, regressor_names
-from gpvo.learning.regressors.inducing import greedy_points
-from gpvo.learning.regressors.numerics import pack
+from gpvo.learning.regressors.numerics import greedy_points, pack
 from gpvo.learning.regressors.sparse import CollapsedBound, Posterior, SparseRegressor
 from synthetic_errors import gaussian_nll, make_problem
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from gpvo.learning.selection import significant_gain, simplest_sufficient
+from gpvo.learning.rows import significant_gain, simplest_sufficient
 
 
 def test_chance_passes_as_often_as_a_t_beyond_its_standard_error_and_a_steady_gain_always() -> None:

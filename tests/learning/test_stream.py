@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gpvo.dataset.stored import BLOCK_ROWS, StoredSets, kept_rows
-from gpvo.dataset.table import read_sets, write_sets
+from gpvo.dataset.table import BLOCK_ROWS, StoredSets, kept_rows, read_sets, write_sets
 from gpvo.errors import GpvoError, SourceError
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.store import save_model
+from gpvo.learning.store import save_model, train_stored
 from gpvo.learning.train import train_sets
-from gpvo.learning.update import train_stored
 from small_model import training_sets
 
 QUICK = TrainConfig(features="velocity,n_inliers")

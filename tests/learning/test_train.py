@@ -25,9 +25,8 @@ from gpvo.learning.methods import METHODS, best_scale
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
-from gpvo.learning.store import card_path, folds_path, picture_path, rows_path, save_model
+from gpvo.learning.store import card_path, config_of, folds_path, picture_path, rows_path, save_model, update
 from gpvo.learning.train import _slips, train_sets
-from gpvo.learning.update import config_of, update
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.predictor import Predictor

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.learning.regressors import Hyperparameters, get_regressor
-from gpvo.learning.regressors.base import Scaling
+from gpvo.learning.regressors import Hyperparameters, Scaling, get_regressor
 from gpvo.learning.regressors.sparse import close
 
 HYPER = Hyperparameters(np.array([1.5, 0.8, 4.0]), signal_var=np.array([2.0, 0.5]), noise_var=np.array([0.1, 0.4]))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.publish.odometry import Floors, OdometryBuilder, lift, messages
 from gpvo.types import Prediction, Status, VoRecord
 from synthetic_flights import ErrorLaw, Events, synthetic_flight

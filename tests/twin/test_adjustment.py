@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.twin.adjustment import adjust, without_loose_frames
+from gpvo.twin.noise import adjust, without_loose_frames
 from gpvo.twin.normal import REACH, NormalEquations, Pieces, damped
 from gpvo.twin.observations import WHITEN, Chart, Estimate, Observations
 from gpvo.types import StereoCamera

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.twin.adjustment import Structure
-from gpvo.twin.noise import Neighbours, draw_signs
+from gpvo.twin.noise import Neighbours, Structure, draw_signs
 from gpvo.twin.observations import Observations
 from gpvo.types import StereoCamera
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.geometry import se3
-from gpvo.geometry.frames import R_FLU_OPTICAL
+from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim.eye import SensorModel, SensorParams
 from gpvo.sim.paths import wandering
 from gpvo.sim.render import StereoRenderer

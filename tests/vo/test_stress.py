@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.dataset.align import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth
 from gpvo.io.source import open_source
 from gpvo.types import Status, StereoFrame
 from gpvo.vo.config import make_config

@@ -2,12 +2,112 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
 
 from gpvo.errors import GpvoError
-from gpvo.learning.regressors.base import FittedGP, Hyperparameters, Regressor
+from gpvo.online.projected import ProjectedGP
+from gpvo.types import Array
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Of a squared-exponential kernel shared by D outputs of d inputs, in the units of the data.
+
+    ``lengthscale`` (d,); ``signal_var``, ``noise_var`` (D,).
+    """
+
+    lengthscale: Array
+    signal_var: Array
+    noise_var: Array
+
+
+@dataclass(frozen=True)
+class FittedGP:
+    """A fitted GP: its posterior in projected form, in the units of the data.
+
+    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.projected``). ``hyper``: what was learnt.
+    ``log_evidence``: log marginal likelihood, or its lower bound, in nats and in the units of the data.
+    ``regressor``: name. ``n_rows``: rows conditioned on.
+    """
+
+    gp: ProjectedGP
+    hyper: Hyperparameters
+    log_evidence: float
+    regressor: str
+    n_rows: int
+
+    def predict(self, X: Array) -> tuple[Array, Array]:
+        """Mean (n, D) and latent variance (n, D) at rows X (n, d); add ``hyper.noise_var`` for an observation."""
+        return self.gp.evaluate(X)
+
+
+class Regressor(Protocol):
+    """Fits D outputs that share one kernel. Options go to the constructor; the same data gives the same bits."""
+
+    @property
+    def name(self) -> str:
+        """By which it is chosen."""
+        ...
+
+    def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
+        """Learn the hyperparameters and the posterior of X (n, d) and Y (n, D), both finite.
+
+        Raises ValueError on shapes that do not fit.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Affine maps that give inputs and outputs zero mean and unit variance: centres and scales (d,), (D,)."""
+
+    x_centre: Array
+    x_scale: Array
+    y_centre: Array
+    y_scale: Array
+
+    @classmethod
+    def of(cls, X: Array, Y: Array) -> Scaling:
+        """Moments of the columns; constant columns get scale 1."""
+        x_centre, y_centre, x_scale, y_scale = X.mean(axis=0), Y.mean(axis=0), X.std(axis=0), Y.std(axis=0)
+        x_scale[~(x_scale > 1e-12 * (1 + np.abs(x_centre)))] = 1.0
+        y_scale[~(y_scale > 1e-12 * np.abs(y_centre))] = 1.0
+        return cls(x_centre, x_scale, y_centre, y_scale)
+
+    def inputs(self, X: Array) -> Array:
+        """Standardised inputs."""
+        return (X - self.x_centre) / self.x_scale
+
+    def outputs(self, Y: Array) -> Array:
+        """Standardised outputs."""
+        return (Y - self.y_centre) / self.y_scale
+
+    def scaled(self, hyper: Hyperparameters) -> Hyperparameters:
+        """Hyperparameters of the data as those of the standardised data."""
+        y2 = self.y_scale**2
+        return Hyperparameters(hyper.lengthscale / self.x_scale, hyper.signal_var / y2, hyper.noise_var / y2)
+
+    def unscaled(self, hyper: Hyperparameters) -> Hyperparameters:
+        """Hyperparameters of the standardised data as those of the data."""
+        y2 = self.y_scale**2
+        return Hyperparameters(hyper.lengthscale * self.x_scale, hyper.signal_var * y2, hyper.noise_var * y2)
+
+
+def checked(X: Array, Y: Array) -> tuple[Array, Array]:
+    """X (n, d) and Y (n, D) as float64, or ValueError with the shapes got."""
+    X, Y = np.asarray(X, dtype=np.float64), np.asarray(Y, dtype=np.float64)
+    Y = Y[:, None] if Y.ndim == 1 else Y
+    if X.ndim != 2 or Y.ndim != 2 or len(X) != len(Y) or len(X) < 2:
+        raise ValueError(f"expected X (n, d) and Y (n, D) with n >= 2, got {X.shape} and {Y.shape}")
+    if not (np.isfinite(X).all() and np.isfinite(Y).all()):
+        raise ValueError("X and Y must be finite")
+    return X, Y
+
 
 __all__ = ["FittedGP", "Hyperparameters", "Regressor", "get_regressor", "regressor_names"]
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from gpvo.learning.regressors.base import FittedGP, Hyperparameters, Scaling, checked
+from gpvo.learning.regressors import FittedGP, Hyperparameters, Scaling, checked
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.regressors.sparse import exact
 from gpvo.types import Array
@@ -30,7 +30,7 @@ class SklearnRegressor:
     name: ClassVar[str] = "sklearn"
 
     def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
-        """See :class:`~gpvo.learning.regressors.base.Regressor`; the posterior is ours, at scikit-learn's optimum."""
+        """See :class:`~gpvo.learning.regressors.Regressor`; the posterior is ours, at scikit-learn's optimum."""
         X, Y = checked(X, Y)
         scaling = Scaling.of(X, Y)
         hyper = self.hyper

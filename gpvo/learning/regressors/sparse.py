@@ -16,8 +16,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gpvo.learning.regressors.base import FittedGP, Hyperparameters, Scaling, checked
-from gpvo.learning.regressors.inducing import greedy_points
+from gpvo.learning.regressors import FittedGP, Hyperparameters, Scaling, checked
 from gpvo.learning.regressors.numerics import (
     LOG_NOISE_BOUNDS,
     LOG_SIGNAL_BOUNDS,
@@ -25,6 +24,7 @@ from gpvo.learning.regressors.numerics import (
     cholesky,
     first_guess,
     fixed_threads,
+    greedy_points,
     length_gradient,
     pack,
     unit_kernel,
@@ -68,7 +68,7 @@ class SparseRegressor:
         return "exact" if self.inducing is None else "sparse"
 
     def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
-        """See :class:`~gpvo.learning.regressors.base.Regressor`."""
+        """See :class:`~gpvo.learning.regressors.Regressor`."""
         X, Y = checked(X, Y)
         scaling = Scaling.of(X, Y)
         Xs, Ys = scaling.inputs(X), scaling.outputs(Y)

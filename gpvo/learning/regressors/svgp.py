@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpvo.learning.regressors.base import FittedGP, Hyperparameters, Scaling, checked
-from gpvo.learning.regressors.inducing import greedy_points
-from gpvo.learning.regressors.numerics import fixed_threads, pick_device
+from gpvo.learning.regressors import FittedGP, Hyperparameters, Scaling, checked
+from gpvo.learning.regressors.numerics import fixed_threads, greedy_points, pick_device
 from gpvo.learning.regressors.sparse import close, start
 from gpvo.types import Array
 
@@ -42,7 +41,7 @@ class SvgpRegressor:
     name: ClassVar[str] = "svgp"
 
     def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
-        """See :class:`~gpvo.learning.regressors.base.Regressor`."""
+        """See :class:`~gpvo.learning.regressors.Regressor`."""
         X, Y = checked(X, Y)
         scaling = Scaling.of(X, Y)
         Xs, Ys = scaling.inputs(X), scaling.outputs(Y)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.noise import fractal, lattice, spectral
 from gpvo.sim.worlds.shapes import Parts, add_stone, grid_faces, icosphere, vertex_normals
 from gpvo.sim.worlds.stone import regolith, rock
+from gpvo.sim.worlds.textures import fractal, lattice, spectral
 from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World, check_ranges
 from gpvo.types import Array
 

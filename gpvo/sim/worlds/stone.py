@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.sim.worlds.noise import F32, spectral
+from gpvo.sim.worlds.textures import F32, spectral
 from gpvo.types import Array
 
 Texture = NDArray[np.uint8]

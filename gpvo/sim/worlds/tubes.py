@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from gpvo.sim.worlds.noise import F32, fractal
 from gpvo.sim.worlds.shapes import Faces, Parts, add_stone, grid_faces, icosphere
+from gpvo.sim.worlds.textures import F32, fractal
 from gpvo.types import Array
 
 _FLOOR = 0.62  # height of the floor under the line, in radii

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.noise import fractal, lattice
 from gpvo.sim.worlds.shapes import Parts, vertex_normals
 from gpvo.sim.worlds.stone import gravel, rock
-from gpvo.sim.worlds.textures import duct, shotcrete
+from gpvo.sim.worlds.textures import duct, fractal, lattice, shotcrete
 from gpvo.sim.worlds.tubes import Line, Tube, bolts, lamp_fixtures, pipe, rough_tube, rubble
 from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array

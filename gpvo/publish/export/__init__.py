@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 from gpvo.errors import GpvoError
-from gpvo.learning.export.c import PREFIX, to_c
-from gpvo.learning.export.onnx import to_onnx
 from gpvo.online.predictor import Predictor
+from gpvo.publish.export.c import PREFIX, to_c
+from gpvo.publish.export.onnx import to_onnx
 
 __all__ = ["FORMATS", "PREFIX", "SUFFIXES", "export_model", "format_of", "to_c", "to_onnx"]
 

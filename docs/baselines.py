@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation.statements import Statement, plain_statement

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError
-from gpvo.learning.export import export_model, to_c, to_onnx
 from gpvo.online import modelfile
 from gpvo.online.base import COASTED, BaseVariance, Velocities, base_columns
 from gpvo.online.division import PARTS, Division
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.guard import Domain
 from gpvo.online.projected import ProjectedGP
+from gpvo.publish.export import export_model, to_c, to_onnx
 from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner

@@ -48,7 +48,7 @@ def to_c(
     """
     if not _NAME.fullmatch(name) or f" {name} " in _KEYWORDS:
         raise GpvoError(f"the prefix {name!r} is no C identifier", cure="a letter first, then letters, digits, _")
-    template = files("gpvo.learning.export").joinpath("predictor.c").read_text(encoding="utf-8")
+    template = files("gpvo.publish.export").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
     code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
     write_text(Path(path), code)

@@ -1,0 +1,227 @@
+"""Evaluations as scripts, evo, plots of one's own and papers read them: plain values by name, and plain files."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon
+from gpvo.evaluation.evaluate import Evaluation
+from gpvo.evaluation.trajectory import pose_document
+from gpvo.evaluation.verdict import verdict
+from gpvo.io.atomic import write_text
+from gpvo.io.tables import write_csv
+from gpvo.io.trajectory import write_tum
+from gpvo.online.features import AXES
+from gpvo.stats.bootstrap import sequence_bootstrap
+from gpvo.types import IMPORTED, Array, Status
+
+_UNITS = ("translation_m", "rotation_rad")
+METHODS = (
+    "constant",
+    "triangulation",
+    "triangulation_scaled",
+    "triangulation_vt",
+    "pointing_matching",
+    "pointing_matching_scaled",
+    "pointing_matching_vt",
+    IMPORTED,
+    f"{IMPORTED}_scaled",
+    "gp_thesis",
+    "base",
+    "learned",
+)
+
+
+def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """The result as scripts read it; what could not be computed is None. SI units; the names are part of the interface.
+
+    ``pooled``: of each method ``nll_per_dim`` and ``nees_dof`` (with the truth's noise) {``mean``, ``low``, ``high``}
+    over the runs. Of each run, beside its name, counts, path length, ATE and segments:
+
+    * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
+    * ``truth_moves_at_rest``: motions that are not scored, as the vehicle stands and the truth moves; they count in
+      ATE, final error and RPE alone.
+    * ``odd_stretches``: motions, in words, in which odometry and truth differ as nowhere else; they are scored.
+    * ``in_domain``: share of the frames in the model's training domain.
+    * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
+      states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
+    * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers come to, in words.
+    * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
+    * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
+      as counted in: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
+      (:mod:`gpvo.dataset.truth_noise`), whichever is more. ``truth_sigma_axes``: by axis, x y z [m], then [rad].
+      ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion; None: nowhere.
+    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None where it
+      does not matter; ``error_change``: relative change of the errors over a second without it.
+    * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
+      {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
+      frame or a second do not reach across a gap in the truth.
+
+    Of each method, beside NEES, coverage, NLL and CRPS:
+
+    * ``nees_dof_interval``: by block, 95 % interval [low, high] of ``nees_dof`` by a bootstrap over blocks of time.
+    * ``nees_dof_truth_noise``: by block, ``nees_dof`` with the truth's own noise added to what the method states.
+    * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS of vectors; it rewards sharp and honest
+      statements alike. ``correlation_gain_nats``: by how much the stated correlations make the errors likelier.
+      ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.
+    * ``nll_per_dim`` takes every statement as Gaussian; ``nll_stated_per_dim`` is of the stated density, a Student-t
+      for models that learnt their tails, and ``nees_dof_median_stated`` the median NEES/dof that it expects.
+    * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``z2_truth_noise``, ``truth_drift_m``, ``count``}: of the
+      motion over windows of a second, joint and (6,) by axis, and the truth's drift (3,) that is counted in as its own
+      velocities contradict its positions; ``horizons`` are the same over lengths of path.
+    * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
+      ``predicted_final_error_independent_m``: the same if all motions were independent.
+
+    ``constant`` is said of the motion of one frame: a motion that bridges lost frames has as many times its covariance.
+    ``gp_thesis`` needs a model file that holds it, as all written by this version do.
+    """
+    runs = [_run_document(e) for e in evaluations]
+    return {"schema": 1, "runs": runs, "pooled": _pooled([r["methods"] for r in runs])}
+
+
+def _pooled(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over the runs, with 95 % intervals by whole runs, of the methods that speak of the motions of every run."""
+    out: dict[str, Any] = {}
+    for method in runs[0] if runs else ():
+        scores = {
+            "nll_per_dim": [r[method]["nll_per_dim"] for r in runs if method in r],
+            "nees_dof": [r[method]["nees_dof_truth_noise"]["joint"] for r in runs if method in r],
+        }
+        if all(len(values) == len(runs) and None not in values for values in scores.values()):
+            out[method] = {n: sequence_bootstrap(np.array(v, np.float64)).document() for n, v in scores.items()}
+    return out
+
+
+def _run_document(e: Evaluation) -> dict[str, Any]:
+    t = e.trajectory
+    counts = {s.value: sum(r.status is s for r in e.run.log) for s in Status}
+    return {
+        "run": e.run.name,
+        "source": e.run.meta.get("source"),
+        "frames": len(e.run.log),
+        "lost": counts["lost"],
+        "degraded": counts["degraded"],
+        "truth_moves_at_rest": e.unscored,
+        "odd_stretches": [str(s) for s in e.odd],
+        "in_domain": e.in_domain,
+        "path_length_m": t.path_length_m,
+        "ate_rmse_m": t.ate_rmse_m,
+        "rmse_origin_m": t.rmse_origin_m,
+        "final_error_m": t.final_error_m,
+        "time_offset_s": e.time_offset_s,
+        "truth_sigma": _by_kind(e.truth_sigma),
+        "truth_sigma_axes": e.truth_sigma.tolist(),
+        "truth_sigma_stated": _by_kind(e.truth_sigma_stated),
+        "truth_tells_from_m": e.tells_from_m,
+        "fixed_rotation": None if e.turned is None else asdict(e.turned),
+        "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},
+        "segments": [asdict(s) for s in t.segments],
+        "poses": pose_document(e.poses),
+        "verdict": asdict(verdict(e)),
+        "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
+    }
+
+
+def _by_kind(sigma: Array) -> dict[str, float]:
+    translation, rotation = np.sqrt((sigma.reshape(2, 3) ** 2).mean(axis=1))
+    return {"translation_m": float(translation), "rotation_rad": float(rotation)}
+
+
+def _methods_of(e: Evaluation) -> list[str]:
+    return [*METHODS, *(m for m in e.consistency if m not in METHODS)]
+
+
+def _horizon(h: Horizon | None) -> dict[str, Any]:
+    keys = ("nees_dof", "nees_dof_truth_noise", "z2_truth_noise", "truth_drift_m")
+    return {k: getattr(h, k, None) for k in keys} | {"count": 0 if h is None else h.count}
+
+
+def _method_document(c: Consistency | None) -> dict[str, Any]:
+    """Scores of one method; of one that says nothing the same entries, all None."""
+
+    def of(name: str) -> Any:
+        return getattr(c, name, None)
+
+    def by_block(name: str) -> dict[str, Any]:
+        return of(name) or dict.fromkeys(BLOCKS)
+
+    return {
+        "nees_dof": {b: i and i.mean for b, i in by_block("nees_dof").items()},
+        "nees_dof_interval": {b: i and [i.low, i.high] for b, i in by_block("nees_dof").items()},
+        "nees_dof_median": by_block("nees_dof_median"),
+        "nees_dof_truth_noise": by_block("nees_dof_truth_noise"),
+        "coverage": dict(zip("123", of("coverage") or [None] * 3, strict=True)),
+        "nll_per_dim": of("nll_per_dim"),
+        "nll_stated_per_dim": of("nll_stated_per_dim"),
+        "nees_dof_median_stated": of("nees_dof_median_stated"),
+        "crps": {unit: of(f"crps_{unit}") for unit in _UNITS},
+        "energy": {unit: of(f"energy_{unit}") for unit in _UNITS},
+        "correlation_gain_nats": of("correlation_gain_nats"),
+        "by_difficulty": {name: of(f"{name}_by_difficulty") for name in ("nees_dof", "coverage")},
+        "predicted_final_error_m": of("predicted_final_error_m"),
+        "predicted_final_error_independent_m": of("predicted_final_error_independent_m"),
+        "one_second": _horizon(of("one_second")),
+        "horizons": [
+            {"length_m": m, **_horizon(h)} for m, h in itertools.zip_longest(HORIZONS_M, of("horizons") or ())
+        ],
+    }
+
+
+def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
+    """``NAME_est.tum`` and ``NAME_truth.tum`` (evo: ``evo_ape tum NAME_truth.tum NAME_est.tum``), ``NAME_motions.csv``
+    (each motion's error and every method's sigma), and ``NAME_methods.csv`` and ``.tex`` (scores)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log, known = e.run.log, e.covered
+    paths = [
+        folder / f"{name}_{kind}" for kind in ("est.tum", "truth.tum", "motions.csv", "methods.csv", "methods.tex")
+    ]
+    write_tum(paths[0], log.t_ns[known], e.T_est[known])
+    write_tum(paths[1], log.t_ns[known], e.T_true[known])
+    rows = e.errors.index
+    columns: dict[str, Any] = {"t_s": log.t_ns[rows] * 1e-9, "dt_s": e.errors.dt_s}
+    columns |= {f"error_{a}": e.errors.xi[:, i] for i, a in enumerate(AXES)}
+    for s in e.statements:
+        sigma = np.sqrt(np.diagonal(s.covariance[rows], axis1=1, axis2=2))
+        columns |= {f"{s.method}_sigma_{a}": sigma[:, i] for i, a in enumerate(AXES[: s.dof])}
+    write_csv(paths[2], columns)
+    scores = _scores(document([e])["runs"][0]["methods"])
+    write_csv(paths[3], scores)
+    write_text(paths[4], latex(scores))
+    return paths
+
+
+def _scores(methods: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Columns of the methods that were scored."""
+    out: dict[str, list[Any]] = {}
+    for method, m in methods.items():
+        if m["nll_per_dim"] is None:
+            continue
+        over = {f"nees_{h['length_m']:g}m": h["nees_dof_truth_noise"] for h in m["horizons"]}
+        row = {"method": method, "nees": m["nees_dof"]["joint"], "nees_median": m["nees_dof_median"]["joint"]}
+        row |= {"nees_1s": m["one_second"]["nees_dof_truth_noise"], **over, "nll": m["nll_per_dim"]}
+        row |= {f"within_{k}_sigma": share for k, share in m["coverage"].items()}
+        row |= {f"energy_{unit}": m["energy"][unit] for unit in ("translation_m", "rotation_rad")}
+        for key, value in row.items():
+            out.setdefault(key, []).append(value)
+    return out
+
+
+def latex(columns: Mapping[str, Sequence[Any]]) -> str:
+    """Columns as a LaTeX table of booktabs, numbers to three digits."""
+
+    def cell(value: Any) -> str:
+        if isinstance(value, str):
+            return value.replace("_", r"\_")
+        return "--" if value is None or not np.isfinite(value) else f"{value:.3g}"
+
+    rows = [" & ".join(map(cell, row)) + r" \\" for row in zip(*columns.values(), strict=True)]
+    head = " & ".join(map(cell, columns)) + r" \\"
+    body = [r"\toprule", head, r"\midrule", *rows, r"\bottomrule"]
+    spec = "l" + "r" * (len(columns) - 1)
+    return "\n".join([rf"\begin{{tabular}}{{{spec}}}", *body, r"\end{tabular}"]) + "\n"
