@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.geometry import frames, se3
+from gpvo.geometry import se3
 from scipy.spatial.transform import Rotation, Slerp
 
 ROTATIONS = Rotation.random(200, random_state=0)
@@ -80,14 +80,14 @@ def test_transform_moves_points():
 
 def test_fixed_frames():
     forward, right, down = np.eye(3)[[2, 0, 1]]
-    np.testing.assert_array_equal(frames.R_FLU_OPTICAL @ forward, [1, 0, 0])
-    np.testing.assert_array_equal(frames.R_FLU_OPTICAL @ right, [0, -1, 0])
-    np.testing.assert_array_equal(frames.R_FLU_OPTICAL @ down, [0, 0, -1])
-    np.testing.assert_array_equal(frames.R_FRD_FLU @ [0, 1, 0], [0, -1, 0])
-    np.testing.assert_array_equal(frames.R_NED_ENU @ [1, 2, 3], [2, 1, -3])
-    np.testing.assert_array_equal(frames.R_FLU_T265 @ [0, 0, -1], [1, 0, 0])
-    np.testing.assert_array_equal(frames.R_FLU_T265 @ [0, 1, 0], [0, 0, 1])
-    for R in (frames.R_FLU_OPTICAL, frames.R_FRD_FLU, frames.R_NED_ENU, frames.R_FLU_T265):
+    np.testing.assert_array_equal(se3.R_FLU_OPTICAL @ forward, [1, 0, 0])
+    np.testing.assert_array_equal(se3.R_FLU_OPTICAL @ right, [0, -1, 0])
+    np.testing.assert_array_equal(se3.R_FLU_OPTICAL @ down, [0, 0, -1])
+    np.testing.assert_array_equal(se3.R_FRD_FLU @ [0, 1, 0], [0, -1, 0])
+    np.testing.assert_array_equal(se3.R_NED_ENU @ [1, 2, 3], [2, 1, -3])
+    np.testing.assert_array_equal(se3.R_FLU_T265 @ [0, 0, -1], [1, 0, 0])
+    np.testing.assert_array_equal(se3.R_FLU_T265 @ [0, 1, 0], [0, 0, 1])
+    for R in (se3.R_FLU_OPTICAL, se3.R_FRD_FLU, se3.R_NED_ENU, se3.R_FLU_T265):
         np.testing.assert_array_equal(R @ R.T, np.eye(3))
         assert np.linalg.det(R) == pytest.approx(1)
         assert not R.flags.writeable
@@ -95,6 +95,6 @@ def test_fixed_frames():
 
 def test_rotated_covariance_is_that_of_rotated_samples():
     A = np.random.default_rng(6).normal(size=(6, 6))
-    C = frames.rotate_covariance(frames.R_FLU_OPTICAL, A @ A.T)
-    rows = np.vstack([frames.R_FLU_OPTICAL @ A[:3], frames.R_FLU_OPTICAL @ A[3:]])
+    C = se3.rotate_covariance(se3.R_FLU_OPTICAL, A @ A.T)
+    rows = np.vstack([se3.R_FLU_OPTICAL @ A[:3], se3.R_FLU_OPTICAL @ A[3:]])
     np.testing.assert_allclose(C, rows @ rows.T, atol=1e-14)
