@@ -142,8 +142,8 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished
 VehicleName = Annotated[
     str, typer.Option("--vehicle", help="What carries the camera: car, rover, multirotor, handheld or any.")
 ]
-MaxAcceleration = Annotated[float | None, typer.Option(help="Of the vehicle in place of its kind's [m/s^2].")]
-MaxTurn = Annotated[float | None, typer.Option(help="The same of its angular acceleration [rad/s^2].")]
+MaxAcceleration = Annotated[float | None, typer.Option(help="Largest acceleration [m/s^2], in place of --vehicle's.")]
+MaxTurn = Annotated[float | None, typer.Option(help="Largest angular acceleration [rad/s^2], likewise.")]
 
 
 def vehicle_of(kind: str, max_acceleration: float | None, max_turn: float | None) -> Vehicle:

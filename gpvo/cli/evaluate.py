@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gpvo.twin.replicate import TwinSettings
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
-Model = Annotated[Path | None, typer.Option(help="Error model: adds constant, scaled and learned.")]
+Model = Annotated[Path | None, typer.Option(help="Error model: adds the rows constant, scaled and learned.")]
 Truth = Annotated[Path | None, typer.Option(help="Ground truth (TUM lines, left camera) in place of the run's own.")]
 Segments = Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")]
 TruthSigma = Annotated[

@@ -23,7 +23,8 @@ def forecast(
         str, typer.Option(help="Frame of the poses: cam (left camera, z forward) or body (FLU, camera forward).")
     ] = "cam",
     draws: Annotated[
-        int, typer.Option(min=1, max=1000, help="Number of simulated flights along the plan, each in other conditions.")
+        int,
+        typer.Option(min=1, max=1000, help="Simulated flights along the plan, each in different conditions."),
     ] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over the distance.")] = None,

@@ -58,7 +58,8 @@ def train(
     tolerance: ToleranceOption = "none",
     gap: GapOption = None,
     statements: Annotated[
-        Path | None, typer.Option(help="Folder for what each method states of the runs left out: files for gpvo score.")
+        Path | None,
+        typer.Option(help="Folder for what each method states of the runs left out, for gpvo score."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
@@ -126,7 +127,7 @@ def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[s
     from gpvo.learning.config import TrainConfig
 
     write_left_out(trained, [read_run(p) for p in paths], TrainConfig(**settings), folder)
-    note(f"gpvo: {folder} holds what each method states of the runs left out: gpvo score {folder}")
+    note(f"gpvo: {folder} holds the covariances stated of the runs left out; score them by: gpvo score {folder}")
 
 
 def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:

@@ -30,13 +30,13 @@ def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -
 def _intro(h: Mapping[str, Any], name: str) -> str:
     choices = h["choices"]
     inputs = ", ".join(f"`{i}`" for i in h["inputs"]) or (
-        "none: no set of them predicts left-out sequences better than the base variance does, beyond chance"
+        "none: no set of features predicts left-out sequences better than the base variance does, beyond chance"
     )
     return "\n".join(
         [
             f"# {name}",
             "",
-            "Predicts the error of stereo visual odometry, with covariance, in the rectified left camera's frame.",
+            "Predicts the error covariance of stereo visual odometry, in the frame of the rectified left camera.",
             "",
             f"* trained on {_today()} with gpvo {h['versions']['gpvo']}",
             f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
@@ -62,10 +62,10 @@ def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
     speeds = [domain[c] for c in ("v_x_mps", "v_y_mps", "v_z_mps") if c in domain]
     if speeds:
         top = max(abs(v) for reach in speeds for v in reach)
-        lines.append(f"* Faster than {top:.2g} m/s along any axis of the camera; no training motion was.")
+        lines.append(f"* Faster than {top:.2g} m/s along any axis of the camera, the highest speed in training.")
     if "n_inliers" in domain:
         lines.append(
-            f"* Where odometry keeps fewer than {math.ceil(domain['n_inliers'][0])} inliers; no training motion did."
+            f"* Where odometry keeps fewer than {math.ceil(domain['n_inliers'][0])} inliers, the fewest in training."
         )
     for fold in table.get("folds", ()):
         found, inside = fold["methods"]["learned"]["nees_dof"]["joint"], fold.get("in_domain", 1.0)
@@ -77,7 +77,7 @@ def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
         elif inside < 0.9:
             lines.append(f"* On flights like `{fold['held_out']}`: only {100 * inside:.0f} % of it was in domain.")
     if h.get("simulated_truth"):
-        lines.append("* As proof that a vehicle is safe: its truth was simulated.")
+        lines.append("* As evidence that a vehicle is safe: the ground truth was simulated.")
     return "\n".join(["## Where not to use it", "", *lines, "", "`gpvo check MODEL RUN` checks this before a flight."])
 
 
@@ -130,7 +130,7 @@ def _table(scores: Iterable[tuple[str, Mapping[str, Any]]]) -> list[str]:
 
 def _scores(table: Mapping[str, Any], name: str) -> str:
     if not table.get("folds"):
-        return "## Scores\n\nOne short sequence: nothing could be left out, so nothing is known about another one."
+        return "## Scores\n\nOne short sequence: none could be left out, so nothing is known about others."
     blocks = table.get("folds_are") == "time blocks"
     lines = [
         "## Scores on sequences left out" if not blocks else "## Scores on parts of the one sequence, left out in turn",
@@ -154,7 +154,7 @@ def _scores(table: Mapping[str, Any], name: str) -> str:
             "",
             f"![Stated against actual error]({name}.svg)",
             "",
-            "Stated against actual error of an axis, for tenths of the motions by what was stated. On the diagonal",
+            "Actual error against stated sigma of each axis, for ten groups of motions sorted by it. On the diagonal",
             "sigma is right; above it sigma is too small. In the green band it is right within a factor of 1.4.",
         ]
     return "\n".join(lines)
@@ -189,10 +189,10 @@ def _calibration(h: Mapping[str, Any]) -> str:
         [
             "## Calibration",
             "",
-            f"By {c['by']} ({c['groups']} left out in turn).{marked}",
+            f"Calibrated by {c['by']} ({c['groups']} left out in turn).{marked}",
             _tails(h["calibration"]),
-            f"Half widths in sigma that covered left-out data on the first axis: {widths}.",
-            *(["These sequences differ in the camera's calibration; its errors are a part of their own."] * apart),
+            f"Half widths, in sigma, of the intervals that covered left-out data on the first axis: {widths}.",
+            *(["The camera's calibration differs between these sequences; a part of the model is for that."] * apart),
         ]
     )
 
@@ -206,7 +206,7 @@ def _tails(calibration: Mapping[str, Any]) -> str:
 def _domain(h: Mapping[str, Any]) -> str:
     ranges = zip(h["training_domain"].items(), h["units"])
     rows = [[f"`{name}`", unit, f"{low:.4g}", f"{high:.4g}"] for (name, (low, high)), unit in ranges]
-    return "\n".join(["## Where it has been", "", *markdown_table(("feature", "unit", "from", "to"), rows)])
+    return "\n".join(["## Range of the training data", "", *markdown_table(("feature", "unit", "from", "to"), rows)])
 
 
 def _limits(h: Mapping[str, Any]) -> str:
@@ -215,7 +215,7 @@ def _limits(h: Mapping[str, Any]) -> str:
             "## Limits",
             "",
             "* Outside the ranges above the covariance grows, `in_domain` falls, and the numbers are a guess.",
-            "* The truth's own noise is part of the error learnt here.",
+            "* The noise of the ground truth is part of the error that was learned.",
             f"* Versions: {', '.join(f'{name} {number}' for name, number in h['versions'].items())}.",
         ]
     )
