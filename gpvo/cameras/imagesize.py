@@ -1,4 +1,4 @@
-"""The size that an image file claims, read from its header: what would fill the memory is never decoded."""
+"""The size that an image file declares, read from its header, so that nothing too large is ever decoded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stereo rig as calibrated: two lenses, how they sit to one another and on the vehicle; and how a true one may
+"""A stereo rig as calibrated: two lenses, their poses to each other and on the vehicle; and how a true one may
 differ from it: data sheets in three numbers, and a rig drawn from them."""
 
 from __future__ import annotations

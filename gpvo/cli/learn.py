@@ -1,4 +1,4 @@
-"""``gpvo train``: error models, and the table of what they would have said of each run left out."""
+"""``gpvo train``: error models, and the table of scores on the runs left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gpvo reproduce``: the thesis' tables and figures beside ours."""
+"""``gpvo reproduce``: the thesis' tables and figures beside those of gpvo."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""gpvo.evaluation."""
+"""Judging runs and stated covariances: scores, verdicts, plots, reports and the scoreboard."""

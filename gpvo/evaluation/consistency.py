@@ -1,4 +1,4 @@
-"""Is what a method says about the motions of a run true? Per motion, over a second, and over lengths of path."""
+"""Is what a method states about the motions of a run honest? Per motion, over a second, and over lengths of path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluations as scripts, evo, plots of one's own and papers read them: plain values by name, and plain files."""
+"""Evaluations as plain values and files: for scripts, evo, plots of your own and papers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``gpvo fuse`` tells machines: the document, and a log of innovations."""
+"""What ``gpvo fuse`` writes for machines: the JSON document, and a log of innovations."""
 
 from __future__ import annotations
 

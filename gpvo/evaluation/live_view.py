@@ -1,4 +1,4 @@
-"""A run as it goes, in the rerun viewer: the left image with its points, the path, and the stated uncertainty.
+"""A run in progress, in the rerun viewer: the left image with its points, the path, and the stated uncertainty.
 
 rerun (Apache-2.0 or MIT) is optional: ``pip install gpvo[viz]``.
 """

@@ -1,4 +1,4 @@
-"""The points behind single motions of a run, as figures: what odometry saw, and what it made of it.
+"""The points behind single motions of a run, as figures: what odometry saw, and which matches it used.
 
 A run folder holds no images, so the sequence is opened again and odometry repeated with the run's own settings.
 """

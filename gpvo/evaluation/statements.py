@@ -1,4 +1,4 @@
-"""What each method says about every motion of a run: one table of covariances per METHOD."""
+"""What each method states about every motion of a run: one table of covariances per METHOD."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is the IMU what it claims to be? Units and axes, told from gravity and from how VO moves."""
+"""Is the IMU what it claims to be? Units and axes, judged by gravity and by the motion of VO."""
 
 from __future__ import annotations
 

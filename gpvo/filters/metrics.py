@@ -1,4 +1,4 @@
-"""What a filtered run is worth: trajectory error against truth, and whether it knew its own error."""
+"""How good a filtered run is: its error against truth, and whether the filter knew its own error."""
 
 from __future__ import annotations
 

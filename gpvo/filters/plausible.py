@@ -1,4 +1,4 @@
-"""Which IMU samples can be: those in the range of a sensor, in step with the ones before, noisy, and on one clock.
+"""Which IMU samples are plausible: in the range of a sensor, consistent with earlier ones, noisy, and on one clock.
 
 What cannot be is missing, not wrong: the filter bridges it and is less sure (see ``Timeline``).
 """

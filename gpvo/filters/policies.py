@@ -1,4 +1,4 @@
-"""Where the measurement noise of VO comes from: the ways that are compared with one another."""
+"""Where the measurement noise of VO comes from: the policies that are compared."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records of relative motions from the poses of another odometry, and what its covariances are of."""
+"""Records of relative motions from the poses of another odometry, and whether its covariances are of poses or motions."""
 
 from __future__ import annotations
 

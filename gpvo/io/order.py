@@ -1,4 +1,4 @@
-"""Are left and right exchanged? The images tell: points before both cameras lie further right in the left image."""
+"""Are left and right swapped? Points in front of both cameras lie further right in the left image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run folder while it is written: for one writer, whole in the end, and taken up where a run broke off."""
+"""A run folder while it is written: one writer, complete at the end, resumable after an interruption."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of objects between two frames as one file, to go on from later with the same bytes.
+"""The state of objects between two frames as one file, from which a run resumes with the same bytes.
 
 It holds numbers, texts, arrays, containers, and objects of odometry's own classes by their attributes, shared ones
 once. Reading it runs no code: a class is looked up by its name in :data:`HOMES`, and its attributes are set.

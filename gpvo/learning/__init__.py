@@ -1,1 +1,1 @@
-"""gpvo.learning."""
+"""Training of error models: base variance, Gaussian processes, calibration and model cards."""

@@ -1,1 +1,1 @@
-"""A process that runs: images or anyone's odometry in, odometry with its covariance out, on the wire."""
+"""``gpvo live``: images or anyone's odometry in, odometry with its covariance out, as messages."""

@@ -1,4 +1,4 @@
-"""``gpvo doctor``: recordings and running topics brought before :mod:`gpvo.live.doctor`."""
+"""``gpvo doctor``: recordings and live topics, examined by :mod:`gpvo.live.doctor`."""
 
 from __future__ import annotations
 

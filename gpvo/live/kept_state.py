@@ -1,4 +1,4 @@
-"""What ``gpvo live`` keeps in a file, to go on from after a restart."""
+"""What ``gpvo live`` keeps in a file, so that a restart continues from it."""
 
 from __future__ import annotations
 

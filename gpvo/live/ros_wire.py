@@ -1,4 +1,4 @@
-"""ROS itself, where it is installed: rclpy and rospy, fed with serialised messages like every other wire."""
+"""ROS itself, where it is installed: rclpy and rospy, fed with serialised messages like every other transport."""
 
 from __future__ import annotations
 

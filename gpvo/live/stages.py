@@ -1,4 +1,4 @@
-"""From messages to VO records: somebody's poses, or pairs of images through gpvo's own odometry."""
+"""From messages to VO records: another odometry's poses, or pairs of images through gpvo's own odometry."""
 
 from __future__ import annotations
 

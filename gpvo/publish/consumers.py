@@ -1,4 +1,4 @@
-"""What the numbers become inside the filters that people fly, and which parameter stands in the way.
+"""What popular filters do with the published numbers, and which parameter hides the covariance.
 
 PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
 libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026) and

@@ -1,1 +1,1 @@
-"""gpvo.reproduce."""
+"""The experiments of the thesis, repeated: flights, tables and figures."""

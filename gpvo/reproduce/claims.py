@@ -1,4 +1,4 @@
-"""What the thesis claims in words (chapters 2, 4 and 5), and what our flights say of it."""
+"""What the thesis claims in words (chapters 2, 4 and 5), and what gpvo's flights say about it."""
 
 from __future__ import annotations
 

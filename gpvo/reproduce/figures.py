@@ -1,4 +1,4 @@
-"""The thesis' figures 4.1 to 4.9 with our flights: error of the position and 3-sigma bound, axis by axis."""
+"""The thesis' figures 4.1 to 4.9 with gpvo's flights: error of the position and 3-sigma bound, axis by axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows of the tables: each way of each experiment, over simulated flights and over real sequences.
+"""The rows of the tables: each method of each experiment, over simulated flights and over real sequences.
 
 Real data: ``DATA/*/*.npz`` are tracks with truth (see :mod:`gpvo.io.tracks`); ``DATA/*/NAME_est.*`` with ``NAME_gt.*``
 are logs of another odometry. Each sequence is judged by models of the others.

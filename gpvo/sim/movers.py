@@ -1,4 +1,4 @@
-"""What moves beside the camera and belongs to no scene: cars, smoke that a draught carries along, spinning dust.
+"""What moves besides the camera and is not part of the static scene: cars, drifting smoke, whirling dust.
 
 Each body is rigid, or nearly so, and placed with respect to the camera's own way, so that any world may have it. Cars
 hide what lies behind them; smoke and dust do not.

@@ -1,4 +1,4 @@
-"""Recorded motion to be flown again: a TUM or EuRoC trajectory, smoothed, scaled and put where it fits."""
+"""Recorded motion, flown again: a TUM or EuRoC trajectory, smoothed, scaled and put where it fits."""
 
 from __future__ import annotations
 

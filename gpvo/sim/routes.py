@@ -1,4 +1,4 @@
-"""Which path a scenario's vehicle is asked to follow, and how large its world must be."""
+"""Which path the vehicle of a scenario follows, and how large its world must be."""
 
 from __future__ import annotations
 

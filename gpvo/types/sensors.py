@@ -1,4 +1,4 @@
-"""What sensors and sources give: cameras, pictures, tracks, IMU samples, the vehicle they sit on, and the truth."""
+"""What sensors and sources give: cameras, images, tracks, IMU samples, the vehicle they sit on, and the truth."""
 
 from __future__ import annotations
 

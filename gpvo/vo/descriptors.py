@@ -1,4 +1,4 @@
-"""The thesis' front end: corners, AKAZE descriptors, brute-force matching left to right and to the frame before."""
+"""The thesis' front end: corners, AKAZE descriptors, brute-force matching left to right and to the previous frame."""
 
 from __future__ import annotations
 

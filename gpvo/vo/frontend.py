@@ -1,4 +1,4 @@
-"""What a front end gives the odometry, and the front end for pixel tracks made by somebody else."""
+"""What a front end gives the odometry, and the front end for pixel tracks made by other software."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an image says about itself: brightness, contrast, sharpness, noise; and two images brought to one light."""
+"""Statistics of an image: brightness, contrast, sharpness, noise; and two images brought to equal brightness."""
 
 from __future__ import annotations
 

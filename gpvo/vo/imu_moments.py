@@ -1,4 +1,4 @@
-"""What an IMU did over a motion, in mean and spread; pieces of time are put together without keeping samples."""
+"""Mean and spread of the IMU over a motion; pieces of time are merged without keeping samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one place that calls OpenCV's feature code, so that a move to another major version is one edit.
+"""The only module that calls OpenCV's feature code, so that a move to another major version is one edit.
 
 OpenCV 5 moved AKAZE out of the main wheel; gpvo stays on 4.x. Arrays are (N, 1, 2) float32 at this border because
 both major versions accept nothing else everywhere.

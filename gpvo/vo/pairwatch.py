@@ -1,4 +1,4 @@
-"""Do the two images of a pair belong together? What is wrong with the right camera, and the cure."""
+"""Do the two images of a pair belong together? What is wrong with the right camera, and the remedy."""
 
 from __future__ import annotations
 

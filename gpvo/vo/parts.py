@@ -1,4 +1,4 @@
-"""Small pieces around the odometry's one screen: the clock, the checks of a frame, the fields of a record."""
+"""Small helpers of the odometry: the clock, the checks of a frame, the fields of a record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When is a motion to be believed? No motion is ever invented in silence."""
+"""When can a motion be believed? No motion is ever invented silently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes down what odometry saw: its matches from motion to motion, joined to tracks.
+"""Records what odometry saw: its matches from motion to motion, joined into tracks.
 
 A front end carries the measurements of a point unchanged from the frame in which it was found to the next match, so
 equal measurements in the reference are the same point. No front end needs to number its points for this.

@@ -1,4 +1,4 @@
-"""What the calibration has wrong between the cameras, found from the residuals of odometry itself.
+"""Errors of the calibration between the cameras, estimated from the residuals of odometry itself.
 
 Where the right image is displaced by (dx, dy) in normalised coordinates, measured disparity is too small by ``fx dx``
 and the row in the right image too large by ``fy dy``. To first order a rotation (wx, wy, wz) of the right camera, a

@@ -1,4 +1,4 @@
-"""Several motions in one image: does something else than the scene move with the points that agree?
+"""Several motions in one image: do the points that agree belong to something other than the scene?
 
 A lorry alongside, smoke, or a texture that travels with the camera may hold more corners than what stands still. Counts
 of corners then say nothing; a scene shows itself by the share of the image that its motion explains, and by going on

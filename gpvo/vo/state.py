@@ -1,4 +1,4 @@
-"""Where odometry stands between two frames: the reference, the last believed motion, and what to expect of the next."""
+"""The state of odometry between two frames: the reference, the last believed motion, and the expected next one."""
 
 from __future__ import annotations
 

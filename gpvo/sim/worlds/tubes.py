@@ -1,4 +1,4 @@
-"""Rough tubes along a line, and what men put into a tunnel: lamps, an air duct, cables, rock bolts; and rubble."""
+"""Rough tubes along a line, and what miners put into a tunnel: lamps, an air duct, cables, rock bolts; and rubble."""
 
 from __future__ import annotations
 
