@@ -1,4 +1,4 @@
-"""Records of relative motions from the poses of another odometry, and whether its covariances are of poses or motions."""
+"""Records of relative motions from the poses of another odometry; are its covariances of poses or of motions?."""
 
 from __future__ import annotations
 

@@ -47,8 +47,8 @@ def motion_covariance(
     Parameters
     ----------
     uvd_prev : (N, 3) inlier measurements in the reference frame.
-    exact_points : take the reference points as exact, as PnP does: 2 to 4 times overconfident in NEES.
-    moved : the transfer of the same points by the same motion, if at hand.
+    exact_points : treat the reference points as exact, as PnP does: 2 to 4 times overconfident in NEES.
+    moved : the transfer of the same points by the same motion, if already computed.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def spherical_covariance(
 ) -> MotionCovariance:
     """The same with each point's covariance replaced by a sphere of equal mean variance (thesis, chapter 3).
 
-    Depth is by far the worst axis, so a sphere wastes what the image says sideways.
+    Depth is by far the worst axis, so a sphere wastes the accuracy that the image has sideways.
     """
     R = T_prev_cur[:3, :3]
     P = triangulate(uvd_cur, camera)
@@ -108,7 +108,7 @@ def covariances_by_method(
     sigma_pairs_px: tuple[tuple[float, float], ...] = (),
     moved: Transfer | None = None,
 ) -> dict[str, MotionCovariance]:
-    """Every asked-for method and pair of sigmas over the same inliers, sharing the derivatives.
+    """Every requested method and pair of sigmas over the same inliers, sharing the derivatives.
 
     ``moved``: the transfer of the same points by the same motion, if at hand.
     """

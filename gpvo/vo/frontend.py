@@ -16,10 +16,10 @@ from gpvo.vo.rig_error import RigError
 
 @dataclass(frozen=True)
 class Observation:
-    """What is known of a frame before any motion.
+    """What is known about a frame before its motion is.
 
-    ``repeated``, ``right_repeated``: the pair, or its right image alone, is that of the frame before bit by bit.
-    ``right_light``: how many times brighter or fuller of contrast the right image is; 1 where they are alike.
+    ``repeated``, ``right_repeated``: the pair, or its right image alone, is identical to that of the previous frame.
+    ``right_light``: by what factor the right image is brighter or has more contrast; 1 if they are alike.
     """
 
     stats: ImageStats | None
@@ -30,11 +30,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class RightSearch:
-    """How points of the left image fared in the right one, while both could still be compared.
+    """How the search in the right image for points of the left one went, while both could still be compared.
 
     Of ``sought`` points ``found`` gave a measurement, ``behind`` lie behind the cameras and ``off_row`` in another row.
-    ``row_error_px`` (n,): right row less left row, of points followed from the frame before; ``row_motion_px`` (n,): by
-    how much these moved down the left image.
+    ``row_error_px`` (n,): right row minus left row, of points followed from the previous frame;
+    ``row_motion_px`` (n,): by how much these moved down the left image.
     """
 
     sought: int
@@ -89,7 +89,7 @@ class Frontend(Protocol):
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
         """Points of the reference found in the observed frame, near where the guess puts them.
 
-        ``from_scratch``: the guess is not to be trusted.
+        ``from_scratch``: the guess cannot be trusted.
         """
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:

@@ -27,7 +27,7 @@ class Transfer:
     """Measurements of the reference frame moved into the current one, with derivatives. Axes last for speed.
 
     ``uvd`` (3, N) prediction; ``H`` (3, 6, N) by a right perturbation of ``T_prev_cur``; ``G`` (3, 3, N) by the
-    reference measurement; ``in_front`` (N,) whether the point lies before the camera.
+    reference measurement; ``in_front`` (N,) whether the point lies in front of the camera.
     """
 
     uvd: Array
@@ -143,7 +143,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Whitened:
-    """The residuals of a motion at unit covariance, for unit pixel noise.
+    """The residuals of a motion, whitened to unit covariance for unit pixel noise.
 
     ``moved``: the transfer of its smoothed points; ``W`` (3, 3, M) the whitener; ``z`` (3, M) residuals; ``A``
     (3, 6, M) their derivatives by a right perturbation of the motion.
@@ -156,7 +156,7 @@ class Whitened:
 
 
 def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
-    """The residuals behind a motion, whitened as they were to find it."""
+    """The residuals of a motion, whitened as when it was estimated."""
     moved = transfer(motion.T_prev_cur, motion.uvd_prev, camera)
     W = whitener(residual_covariance(moved.G, motion.noise.S, motion.noise.S, motion.noise.persistent))
     return Whitened(moved, W, apply_whitener(W, motion.residuals.T), apply_whitener(W, moved.H))
@@ -180,11 +180,11 @@ def refine(
     """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
 
     Each point's stacked residual is weighted with the full inverse of its covariance at unit pixel noise of the form
-    ``noise``, which may hold an error of disparity that a point keeps while it is followed: a patch that looks
-    different on the right is misplaced by the same in each frame. The derivatives are taken at the points as smoothed
-    by both frames, not as measured in the first: else the noise of far points, entering the derivative, biases the
-    motion (errors in variables; B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000, section 6.1: this is
-    the two-frame problem with the points eliminated).
+    ``noise``, which may include a disparity error that a point keeps while it is followed: a patch that looks
+    different in the right image is misplaced by the same amount in each frame. The derivatives are evaluated at the
+    points smoothed over both frames, not as measured in the first: otherwise the noise of far points enters the
+    derivative and biases the motion (errors in variables; B. Triggs et al., "Bundle adjustment, a modern synthesis",
+    2000, section 6.1: this is the two-frame problem with the points eliminated).
 
     If ``robust``, the noise scale is taken from the median residual, points beyond its 99.9 % ellipsoid are left out,
     and the rest are weighted by Huber's rule.

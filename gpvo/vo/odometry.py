@@ -34,12 +34,12 @@ class StereoOdometry:
     ----------
     camera : the rectified pair.
     config : settings; default the preset ``fast``.
-    mask : (H, W) bool, where the left image may be used.
-    known : what is known of the calibration's errors; default nothing, or with ``self_calibration`` off that there are
-        none.
+    mask : (H, W) bool, True where the left image may be used.
+    known : what is known about errors of the calibration; by default nothing, or, with ``self_calibration`` off, that
+        there are none.
 
-    Frames must be rectified and of the camera's size, in time order. ``last``: the points behind the last motion, for
-    drawing. ``pair``: what is wrong with the pairs of images; ``rig_error``: with the calibration.
+    Frames must be rectified, of the camera's size, and in time order. ``last``: the points behind the last motion, for
+    drawing. ``pair``: what is wrong with the pairs of images; ``rig_error``: what is wrong with the calibration.
     """
 
     def __init__(
@@ -66,10 +66,10 @@ class StereoOdometry:
         self.last: Followed = Followed(EMPTY, np.zeros(0, bool))
 
     def step(self, frame: StereoFrame | TrackFrame, imu: ImuLog | None = None) -> VoRecord:
-        """Take in one frame and say how the camera moved since the reference frame.
+        """Process one frame: how the camera moved since the reference frame.
 
-        ``imu`` holds the samples since the last frame, if any. Mean and spread of all since the reference go into the
-        record: they are of the same interval as its motion.
+        ``imu`` holds the samples since the last frame, if any. The record gets the mean and spread of all samples since
+        the reference, so that they cover the same interval as its motion.
 
         Raises
         ------

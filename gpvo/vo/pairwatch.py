@@ -36,7 +36,7 @@ class PairWatch:
         self._seen: Counter[str] = Counter()
 
     def step(self, seen: Observation, right: RightSearch | None) -> list[str]:
-        """What speaks against this pair, in words; nothing for a good one."""
+        """What is doubtful about this pair, in words; empty for a good one."""
         self._frames += 1
         self._seen["frozen"] += seen.right_repeated
         self._seen["light"] += not 1 / _DARKER < seen.right_light < _DARKER
@@ -57,7 +57,7 @@ class PairWatch:
         return doubts
 
     def findings(self) -> list[str]:
-        """What was wrong in more than a twentieth of the pairs, with the cure."""
+        """What was wrong in more than a twentieth of the pairs, with the remedy."""
         often = [(n, cause) for cause, n in self._seen.items() if n > max(2, _NAMED_FROM * self._frames)]
         return [f"{_CURES[cause]} ({n} of {self._frames} pairs)" for n, cause in sorted(often, reverse=True)]
 

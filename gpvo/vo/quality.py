@@ -23,7 +23,7 @@ class Verdict:
 
 
 def agrees(T_prev_cur: Array, matches: Matches, camera: StereoCamera, threshold_px: float) -> NDArray[np.bool_]:
-    """(N,) whether the motion puts each point where it was found: in the left image, and in disparity."""
+    """(N,) whether the motion predicts each point where it was found, in the left image and in disparity."""
     moved = transfer(T_prev_cur, matches.uvd_prev, camera)
     off = matches.uvd_cur - moved.uvd.T
     return moved.in_front & (np.hypot(off[:, 0], off[:, 1]) < threshold_px) & (np.abs(off[:, 2]) < 1.5 * threshold_px)
@@ -41,9 +41,9 @@ def judge(
 ) -> Verdict:
     """Status of a solved motion.
 
-    ``frozen``: what repeats itself bit by bit although the camera was moving. ``usual_inliers``: of the motions so far.
-    ``doubts``: what others hold against it. The rig's baseline is the ruler for translation: a motion that is uncertain
-    by half of it is ``degraded``, by five of it ``lost``.
+    ``frozen``: which images repeat exactly although the camera was moving. ``usual_inliers``: number in motions so far.
+    ``doubts``: objections from other checks. Translation is measured against the baseline: a motion with a standard
+    deviation of half a baseline is ``degraded``, of five baselines ``lost``.
     """
     if frozen:
         return Verdict(Status.LOST, frozen)

@@ -125,9 +125,9 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
 
 
 def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRig:
-    """The rig with the right camera turned, its focal length and centre changed as fits the displacements best.
+    """The rig with rotation, focal length and centre of the right camera changed to explain the displacements best.
 
-    What no turn, focal length or centre explains (a lens' bend) is left over.
+    What none of them explains (lens distortion) remains.
     """
     v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
     x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()

@@ -1,8 +1,9 @@
 """Several motions in one image: do the points that agree belong to something other than the scene?
 
-A lorry alongside, smoke, or a texture that travels with the camera may hold more corners than what stands still. Counts
-of corners then say nothing; a scene shows itself by the share of the image that its motion explains, and by going on
-as a vehicle goes on. Which motion is the scene's is never sure: the covariance is that of the mixture.
+A lorry alongside, smoke, or a texture that travels with the camera may have more corners than the static scene. The
+number of corners then says nothing; the scene is recognised by the share of the image that its motion explains, and by
+a motion that a vehicle could continue. Which motion is that of the scene is never certain: the covariance is that of
+the mixture.
 """
 
 from __future__ import annotations

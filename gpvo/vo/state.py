@@ -41,7 +41,7 @@ class State:
         return cls(t_ns, t_ns, t_ns, np.eye(4), np.zeros(6), 0.0, points, leaps=Leaps(t_ns))
 
     def frozen(self, seen: Observation) -> str:
-        """What repeats itself although the camera was moving; empty for nothing."""
+        """What repeats although the camera was moving; empty if nothing does."""
         if seen.right_repeated:
             return "frozen right image"
         return "frozen image" if seen.repeated and self.parallax_px > 0.3 else ""
@@ -56,7 +56,7 @@ class State:
         return self.T_ref_believed @ se3.exp(self.twist * dt_s)
 
     def expected(self, t_ns: int, guess: Array, max_acceleration_mps2: float) -> Expected | None:
-        """What the vehicle's last velocity lets expect of the motion to ``t_ns``; None before there is one."""
+        """The motion to ``t_ns`` expected from the last velocity of the vehicle; None before there is one."""
         if self.t_twist_ns is None:
             return None
         step_s, age_s = ((t_ns - since) * 1e-9 for since in (self.t_believed_ns, self.t_twist_ns))
