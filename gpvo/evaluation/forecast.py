@@ -20,11 +20,11 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import position_in_world, symmetrise
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.trajectory import Trajectory, read_tum
+from gpvo.learning.sample import TrainingSample
 from gpvo.online.base import TWIST_COLUMNS, positions
 from gpvo.online.features import FeatureStream
 from gpvo.online.guard import DEGRADED_BELOW
 from gpvo.online.predictor import Predictor
-from gpvo.online.sample import TrainingSample
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 DRAWS = 8

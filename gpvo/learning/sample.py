@@ -2,13 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.online.sample import TrainingSample
+from gpvo.errors import ModelError
+from gpvo.types import Array
+
+_UPPER = np.triu_indices(6)
+
+
+@dataclass(frozen=True)
+class TrainingSample:
+    """Rows of the training set, from every sequence alike: motions whose end is the reference of the next.
+
+    ``X`` (n, d): the model's features, NaN where unknown. ``sequence`` (n,): which sequence each row is from.
+    ``dt_s`` (n,): duration of each motion, more than a frame's where odometry kept its reference.
+    ``geometry`` (n, 6, 6): covariance by the model's geometric method [m, rad]; None where the model has none.
+    """
+
+    X: Array
+    sequence: NDArray[np.int32]
+    dt_s: Array
+    geometry: Array | None
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Named arrays for a model file; :meth:`from_arrays` is the inverse (features to single precision)."""
+        out: dict[str, NDArray[Any]] = {"sample.X": self.X.astype(np.float32), "sample.sequence": self.sequence}
+        out["sample.dt_s"] = self.dt_s
+        if self.geometry is not None:
+            out["sample.geometry"] = self.geometry[:, _UPPER[0], _UPPER[1]]
+        return out
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], n_features: int) -> TrainingSample:
+        """The sample of a model file. Raises ModelError where it has none, as older files."""
+        if any(f"sample.{name}" not in arrays for name in ("X", "sequence", "dt_s")):
+            raise ModelError("the model holds no sample of its training rows", cure="train it again")
+        X, sequence, dt_s = arrays["sample.X"].astype(np.float64), arrays["sample.sequence"], arrays["sample.dt_s"]
+        packed = arrays.get("sample.geometry")
+        sizes_fit = X.ndim == 2 and X.shape[1] == n_features and sequence.shape == dt_s.shape == (len(X),) != (0,)
+        if not sizes_fit or (packed is not None and packed.shape != (len(X), 21)):
+            raise ModelError("the model's sample of training rows does not fit its features", cure="train it again")
+        if packed is None:
+            return cls(X, sequence, dt_s, None)
+        geometry = np.empty((len(X), 6, 6))
+        geometry[:, _UPPER[0], _UPPER[1]] = packed
+        geometry[:, _UPPER[1], _UPPER[0]] = packed
+        return cls(X, sequence, dt_s, geometry)
+
 
 SAMPLE_ROWS = 1024
 _LEAST_PER_SEQUENCE = 16

@@ -16,7 +16,7 @@ from gpvo.online.division import Division
 from gpvo.online.guard import Domain, DomainCheck, growth
 from gpvo.online.projected import ProjectedGP
 from gpvo.online.stored import LARGEST, Stored, check_arrays, check_related
-from gpvo.types import Array, MotionError, Prediction
+from gpvo.types import Array, Prediction
 
 LN_LARGEST = 60.0
 """Log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
@@ -24,18 +24,6 @@ LEAST_VAR = 1e-24
 """No motion is known better [m^2, rad^2]."""
 DURATIONS_S = (1e-6, 1e4)
 """A motion whose stated duration lies outside has the usual one."""
-
-
-@dataclass(frozen=True)
-class Variances:
-    """Of n rows, before calibration: ``place``, where they lie; (n, 6) each: ``known`` aleatoric variance, ``total``
-    with ignorance of it; ``limit``, as wrong as a motion can be. ``dt_s`` (n,): durations that were used."""
-
-    place: DomainCheck
-    known: Array
-    total: Array
-    limit: Array
-    dt_s: Array
 
 
 @dataclass(frozen=True)
@@ -101,18 +89,20 @@ class ErrorModel(Stored):
         counts as missing.
         """
         X = np.where(np.abs(X) < LARGEST, X, np.nan)
-        v = self.variances(X, dt_s)
-        place = v.place
-        variance = within(v.total * self.factor, v.limit)
-        stated = self.split(variance, X, geometry)
+        duration, columns = self._duration(X, dt_s), self._base_columns(X)
+        base, plain = (np.maximum(v, LEAST_VAR) for v in self.base.both(columns, duration))
+        place = self._locate(X, base, duration)
+        known, total = self._variances(place, base, plain)
+        variance = within(total * self.factor, self.velocities.largest_error_var(columns[:, :6], duration))
+        stated = self.division.split(variance, self.twist(X), geometry)
         _, ln_det = np.linalg.slogdet(stated.covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)
         return stated.extended(
             Prediction,
-            dt_s=v.dt_s,
+            dt_s=duration,
             nu=self.degrees_of_freedom,
-            epistemic=variance * (1.0 - v.known / v.total),
+            epistemic=variance * (1.0 - known / total),
             confidence=place.in_domain * precision,
             in_domain=place.in_domain,
         )
@@ -140,11 +130,8 @@ class ErrorModel(Stored):
         shortest, longest = DURATIONS_S
         return np.where((dt_s >= shortest) & (dt_s <= longest), dt_s, self.dt_s)
 
-    def variances(self, X: Array, dt_s: Array | None) -> Variances:
-        """Variances of rows X (n, d), before calibration."""
-        duration, columns = self._duration(X, dt_s), self._base_columns(X)
-        base, plain = (np.maximum(v, LEAST_VAR) for v in self.base.both(columns, duration))
-        place = self._locate(X, base, duration)
+    def _variances(self, place: DomainCheck, base: Array, plain: Array) -> tuple[Array, Array]:
+        """(n, 6) each, before calibration: aleatoric variance, and the total with ignorance of it."""
         log_ratio, spread = self.gp.evaluate(place.inside[:, self.inputs])
         outside = (1.0 - place.in_domain)[:, None]
         # The mean of a log-normal has half the variance of the log in it: that half is owed to ignorance.
@@ -155,24 +142,23 @@ class ErrorModel(Stored):
         grown = growth(place.distance, self.outside_power)[:, None]
         # What odometry says of itself means what it meant in training only where the surroundings are alike.
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
-        limit = self.velocities.largest_error_var(columns[:, :6], duration)
-        return Variances(place, base * np.exp(known), total, limit, duration)
+        return base * np.exp(known), total
 
     def _base_columns(self, X: Array) -> Array:
         """The base's columns, missing ones by :attr:`absent`, geometric log variances never below the training's
         smallest."""
-        at, _, smallest = self._base_place
+        at, smallest = self._base_place
         C = X[:, at]
         C = np.where(np.isfinite(C), C, self.absent)
         C[:, 6:] = np.minimum(np.maximum(C[:, 6:], smallest), LN_LARGEST)
         return C
 
     @cached_property
-    def _base_place(self) -> tuple[NDArray[np.int64], Array, Array]:
-        """Where the base's columns are, their typical values, and the smallest geometric variances of the training."""
+    def _base_place(self) -> tuple[NDArray[np.int64], Array]:
+        """Where the base's columns are, and the smallest geometric variances of the training."""
         at = np.array(positions(self.columns, self.base.columns), dtype=np.int64)
         d = self.domain
-        return at, d.centre[at], (d.centre + d.scale * d.low)[at][6:]
+        return at, (d.centre + d.scale * d.low)[at][6:]
 
     @cached_property
     def absent(self) -> Array:
@@ -187,10 +173,6 @@ class ErrorModel(Stored):
     def twist(self, X: Array) -> Array:
         """(n, 6) velocities of rows X (n, d)."""
         return X[:, self._base_place[0][:6]]
-
-    def split(self, variance: Array, X: Array, geometry: Array | None) -> MotionError:
-        """The errors of rows X by their parts, without a mean, from variances (n, 6)."""
-        return self.division.split(variance, self.twist(X), geometry)
 
 
 def within(variance: Array, limit: Array) -> Array:

@@ -8,11 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.online.slip import SlipDetector, flag_slips
 from gpvo.online.stored import Stored
 from gpvo.types import Array, StereoCamera
-
-__all__ = ["Domain", "DomainCheck", "SlipDetector", "camera_problems", "flag_slips"]
 
 _RARE = 0.0002
 

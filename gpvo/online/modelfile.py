@@ -18,7 +18,7 @@ Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers 
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
 * ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`; all there is in a model of
   positions;
-* ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.online.sample.TrainingSample`.
+* ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.learning.sample.TrainingSample`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ import os
 import struct
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -129,56 +128,43 @@ def _check_document(document: Any, path: Path) -> None:
         raise ModelError(problem.what, where=path) from None
 
 
-@dataclass(frozen=True)
-class _Key:
-    """One key of a header: what it must be, in words and as a test; absent keys are for the reader to miss."""
-
-    words: str
-    holds: Callable[[Any], bool] = field(repr=False)
-
-
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(v, str) for v in value)
+def _are(kind: type, values: Any) -> bool:
+    return isinstance(values, list) and all(isinstance(v, kind) for v in values)
 
 
-def _are_objects(values: Any) -> bool:
-    return all(isinstance(v, dict) for v in values)
-
-
-_MAPPING = _Key("an object", lambda v: isinstance(v, dict))
-_TEXT = _Key("text", lambda v: isinstance(v, str))
-_HEADER: dict[str, _Key] = {
-    "features": _Key(
-        "a list of different names", lambda v: _are_texts(v) and 0 < len(v) <= 1000 and len(set(v)) == len(v)
-    ),
-    "units": _Key("a list of texts", _are_texts),
-    "dt_s": _Key("a number of seconds from 1e-6 to 1e4", lambda v: _is_number(v) and 1e-6 <= v <= 1e4),
-    "rate_hz": _Key("a positive number", lambda v: _is_number(v) and v > 0),
+_OBJECT = "an object", lambda v: isinstance(v, dict)
+_TEXT = "text", lambda v: isinstance(v, str)
+_HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "features": ("a list of different names", lambda v: _are(str, v) and 0 < len(v) <= 1000 and len(set(v)) == len(v)),
+    "units": ("a list of texts", lambda v: _are(str, v)),
+    "dt_s": ("a number of seconds from 1e-6 to 1e4", lambda v: _is_number(v) and 1e-6 <= v <= 1e4),
+    "rate_hz": ("a positive number", lambda v: _is_number(v) and v > 0),
     "target": _TEXT,
     "frame": _TEXT,
     "base_method": _TEXT,
-    "camera": _MAPPING,
-    "scores": _Key("an object of objects", lambda v: isinstance(v, dict) and _are_objects(v.values())),
-    "calibration": _MAPPING,
-    "config": _MAPPING,
-    "versions": _MAPPING,
-    "sequences": _Key(
+    "camera": _OBJECT,
+    "scores": ("an object of objects", lambda v: isinstance(v, dict) and _are(dict, list(v.values()))),
+    "calibration": _OBJECT,
+    "config": _OBJECT,
+    "versions": _OBJECT,
+    "sequences": (
         "a list of named sequences",
-        lambda v: isinstance(v, list) and _are_objects(v) and _are_texts([s.get("name") for s in v]),
+        lambda v: _are(dict, v) and _are(str, [s.get("name") for s in v]),
     ),
 }
+"""What a key of a header must be, in words and as a test; absent keys are for the reader to miss."""
 
 
 def _check_header(header: Mapping[str, Any]) -> None:
     """Raise ModelError, one line, for the first key of a header that is not what its readers take; null is unknown."""
-    for name, key in _HEADER.items():
+    for name, (words, holds) in _HEADER.items():
         value = header.get(name)
-        if value is not None and not key.holds(value):
-            raise ModelError(f"its header's '{name}' is not {key.words}")
+        if value is not None and not holds(value):
+            raise ModelError(f"its header's '{name}' is not {words}")
     features, units = header.get("features"), header.get("units")
     if features and units and len(features) != len(units):
         raise ModelError(f"its header names {len(units)} units of {len(features)} features")

@@ -11,8 +11,8 @@ import pytest
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.learning.sample import TrainingSample
 from gpvo.online.predictor import Predictor
-from gpvo.online.sample import TrainingSample
 from gpvo.types import Status, StereoCamera, StereoFrame, VoRecord
 from gpvo.vo.odometry import StereoOdometry
 from small_model import small_model
