@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.learning.regressors import Hyperparameters, Regressor, get_regressor, regressor_names
-from gpvo.learning.regressors.numerics import greedy_points, pack
-from gpvo.learning.regressors.sparse import CollapsedBound, Posterior, SparseRegressor
+from gpvo.learning.regressors.numerics import Posterior, greedy_points, pack
+from gpvo.learning.regressors.sparse import CollapsedBound, SparseRegressor
 from synthetic_errors import gaussian_nll, make_problem
 
 QUICK = {

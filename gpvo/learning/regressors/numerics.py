@@ -1,23 +1,32 @@
 """Shared pieces of the regressors: threads, the unit kernel and its gradient, safe factors, the optimiser's numbers,
-and inducing points."""
+inducing points, and the posterior on them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from gpvo.learning.regressors import Hyperparameters
+from gpvo.learning.regressors import Hyperparameters, Scaling
+from gpvo.online.projected import ProjectedGP
 from gpvo.types import Array
 
 LOG_LENGTH_BOUNDS = (np.log(0.05), np.log(50.0))
 LOG_SIGNAL_BOUNDS = (np.log(1e-6), np.log(1e3))
 LOG_NOISE_BOUNDS = (np.log(1e-6), np.log(1e2))
 """Bounds of the learnt quantities for inputs and outputs of unit variance: sums of many features rarely need more."""
+
+
+CHUNK_ROWS = 8192
+
+_RANK_TOLERANCE = 1e-11
+"""Directions of the points' kernel matrix below this share of the largest are rounding, not information."""
 
 
 @contextmanager
@@ -114,3 +123,105 @@ def greedy_points(U: Array, m: int, *, seed: int = 0, tolerance: float = 1e-6) -
         rows.append(i)
         left[rows] = -1.0
     return U[rows]
+
+
+def chunks(*arrays: Array) -> Iterator[tuple[Tensor, ...]]:
+    """The rows piece by piece."""
+    for i in range(0, len(arrays[0]), CHUNK_ROWS):
+        yield tuple(torch.tensor(a[i : i + CHUNK_ROWS]) for a in arrays)
+
+
+def sums(Xs: Array, Ys: Array, Z: Tensor, lengthscale: Array) -> tuple[Tensor, Tensor]:
+    """``k k^T`` (m, m) and ``k y`` (m, D) summed over the rows, k being the unit kernel to the m points Z (m, d)."""
+    kk = torch.zeros(len(Z), len(Z), dtype=torch.float64)
+    ky = torch.zeros(len(Z), Ys.shape[1], dtype=torch.float64)
+    for X, Y in chunks(Xs / lengthscale, Ys):
+        K = unit_kernel(X, Z)
+        ky.addmm_(K.T, Y)
+        kk.addmm_(K.T, K)
+    return kk, ky
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Directions in which the rows say different things: one decomposition that serves every output.
+
+    ``projection`` P (r, m) of the kernel's values at the points onto directions of unit prior variance;
+    ``eigenvalues`` (r,) of the rows' sums of squares along them; ``z_y`` (r, D) their sums with the outputs; ``yy``
+    (D,) squares of the outputs; ``lost``: prior variance of the ``n`` rows that the points do not explain.
+    """
+
+    projection: Array
+    eigenvalues: Array
+    z_y: Array
+    yy: Array
+    lost: float
+    n: int
+
+    @classmethod
+    def of(cls, Xs: Array, Ys: Array, points: Array, lengthscale: Array) -> Posterior:
+        """Of standardised rows; ``points`` (m, d) over the length scales, the exact one where they are the rows."""
+        Z = torch.tensor(points)
+        prior, V = torch.linalg.eigh(unit_kernel(Z, Z))
+        kept = prior > _RANK_TOLERANCE * prior[-1]
+        whiten = V[:, kept].T / prior[kept].sqrt()[:, None]
+        if len(points) == len(Xs) and np.array_equal(points, Xs / lengthscale):
+            P, eigenvalues = whiten.flip(0), prior[kept].flip(0)
+            z_y = eigenvalues[:, None] * (P @ torch.tensor(Ys))
+        else:
+            kk, ky = sums(Xs, Ys, Z, lengthscale)
+            S = whiten @ kk @ whiten.T
+            eigenvalues, U = torch.linalg.eigh(0.5 * (S + S.T))
+            P, eigenvalues = (U.flip(1).T @ whiten).contiguous(), eigenvalues.flip(0).clamp_min(0.0)
+            z_y = P @ ky
+        lost = max(len(Xs) - float(eigenvalues.sum()), 0.0)
+        return cls(P.numpy().copy(), eigenvalues.numpy(), z_y.numpy(), (Ys**2).sum(axis=0), lost, len(Xs))
+
+    def value_and_gradient(self, output: int, logs: Array) -> tuple[float, Array]:
+        """Negative bound of one output, per row, and its gradient, at log(signal, noise variance): O(r)."""
+        s, v = np.exp(logs)
+        ratio, zy2, lam = s / v, self.z_y[:, output] ** 2, self.eigenvalues
+        grown = 1.0 + ratio * lam
+        left = (self.yy[output] - ratio * (zy2 / grown).sum()) / v
+        log_det = np.log(grown).sum() + self.n * (logs[1] + np.log(2 * np.pi))
+        d_ratio = 0.5 * ratio * ((lam / grown).sum() - (zy2 / grown**2).sum() / v + self.lost)
+        gradient = np.array([d_ratio, 0.5 * (self.n - left) - d_ratio])
+        return 0.5 * (log_det + left + ratio * self.lost) / self.n, gradient / self.n
+
+    def maximise(self, hyper: Hyperparameters) -> Hyperparameters:
+        """Signal and noise variances of each output learnt anew on all rows, length scales kept."""
+        box = [LOG_SIGNAL_BOUNDS, LOG_NOISE_BOUNDS]
+        found = []
+        for j, logs in enumerate(np.log(np.stack([hyper.signal_var, hyper.noise_var], 1))):
+            best = minimize(
+                lambda t, j=j: self.value_and_gradient(j, t),
+                np.clip(logs, *np.array(box).T),
+                jac=True,
+                method="L-BFGS-B",
+                bounds=box,
+                options={"ftol": 1e-10, "gtol": 1e-7},
+            )
+            found.append(np.exp(best.x))
+        signal, noise = np.array(found).T.copy()
+        return Hyperparameters(hyper.lengthscale, signal, noise)
+
+    def bound(self, hyper: Hyperparameters) -> float:
+        """Lower bound on the log marginal likelihood, all outputs [nats]."""
+        logs = np.log(np.stack([hyper.signal_var, hyper.noise_var], 1))
+        return -self.n * sum(self.value_and_gradient(j, logs[j])[0] for j in range(len(logs)))
+
+    def projected(self, hyper: Hyperparameters, scaling: Scaling, points: Array) -> ProjectedGP:
+        """In the units of the data; ``hyper`` and ``points`` (over the length scales) of the standardised data."""
+        ratio = (hyper.signal_var / hyper.noise_var)[:, None]
+        gain = ratio / (1.0 + ratio * self.eigenvalues[None])
+        signal = hyper.signal_var * scaling.y_scale**2
+        return ProjectedGP(
+            centre=scaling.x_centre.copy(),
+            lengthscale=hyper.lengthscale * scaling.x_scale,
+            points=points.copy(),
+            projection=self.projection,
+            weights=gain * self.z_y.T * scaling.y_scale[:, None],
+            reduction=gain * self.eigenvalues[None] * signal[:, None],
+            signal_var=signal,
+            offset=scaling.y_centre.copy(),
+        )

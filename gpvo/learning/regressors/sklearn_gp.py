@@ -3,43 +3,31 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from gpvo.learning.regressors import FittedGP, Hyperparameters, Scaling, checked
-from gpvo.learning.regressors.numerics import fixed_threads
-from gpvo.learning.regressors.sparse import exact
+from gpvo.learning.regressors import Hyperparameters
+from gpvo.learning.regressors.sparse import OnPoints
 from gpvo.types import Array
 
 
-@dataclass(frozen=True)
-class SklearnRegressor:
-    """Constant * RBF + white noise; signal and noise variance are shared by all (standardised) outputs.
+@dataclass(frozen=True, kw_only=True)
+class SklearnRegressor(OnPoints):
+    """Constant * RBF + white noise; signal and noise variance are shared by all (standardised) outputs. The posterior
+    is ours, at scikit-learn's optimum.
 
-    ``restarts``: scikit-learn's ``n_restarts_optimizer``. Other options as in
-    :class:`~gpvo.learning.regressors.sparse.SparseRegressor`.
+    ``restarts``: scikit-learn's ``n_restarts_optimizer``.
     """
 
-    isotropic: bool = False
-    hyper: Hyperparameters | None = None
+    inducing: None = None
     restarts: int = 0
-    threads: int = 1
 
     name: ClassVar[str] = "sklearn"
+    relearns: ClassVar[bool] = False
 
-    def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
-        """See :class:`~gpvo.learning.regressors.Regressor`; the posterior is ours, at scikit-learn's optimum."""
-        X, Y = checked(X, Y)
-        scaling = Scaling.of(X, Y)
-        hyper = self.hyper
-        if hyper is None:
-            with fixed_threads(self.threads):
-                hyper = scaling.unscaled(self._learn(scaling.inputs(X), scaling.outputs(Y), seed))
-        return replace(exact(hyper=hyper, threads=self.threads).fit(X, Y), regressor=self.name)
-
-    def _learn(self, Xs: Array, Ys: Array, seed: int) -> Hyperparameters:
+    def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, None]:
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
@@ -52,6 +40,7 @@ class SklearnRegressor:
             gpr.fit(Xs, Ys)
         signal, white = gpr.kernel_.k1, gpr.kernel_.k2
         lengths = np.broadcast_to(np.atleast_1d(signal.k2.length_scale), d).astype(np.float64)
-        return Hyperparameters(
+        hyper = Hyperparameters(
             lengths, np.full(D, float(signal.k1.constant_value)), np.full(D, float(white.noise_level))
         )
+        return hyper, None

@@ -15,43 +15,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpvo.learning.regressors import FittedGP, Hyperparameters, Scaling, checked
-from gpvo.learning.regressors.numerics import fixed_threads, greedy_points, pick_device
-from gpvo.learning.regressors.sparse import close, start
+from gpvo.learning.regressors import Hyperparameters
+from gpvo.learning.regressors.numerics import greedy_points, pick_device
+from gpvo.learning.regressors.sparse import OnPoints, start
 from gpvo.types import Array
 
 
-@dataclass(frozen=True)
-class SvgpRegressor:
+@dataclass(frozen=True, kw_only=True)
+class SvgpRegressor(OnPoints):
     """For millions of rows: every row can influence the hyperparameters and the inducing points.
 
-    ``steps`` minibatches of ``batch`` rows at learning rate ``rate``, falling to a tenth. Other options as in
-    :class:`~gpvo.learning.regressors.sparse.SparseRegressor`; ``device`` "auto" is CUDA where there is one.
+    ``steps`` minibatches of ``batch`` rows at learning rate ``rate``, falling to a tenth. ``device`` "auto" is CUDA
+    where there is one.
     """
 
     inducing: int = 256
-    isotropic: bool = False
-    hyper: Hyperparameters | None = None
     steps: int = 300
     batch: int = 512
     rate: float = 0.03
     device: str = "auto"
-    threads: int = 1
 
     name: ClassVar[str] = "svgp"
-
-    def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
-        """See :class:`~gpvo.learning.regressors.Regressor`."""
-        X, Y = checked(X, Y)
-        scaling = Scaling.of(X, Y)
-        Xs, Ys = scaling.inputs(X), scaling.outputs(Y)
-        with fixed_threads(self.threads):
-            if self.hyper is not None:
-                hyper = scaling.scaled(self.hyper)
-                points = greedy_points(Xs / hyper.lengthscale, self.inducing, seed=seed)
-            else:
-                hyper, points = self._learn(Xs, Ys, seed)
-            return close(Xs, Ys, scaling, hyper, points, self.name, relearn=self.hyper is None)
 
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array]:
         """Maximise the variational bound by Adam; standardised hyperparameters, points over the length scales."""
