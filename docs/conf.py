@@ -21,7 +21,13 @@ html_theme_options = {
 html_static_path = ["_static"]  # custom.css
 html_copy_source = False
 html_show_copyright = False
-autodoc_default_options = {"members": True, "member-order": "bysource", "undoc-members": False}
+# Each name once, where it is defined: packages that pass names on list none of them again.
+autodoc_default_options = {
+    "members": True,
+    "member-order": "bysource",
+    "undoc-members": False,
+    "ignore-module-all": True,
+}
 autodoc_typehints = "signature"
 autodoc_class_signature = "mixed"
 napoleon_use_ivar = True

@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from gpvo.cli.importing import import_log
+from gpvo.cli.files import import_log
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.trajectory import pose_document
