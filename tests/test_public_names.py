@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import subprocess
 import sys
 
 import gpvo
 import pytest
+from gpvo.errors import GpvoError
 
 NAMES = [
     "GpvoError",
@@ -44,3 +47,17 @@ def test_what_flies_loads_numpy_and_safetensors_at_most(then: str) -> None:
     if not then:
         code = "import sys, gpvo; print('safetensors' in sys.modules)"
         assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
+
+
+def test_every_module_finds_what_it_imports() -> None:
+    """Also those that a command imports only when it needs them; a package that is not installed is another matter."""
+    for module in pkgutil.walk_packages(gpvo.__path__, "gpvo."):
+        if module.name.endswith("__main__"):
+            continue
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as e:
+            if (e.name or "").startswith("gpvo"):
+                raise
+        except GpvoError:
+            pass  # names the extra that is missing
