@@ -40,8 +40,13 @@ reproduce(Plan(seeds=0, points_seeds=2, training=training, duration_s=5.0, only=
 
 
 def start(*command: object) -> subprocess.Popen[bytes]:
-    """In a process group of its own: workers outlive the process that made them, and Ctrl-C reaches all of them."""
-    return subprocess.Popen([*map(str, command)], stdout=-1, stderr=-1, start_new_session=True)
+    """In a process group of its own: workers outlive the process that made them, and Ctrl-C reaches all of them, also
+    where the tests themselves run in the background of a shell and have to ignore it."""
+
+    def heed() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    return subprocess.Popen([*map(str, command)], stdout=-1, stderr=-1, start_new_session=True, preexec_fn=heed)
 
 
 def finish(*command: object) -> float:
