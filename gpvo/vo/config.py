@@ -26,7 +26,7 @@ class VoConfig:
     min_disparity_px: float = 0.5  # below, depth is unknown even in order of magnitude
     max_disparity_share: float = 0.25  # of the image width
     ransac_threshold_px: float = 2.0
-    ransac_iterations: int = 150
+    ransac_iterations: int = 1000  # at most: few where most points agree
     min_inliers: int = 8  # fewer: lost; P3P needs four
     weak_inliers: int = 20  # fewer: degraded
     max_acceleration_mps2: float = 40.0  # of the vehicle: beyond, a motion is something else's
@@ -61,7 +61,12 @@ PRESETS: dict[str, VoConfig] = {
     "fast": VoConfig(),
     # What the thesis describes, to the letter: every frame is matched afresh to the one before.
     "thesis": VoConfig(
-        preset="thesis", keyframe_parallax_px=0.0, max_features=500, self_calibration=False, persistent_noise=False
+        preset="thesis",
+        keyframe_parallax_px=0.0,
+        max_features=500,
+        ransac_iterations=150,
+        self_calibration=False,
+        persistent_noise=False,
     ),
 }
 

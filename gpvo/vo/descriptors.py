@@ -81,4 +81,4 @@ class DescriptorFrontend:
     def _features(self, image: opencv.Image) -> tuple[opencv.Points, NDArray[np.uint8]]:
         config = self._config
         uv = opencv.corners(image, config.max_features, config.corner_quality, config.min_distance_px, self._mask)
-        return opencv.describe(image, uv, quick=True)
+        return opencv.describe(image, uv)

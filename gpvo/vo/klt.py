@@ -1,8 +1,9 @@
 """The fast front end: corners at half resolution, followed and matched left to right by Lucas-Kanade.
 
 Whole-pixel corners dominate the error of a descriptor pipeline; here a corner only says which patch to follow, and
-every position that enters the motion is the sub-pixel result of aligning that patch. Descriptors are the fallback
-when the motion cannot be guessed.
+every position that enters the motion is the sub-pixel result of aligning that patch. Where too little is found near
+the guess, both images are matched afresh by features of every scale (P. Alcantarilla, J. Nuevo, A. Bartoli, "Fast
+explicit diffusion for accelerated features in nonlinear scale spaces", 2013).
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from gpvo.vo.opencv import Image, Points
 from gpvo.vo.rig_error import RigError
 from gpvo.vo.rivals import cells
 
+_FEATURES = 2000  # of an image that is matched afresh
+
 
 @dataclass
 class _View:
@@ -38,6 +41,7 @@ class _View:
     uvd: Array  # (N, 3) points usable as reference
     left_uv: Points  # (N, 2) their positions in the left image, the templates' centres
     strong: int = 0  # the points from here on are spare ones
+    features: tuple[Points, NDArray[np.uint8]] | None = None  # those of the left image to find again, once asked for
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,7 @@ class KltFrontend:
         self._camera = camera
         self._rig_error = rig_error
         self._config = config
+        self._mask = None if mask is None else np.ascontiguousarray(mask.astype(np.uint8) * 255)
         half = None if mask is None else mask[: camera.height // 2 * 2 : 2, : camera.width // 2 * 2 : 2]
         self._half_mask = None if half is None else np.ascontiguousarray(half.astype(np.uint8) * 255)
         self._reference: _View | None = None
@@ -112,18 +117,15 @@ class KltFrontend:
         if reference is None or current is None or len(reference.uvd) == 0:
             return EMPTY
         config = self._config
-        uvd, left_uv, guess = reference.uvd, reference.left_uv, self._predict(T_prev_cur_guess)
-        index = np.arange(len(uvd))
         if from_scratch:
-            index, uv = self._match_descriptors(reference, current)
-            uvd, left_uv = uvd[index], left_uv[index]
-            guess = np.column_stack([uv, uvd[:, 2]])
+            return self._find_again(reference, current)
+        uvd, left_uv, guess = reference.uvd, reference.left_uv, self._predict(T_prev_cur_guess)
         left = in_light_of(current.left, current.light_left, reference.light_left)
         cur_left, found = opencv.track(
             reference.left, left, left_uv, guess[:, :2], config.klt_window_px, config.klt_levels
         )
         uvd, from_left, cur_left, disparity = uvd[found], left_uv[found], cur_left[found], guess[found, 2]
-        spare = index[found] >= reference.strong
+        spare = np.flatnonzero(found) >= reference.strong
         # One search in the right image serves both the followed points and the new corners between them.
         new_uv, new_disparity, detected = self._new_corners(current, cur_left)
         both_uv = np.concatenate([cur_left, new_uv])
@@ -180,7 +182,7 @@ class KltFrontend:
 
         The first of them, whose number comes last, are the image's best; the others stand alone in their parts of it.
         """
-        corners, coarse = view.survey.result()
+        corners, _ = view.survey.result()
         uv, limit = corners * 2.0, self._config.max_features
         strong = uv[:limit]
         if len(taken_uv) and len(uv):
@@ -190,12 +192,17 @@ class KltFrontend:
             strong = strong[distance2.min(1) > self._config.min_distance_px**2]
         best = strong[: max(limit - len(taken_uv), 0)]
         uv = np.concatenate([best, self._alone(uv[limit:], np.concatenate([best, taken_uv]))])
+        return *self._rough(view, uv), len(best)
+
+    def _rough(self, view: _View, uv: Points) -> tuple[Points, Array]:
+        """Points (N, 2) of the left image with their rough disparity (N,)."""
+        _, coarse = view.survey.result()
         column, row = (uv / 4).astype(int).T
         near = coarse[np.clip(row, 0, coarse.shape[0] - 1), np.clip(column, 0, coarse.shape[1] - 1)]
         known = near >= 0
         # Where the block matcher saw nothing, the median of what it saw is the fairest start.
         default = np.median(near[known]) if known.any() else 2.0
-        return uv, 4.0 * np.where(known, near, default), len(best)
+        return uv, 4.0 * np.where(known, near, default)
 
     def _alone(self, uv: Points, taken_uv: Points) -> Points:
         """The strongest of the corners (N, 2) in each cell of the image that holds none of those taken."""
@@ -236,14 +243,22 @@ class KltFrontend:
             row_motion[seen],
         )
 
-    def _match_descriptors(self, reference: _View, current: _View) -> tuple[NDArray[np.int64], Points]:
-        """Reference points (indices) and their places in the current left image, without any guess."""
-        described = self._pool.submit(opencv.describe, reference.half_left, reference.left_uv / 2, quick=True)
-        cur_uv, cur_bits = opencv.describe(current.half_left, current.survey.result()[0], quick=True)
-        ref_uv, ref_bits = described.result()
-        pairs = opencv.match_mutual(ref_bits, cur_bits)
-        # AKAZE drops corners at the border, so the kept ones are found again by their place.
-        place = {(round(float(x), 2), round(float(y), 2)): k for k, (x, y) in enumerate(reference.left_uv / 2)}
-        index = np.array([place.get((round(float(x), 2), round(float(y), 2)), -1) for x, y in ref_uv], np.int64)
-        pairs = pairs[index[pairs[:, 0]] >= 0] if len(pairs) else pairs
-        return index[pairs[:, 0]], 2.0 * cur_uv[pairs[:, 1]]
+    def _find_again(self, reference: _View, current: _View) -> Matches:
+        """Match both left images afresh, without any guess and over any change of scale."""
+        (from_uv, from_bits), (to_uv, to_bits) = self._features(reference), self._features(current)
+        pairs = opencv.match_mutual(from_bits, to_bits)
+        before, good_before, _ = self._find_right(reference, *self._rough(reference, from_uv[pairs[:, 0]]))
+        uv = to_uv[pairs[:, 1]]
+        after, good_after, row_error = self._find_right(current, *self._rough(current, uv))
+        good = good_before & good_after
+        new_uv, disparity, detected = self._new_corners(current, uv[good])
+        new_uvd, new_good, _ = self._find_right(current, new_uv, disparity)
+        self._new = _New.of(detected, new_uv, new_uvd, new_good)
+        self._matched_left, self._matched_uvd = uv[good], after[good]
+        # Wrong pairs are no second motion: nothing is said of points sought in vain.
+        return Matches(before[good], after[good], row_error[good], len(pairs))
+
+    def _features(self, view: _View) -> tuple[Points, NDArray[np.uint8]]:
+        if view.features is None:
+            view.features = opencv.features(view.left, _FEATURES, self._mask)
+        return view.features

@@ -65,18 +65,27 @@ def coarse_disparity(left: Image, right: Image, max_disparity_px: int) -> NDArra
     return matcher.compute(*wide)[:, count:].astype(np.float32) / 16.0
 
 
-def describe(image: Image, points: Points, *, quick: bool) -> tuple[Points, NDArray[np.uint8]]:
+def describe(image: Image, points: Points) -> tuple[Points, NDArray[np.uint8]]:
     """AKAZE descriptors at given corners: the corners that got one (N, 2), and the descriptors (N, 61).
 
-    ``quick`` builds one octave and one layer only: the same bits at corners of that scale, at a quarter of the cost.
+    One octave and one layer: the bits that more would give at corners of that scale, at a quarter of the cost.
     The key point size must not be 1, which silently gives all-zero descriptors.
     """
-    akaze = cv2.AKAZE.create(nOctaves=1, nOctaveLayers=1) if quick else cv2.AKAZE.create()
+    akaze = cv2.AKAZE.create(nOctaves=1, nOctaveLayers=1)
     keypoints = [cv2.KeyPoint(float(x), float(y), 8.0, -1, 0, 0, 0) for x, y in points]
     kept, descriptors = akaze.compute(image, keypoints)
     if descriptors is None:
         return np.empty((0, 2), np.float32), np.empty((0, 61), np.uint8)
     return np.array([k.pt for k in kept], np.float32).reshape(-1, 2), descriptors
+
+
+def features(image: Image, count: int, mask: Image | None) -> tuple[Points, NDArray[np.uint8]]:
+    """The strongest AKAZE features at every scale of the image: places (N, 2) and descriptors (N, 61)."""
+    # A low threshold: where there is little contrast, the strongest are still the best there is.
+    keypoints, descriptors = cv2.AKAZE.create(threshold=1e-4, max_points=count).detectAndCompute(image, mask)
+    if descriptors is None:
+        return np.empty((0, 2), np.float32), np.empty((0, 61), np.uint8)
+    return np.array([k.pt for k in keypoints], np.float32), np.asarray(descriptors, np.uint8)
 
 
 def match_mutual(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float = 0.85) -> NDArray[np.int64]:

@@ -119,6 +119,17 @@ def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
     assert unexplained(scene_motion, alone, CAMERA, config) is None
 
 
+def drive(count: int) -> stress.Footage:
+    """The first frames of KITTI raw 0001."""
+    source = open_source(Path(os.environ["GPVO_DATA"]) / "kitti_2011_09_26_0001")
+    frames = [f for f in source if isinstance(f, StereoFrame)][:count]
+    assert source.truth is not None
+    T_world_cam, known = interpolate_truth(source.truth, np.array([f.t_ns for f in frames]))
+    assert known.all()
+    assert source.camera is not None
+    return stress.Footage(source.camera, frames, T_world_cam)
+
+
 @pytest.mark.slow
 def test_the_stress_list() -> None:
     """Sixty frames at 1.6 m/s; every fault but two kinds that remain, in part, unseen.
@@ -137,12 +148,25 @@ def test_the_stress_list() -> None:
 @pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
 def test_the_stress_list_on_a_drive() -> None:
     """Sixty frames of KITTI raw 0001, about 10 m/s: no fault is silent."""
-    source = open_source(Path(os.environ["GPVO_DATA"]) / "kitti_2011_09_26_0001")
-    frames = [f for f in source if isinstance(f, StereoFrame)][:60]
-    assert source.truth is not None
-    T_world_cam, known = interpolate_truth(source.truth, np.array([f.t_ns for f in frames]))
-    assert known.all()
-    assert source.camera is not None
-    whole = stress.Footage(source.camera, frames, T_world_cam)
+    whole = drive(60)
     silent = {fault: stress.run(change(whole)).silent for fault, change in stress.FAULTS.items()}
     assert sum(map(len, silent.values())) == 0, silent
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
+@pytest.mark.parametrize(("stride", "least"), [(13, 0.9), (16, 0.85), (20, 0.7)])
+def test_wide_gaps_on_a_drive(stride: int, least: float) -> None:
+    """Drive 0001, of whose 108 frames every 13th, 16th or 20th is seen: the share of motions within a tenth.
+
+    The rest are called lost or degraded, none is silent.
+    """
+    whole = drive(108)
+    outcomes = [
+        stress.run(stress.Footage(whole.camera, whole.frames[first::stride], whole.T_world_cam[first::stride]))
+        for first in (0, stride // 2)
+    ]
+    good = np.concatenate([o.error_m[1:] < 0.1 * o.moved_m[1:] for o in outcomes])
+    usable = np.concatenate([[r.usable for r in o.records[1:]] for o in outcomes])
+    assert (good & usable).mean() >= least
+    assert all(o.silent == [] for o in outcomes)
