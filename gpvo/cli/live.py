@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli import common as flags
-from gpvo.cli.output import one_of, print_json
+from gpvo.cli.output import one_of, print_json, say
 from gpvo.errors import GpvoError, printable
 
 
@@ -153,9 +153,10 @@ def doctor(
     for name, findings in found.items():
         print(f"{printable(name)}: {len(findings) or 'nothing'} found")
         for finding in findings:
-            print(f"  {finding}")
+            for line in str(finding).splitlines():
+                say(f"  {line}")
         for line in lines(judged[name]) if name in judged else ():
-            print(f"  {line}")
+            say(f"  {line}")
 
 
 def _one_wire(**given: bool) -> str | None:

@@ -45,7 +45,8 @@ def verdict(e: Evaluation) -> Verdict:
         )
         return Verdict("amber", "There is no ground truth, so no covariance can be judged.", told_of_none)
     if not judged:
-        return Verdict("red", "No covariance was stated, so nothing can be judged.", tuple(_conditions(e)))
+        cure = "gpvo train learns one from such runs; --model states it here."
+        return Verdict("red", "No covariance was stated, so nothing can be judged.", (*_conditions(e), cure))
     best = min(judged, key=lambda m: judged[m].nll_per_dim or 0.0)
     # What a vehicle would be told is judged first; others only where it is wrong.
     told = "learned" if "learned" in judged else best
