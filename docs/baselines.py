@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.errors import MotionErrors
+from gpvo.evaluation.by_twins import METHOD as TWIN
+from gpvo.evaluation.by_twins import twin_covariance
 from gpvo.evaluation.statements import Statement, plain_statement
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
 from gpvo.online.features import THESIS, FeatureStream
-from gpvo.twin.covariance import METHOD as TWIN
-from gpvo.twin.covariance import twin_covariance
 from gpvo.types import Array, StereoTracks, VoLog
 from gpvo.vo.points import triangulate
 

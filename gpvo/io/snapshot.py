@@ -64,10 +64,11 @@ def digest_of(*state: Any) -> str:
 
 
 @cache
-def code_digest() -> str:
-    """SHA-256 of the package's files and what they run on: what other code has kept is not taken up."""
+def code_digest(folder: Path = Path(__file__).parents[1]) -> str:
+    """SHA-256 of a folder of the package, by default of all of it, and of what it runs on: what other code has kept is
+    not taken up."""
     sha = hashlib.sha256(f"{platform.python_version()} {np.__version__}".encode())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    for path in sorted(folder.rglob("*.py")):
         sha.update(path.read_bytes())
     return sha.hexdigest()
 

@@ -8,12 +8,11 @@ import pytest
 from gpvo.cameras.rig import TOLERANCES, Tolerance, TrueRig
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError, SourceError
-from gpvo.evaluation.by_twins import ratios
+from gpvo.evaluation.by_twins import ratios, twin_covariance
 from gpvo.io import open_source
 from gpvo.io.run import read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
-from gpvo.twin.covariance import twin_covariance
 from gpvo.twin.estimate import estimate
 from gpvo.twin.gap import Gap, pooled, read_gap
 from gpvo.twin.replicate import TwinSettings, make_twins, read_tolerance, rig_errors, twin_source
