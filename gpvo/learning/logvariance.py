@@ -10,6 +10,8 @@ for each sequence (a random effect) is taken out for the same reason: only what 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,15 +108,11 @@ def _mode(prior: ProjectedGP, Z: Array, ratio: Array, weight: Array, group: NDAr
         if np.abs(g - moved).max() < _ENOUGH:
             break
     explained = _PRIOR_VAR - 1.0 / precision
-    return ProjectedGP(
-        centre=prior.centre,
-        lengthscale=prior.lengthscale,
-        points=prior.points,
+    return replace(
+        prior,
         projection=V.T @ prior.projection,
         weights=A.T.copy(),
         reduction=(explained @ _ROTATION**2).T.copy(),
-        signal_var=prior.signal_var,
-        offset=np.zeros(6),
     )
 
 
