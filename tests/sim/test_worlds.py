@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds import build_world, cache, tunnel
+from gpvo.sim.worlds import build_world, cache_folder, load_world, tunnel
 from gpvo.sim.worlds.shapes import grid_faces, icosphere, rectangle, vertex_normals
 from gpvo.sim.worlds.world import TriangleDistance, World
 
@@ -63,9 +63,9 @@ def test_a_world_offers_what_paths_need(kind: str) -> None:
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_the_cache_gives_back_what_was_built(kind: str) -> None:
     world = build_world(kind, 5, **SMALL[kind])
-    files = list(cache.cache_folder().glob(f"{kind}-5-*.npz"))
+    files = list(cache_folder().glob(f"{kind}-5-*.npz"))
     assert len(files) == 1
-    again = cache.load_world(files[0])
+    again = load_world(files[0])
     for name in ("vertices", "normals", "uv", "light", "albedo", "faces", "material"):
         np.testing.assert_array_equal(getattr(world.mesh, name), getattr(again.mesh, name))
     np.testing.assert_array_equal(world.textures, again.textures)
@@ -75,7 +75,7 @@ def test_the_cache_gives_back_what_was_built(kind: str) -> None:
 
 def test_a_damaged_cache_file_is_built_anew() -> None:
     world = build_world("room", 6, **SMALL["room"])
-    (path,) = cache.cache_folder().glob("room-6-*.npz")
+    (path,) = cache_folder().glob("room-6-*.npz")
     path.write_bytes(path.read_bytes()[:1000])
     again = build_world("room", 6, **SMALL["room"])
     np.testing.assert_array_equal(world.mesh.vertices, again.mesh.vertices)
