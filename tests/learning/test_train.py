@@ -79,7 +79,8 @@ def test_heavy_tails_are_stated_and_carried_to_the_prediction(tmp_path):
 
 @pytest.mark.parametrize("right", [True, False])
 def test_the_geometry_is_believed_where_it_is_right(right):
-    """Of each motion sideways error and yaw go together by 0.8, with a sign that changes at random."""
+    """Of each motion sideways error and yaw go together by 0.8, with a sign that changes at random; the variances are
+    those that the geometry states."""
     sets = []
     for i, s in enumerate(training_sets(range(4), n=400)):
         rng = np.random.default_rng(i)
@@ -87,8 +88,10 @@ def test_the_geometry_is_believed_where_it_is_right(right):
         R[:, 0, 4] = R[:, 4, 0] = 0.8 * rng.choice([-1.0, 1.0], len(s))
         drawn = np.linalg.cholesky(R) @ rng.standard_normal((len(s), 6, 1))
         sigma = np.array([1.0, 1.0, 2.0, 0.4, 0.4, 0.4]) * 1e-3
-        stated = (R if right else rng.permutation(R)) * np.outer(sigma, sigma)
-        sets.append(replace(s, Y=drawn[..., 0] * sigma, covariances=dict.fromkeys(s.covariances, stated)))
+        scale = s.covariances["pointing_matching"][:, :1, 0] / sigma[0] ** 2
+        stated = (R if right else rng.permutation(R)) * np.outer(sigma, sigma) * scale[..., None]
+        error = drawn[..., 0] * sigma * np.sqrt(scale)
+        sets.append(replace(s, Y=error, covariances=dict.fromkeys(s.covariances, stated)))
     weight = fit_model(sets, QUICK).model.division.geometry_weight[0]
     assert weight >= 0.75 if right else weight <= 0.25
 
