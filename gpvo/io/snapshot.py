@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
+from gpvo.geometry.covariance import LARGEST
 from gpvo.io.atomic import replacing
 from gpvo.io.tracks import load_arrays
 
@@ -137,6 +139,8 @@ class _Restore:
 
     def value(self, node: Any) -> Any:
         if not isinstance(node, dict):
+            if isinstance(node, float) and LARGEST < abs(node) < math.inf:
+                raise ValueError(f"{node:g} is beyond all measure")
             return node
         kind = next(iter(node), "")
         if kind == "number":
@@ -182,7 +186,10 @@ class _Restore:
     def _array(self, of: list[Any]) -> NDArray[Any]:
         dtype, shape, order, offset = of
         count = int(np.prod(shape, dtype=np.int64))
-        return np.frombuffer(self._data, np.dtype(dtype), count, offset).reshape(shape, order=order).copy(order="K")
+        array = np.frombuffer(self._data, np.dtype(dtype), count, offset).reshape(shape, order=order)
+        if array.dtype.kind == "f" and (np.isfinite(array) & (np.abs(array) > np.float64(LARGEST))).any():
+            raise ValueError("a number is beyond all measure")
+        return array.copy(order="K")
 
 
 def _name(cls: type) -> str:

@@ -74,3 +74,10 @@ def test_a_damaged_or_other_file_is_none(tmp_path: Path) -> None:
     for cut in range(0, len(raw), 7):
         (tmp_path / "s.npz").write_bytes(raw[:cut])
         assert load_snapshot(tmp_path / "s.npz", "key") is None
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, np.array([0.0, 1e200]), np.array([1e38], np.float32)])
+def test_numbers_beyond_all_measure_are_not_taken_up(value: object, tmp_path: Path) -> None:
+    save_snapshot(tmp_path / "s.npz", "key", [value])
+    back = load_snapshot(tmp_path / "s.npz", "key")
+    assert (back is None) == (np.abs(value).max() > 1e100)
