@@ -13,8 +13,8 @@ from gpvo.geometry import se3
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, Mailbox, Sequence, StampWatch
 from gpvo.publish.odometry import Odometry
-from gpvo.types import Status
-from shim_bags import Kept, engine, flight, flown, shim_predictor
+from gpvo.types import Status, StereoCamera
+from shim_bags import TOPIC, Kept, engine, flight, flown, shim_predictor
 
 SECOND = 10**9
 RATE = 20
@@ -93,6 +93,16 @@ def _one_stamp(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arriv
     return [*a[:k], _moved(a[k], float(rng.choice([-1, 1]) * rng.uniform(12, 1e8))), *a[k + 1 :]]
 
 
+def _pressed(a: list[Arrival], k: int, rng: np.random.Generator) -> list[Arrival]:
+    """The engine is busy while messages come: what a full queue held last is all that it sees of them."""
+    box, busy = Mailbox(depth=int(rng.integers(2, 11))), int(rng.integers(12, 30))
+    for i in range(k, k + busy):
+        box.put(TOPIC, str(i).encode())
+    kept = [int(data) for _, _, data in iter(lambda: box.get(0.0), None)]
+    assert box.dropped == {TOPIC: busy - len(kept)}
+    return [*a[:k], *(a[i] for i in kept), *a[k + busy :]]
+
+
 def _pose(arrival: Arrival) -> np.ndarray:
     p, q = arrival.message.pose.pose.position, arrival.message.pose.pose.orientation
     return se3.from_quaternion(np.array([[p.x, p.y, p.z]]), np.array([[q.x, q.y, q.z, q.w]]))[0]
@@ -100,6 +110,7 @@ def _pose(arrival: Arrival) -> np.ndarray:
 
 FAULTS: list[Callable[[list[Arrival], int, np.random.Generator], list[Arrival]]] = [
     _twice, _late, _shuffled, _missing, _absurd, _glitch, _half_a_message, _restarted, _clock, _one_stamp,
+    _pressed,
 ]  # fmt: skip
 
 
@@ -138,6 +149,31 @@ def test_fault_campaign(
         # Within a second of the last faulty message the odometry is as sure as it was.
         late = np.median([np.diagonal(o.twist_covariance) for o in tail if o.twist_covariance is not None], axis=0)
         assert (late < 10 * healthy).all()
+
+
+@pytest.mark.parametrize("trials", [2, pytest.param(TRIALS, marks=pytest.mark.slow)])
+def test_a_camera_that_becomes_another_is_told_within_a_second_and_every_ten(trials: int) -> None:
+    """Its baseline or its lens is not the model's, from some message on and until another one."""
+    camera, predictor = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480), shim_predictor()
+    predictor.camera = camera
+    arrivals = flown(*flight(n=400, rate_hz=RATE))
+    for trial in range(trials):
+        rng = np.random.default_rng([trial, 99])
+        factor = float(np.exp(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0)))
+        other = [replace(camera, baseline_m=0.1 * factor), replace(camera, fx_px=400.0 * factor)][trial % 2]
+        predictor.reset()
+        live, kept, told = engine(predictor=predictor)
+        at = []
+        k, last = int(rng.integers(1, 80)), int(rng.integers(340, 370))
+        for i, arrival in enumerate(arrivals):
+            live.stage.camera, before = other if k <= i < last else camera, len(told)
+            live.take(arrival)
+            at += [i] * sum("the model was trained with" in text for text in told[before:])
+        assert len(at) == 2
+        assert 0 <= at[0] - k <= RATE
+        assert 0 <= at[1] - at[0] - 10 * RATE <= RATE
+        assert len(kept.frames) == len(arrivals)
+        assert (kept.reports[0].level, kept.reports[-1].level) == (0, 0)
 
 
 def _never_confident_across_a_jump(frames: list[Odometry], healthy: np.ndarray) -> None:
