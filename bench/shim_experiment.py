@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gpvo.cli.importing import import_log
+from gpvo.cli.files import import_log
 from gpvo.dataset.build import TrainingSet
 from gpvo.io.foreign import read_foreign
 from gpvo.io.jsonfile import write_json
