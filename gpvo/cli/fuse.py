@@ -101,7 +101,6 @@ def publish(
     method: Annotated[str, typer.Option(help="Geometric covariance to use where there is no prediction.")] = (
         "pointing_matching"
     ),
-    correct_twist: Annotated[bool, typer.Option(help="Subtract the predicted mean error from the twist.")] = False,
     topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry",
     system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1,
     consumer: Annotated[str | None, typer.Option(help="px4, ardupilot, robot_localization or fusioncore.")] = None,
@@ -125,7 +124,6 @@ def publish(
         link=link,
         model=model,
         method=method,
-        correct_twist=correct_twist,
         topic=topic,
         system=system,
         consumer=consumer,

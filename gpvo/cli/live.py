@@ -49,9 +49,6 @@ def live(
     pose_covariance: Annotated[str, typer.Option(help="accumulated since the start, or the last increment.")] = (
         "accumulated"
     ),
-    correct_twist: Annotated[
-        bool, typer.Option("--correct-twist", help="Subtract the predicted mean error from the twist.")
-    ] = False,
     state: Annotated[
         Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
     ] = None,
@@ -92,7 +89,7 @@ def live(
             topic=topic,
             pose_topic=pose_topic,
             depth=depth,
-            engine=EngineSettings(correct_twist, pose_covariance == "increment", state, carrier),
+            engine=EngineSettings(pose_covariance == "increment", state, carrier),
         )
     )
     if json_:

@@ -63,7 +63,6 @@ class EngineSettings:
     10 s and at the end. ``vehicle``: what slips are told by.
     """
 
-    correct_twist: bool = False
     increment: bool = False
     state: Path | None = None
     vehicle: Vehicle = VEHICLES["any"]
@@ -169,9 +168,7 @@ class Engine:
         """Starts where the source says, or where the saved state stopped."""
         resume, start = self._resume, np.eye(4) if taken.T_parent_body is None else taken.T_parent_body
         T_odom_body = start if resume is None else resume.T_odom_body
-        builder = OdometryBuilder(
-            self.stage.T_body_cam, T_odom_body, self.stage.method, correct_twist=self.settings.correct_twist
-        )
+        builder = OdometryBuilder(self.stage.T_body_cam, T_odom_body, self.stage.method)
         if resume is not None:
             A = se3.adjoint(se3.inverse(self.stage.T_body_cam))
             in_body = rotate_covariance(T_odom_body[:3, :3].T, resume.pose_covariance)

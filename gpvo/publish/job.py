@@ -31,7 +31,6 @@ class PublishSettings:
     link: str | None = None
     model: Path | None = None
     method: str = "pointing_matching"
-    correct_twist: bool = False
     topic: str = ros.TOPIC
     system: int = 1
     consumer: str | None = None
@@ -108,9 +107,7 @@ def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: Publi
     usable = [r for r in run.log if r.usable]
     if usable and not predictions and not any(r.covariances for r in usable):
         raise GpvoError("holds neither predictions nor covariances", where=run.path, cure="give --model")
-    builder = OdometryBuilder(
-        T_body_cam=run.mounting.T_body_cam, method=settings.method, correct_twist=settings.correct_twist
-    )
+    builder = OdometryBuilder(T_body_cam=run.mounting.T_body_cam, method=settings.method)
     try:
         return list(messages(run.log, predictions, builder))
     except GpvoError as error:

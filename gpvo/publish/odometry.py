@@ -81,13 +81,11 @@ class OdometryBuilder:
     T_body_cam : (4, 4) mounting of the camera; None takes a forward-looking camera at the body's origin.
     T_odom_body : (4, 4) body pose of the first frame in ``odom``.
     method : geometric covariance used where there is no prediction.
-    correct_twist : take the mean error off the twist. The pose stays VO's own: it must not jump.
     """
 
     T_body_cam: Array | None = None
     T_odom_body: Array = field(default_factory=lambda: np.eye(4))
     method: str | None = None
-    correct_twist: bool = False
     floors: Floors = field(default_factory=Floors)
 
     def __post_init__(self) -> None:
@@ -113,7 +111,7 @@ class OdometryBuilder:
             return self._lost(record, prediction, base)
         error = self._error(record, prediction)
         chain = base.extended(record, error)
-        twist, twist_covariance = self._twist(record, error, prediction, chain)
+        twist, twist_covariance = self._twist(record, error, chain)
         self._remember(record, chain)
         self._last = (record.t_ns, chain.T_first_cam, frame_jitter(error.jitter) + error.white)
         return self._message(record, prediction, chain, twist, twist_covariance)
@@ -123,9 +121,7 @@ class OdometryBuilder:
         if prediction is not None:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
-            if self.correct_twist:
-                return prediction
-            # What is not taken off remains part of the error.
+            # A mean is not taken off, as the pose must not jump; so it is part of the error.
             return replace(prediction, white=prediction.white + np.outer(prediction.mean, prediction.mean))
         covariance = record.covariances.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
@@ -135,9 +131,7 @@ class OdometryBuilder:
             )
         return MotionError.independent(covariance, dt_s=record.dt_s)
 
-    def _twist(
-        self, record: VoRecord, error: MotionError, prediction: Prediction | None, chain: _Chain
-    ) -> tuple[Array, Array]:
+    def _twist(self, record: VoRecord, error: MotionError, chain: _Chain) -> tuple[Array, Array]:
         """Body twist since the last good frame, and its covariance.
 
         Usually that frame is the reference. Where it is not (the vehicle stood still, or a keyframe is kept), the
@@ -150,10 +144,7 @@ class OdometryBuilder:
             raise GpvoError(f"the frame at t_ns {record.t_ns} does not follow the one at {t_last}")
         if t_last == record.t_prev_ns:
             xi, covariance = se3.log(record.T_prev_cur), error.covariance
-            if self.correct_twist and prediction is not None:
-                xi = se3.log(record.T_prev_cur @ se3.exp(-prediction.mean))
         else:
-            # Both motions have the mean of their reference in them: nothing is left of it to take off.
             T_rel = se3.inverse(T_last) @ chain.T_first_cam
             A = se3.adjoint(se3.inverse(T_rel))
             xi, covariance = se3.log(T_rel), error.covariance - own + A @ noise_last @ A.T

@@ -29,7 +29,6 @@ DEFAULTS: dict[str, Any] = {
     "topic": "/gpvo/odometry",
     "pose_topic": "",
     "pose_covariance": "accumulated",
-    "correct_twist": False,
     "state": "",
     "depth": 10,
 }
@@ -60,7 +59,6 @@ def settings_of(given: dict[str, Any]) -> LiveSettings:
         pose_topic=p["pose_topic"],
         depth=p["depth"],
         engine=EngineSettings(
-            correct_twist=p["correct_twist"],
             increment=p["pose_covariance"] == "increment",
             state=None if p["state"] is None else Path(p["state"]),
         ),
