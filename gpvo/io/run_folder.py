@@ -15,8 +15,9 @@ from gpvo.io import run_table
 from gpvo.io.atomic import FolderLock
 from gpvo.io.jsonfile import read_json
 from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
+from gpvo.io.run_read import check_log
 from gpvo.io.snapshot import load_snapshot
-from gpvo.types import ImuLog, Mounting, StereoCamera, TruthLog, VoRecord
+from gpvo.types import ImuLog, Mounting, StereoCamera, TruthLog, VoLog, VoRecord
 
 SCHEMA = 1
 FILES = (
@@ -49,6 +50,7 @@ def take_up(chunks: Path, key: str) -> Kept | None:
         late = [p for paths in parts.values() for p in paths if int(p.stem.rpartition("_")[2]) >= count]
         kept = {kind: [p for p in paths if p not in late] for kind, paths in parts.items() if paths}
         records = [r for path in kept["log"] for r in run_table.records_from(read_columns(path)[0])]
+        check_log(VoLog(records), chunks)
         groups = {kind: [placed_columns(path) for path in paths] for kind, paths in kept.items()}
         whole = len(kept["log"]) == count and all(len(g) in (0, count) for g in groups.values())
     # No state, one of other settings or another version, a damaged chunk, or no library that reads it.

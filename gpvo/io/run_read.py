@@ -164,11 +164,12 @@ def _read_log(path: Path, camera: StereoCamera | None) -> VoLog:
         columns, _ = read_columns(part)
         records += _guarded(part, lambda columns=columns: run_table.records_from(columns))
     log = VoLog(records, camera)
-    _check_log(log, path / "vo_log.parquet")
+    check_log(log, path / "vo_log.parquet")
     return log
 
 
-def _check_log(log: VoLog, path: Path) -> None:
+def check_log(log: VoLog, path: Path) -> None:
+    """Raise SourceError where stamps, motions or covariances of a log read from ``path`` cannot be."""
     t = log.t_ns
     if len(t) == 0:
         raise SourceError("holds no records", where=path)
@@ -192,7 +193,7 @@ def _check_covariances(C: Array, what: str, path: Path, *, semi: bool = False) -
 
 def _check_poses(T: Array, path: Path) -> None:
     R = T[:, :3, :3]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         good = np.isfinite(T).all(axis=(1, 2))
         good &= np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) < 1e-6
     if not good.all():

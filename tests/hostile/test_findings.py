@@ -74,7 +74,9 @@ FINDINGS = {
     ),
     "a killed run begins anew": ("../kills/test_resume: the_same_bytes_after_breaking_off_twice",),
     "what is kept of a run or a session": (
-        "../kills/test_resume: a_state_that_cannot_be_is_refused_in_one_line",
+        "../kills/test_resume: a_state_that_cannot_be_is_refused_in_one_line,"
+        " chunks_with_motions_that_cannot_be_are_not_gone_on_with",
+        "test_runs: a_mounting_beyond_all_measure_is_refused_without_a_warning",
         "../io/test_snapshot: numbers_beyond_all_measure_are_not_taken_up",
         "../live/test_engine: a_state_that_cannot_be_is_refused_in_one_line",
     ),

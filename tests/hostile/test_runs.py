@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from gpvo.errors import GpvoError, SourceError
+from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.run import RunWriter, is_finished, read_run, write_run
 from gpvo.online.predictor import Predictor
 from gpvo.types import VoLog
@@ -59,6 +61,15 @@ def test_a_covariance_that_is_none_is_refused(column: str, value: float, run: Pa
     _change(run / "vo_log.parquet", column, value)
     with pytest.raises(SourceError, match=r"vo_log\.parquet: "):
         read_run(run)
+
+
+def test_a_mounting_beyond_all_measure_is_refused_without_a_warning(run: Path) -> None:
+    rig = read_json(run / "rig.json")
+    write_json(run / "rig.json", {**rig, "T_body_cam": np.diag([1e300, 1.0, 1.0, 1.0])})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(SourceError, match=r"rig\.json: row 0 holds no rigid motion"):
+            read_run(run)
 
 
 @pytest.mark.parametrize(("column", "value"), [("cov_white_00", -1.0), ("mean_x_m", np.inf), ("cov_jitter_01", 1.0),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from gpvo import runner
@@ -156,10 +158,10 @@ def test_a_source_that_changed_is_told(tmp_path: Path, monkeypatch: pytest.Monke
         list(runner.steps(source, runner.VoConfig(), done=shifted))
 
 
-def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def broken_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The source of a run that broke off after two chunks."""
     monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
-    path, state = tracks(tmp_path), tmp_path / "run" / "chunks" / "state.npz"
-    left = iter(range(13))
+    path, left = tracks(tmp_path), iter(range(13))
 
     def stop(*_: object) -> None:
         if next(left, None) is None:
@@ -167,6 +169,30 @@ def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypat
 
     with pytest.raises(KeyboardInterrupt):
         runner.run(open_source(path), tmp_path / "run", on_frame=stop, resume="")
+    return path
+
+
+@pytest.mark.parametrize(("column", "value"), [("p_x_m", float("nan")), ("R_00", 1e90)])
+def test_chunks_with_motions_that_cannot_be_are_not_gone_on_with(
+    column: str, value: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = broken_off(tmp_path, monkeypatch)
+    chunk = tmp_path / "run" / "chunks" / "log_000000.parquet"
+    table = pq.read_table(chunk)
+    values = [*table[column].to_pylist()[:-1], value]
+    at = table.column_names.index(column)
+    pq.write_table(table.set_column(at, column, pa.array(values, pa.float64())), chunk)
+    went: list[int] = []
+    step = StereoOdometry.step
+    monkeypatch.setattr(StereoOdometry, "step", lambda *a: (went.append(1), step(*a))[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        runner.run(open_source(path), tmp_path / "run", resume="")
+    assert len(went) == len(read_run(tmp_path / "run").log)
+
+
+def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, state = broken_off(tmp_path, monkeypatch), tmp_path / "run" / "chunks" / "state.npz"
     with np.load(state) as file:
         tree, data = json.loads(file["tree"].tobytes()), file["data"]
     _, made_by = tree["state"]["tuple"]
