@@ -1,0 +1,102 @@
+"""One camera's images: working memory and the order in which the kernels run."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.sim.render import raster, shade
+from gpvo.sim.render.groups import COLUMNS, SCRATCH, TAPS
+from gpvo.sim.render.lanes import LANES
+from gpvo.sim.render.scene import RayTable, Scene
+from gpvo.types import Array
+
+_MOST_TAPS = 3
+
+
+class Drawer:
+    """Draws a scene through one lens, in horizontal bands that may run in different threads.
+
+    ``radiance`` and ``depth`` (H, W) float32 hold the last image.
+    """
+
+    def __init__(self, scene: Scene, table: RayTable, far_m: float, bands: int) -> None:
+        self._scene, self._table, self._far = scene, table, float(far_m)
+        H, W, groups = table.height, table.width, table.rays.shape[1]
+        edges = np.linspace(0, H, bands + 1).astype(int)
+        self.bands = list(pairwise(edges.tolist()))
+        self._frame = np.zeros((H, groups, 5, LANES), np.float32)
+        self._radiance, self._depth = (np.zeros((H, groups * LANES), np.float32) for _ in range(2))
+        self.radiance, self.depth = self._radiance[:, :W], self._depth[:, :W]
+        self._index = np.zeros(len(scene.sphere), np.int32)
+        self._distance = np.zeros(len(scene.sphere), np.float32)
+        self._light_map = _light_map(scene)
+        most = int(np.diff(scene.vertex_start).max())
+        self._memory = [_Memory(most) for _ in self.bands]
+
+    def aim(self, T_world_cam: Array) -> None:
+        """Choose the clusters to draw from a pose, nearest first."""
+        self._R = np.ascontiguousarray(T_world_cam[:3, :3].T)
+        self._P = np.ascontiguousarray(T_world_cam[:3, 3])
+        s, t = self._scene, self._table
+        n = raster.cull(
+            s.sphere, s.cone, self._R, self._P, t.reach, t.max_angle_rad, self._far, self._index, self._distance
+        )
+        order = np.argsort(self._distance[:n], kind="stable")
+        self._order, self._near = self._index[order], self._distance[order]
+        self._triangles = int((s.triangle_start[self._order + 1] - s.triangle_start[self._order]).sum())
+
+    def draw(self, band: int, lights: Array) -> None:
+        """Fill the rows of a band of ``radiance`` and ``depth``.
+
+        ``lights``: ambient, head lamp.
+        """
+        s, t, memory = self._scene, self._table, self._memory[band]
+        y0, y1 = self.bands[band]
+        memory.make_room(self._triangles + 1)
+        raster.clear(t.rays, t.valid, self._frame, y0, y1)
+        kept = raster.visibility(
+            self._order, self._near,
+            (s.vertices, s.triangles, s.vertex_start, s.triangle_start, s.cluster_material),
+            self._R, self._P, t.plane, t.reach, np.float32(t.bend), t.width, self._frame, y0, y1, memory.camera,
+            memory.pixel, memory.rows, memory.corner,
+        )  # fmt: skip
+        # Marks the tables as not filled, and the blank triangle's as filled with nothing.
+        memory.table[:kept, TAPS] = 0
+        memory.table[0] = 0
+        memory.table[0, TAPS] = 1
+        shade.shade(
+            self._frame, memory.rows, memory.corner, s.vertices, s.texels,
+            (s.texture_size, s.level_start), self._R, self._P, lights, t.rays, t.width, t.plane, t.reach, _MOST_TAPS,
+            memory.table, memory.table.view(np.int32), memory.scratch, self._radiance, self._depth, y0, y1,
+        )  # fmt: skip
+        if self._light_map is not None:
+            shade.cast_shadows(
+                self._frame, memory.corner, s.vertices, memory.table, self._light_map, self.radiance, y0, y1
+            )
+
+
+class _Memory:
+    """What one band needs for itself, so that bands can run side by side."""
+
+    def __init__(self, most_vertices: int) -> None:
+        self.camera, self.pixel = np.zeros((3, most_vertices)), np.zeros((2, most_vertices), np.float32)
+        self.scratch = np.zeros(SCRATCH, np.float32)
+        self.rows: NDArray[np.float32] = np.zeros((0, 10), np.float32)
+
+    def make_room(self, triangles: int) -> None:
+        if len(self.rows) < triangles:
+            size = triangles * 5 // 4
+            self.rows = np.zeros((size, 10), np.float32)
+            self.corner = np.zeros((size, 4), np.int32)
+            self.table = np.zeros((size, COLUMNS), np.float32)
+
+
+def _light_map(scene: Scene) -> tuple[NDArray[np.uint8], int, np.float32, np.float32, np.float32] | None:
+    lm = scene.light_map
+    if lm is None:
+        return None
+    u, v = np.float32(lm.origin[0]), np.float32(lm.origin[1])
+    return np.ascontiguousarray(lm.image), lm.material, u, v, np.float32(1 / lm.texel)
