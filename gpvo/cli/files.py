@@ -182,7 +182,6 @@ def import_(
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
-    from gpvo.cli.files import import_log
     from gpvo.io.foreign import read_foreign
 
     offset, sigma = None, None
