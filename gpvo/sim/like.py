@@ -13,7 +13,7 @@ from gpvo.errors import SourceError
 from gpvo.io.run import Run, read_run, read_tracks
 from gpvo.sim.recorded import longest_flight_s
 from gpvo.types import Array, StereoCamera, StereoTracks
-from gpvo.vo.motion import refine, transfer
+from gpvo.vo.motion import refine, transfer, whitened
 from gpvo.vo.sigmas import NoiseEstimator
 
 _IMU_HZ = 200.0
@@ -91,7 +91,7 @@ class _Tracking:
         motion = refine(T_prev_cur, uvd, uvd_now, camera, noise=self._noise.value)
         if motion is None:
             return
-        self._noise.update(motion, transfer(motion.T_prev_cur, motion.uvd_prev, camera).G)
+        self._noise.update(motion, whitened(motion, camera))
         expected = transfer(T_prev_cur, before[1], camera)
         u, v, _ = expected.uvd
         stays = expected.in_front & (u > 0) & (v > 0) & (u < camera.width) & (v < camera.height)

@@ -126,12 +126,8 @@ class KltFrontend:
         )
         uvd, from_left, cur_left, disparity = uvd[found], left_uv[found], cur_left[found], guess[found, 2]
         spare = np.flatnonzero(found) >= reference.strong
-        # One search in the right image serves both the followed points and the new corners between them.
-        new_uv, new_disparity, detected = self._new_corners(current, cur_left)
-        both_uv = np.concatenate([cur_left, new_uv])
-        both_uvd, both_good, row_error = self._find_right(current, both_uv, np.concatenate([disparity, new_disparity]))
+        both_uvd, both_good, row_error = self._with_new_corners(current, cur_left, disparity)
         n = len(cur_left)
-        self._new = _New.of(detected, new_uv, both_uvd[n:], both_good[n:])
         uvd_cur, good = both_uvd[:n], both_good[:n]
         self._matched_left, self._matched_uvd = cur_left[good], uvd_cur[good]
         right = self._right_search(both_uvd, both_good, row_error, cur_left[:, 1] - from_left[:, 1])
@@ -144,9 +140,7 @@ class KltFrontend:
         assert current is not None
         if inliers is None:
             self._matched_left, self._matched_uvd = _NO_POINTS, np.empty((0, 3))
-            new_uv, disparity, detected = self._new_corners(current, _NO_POINTS)
-            new_uvd, good, _ = self._find_right(current, new_uv, disparity)
-            self._new = _New.of(detected, new_uv, new_uvd, good)
+            self._with_new_corners(current, _NO_POINTS, np.empty(0))
             inliers = np.zeros(0, bool)
         uv, new = self._matched_left[inliers], self._new
         current.left_uv = np.concatenate([uv, new.left_uv])
@@ -210,6 +204,17 @@ class KltFrontend:
         chosen, first = np.unique(cell, return_index=True)
         return uv[first[~np.isin(chosen, taken)]]
 
+    def _with_new_corners(
+        self, view: _View, uv: Points, disparity: Array
+    ) -> tuple[Array, NDArray[np.bool_], Array]:
+        """One search in the right image for both known points of the left one and the new corners between them: as
+        :meth:`_find_right`, the known points first."""
+        new_uv, new_disparity, detected = self._new_corners(view, uv)
+        found = self._find_right(view, np.concatenate([uv, new_uv]), np.concatenate([disparity, new_disparity]))
+        n = len(uv)
+        self._new = _New.of(detected, new_uv, found[0][n:], found[1][n:])
+        return found
+
     def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_], Array]:
         """(N, 3) measurements of left points, from a guessed disparity; which of them can be believed; and by how much
         the right row lies below the left one, NaN where nothing was found."""
@@ -248,15 +253,12 @@ class KltFrontend:
         (from_uv, from_bits), (to_uv, to_bits) = self._features(reference), self._features(current)
         pairs = opencv.match_mutual(from_bits, to_bits)
         before, good_before, _ = self._find_right(reference, *self._rough(reference, from_uv[pairs[:, 0]]))
-        uv = to_uv[pairs[:, 1]]
-        after, good_after, row_error = self._find_right(current, *self._rough(current, uv))
-        good = good_before & good_after
-        new_uv, disparity, detected = self._new_corners(current, uv[good])
-        new_uvd, new_good, _ = self._find_right(current, new_uv, disparity)
-        self._new = _New.of(detected, new_uv, new_uvd, new_good)
-        self._matched_left, self._matched_uvd = uv[good], after[good]
+        uv, n = to_uv[pairs[:, 1]], len(pairs)
+        uvd, found, row_error = self._with_new_corners(current, *self._rough(current, uv))
+        good = good_before & found[:n]
+        self._matched_left, self._matched_uvd = uv[good], uvd[:n][good]
         # Wrong pairs are no second motion: nothing is said of points sought in vain.
-        return Matches(before[good], after[good], row_error[good], len(pairs))
+        return Matches(before[good], uvd[:n][good], row_error[:n][good], n)
 
     def _features(self, view: _View) -> tuple[Points, NDArray[np.uint8]]:
         if view.features is None:

@@ -232,7 +232,7 @@ class StereoOdometry:
                 v_t=dict.fromkeys(config.stated, C[:3, :3]),
             )
         if self.config.persistent_noise:
-            self._noise.update(motion, white.moved.G)
+            self._noise.update(motion, white)
         self._sigmas.update(moments)
         if self._sigmas.estimates:
             self._sigmas.design.update(motion, white, self.camera)

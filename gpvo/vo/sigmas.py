@@ -147,18 +147,18 @@ class NoiseEstimator:
         self._sums: Array = np.zeros(3)
         self.value = PointNoise()
 
-    def update(self, motion: Motion, G: Array) -> None:
-        """Take in a motion, with the derivatives (3, 3, M) of its residuals by the reference measurement."""
-        self.value = PointNoise(self._shared(motion, G), self.value.persistent)
-        self.value = PointNoise(self.value.shared, self._persistent(motion.residuals, G))
+    def update(self, motion: Motion, white: Whitened) -> None:
+        """Take in a motion and its whitened residuals."""
+        self.value = PointNoise(self._shared(motion, white), self.value.persistent)
+        self.value = PointNoise(self.value.shared, self._persistent(motion.residuals, white.moved.G))
 
-    def _shared(self, motion: Motion, G: Array) -> float:
+    def _shared(self, motion: Motion, white: Whitened) -> float:
         """Least squares over the products ``r_u^2``, ``r_d^2`` and ``r_u r_d`` of all points."""
-        C = residual_covariance(G, self.value.S, self.value.S, self.value.persistent)
-        alone = residual_covariance(G, PointNoise(0.0).S, PointNoise(0.0).S, self.value.persistent)
-        r = motion.residuals.T / motion.scale_px
-        z2 = (apply_whitener(whitener(C), r) ** 2).sum(0)
-        r = r * np.sqrt(np.minimum(1.0, _CUT / np.maximum(z2, 1e-9)))
+        G, noise, variance = white.moved.G, motion.noise, motion.scale_px**2
+        C = residual_covariance(G, noise.S, noise.S, noise.persistent)
+        alone = residual_covariance(G, PointNoise(0.0).S, PointNoise(0.0).S, noise.persistent)
+        z2 = (white.z**2).sum(0)
+        r = motion.residuals.T * np.sqrt(np.minimum(1.0 / variance, _CUT / np.maximum(z2, 1e-9 * variance)))
         normal, moments = np.zeros((2, 2)), np.zeros(2)
         for i, j in ((0, 0), (2, 2), (0, 2)):
             both = G[i, 0] * G[j, 2] + G[i, 2] * G[j, 0] + float(i != j)

@@ -44,7 +44,7 @@ def _fly(
         motion = refine(T, rig.correct(seen[0]), rig.correct(seen[1]), CAMERA, noise=noise.value)
         assert motion is not None
         white = whitened(motion, CAMERA)
-        noise.update(motion, white.moved.G)
+        noise.update(motion, white)
         rig.update(motion, white, row_error[motion.inliers], 0.5)
     return rig
 

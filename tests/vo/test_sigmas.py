@@ -24,7 +24,7 @@ def test_persistent_noise_is_found(persistent_px: float) -> None:
         after[:3] += rng.uniform(-3, 3, (3, 3))
         motion = refine(T, before, after, CAMERA, noise=noise.value)
         assert motion is not None
-        noise.update(motion, transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA).G)
+        noise.update(motion, whitened(motion, CAMERA))
     assert 0.15 * np.sqrt(noise.value.persistent) == pytest.approx(persistent_px, rel=0.25, abs=0.03)
 
 
@@ -40,7 +40,7 @@ def test_what_left_column_and_disparity_share_is_found(shared: float) -> None:
         after[:3] += rng.uniform(-3, 3, (3, 3))
         motion = refine(T, before, after, CAMERA, noise=noise.value)
         assert motion is not None
-        noise.update(motion, transfer(motion.T_prev_cur, motion.uvd_prev, CAMERA).G)
+        noise.update(motion, whitened(motion, CAMERA))
     assert noise.value.shared == pytest.approx(shared, abs=0.08)
     assert noise.value.persistent < 0.5
 
