@@ -34,7 +34,7 @@ CONFIG = TrainConfig(features="velocity,rotation")
 def run(folder: Path, out: Path, only: Sequence[str], systems: Sequence[str] | None = None) -> dict[str, Any]:
     """The document of both experiments; ``shim.json`` in ``out``. Raises SourceError where a log cannot be read."""
     names = systems or sorted({p.stem for p in folder.glob("*/*.tum")} - {"truth"})
-    runs = {s: [_imported(p, out / "runs") for p in sorted(folder.glob(f"*/{s}.tum"))] for s in names}
+    runs = {s: [imported(p, out / "runs") for p in sorted(folder.glob(f"*/{s}.tum"))] for s in names}
     sets = {s: [replace(CONFIG.rows_of(read_run(p)), name=p.name) for p in paths] for s, paths in runs.items()}
     found: dict[str, Any] = {}
     for system in names:
@@ -52,7 +52,7 @@ def run(folder: Path, out: Path, only: Sequence[str], systems: Sequence[str] | N
     return found
 
 
-def _imported(log: Path, runs: Path) -> Path:
+def imported(log: Path, runs: Path) -> Path:
     """The run of a log against the truth beside it, made unless it is there."""
     out = runs / log.stem / log.parent.name
     if not (out / "run.json").is_file():

@@ -13,7 +13,7 @@ from gpvo.errors import SourceError
 from gpvo.io.run import Run, read_run, read_tracks
 from gpvo.sim.recorded import longest_flight_s
 from gpvo.types import Array, StereoCamera, StereoTracks
-from gpvo.vo.motion import refine, transfer, whitened
+from gpvo.vo.motion import predict_uvd, refine, whitened
 from gpvo.vo.sigmas import NoiseEstimator
 
 _IMU_HZ = 200.0
@@ -92,9 +92,8 @@ class _Tracking:
         if motion is None:
             return
         self._noise.update(motion, whitened(motion, camera))
-        expected = transfer(T_prev_cur, before[1], camera)
-        u, v, _ = expected.uvd
-        stays = expected.in_front & (u > 0) & (v > 0) & (u < camera.width) & (v < camera.height)
+        (u, v, _), in_front = predict_uvd(T_prev_cur, before[1], camera)
+        stays = in_front & (u > 0) & (v > 0) & (u < camera.width) & (v < camera.height)
         self.sigma_px.append(motion.scale_px)
         self._count.append(len(now[0]))
         self._ended.append(1.0 - float(np.isin(before[0][stays], both).mean()))

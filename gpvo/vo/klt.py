@@ -19,7 +19,7 @@ from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
 from gpvo.vo.image import Light, image_stats, in_light_of
-from gpvo.vo.motion import transfer
+from gpvo.vo.motion import predict_uvd
 from gpvo.vo.opencv import Image, Points
 from gpvo.vo.rig_error import RigError
 from gpvo.vo.rivals import cells
@@ -155,11 +155,10 @@ class KltFrontend:
         """(N, 3) where the guess puts the reference's points; the old place for those it puts out of sight."""
         assert self._reference is not None
         uvd = self._reference.uvd
-        moved = transfer(T_prev_cur, uvd, self._camera)
+        (u, v, d), in_front = predict_uvd(T_prev_cur, uvd, self._camera)
         w, h = self._camera.width, self._camera.height
-        u, v, d = moved.uvd
-        visible = moved.in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
-        return np.where(visible[:, None], moved.uvd.T, uvd)
+        visible = in_front & (u >= 0) & (u < w) & (v >= 0) & (v < h) & (d < w)
+        return np.where(visible[:, None], np.column_stack([u, v, d]), uvd)
 
     def _survey(self, half_left: Image, half_right: Image) -> tuple[Points, NDArray[np.float32]]:
         """Corners of the half-size left image, strongest first, and disparity at a quarter of the size."""
@@ -204,9 +203,7 @@ class KltFrontend:
         chosen, first = np.unique(cell, return_index=True)
         return uv[first[~np.isin(chosen, taken)]]
 
-    def _with_new_corners(
-        self, view: _View, uv: Points, disparity: Array
-    ) -> tuple[Array, NDArray[np.bool_], Array]:
+    def _with_new_corners(self, view: _View, uv: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_], Array]:
         """One search in the right image for both known points of the left one and the new corners between them: as
         :meth:`_find_right`, the known points first."""
         new_uv, new_disparity, detected = self._new_corners(view, uv)

@@ -36,23 +36,37 @@ class Transfer:
     in_front: NDArray[np.bool_]
 
 
-def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transfer:
-    """Predict (u, v, d) in the current frame from (N, 3) in the reference frame. See :class:`Transfer`."""
+def predict_uvd(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> tuple[Array, NDArray[np.bool_]]:
+    """Prediction (3, N) of (u, v, d) in the current frame from (N, 3) in the reference frame; which are in front."""
+    _, _, uvd, in_front = _placed(T_prev_cur, uvd_prev, camera)
+    return uvd, in_front
+
+
+def _placed(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """The points (3, N) divided by their depth in the reference frame, one over the third of them, and
+    :func:`predict_uvd`."""
     fx, fy, b = camera.fx_px, camera.fy_px, camera.baseline_m
     R = T_prev_cur[:3, :3].T
-    t = -R @ T_prev_cur[:3, 3]
-    n = len(uvd_prev)
     rho = uvd_prev[:, 2] / (fx * b)
-    m_prev = np.empty((3, n))
+    m_prev = np.empty((3, len(uvd_prev)))
     m_prev[0] = (uvd_prev[:, 0] - camera.cx_px) / fx
     m_prev[1] = (uvd_prev[:, 1] - camera.cy_px) / fy
     m_prev[2] = 1.0
-    m = R @ m_prev + t[:, None] * rho
+    m = R @ m_prev + (-R @ T_prev_cur[:3, 3])[:, None] * rho
     in_front = m[2] > 1e-6
     w = 1.0 / np.where(in_front, m[2], 1.0)
+    uvd = np.stack([fx * (m[0] * w) + camera.cx_px, fy * (m[1] * w) + camera.cy_px, fx * b * rho * w])
+    return m, w, uvd, in_front
+
+
+def transfer(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> Transfer:
+    """:func:`predict_uvd`, with its derivatives."""
+    fx, fy, b = camera.fx_px, camera.fy_px, camera.baseline_m
+    m, w, uvd, in_front = _placed(T_prev_cur, uvd_prev, camera)
+    R = T_prev_cur[:3, :3].T
+    t = -R @ T_prev_cur[:3, 3]
+    n, rho, d = len(uvd_prev), uvd_prev[:, 2] / (fx * b), uvd[2]
     x, y = m[0] * w, m[1] * w
-    d = fx * b * rho * w
-    uvd = np.stack([fx * x + camera.cx_px, fy * y + camera.cy_px, d])
 
     # d(u, v, d)/dm, applied to nine directions of m at once: six of the motion, three of the measurement.
     dm = np.zeros((9, 3, n))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gpvo.types import Array, Status, StereoCamera
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import Matches
-from gpvo.vo.motion import Motion, transfer
+from gpvo.vo.motion import Motion, predict_uvd
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Verdict:
 
 def agrees(T_prev_cur: Array, matches: Matches, camera: StereoCamera, threshold_px: float) -> NDArray[np.bool_]:
     """(N,) whether the motion predicts each point where it was found, in the left image and in disparity."""
-    moved = transfer(T_prev_cur, matches.uvd_prev, camera)
-    off = matches.uvd_cur - moved.uvd.T
-    return moved.in_front & (np.hypot(off[:, 0], off[:, 1]) < threshold_px) & (np.abs(off[:, 2]) < 1.5 * threshold_px)
+    uvd, in_front = predict_uvd(T_prev_cur, matches.uvd_prev, camera)
+    off = matches.uvd_cur - uvd.T
+    return in_front & (np.hypot(off[:, 0], off[:, 1]) < threshold_px) & (np.abs(off[:, 2]) < 1.5 * threshold_px)
 
 
 def judge(

@@ -129,7 +129,7 @@ class RigError:
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
         kinds = product(_MOUNTINGS, _LENSES) if self._may_be_exact else ()
         covariances = [prior_covariance(camera, *kind) for kind in kinds] or [self._start.covariance]
-        self._priors = [_Prior.of(self._start.mean, covariance) for covariance in covariances]
+        self._priors = _Priors.of(self._start.mean, np.stack(covariances))
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
     def correct(self, uvd: Array) -> Array:
@@ -199,24 +199,23 @@ class RigError:
 
     def _mixed(self, information: Array, score: Array) -> RigState:
         """The posterior over rigs of every kind, as one Gaussian of its mean and covariance."""
-        fits, log_odds = [], []
-        for prior in self._priors:
-            covariance = np.asarray(np.linalg.inv(prior.precision + information), np.float64)
-            mean = covariance @ (prior.score + score)
-            fits.append((mean, covariance))
-            # Savage-Dickey: against a rig whose disparities are exact, which is as likely as all kinds of others.
-            P, m = covariance[_DX, _DX], mean[_DX]
-            log_odds.append(0.5 * (m @ np.linalg.solve(P, m) + np.linalg.slogdet(P)[1] - prior.log_det_dx))
-        if len(fits) == 1:
-            return RigState(*fits[0], 1.0)
-        weight = np.exp(np.array([np.log(len(fits)), *log_odds]) - max(0.0, *log_odds))
+        priors = self._priors
+        covariances = np.asarray(np.linalg.inv(priors.precision + information), np.float64)
+        means = np.einsum("kij,kj->ki", covariances, priors.score + score)
+        if len(means) == 1:
+            return RigState(means[0], covariances[0], 1.0)
+        # Savage-Dickey: against a rig whose disparities are exact, which is as likely as all kinds of others.
+        P, m = covariances[:, _DX, _DX], means[:, _DX]
+        distance2 = (m * np.linalg.solve(P, m[..., None])[..., 0]).sum(axis=1)
+        log_odds = 0.5 * (distance2 + np.linalg.slogdet(P)[1] - priors.log_det_dx)
+        weight = np.exp(np.append(np.log(len(means)), log_odds) - max(0.0, log_odds.max()))
         weight /= weight.sum()
-        mean, best = np.zeros(2 * N_TERMS), int(np.argmax(weight[1:]))
-        covariance = np.zeros_like(fits[0][1])
-        exact = self._without_disparity(*fits[best])
-        for w, (m, P) in zip(weight, (exact, *fits), strict=True):
-            mean += w * m
-            covariance += w * (P + np.outer(m, m))
+        best = int(np.argmax(log_odds))
+        exact_mean, exact_covariance = self._without_disparity(means[best], covariances[best])
+        mean = weight[0] * exact_mean + weight[1:] @ means
+        squares = covariances + means[:, :, None] * means[:, None]
+        covariance = weight[0] * (exact_covariance + np.outer(exact_mean, exact_mean))
+        covariance = covariance + np.tensordot(weight[1:], squares, 1)
         return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[0]))
 
     @staticmethod
@@ -238,18 +237,19 @@ class RigError:
 
 
 @dataclass(frozen=True)
-class _Prior:
-    """One kind of rig: precision (30, 30) and precision times mean (30,), log determinant of the covariance of dx."""
+class _Priors:
+    """K kinds of rig: precision (K, 30, 30) and precision times mean (K, 30), log determinant (K,) of the covariance of
+    dx."""
 
     precision: Array
     score: Array
-    log_det_dx: float
+    log_det_dx: Array
 
     @classmethod
-    def of(cls, mean: Array, covariance: Array) -> _Prior:
-        """Of a Gaussian of this mean (30,) and covariance (30, 30)."""
+    def of(cls, mean: Array, covariance: Array) -> _Priors:
+        """Of Gaussians of this mean (30,) and these covariances (K, 30, 30)."""
         precision = np.asarray(np.linalg.inv(covariance), np.float64)
-        return cls(precision, precision @ mean, float(np.linalg.slogdet(covariance[_DX, _DX])[1]))
+        return cls(precision, precision @ mean, np.linalg.slogdet(covariance[:, _DX, _DX])[1])
 
 
 class _Blocks:

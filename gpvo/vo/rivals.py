@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import Matches
-from gpvo.vo.motion import Motion, transfer
+from gpvo.vo.motion import Motion, predict_uvd
 from gpvo.vo.quality import worst_translation_sigma_m
 
 _CELLS = 96  # of the whole image
@@ -137,11 +137,10 @@ def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: 
     if matches.sought_uvd is None:
         return None
     off_px = _off_px(motion.T_prev_cur, matches, camera)
-    moved = transfer(motion.T_prev_cur, matches.sought_uvd, camera)
-    u, v, d = moved.uvd
+    (u, v, d), in_front = predict_uvd(motion.T_prev_cur, matches.sought_uvd, camera)
     margin = config.klt_window_px
     inside = (u - d > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin)
-    sought = np.unique(cells(matches.sought_uvd[moved.in_front & inside], camera))
+    sought = np.unique(cells(matches.sought_uvd[in_front & inside], camera))
     agree = np.isin(sought, cells(matches.uvd_prev[off_px < config.ransac_threshold_px], camera))
     free = off_px > max(config.ransac_threshold_px, 6 * motion.scale_px)
     return free if free.sum() >= _LEAST and agree.sum() < _EXPLAINED * len(sought) else None
@@ -163,6 +162,6 @@ def areas(first: Motion, second: Motion, matches: Matches, camera: StereoCamera,
 
 def _off_px(T_prev_cur: Array, matches: Matches, camera: StereoCamera) -> Array:
     """(N,) distance [px] of each point from where the motion puts it, in image and disparity."""
-    moved = transfer(T_prev_cur, matches.uvd_prev, camera)
-    off = np.linalg.norm(matches.uvd_cur - moved.uvd.T, axis=1)
-    return np.where(moved.in_front, off, np.inf)
+    uvd, in_front = predict_uvd(T_prev_cur, matches.uvd_prev, camera)
+    off = np.linalg.norm(matches.uvd_cur - uvd.T, axis=1)
+    return np.where(in_front, off, np.inf)
