@@ -23,7 +23,7 @@ sys.path.insert(0, str(_TESTS))
 from gpvo.learning.logvariance import fit_log_variance  # noqa: E402
 from gpvo.learning.regressors import get_regressor  # noqa: E402
 from gpvo.online import modelfile  # noqa: E402
-from gpvo.online.projected import NoisyGP, ProjectedGP  # noqa: E402
+from gpvo.online.projected import ProjectedGP  # noqa: E402
 from synthetic_errors import Problem, gaussian_nll, make_problem  # noqa: E402
 
 Results = dict[str, dict[str, Any]]
@@ -126,7 +126,7 @@ def loading(fit: Fit) -> Results:
     """Import of everything that flies, the model file, and one prediction, in a fresh interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.gpvo"
-        modelfile.save(path, NoisyGP(fit.mean, np.zeros(6)).to_arrays(""), {"features": []})
+        modelfile.save(path, fit.mean.to_arrays(), {"features": []})
         code = f"""
 import json, time
 def megabytes():
@@ -135,8 +135,8 @@ before, begin = megabytes(), time.perf_counter()
 import numpy as np
 import gpvo.online.predictor
 from gpvo.online import modelfile
-from gpvo.online.projected import NoisyGP
-NoisyGP.from_arrays(modelfile.load({str(path)!r})[0], "").predict(np.zeros((1, 8)))
+from gpvo.online.projected import ProjectedGP
+ProjectedGP.from_arrays(modelfile.load({str(path)!r})[0]).evaluate(np.zeros((1, 8)))
 print(json.dumps([time.perf_counter() - begin, megabytes() - before]))
 """
         found = np.array([child(code) for _ in range(7)])

@@ -185,6 +185,6 @@ def _clip(folder: Path) -> Path:
     camera = pinhole(752, 480, 0.11)
     clip = render_clip(camera, wander(60))
     pairs = np.array([[f.left, f.right] for f in clip.frames], dtype=np.uint8)
-    place = {"f": camera.fx_px, "cx": camera.cx_px, "cy": camera.cy_px, "baseline_m": camera.baseline_m}
+    place: dict[str, Any] = {"f": camera.fx_px, "cx": camera.cx_px, "cy": camera.cy_px, "baseline_m": camera.baseline_m}
     np.savez(folder / "clip.npz", pairs=pairs, **place)
     return folder / "clip.npz"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from typing import Any
 
 import numpy as np
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
@@ -53,7 +54,7 @@ def run() -> dict[str, dict]:
             0.064,
         ),
     }
-    out = {}
+    out: dict[str, dict[str, Any]] = {}
     for name, (camera, baseline) in cameras.items():
         value, limit = _pairs_per_second(camera, baseline), _WANTED[name]
         out[name] = {

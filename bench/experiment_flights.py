@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
+from gpvo.files import read_json, write_json
 from gpvo.io import open_source
-from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.run import Run, read_run
 from gpvo.runner import run as run_vo
 from gpvo.sim.points import simulate_points

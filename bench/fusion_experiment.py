@@ -17,11 +17,10 @@ from gpvo.dataset.build import build_run
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
 from gpvo.evaluation.fusion_plot import save
 from gpvo.evaluation.fusion_report import document
+from gpvo.files import write_json, write_text
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
 from gpvo.filters.study import Study, fit_scalars, make_policies, study
-from gpvo.io.atomic import write_text
-from gpvo.io.jsonfile import write_json
 from gpvo.io.run import Run
 from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig

@@ -23,7 +23,7 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
 from gpvo.evaluation.evaluate import judged, predictions_by_stamp
 from gpvo.evaluation.statements import statements
-from gpvo.io.jsonfile import write_json
+from gpvo.files import write_json
 from gpvo.io.run import Run, read_run
 from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from gpvo.cli.files import import_log
 from gpvo.dataset.build import TrainingSet
+from gpvo.files import write_json
 from gpvo.io.foreign import read_foreign
-from gpvo.io.jsonfile import write_json
 from gpvo.io.run import read_run
 from gpvo.learning.check import check
 from gpvo.learning.config import TrainConfig

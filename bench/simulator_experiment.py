@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from gpvo import runner
 from gpvo.dataset.errors import MotionErrors, motion_errors
+from gpvo.files import write_json
 from gpvo.io import open_source
-from gpvo.io.jsonfile import write_json
 from gpvo.io.run import Run, read_run
 from gpvo.sim.scenario import load_scenario
 from gpvo.sim.sequence import simulate

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
-from gpvo.io.jsonfile import write_json
+from gpvo.files import write_json
 from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
 from gpvo.io.toml import read_toml

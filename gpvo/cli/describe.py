@@ -128,9 +128,9 @@ def _calibration(path: Path) -> dict[str, Any]:
 
 
 def _model(path: Path) -> dict[str, Any]:
-    from gpvo.online.modelfile import read_header
+    from gpvo.online import modelfile
 
-    header = read_header(path)
+    _, header = modelfile.load(path)
     try:
         return _of_header(header)
     except (AttributeError, KeyError, TypeError):

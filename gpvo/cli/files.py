@@ -126,7 +126,7 @@ def info(
     Example: gpvo info MH_01_easy/
     """
     from gpvo.cli.describe import as_lines, describe
-    from gpvo.io.jsonfile import plain
+    from gpvo.files import plain
 
     given = options.source_options(
         calibration=calibration, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic

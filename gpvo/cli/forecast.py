@@ -133,7 +133,7 @@ def _write(out: Path, f: Forecast) -> None:
 
 def _draw(plot: Path, f: Forecast, title: str) -> None:
     from gpvo.evaluation import plots
-    from gpvo.io.atomic import replacing
+    from gpvo.files import replacing
 
     with replacing(plot) as temporary:
         plots.forecast(f, title).savefig(temporary, dpi=110, format="png")

@@ -134,7 +134,7 @@ def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:
     """The header also says which sequences are twins, whose truth was simulated."""
     from dataclasses import replace
 
-    from gpvo.io.jsonfile import read_json
+    from gpvo.files import read_json
     from gpvo.twin.replicate import simulated_truth
 
     origin = simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
@@ -203,7 +203,7 @@ def _train_file(paths: list[Path], config: TrainConfig, update: Path | None) -> 
 
 def _frames(paths: list[Path]) -> int:
     """How many frames the runs say they have."""
-    from gpvo.io.jsonfile import read_json
+    from gpvo.files import read_json
 
     return sum(int(read_json(p / "run.json").get("frames") or 0) for p in paths if (p / "run.json").is_file())
 

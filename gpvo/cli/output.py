@@ -85,7 +85,7 @@ def new_table(*columns: str) -> Table:
 
 def print_json(document: dict[str, Any]) -> None:
     """Print a document in the form scripts read."""
-    from gpvo.io.jsonfile import plain
+    from gpvo.files import plain
 
     print(json.dumps(plain(document), indent=2))
 

@@ -157,8 +157,7 @@ def calibration(
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
     from gpvo.errors import SourceError
-    from gpvo.io.atomic import write_text
-    from gpvo.io.jsonfile import read_json
+    from gpvo.files import read_json, write_text
     from gpvo.io.run import read_run
     from gpvo.vo.rig_findings import camchain, corrected, document, read_state, rig_of
 

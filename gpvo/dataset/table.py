@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import SourceError
-from gpvo.io.atomic import replacing
+from gpvo.files import replacing
 from gpvo.types import Array, StereoCamera
 
 SCHEMA = 1

@@ -14,28 +14,15 @@ from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.trajectory import pose_document
 from gpvo.evaluation.verdict import verdict
-from gpvo.io.atomic import write_text
+from gpvo.files import write_text
 from gpvo.io.tables import write_csv
 from gpvo.io.trajectory import write_tum
+from gpvo.learning.methods import METHODS
 from gpvo.online.features import AXES
 from gpvo.stats.bootstrap import sequence_bootstrap
-from gpvo.types import IMPORTED, Array, Status
+from gpvo.types import Array, Status
 
 _UNITS = ("translation_m", "rotation_rad")
-METHODS = (
-    "constant",
-    "triangulation",
-    "triangulation_scaled",
-    "triangulation_vt",
-    "pointing_matching",
-    "pointing_matching_scaled",
-    "pointing_matching_vt",
-    IMPORTED,
-    f"{IMPORTED}_scaled",
-    "gp_thesis",
-    "base",
-    "learned",
-)
 
 
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:

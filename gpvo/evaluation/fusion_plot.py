@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import Trace
 from gpvo.evaluation.fusion_report import nis_band, nis_over_runs
-from gpvo.io.atomic import replacing
+from gpvo.files import replacing
 
 
 def require_picture(path: Path) -> None:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport, Trace
+from gpvo.files import write_text
 from gpvo.filters.gate import chi2_quantile
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import LEARNED
 from gpvo.filters.run import FusedRun
 from gpvo.filters.study import Study
-from gpvo.io.atomic import write_text
 from gpvo.types import Array
 
 _AXES = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")

@@ -16,7 +16,7 @@ from gpvo.evaluation import curves, panels
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.panels import Panel, colour
-from gpvo.io.atomic import replacing
+from gpvo.files import replacing
 from gpvo.types import Array
 
 

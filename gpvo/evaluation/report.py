@@ -20,8 +20,8 @@ from gpvo.evaluation.panels import spread
 from gpvo.evaluation.statements import statements
 from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors
 from gpvo.evaluation.verdict import HONEST
+from gpvo.files import write_text
 from gpvo.geometry import se3
-from gpvo.io.atomic import write_text
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
 from gpvo.types import Array

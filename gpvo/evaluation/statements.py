@@ -12,8 +12,8 @@ import numpy as np
 from gpvo.accumulation import along
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.learning.thesis import ThesisModel
 from gpvo.online.features import FeatureStream
-from gpvo.online.thesis import ThesisModel
 from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoLog
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def statements(
             out.append(plain_statement(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
         out.append(_translation_only(log, method))
     if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
-        out.append(_thesis(log, ThesisModel.from_arrays(arrays)))
+        out.append(_thesis(log, ThesisModel.of_file(arrays)))
     if predictions and predictor is not None:
         out.append(_predicted("base", log, predictor.base().replay(log)))
     if predictions:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.atomic import replacing
+from gpvo.files import replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from gpvo.errors import SourceError
+from gpvo.files import FolderLock, read_json
 from gpvo.io import run_table
-from gpvo.io.atomic import FolderLock
-from gpvo.io.jsonfile import read_json
 from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
 from gpvo.io.run_read import check_log
 from gpvo.io.snapshot import load_snapshot

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import CalibrationError, SourceError, printable
+from gpvo.files import read_json
 from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_table
-from gpvo.io.jsonfile import read_json
 from gpvo.io.parquet import read_columns
 from gpvo.types import (
     Array,

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
+from gpvo.files import replacing
 from gpvo.geometry.covariance import LARGEST
-from gpvo.io.atomic import replacing
 from gpvo.io.tracks import load_arrays
 
 HOMES = ("gpvo.types", "gpvo.vo")

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import SourceError
+from gpvo.files import write_text
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.io.atomic import write_text
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
 from gpvo.types import IMPORTED, Array, Status, VoLog, VoRecord

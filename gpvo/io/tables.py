@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gpvo.io.atomic import write_text
+from gpvo.files import write_text
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:

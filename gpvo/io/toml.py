@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gpvo.errors import GpvoError
-from gpvo.io.atomic import write_text
-from gpvo.io.jsonfile import plain
+from gpvo.files import plain, write_text
 
 try:
     import tomllib

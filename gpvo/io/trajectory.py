@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
+from gpvo.files import replacing
 from gpvo.geometry import se3
-from gpvo.io.atomic import replacing
 from gpvo.io.stamps import integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.types import Array, TruthLog
 

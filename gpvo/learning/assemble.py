@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.learning.basefit import learn_velocities
+from gpvo.learning.basefit import learn_domain, learn_velocities
 from gpvo.learning.calibrate import (
     LEVELS,
     Scale,
@@ -27,11 +27,10 @@ from gpvo.learning.spans import at_most
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.division import Division, ln_faster, of_calibration
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.guard import Domain
 from gpvo.online.projected import ProjectedGP
 from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
-from gpvo.types import Array
+from gpvo.types import Array, MotionError
 
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _LEAST_KNOWN = 0.5
@@ -57,7 +56,7 @@ def assemble(
     z = error / np.sqrt(of.variance)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z**2).mean(axis=1), rows.group)
-    domain, high = Domain.learn(of.X), np.zeros(6)
+    domain, high = learn_domain(of.X), np.zeros(6)
     places = np.array([columns.index(n) for n in inputs or columns[:1]], dtype=np.int64)
     if gp is not None:
         high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
@@ -109,16 +108,23 @@ class _Residuals:
         return root, rest, self.error - self.patterns.error
 
     def divided(self, model: ErrorModel) -> tuple[Array, Array]:
-        """Covariances of the parts and root of the calibration, as :meth:`Division.covariances`; the latter by the
-        patterns of the other flights."""
+        """Covariances (n, 3, 6, 6) of jitter, white and bias, the bias without that of calibration, and the root
+        (n, 6, 6) of the latter, by the patterns of the other flights."""
         if self.patterns is None:
-            return model.division.covariances(self.variance, model.twist(self.X), self.geometry)
+            return _covariances(model.division.split(self.variance, model.twist(self.X), self.geometry))
         parts, root = np.empty((len(self.error), 3, 6, 6)), np.empty((len(self.error), 6, 6))
         for fold, patterns in self._folds():
             of_fold = replace(model.division, calibration_patterns=patterns)
             geometry = None if self.geometry is None else self.geometry[fold]
-            parts[fold], root[fold] = of_fold.covariances(self.variance[fold], model.twist(self.X[fold]), geometry)
+            split = of_fold.split(self.variance[fold], model.twist(self.X[fold]), geometry)
+            parts[fold], root[fold] = _covariances(split)
         return parts, root
+
+
+def _covariances(e: MotionError) -> tuple[Array, Array]:
+    """Of the parts that a division makes of errors, (n, 3, 6, 6), and the root (n, 6, 6) of the calibration."""
+    bias = e.persistent_root[..., :6]
+    return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
 
 
 @dataclass(frozen=True)
@@ -228,7 +234,7 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     out = np.zeros(len(X))
     labels = np.unique(group)
     for g in labels if len(labels) > 1 else ():
-        out[group == g] = Domain.learn(X[group != g]).locate(X[group == g], noise[group == g]).distance
+        out[group == g] = learn_domain(X[group != g]).locate(X[group == g], noise[group == g]).distance
     return out
 
 

@@ -1,4 +1,5 @@
-"""What is known before a GP learns anything, from training rows: the base variance, and how fast the vehicle is."""
+"""What is known before a GP learns anything, from training rows: the base variance, how fast the vehicle is, and where
+the rows lie."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import numpy as np
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.rows import Rows
 from gpvo.online.base import COASTED, TWIST_COLUMNS, Velocities
+from gpvo.online.guard import Domain
 from gpvo.stats.student_t import NU, log_fisher, log_scale_score, negative_log_likelihood
 from gpvo.types import Array
 
@@ -14,6 +16,7 @@ _SMALLEST, _LARGEST = 1e-6, 1e3
 """Of a term of usual size, over the mean square."""
 _STEPS, _HALVINGS, _ENOUGH = 100, 10, 1e-10
 _LEAST_RATE_VAR = 1e-6
+_RARE = 0.0002
 
 
 def fit_coefficients(terms: Array, error: Array, weight: Array) -> Array:
@@ -88,3 +91,29 @@ def _changes(s: TrainingSet, m: int, step_s: float) -> Array:
     first = first[s.t_ns[later[first]] - s.t_ns[first] <= (m + 0.5) * step_s * 1e9]
     change = rate[later[first]] - rate[first]
     return np.asarray(change[np.isfinite(change).all(axis=1)])
+
+
+def learn_domain(X: Array, *, margin: float = 0.02) -> Domain:
+    """Where training rows (n, d) lie, not finite where a value is missing.
+
+    The narrower range leaves out one row in five thousand at either end; to both ``margin`` of its width is added.
+    """
+    X = np.where(np.isfinite(X), X, np.nan)
+    centre = np.nanmedian(X, axis=0)
+    q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
+    spread = np.nanstd(X, axis=0)
+    # A feature that mostly rests at one value has no quartiles to speak of.
+    scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
+    scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, 1.0)
+    U = (X - centre) / scale
+    low, high = np.nanquantile(U, [_RARE, 1.0 - _RARE], axis=0)
+    pad = margin * (high - low)
+    least, most = np.nanmin(U, axis=0), np.nanmax(U, axis=0)
+    U = np.clip(np.nan_to_num(U), low - pad, high + pad)
+    C = np.cov(U, rowvar=False).reshape(X.shape[1], -1)
+    # Shrunk towards its diagonal, so that collinear features do not make a razor-thin domain.
+    C = 0.9 * C + 0.1 * np.diag(np.diagonal(C)) + 1e-6 * np.eye(len(C))
+    whitening = np.linalg.inv(np.linalg.cholesky(C)).T
+    radius = np.linalg.norm(U @ whitening, axis=1).max(keepdims=True)
+    low, high, least, most = low - pad, high + pad, least - pad, most + pad
+    return Domain(centre, scale, low, high, least, most, whitening, radius, np.asarray(np.isnan(X).any(axis=0)))

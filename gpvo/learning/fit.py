@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.learning.assemble import assemble
-from gpvo.learning.basefit import fit_coefficients
+from gpvo.learning.basefit import fit_coefficients, learn_domain
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
 from gpvo.learning.rows import Rows, group_folds, significant_gain, simplest_sufficient
 from gpvo.online.base import OF_MOTION, BaseVariance, base_columns, parts
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.guard import Domain
 from gpvo.online.projected import ProjectedGP
 from gpvo.online.stored import different_arrays
 from gpvo.stats.student_t import negative_log_likelihood
@@ -163,4 +162,4 @@ def _gp_inputs(rows: Rows, inputs: Sequence[str]) -> Array:
     if not inputs:
         return np.zeros((len(rows.error), 0))
     X = rows.select(inputs)
-    return Domain.learn(X).locate(X).inside
+    return learn_domain(X).locate(X).inside

@@ -9,11 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.learning.config import supported_columns
-from gpvo.learning.regressors import get_regressor
-from gpvo.online.features import THESIS
-from gpvo.online.projected import NoisyGP
-from gpvo.online.thesis import ThesisModel
+from gpvo.learning.thesis import ThesisModel
 from gpvo.types import IMPORTED, Array
 
 Statement = Callable[[TrainingSet], tuple[Array, Array] | None]
@@ -110,28 +106,3 @@ def _translation_only(method: str) -> Statement:
 def thesis_statement(model: ThesisModel) -> Statement:
     """What the thesis' model states of a sequence."""
     return lambda s: model.predict(s.select(model.columns))
-
-
-def fit_thesis(
-    sets: Sequence[TrainingSet],
-    columns: Sequence[str] = THESIS,
-    regressor: str = "sparse",
-    *,
-    shared: bool = False,
-    seed: int = 0,
-    inducing: int = 128,
-) -> ThesisModel:
-    """GPs of the errors on ``columns``, by default velocity and inlier count (velocity alone where the log has no
-    counts): one isotropic RBF kernel for each axis, or ``shared`` by all, and constant noise."""
-    names = supported_columns(sets, columns) or THESIS[:3]
-    X, Y = np.concatenate([s.select(names) for s in sets]), np.concatenate([s.Y for s in sets])
-    known = np.isfinite(X).all(axis=1)
-    X, Y = X[known], Y[known]
-    centre, spread = X.mean(axis=0), np.maximum(X.std(axis=0), 1e-9)
-    scale = np.maximum(Y.std(axis=0), 1e-12)
-    points = {} if regressor in ("exact", "sklearn") else {"inducing": inducing}
-    gps = []
-    for y in [Y / scale] if shared else np.split(Y / scale, len(scale), axis=1):
-        fit = get_regressor(regressor, n_rows=len(X), isotropic=True, **points).fit((X - centre) / spread, y, seed=seed)
-        gps.append(NoisyGP(fit.gp, np.log(fit.hyper.noise_var)))
-    return ThesisModel(tuple(names), centre, spread, scale, tuple(gps))

@@ -10,11 +10,11 @@ import numpy as np
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import leave_one_out
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.methods import METHODS, fit_thesis, thesis_statement
+from gpvo.learning.methods import METHODS, thesis_statement
 from gpvo.learning.scores import average, empty, score
+from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.learning.train import TrainedModel, header_of_sets
 from gpvo.online.features import THESIS, resolve, units
-from gpvo.online.thesis import ThesisModel
 
 
 def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:

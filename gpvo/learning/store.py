@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gpvo.dataset.table import CHUNK_ROWS, StoredSets, read_sets, write_sets
 from gpvo.errors import ModelError
-from gpvo.io.atomic import write_text
+from gpvo.files import write_text
 from gpvo.io.run_read import Run
 from gpvo.learning.card import model_card
 from gpvo.learning.cardplot import stated_against_actual
@@ -65,7 +65,7 @@ def save_model(trained: TrainedModel, path: str | Path) -> None:
 def training_rows(path: str | Path) -> list[TrainingSet]:
     """The rows a model was trained on. Raises ModelError where they are gone or are another model's."""
     path = Path(path)
-    header = modelfile.read_header(path)
+    header = modelfile.load(path)[1]
     if not rows_path(path).is_file():
         raise ModelError(
             "the training rows are not beside the model", where=rows_path(path), cure="train again from all runs"
@@ -79,7 +79,7 @@ def training_rows(path: str | Path) -> list[TrainingSet]:
 def config_of(path: str | Path) -> TrainConfig:
     """The settings a model was trained with."""
     known = {f.name for f in fields(TrainConfig)}
-    return TrainConfig(**{k: v for k, v in modelfile.read_header(path).get("config", {}).items() if k in known})
+    return TrainConfig(**{k: v for k, v in modelfile.load(path)[1].get("config", {}).items() if k in known})
 
 
 def update(

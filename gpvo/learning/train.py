@@ -16,20 +16,21 @@ from gpvo import __version__
 from gpvo.dataset.build import MIN_ROWS, TrainingSet
 from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
 from gpvo.errors import GpvoError
-from gpvo.io.jsonfile import read_json, write_json
+from gpvo.files import read_json, write_json
 from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
-from gpvo.learning.methods import METHODS, fit_thesis, method_arrays, simple_statements, thesis_statement
-from gpvo.learning.parallel import map_jobs
+from gpvo.learning.methods import METHODS, method_arrays, simple_statements, thesis_statement
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.scores import average, empty, score, stated_and_actual
+from gpvo.learning.thesis import fit_thesis
 from gpvo.online import modelfile
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import units
 from gpvo.online.predictor import Predictor
+from gpvo.parallel import map_jobs
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 from gpvo.stats.consistency import nees
 from gpvo.types import Array, Prediction

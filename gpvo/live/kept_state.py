@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.files import read_json, write_json
 from gpvo.geometry.covariance import are_positive_definite, symmetrise
 from gpvo.geometry.se3 import is_rigid
-from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.types import Array
 

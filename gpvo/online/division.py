@@ -64,13 +64,6 @@ class Division(Stored):
             persistent_tau_s=self.persistent_tau_s,
         )
 
-    def covariances(self, variance: Array, twist: Array, geometry: Array | None) -> tuple[Array, Array]:
-        """Covariances (n, 3, 6, 6) of jitter, white and bias, the bias without that of calibration, and the root
-        (n, 6, 6) of the latter."""
-        e = self.split(variance, twist, geometry)
-        bias = e.persistent_root[..., :6]
-        return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
-
     def _correlations(self, n: int, geometry: Array | None) -> Array:
         """(n, 2, 6, 6) of jitter and white."""
         own, w = self.correlation[:2], float(self.geometry_weight[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,12 +51,13 @@ class ErrorModel(Stored):
     nu: Array
     dt_s: float
 
-    def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file, those of its parts among them."""
-        out = super().to_arrays(prefix)
-        for name, part in (("", self.division), ("", self.velocities), ("", self.base), ("gp.", self.gp)):
-            out |= part.to_arrays(prefix + name)
-        return out | self.domain.to_arrays(f"{prefix}domain.")
+    parts: ClassVar = {
+        "gp": (ProjectedGP, "gp."),
+        "domain": (Domain, "domain."),
+        "base": (BaseVariance, ""),
+        "division": (Division, ""),
+        "velocities": (Velocities, ""),
+    }
 
     @classmethod
     def of_file(
@@ -65,16 +66,8 @@ class ErrorModel(Stored):
         """From the arrays of a file. Raises ModelError where something is missing or is not what the schema of
         :mod:`gpvo.online.stored` says."""
         check_arrays(arrays, len(columns))
-        model = cls.from_arrays(
-            arrays,
-            columns=columns,
-            gp=ProjectedGP.from_arrays(arrays, "gp."),
-            domain=Domain.from_arrays(arrays, "domain."),
-            base=BaseVariance.from_arrays(arrays, method=method, residual=RESIDUAL_COLUMN in columns),
-            division=Division.from_arrays(arrays),
-            velocities=Velocities.from_arrays(arrays),
-            dt_s=dt_s,
-        )
+        residual = RESIDUAL_COLUMN in columns
+        model = cls.from_arrays(arrays, columns=columns, method=method, residual=residual, dt_s=dt_s)
         check_related(arrays, len(columns))
         if unknown := set(model.base.columns) - set(columns):
             raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")

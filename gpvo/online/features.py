@@ -36,24 +36,13 @@ class Feature:
 class FeatureGroup:
     """Columns computed together. ``start(camera)`` gives a step function with its own, empty memory.
 
-    The step function is called once per record, in time order, and returns one number per column. ``parts``: groups
-    that it is made of, where a few of its columns are not worth the time of all.
+    The step function is called once per record, in time order, and returns one number per column. Several may share a
+    ``name``, by which they are selected: each is worked out only where one of its own columns is wanted.
     """
 
     name: str
     columns: tuple[Feature, ...]
     start: Callable[[StereoCamera | None], Step]
-    parts: tuple[FeatureGroup, ...] = ()
-
-    @classmethod
-    def of_parts(cls, name: str, *parts: FeatureGroup) -> FeatureGroup:
-        """The parts' columns in their order, each worked out only where one of its own is wanted."""
-
-        def start(camera: StereoCamera | None) -> Step:
-            steps = [part.start(camera) for part in parts]
-            return lambda record: [value for step in steps for value in step(record)]
-
-        return cls(name, tuple(column for part in parts for column in part.columns), start, parts)
 
 
 def _count(value: int) -> float:
@@ -79,7 +68,7 @@ def _seen(r: VoRecord, focal: float) -> Sequence[float]:
     return [*disparities, r.spread_u, r.spread_v, log_of(r.reproj_rms_px / focal), r.log10_condition]
 
 
-def _stated(method: str) -> tuple[FeatureGroup, FeatureGroup]:
+def _stated(name: str, method: str) -> tuple[FeatureGroup, FeatureGroup]:
     """Logs of the variances that a record states by a method, and of the covariance's determinant."""
 
     def variances(r: VoRecord, _: float) -> Sequence[float]:
@@ -93,8 +82,8 @@ def _stated(method: str) -> tuple[FeatureGroup, FeatureGroup]:
 
     units = ", ".join(f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES)
     return (
-        FeatureGroup(method, _columns(units), _stateless(variances)),
-        FeatureGroup(method, _columns(f"ln_det_{method} [ln]"), _stateless(determinant)),
+        FeatureGroup(name, _columns(units), _stateless(variances)),
+        FeatureGroup(name, _columns(f"ln_det_{method} [ln]"), _stateless(determinant)),
     )
 
 
@@ -141,19 +130,16 @@ BUILT_IN = (
         _columns("n_detected [1], n_stereo [1], n_tracked [1], n_inliers [1], inlier_ratio [1]"),
         _stateless(_counts),
     ),
-    FeatureGroup.of_parts(
+    FeatureGroup(
         "geometry",
-        FeatureGroup(
-            "seen",
-            _columns(
-                "ln_disparity_p10 [ln focal lengths], ln_disparity_p50 [ln focal lengths], "
-                "ln_disparity_p90 [ln focal lengths], spread_u [focal lengths], spread_v [focal lengths], "
-                "ln_reproj_rms [ln focal lengths], log10_condition [log10]"
-            ),
-            _stateless(_seen),
+        _columns(
+            "ln_disparity_p10 [ln focal lengths], ln_disparity_p50 [ln focal lengths], "
+            "ln_disparity_p90 [ln focal lengths], spread_u [focal lengths], spread_v [focal lengths], "
+            "ln_reproj_rms [ln focal lengths], log10_condition [log10]"
         ),
-        *(part for method in GEOMETRIC_METHODS for part in _stated(method)),
+        _stateless(_seen),
     ),
+    *(group for method in GEOMETRIC_METHODS for group in _stated("geometry", method)),
     FeatureGroup(
         "image",
         _columns("brightness [0..1], contrast [0..1], sharpness [log10], noise_level [0..1]"),
@@ -175,7 +161,7 @@ BUILT_IN = (
         ),
         lambda _: Agility(),
     ),
-    FeatureGroup.of_parts(IMPORTED, *_stated(IMPORTED)),
+    *_stated(IMPORTED, IMPORTED),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
     FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (log_of(r.reproj_rms_px),))),
     # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.
@@ -195,17 +181,19 @@ THESIS = ("v_x_mps", "v_y_mps", "v_z_mps", "n_inliers")
 
 
 @cache
-def groups() -> dict[str, FeatureGroup]:
+def groups() -> dict[str, tuple[FeatureGroup, ...]]:
     """All groups by name: the built-in ones, then those of installed packages.
 
     A package joins with ``[project.entry-points."gpvo.features"]`` and ``name = "package.module:GROUP"``, GROUP being a
     :class:`FeatureGroup`. A model that uses its columns is refused where the package is not installed. A built-in name
     cannot be taken over.
     """
-    found = {g.name: g for g in BUILT_IN}
+    found: dict[str, tuple[FeatureGroup, ...]] = {}
+    for group in BUILT_IN:
+        found[group.name] = (*found.get(group.name, ()), group)
     for entry in entry_points(group="gpvo.features"):
         group = entry.load()
-        found.setdefault(group.name, group)
+        found.setdefault(group.name, (group,))
     return found
 
 
@@ -223,7 +211,7 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
     out: dict[str, None] = {}
     for name in wanted:
         if name in groups():
-            out.update(dict.fromkeys(c.name for c in groups()[name].columns))
+            out.update(dict.fromkeys(c.name for group in groups()[name] for c in group.columns))
         elif name in columns:
             out[name] = None
         else:
@@ -239,7 +227,7 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
 @cache
 def known_columns() -> dict[str, str]:
     """All columns with their units, those of installed packages included."""
-    return {c.name: c.unit for g in groups().values() for c in g.columns}
+    return {c.name: c.unit for of_name in groups().values() for group in of_name for c in group.columns}
 
 
 def units(names: Sequence[str]) -> tuple[str, ...]:
@@ -258,10 +246,10 @@ class FeatureStream:
         self.names = tuple(names)
         self._pick: list[tuple[Step, list[tuple[int, int]]]] = []
         place = {name: i for i, name in enumerate(self.names)}
-        for part in (part for group in groups().values() for part in group.parts or (group,)):
-            picked = [(place[c.name], j) for j, c in enumerate(part.columns) if c.name in place]
+        for group in (group for of_name in groups().values() for group in of_name):
+            picked = [(place[c.name], j) for j, c in enumerate(group.columns) if c.name in place]
             if picked:
-                self._pick.append((part.start(camera), picked))
+                self._pick.append((group.start(camera), picked))
         unknown = set(self.names) - known_columns().keys()
         if unknown:
             raise GpvoError(

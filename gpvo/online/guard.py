@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from gpvo.online.stored import Stored
 from gpvo.types import Array, StereoCamera
 
-_RARE = 0.0002
-
 _CAMERA = 0.25
 _MISSING = 2.0  # Standard deviations outside, where training never missed the value.
 DEGRADED_BELOW = 0.5
@@ -48,32 +46,6 @@ class Domain(Stored):
     whitening: Array
     radius: Array
     may_miss: NDArray[np.bool_]
-
-    @classmethod
-    def learn(cls, X: Array, *, margin: float = 0.02) -> Domain:
-        """From training rows (n, d), not finite where a value is missing.
-
-        The narrower range leaves out one row in five thousand at either end; to both ``margin`` of its width is added.
-        """
-        X = np.where(np.isfinite(X), X, np.nan)
-        centre = np.nanmedian(X, axis=0)
-        q25, q75 = np.nanquantile(X, [0.25, 0.75], axis=0)
-        spread = np.nanstd(X, axis=0)
-        # A feature that mostly rests at one value has no quartiles to speak of.
-        scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
-        scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, 1.0)
-        U = (X - centre) / scale
-        low, high = np.nanquantile(U, [_RARE, 1.0 - _RARE], axis=0)
-        pad = margin * (high - low)
-        least, most = np.nanmin(U, axis=0), np.nanmax(U, axis=0)
-        U = np.clip(np.nan_to_num(U), low - pad, high + pad)
-        C = np.cov(U, rowvar=False).reshape(X.shape[1], -1)
-        # Shrunk towards its diagonal, so that collinear features do not make a razor-thin domain.
-        C = 0.9 * C + 0.1 * np.diag(np.diagonal(C)) + 1e-6 * np.eye(len(C))
-        whitening = np.linalg.inv(np.linalg.cholesky(C)).T
-        radius = np.linalg.norm(U @ whitening, axis=1).max(keepdims=True)
-        low, high, least, most = low - pad, high + pad, least - pad, most + pad
-        return cls(centre, scale, low, high, least, most, whitening, radius, np.asarray(np.isnan(X).any(axis=0)))
 
     def locate(self, X: Array, noise: Array | float = 0.0) -> DomainCheck:
         """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it.

@@ -16,7 +16,7 @@ Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers 
   :class:`gpvo.online.estimate.ErrorModel`;
 * ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
-* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.online.thesis.ThesisModel`; all there is in a model of
+* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.learning.thesis.ThesisModel`; all there is in a model of
   positions;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.learning.sample.TrainingSample`.
 """
@@ -28,7 +28,6 @@ import json
 import math
 import os
 import struct
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -40,6 +39,7 @@ from safetensors.numpy import load as _load_tensors
 from safetensors.numpy import save as _save_tensors
 
 from gpvo.errors import ModelError, printable
+from gpvo.files import parse_json, plain, replacing
 
 SCHEMA = 1
 KIND = "gpvo-error-model"
@@ -51,25 +51,15 @@ def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], heade
     """Write arrays and header atomically; returns the digest (64 hexadecimal digits).
 
     Arrays are float64, float32, int64, int32, uint8 or bool. The header is anything JSON can hold; numbers that are not
-    finite become null. Raises ModelError where an array's type is not one of these.
+    finite become null. Raises ModelError for what the file cannot hold, SourceError where it cannot be written.
     """
     path = Path(path)
     tidy = {name: _storable(name, arrays[name]) for name in sorted(arrays)}
-    clean = _jsonable(header)
+    clean = plain(header, _not_held)
     digest = _digest(tidy, clean)
     document = {"schema": SCHEMA, "kind": KIND, "digest": digest, "header": clean}
-    blob = _save_tensors(tidy, metadata={"gpvo": _canonical(document)})
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(blob)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException as problem:
-        Path(temporary).unlink(missing_ok=True)
-        if isinstance(problem, OSError):
-            raise ModelError(f"cannot be written: {problem.strerror}", where=path) from None
-        raise
+    with replacing(path) as temporary:
+        temporary.write_bytes(_save_tensors(tidy, metadata={"gpvo": _canonical(document)}))
     return digest
 
 
@@ -87,27 +77,13 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
         arrays = _load_tensors(blob)
         (n_header,) = struct.unpack("<Q", blob[:8])
         text = json.loads(blob[8 : 8 + n_header])["__metadata__"]["gpvo"]
-        document = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        document = parse_json(text)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise ModelError("is not a gpvo model file, or is truncated or damaged", where=path) from None
     _check_document(document, path)
     if _digest(arrays, document["header"]) != document["digest"]:
         raise ModelError("the content does not match its digest", where=path, cure="copy or train the model again")
     return arrays, document["printable"]
-
-
-def read_header(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The header alone."""
-    return load(path)[1]
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no JSON")
-
-
-def _finite(number: str) -> float:
-    value = float(number)
-    return value if math.isfinite(value) else _refuse(number)
 
 
 def _check_document(document: Any, path: Path) -> None:
@@ -186,18 +162,7 @@ def _storable(name: str, array: NDArray[Any]) -> NDArray[Any]:
     return array.astype(array.dtype.newbyteorder("<"), copy=False)
 
 
-def _jsonable(value: Any) -> Any:
-    """Plain JSON types: NumPy values converted, numbers that are not finite as None, keys as text."""
-    if isinstance(value, Mapping):
-        return {str(k): _jsonable(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray | list | tuple):
-        return [_jsonable(v) for v in (value.tolist() if isinstance(value, np.ndarray) else value)]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, str | int | float | bool):
-        return value
+def _not_held(value: Any) -> NoReturn:
     raise ModelError(f"a model header cannot hold a {type(value).__name__}")
 
 

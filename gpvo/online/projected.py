@@ -14,15 +14,12 @@ with inducing points M. Titsias (2009), equation 6.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gpvo.errors import ModelError
 from gpvo.online.stored import Stored
 from gpvo.types import Array
 
@@ -84,29 +81,3 @@ class ProjectedGP(Stored):
             return mean, var
         z = self.kernel(X) @ self.projection.T
         return z @ self.weights.T + self.offset, np.maximum(self.signal_var - (z * z) @ self.reduction.T, 0.0)
-
-
-@dataclass(frozen=True)
-class NoisyGP:
-    """A GP of what is measured, with a noise that is everywhere the same: ``log_noise_var`` (D,)."""
-
-    latent: ProjectedGP
-    log_noise_var: Array
-
-    def predict(self, X: ArrayLike) -> tuple[Array, Array]:
-        """Mean and variance (n, D) of what is measured at rows X (n, d)."""
-        mean, variance = self.latent.evaluate(X)
-        return mean, variance + np.exp(self.log_noise_var)
-
-    def to_arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
-        """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
-        return {**self.latent.to_arrays(f"{prefix}mean."), f"{prefix}log_noise_offset": self.log_noise_var}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str) -> NoisyGP:
-        """The GP from named arrays. Raises ModelError where one is missing."""
-        try:
-            noise = np.asarray(arrays[f"{prefix}log_noise_offset"], np.float64)
-        except KeyError as missing:
-            raise ModelError(f"the model file lacks the array {missing}") from None
-        return cls(ProjectedGP.from_arrays(arrays, f"{prefix}mean."), noise)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,19 +32,36 @@ _Stored = TypeVar("_Stored", bound="Stored")
 class Stored:
     """A dataclass whose arrays stand in a model file by the names of its fields, after a prefix."""
 
+    parts: ClassVar[Mapping[str, tuple[type[Stored], str]]] = {}
+    """Fields that are stored in turn: of which class, and what stands before the names of their arrays."""
+
     def to_arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
         """Named arrays for a model file; :meth:`from_arrays` is the inverse."""
         own = {name: getattr(self, name) for name in field_names(type(self))}
-        return {prefix + name: a for name, a in own.items() if isinstance(a, np.ndarray)}
+        out = {prefix + name: a for name, a in own.items() if isinstance(a, np.ndarray)}
+        for name, (_, place) in self.parts.items():
+            out |= own[name].to_arrays(prefix + place)
+        return out
 
     @classmethod
     def from_arrays(cls: type[_Stored], arrays: _Arrays, prefix: str = "", **others: Any) -> _Stored:
-        """From arrays that fit the schema, and ``others`` that are none. Raises ModelError where one is missing."""
-        try:
-            own = {name: arrays[prefix + name] for name in field_names(cls) if name not in others}
-        except KeyError as missing:
-            raise ModelError(f"lacks the array {missing}: an older gpvo wrote the file, or it is damaged") from None
-        return cls(**{n: np.asarray(a, np.float64) if a.dtype.kind == "f" else a for n, a in own.items()}, **others)
+        """From arrays that fit the schema, and ``others``, fields of it or its parts that are none.
+
+        Raises ModelError where an array is missing.
+        """
+        own = {name: value for name, value in others.items() if name in field_names(cls)}
+        own |= {name: part.from_arrays(arrays, prefix + place, **others) for name, (part, place) in cls.parts.items()}
+        for name in field_names(cls):
+            if name not in own:
+                own[name] = _array(arrays, prefix + name)
+        return cls(**own)
+
+
+def _array(arrays: _Arrays, name: str) -> NDArray[Any]:
+    """One array, floats in double precision."""
+    if name not in arrays:
+        raise ModelError(f"lacks the array '{name}': an older gpvo wrote the file, or it is damaged")
+    return np.asarray(arrays[name], np.float64) if arrays[name].dtype.kind == "f" else arrays[name]
 
 
 def arrays_of_base(arrays: _Arrays) -> dict[str, NDArray[Any]]:

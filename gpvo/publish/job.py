@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.errors import GpvoError
-from gpvo.io.atomic import write_text
+from gpvo.files import write_text
 from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.publish import consumers, mavlink, ros

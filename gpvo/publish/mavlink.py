@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FRD_FLU, rotate_covariance
-from gpvo.io.atomic import replacing
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 

@@ -18,13 +18,13 @@ from gpvo.dataset.build import TrainingSet, build_run, observe
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.evaluation.evaluate import predictions_by_stamp
 from gpvo.evaluation.statements import corrected, statements
+from gpvo.files import write_arrays
 from gpvo.geometry import se3
-from gpvo.io.atomic import write_arrays
 from gpvo.io.run import Run, read_run
 from gpvo.learning import methods
+from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online.features import THESIS
 from gpvo.online.predictor import Predictor
-from gpvo.online.thesis import ThesisModel
 from gpvo.reproduce.experiments import Experiment, Way, printed
 from gpvo.reproduce.models import ModelJob, sets_of
 from gpvo.reproduce.stages import Store, digest_of
@@ -171,7 +171,7 @@ class BoundsJob:
         elif kind == "joint":
             found = [_joint(r, name) for r in runs]
         elif kind == "motion":
-            gp = methods.thesis_statement(methods.fit_thesis(sets_of(self.training)))
+            gp = methods.thesis_statement(fit_thesis(sets_of(self.training)))
             found = [_motion(r, gp) for r in runs]
         else:
             assert self.model is not None

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpvo.dataset.build import TrainingSet, build_run
-from gpvo.io.atomic import write_arrays
+from gpvo.files import write_arrays
 from gpvo.io.run import read_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.position import train_position

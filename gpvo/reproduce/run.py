@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gpvo import __version__
-from gpvo.io.jsonfile import plain, write_json
+from gpvo.files import plain, write_json
 from gpvo.reproduce import figures, models, rows, scores, tables
 from gpvo.reproduce.claims import claims
 from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS, Plan

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from gpvo import files
 from gpvo.errors import GpvoError, SourceError
-from gpvo.io import atomic
-from gpvo.io.atomic import FolderLock
-from gpvo.io.jsonfile import plain
-from gpvo.learning.parallel import map_jobs
+from gpvo.files import FolderLock, plain
+from gpvo.parallel import map_jobs
 
 Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 _LENGTH = 12
@@ -108,4 +107,4 @@ def only_user(root: Path) -> Iterator[None]:
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic.write_text(path, text)
+    files.write_text(path, text)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gpvo.errors import GpvoError
 from gpvo.geometry.se3 import path_length_m
-from gpvo.learning.parallel import map_jobs
+from gpvo.parallel import map_jobs
 from gpvo.sim.scenario import Flight, Scenario, points_scenario
 
 

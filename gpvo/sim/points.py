@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.rig import RIG_ERRORS, Tolerance, TrueRig
 from gpvo.errors import GpvoError
+from gpvo.files import write_arrays
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
-from gpvo.io.atomic import write_arrays
 from gpvo.sim import clouds, imu, movers
 from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3

@@ -10,8 +10,8 @@ from statistics import NormalDist
 import numpy as np
 
 from gpvo.errors import SourceError
+from gpvo.files import read_json
 from gpvo.geometry import se3
-from gpvo.io.jsonfile import read_json
 from gpvo.types import Array, TruthLog, VoRecord
 
 SPAN = "1 s"

@@ -12,8 +12,8 @@ from gpvo.cameras.kalibr import make_lens
 from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
+from gpvo.files import read_json
 from gpvo.geometry import se3
-from gpvo.io.jsonfile import read_json
 from gpvo.types import StereoCamera
 from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 

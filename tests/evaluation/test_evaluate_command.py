@@ -12,13 +12,13 @@ from evaluation_runs import make_run, stated_covariance
 from gpvo import cli
 from gpvo.dataset.build import build
 from gpvo.errors import ModelError
-from gpvo.evaluation.document import METHODS, document
+from gpvo.evaluation.document import document
 from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
 from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run, write_run
 from gpvo.io.trajectory import write_tum
-from gpvo.learning.methods import fit_thesis, thesis_statement
+from gpvo.learning.methods import METHODS, fit_thesis, thesis_statement
 from gpvo.learning.scores import score
 from gpvo.learning.store import save_model
 from gpvo.online import modelfile

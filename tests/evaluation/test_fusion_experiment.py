@@ -12,10 +12,10 @@ from bench.experiment_flights import Campaign, Rise, rise, training_runs, unseen
 from bench.fusion_experiment import Outcome, experiment, main, markdown, trained, write
 from gpvo.errors import GpvoError
 from gpvo.evaluation.fusion import FusionReport
+from gpvo.files import read_json, write_json
 from gpvo.filters.metrics import Scores
 from gpvo.filters.study import Study
 from gpvo.geometry import se3
-from gpvo.io.jsonfile import read_json, write_json
 from gpvo.io.run import Run, read_run, write_run
 from gpvo.stats.bootstrap import Interval
 from gpvo.types import Status, TruthLog, VoLog, VoRecord

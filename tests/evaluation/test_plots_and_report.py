@@ -156,7 +156,7 @@ def test_the_file_is_whole_or_absent(evaluation, tmp_path, monkeypatch):
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("gpvo.io.atomic.os.replace", fail)
+    monkeypatch.setattr("gpvo.files.os.replace", fail)
     with pytest.raises(SourceError, match=r"report\.html: cannot be written: disk full"):
         write_report([evaluation], target)
     assert target.read_bytes() == before

@@ -20,11 +20,11 @@ from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import CalibrationError, GpvoError, SourceError
+from gpvo.files import read_json
 from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
-from gpvo.io.jsonfile import read_json
 from gpvo.io.parquet import read_columns
 from gpvo.io.run_read import _read_imu
 from gpvo.io.tracks import TracksSource

@@ -17,8 +17,8 @@ from bag_maker import stereo_bag
 from campaign import CAMERA, READERS
 from gpvo import runner
 from gpvo.cli import app
+from gpvo.files import write_json
 from gpvo.io import open_source
-from gpvo.io.jsonfile import write_json
 from gpvo.io.run import RunWriter, write_run
 from gpvo.io.stated import write_stated
 from gpvo.io.trajectory import write_tum

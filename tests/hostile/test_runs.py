@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from gpvo.errors import GpvoError, SourceError
-from gpvo.io.jsonfile import read_json, write_json
+from gpvo.files import read_json, write_json
 from gpvo.io.run import RunWriter, is_finished, read_run, write_run
 from gpvo.online.predictor import Predictor
 from gpvo.types import VoLog

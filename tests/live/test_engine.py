@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from bag_maker import BagMaker
 from gpvo.errors import GpvoError
+from gpvo.files import write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.foreign_records import to_records
-from gpvo.io.jsonfile import write_json
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError
+from gpvo.learning.basefit import learn_domain
 from gpvo.online import modelfile
 from gpvo.online.base import COASTED, BaseVariance, Velocities, base_columns
 from gpvo.online.division import PARTS, Division
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.guard import Domain
 from gpvo.online.projected import ProjectedGP
 from gpvo.publish.export import export_model, to_c, to_onnx
 from gpvo.types import Prediction
@@ -64,7 +64,7 @@ def some_model(
         columns=columns,
         inputs=inputs,
         gp=random_gp(rng, 4, 20, 0.3) if ratio == "of conditions" else ProjectedGP.constant(rng.standard_normal(6)),
-        domain=Domain.learn(X),
+        domain=learn_domain(X),
         base=BaseVariance(theta, theta[::-1] * [1.0, 1.0, 1.0, 1.0, 0.0], method, residual),
         division=Division(
             correlation=correlation,

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from gpvo.files import write_arrays
 from gpvo.geometry import se3
-from gpvo.io.atomic import write_arrays
 from gpvo.reproduce.bounds import as_arrays, bounds_of, compounded, load_bounds, mean_shift, summed_v_t
 from gpvo.types import MotionError, Status, TruthLog, VoLog, VoRecord
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gpvo.cameras.kalibr import read_camchain
 from gpvo.errors import GpvoError
+from gpvo.files import write_json
 from gpvo.geometry import se3
-from gpvo.io.jsonfile import write_json
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.motion import refine, whitened
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance

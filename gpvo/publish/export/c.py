@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import GpvoError
-from gpvo.io.atomic import write_text
+from gpvo.files import write_text
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.stored import LARGEST

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.errors import MissingExtraError
-from gpvo.io.atomic import replacing
+from gpvo.files import replacing
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.division import LN_FASTEST, PARTS
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel

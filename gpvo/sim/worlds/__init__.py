@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
-from gpvo.io.atomic import replacing
+from gpvo.files import replacing
 from gpvo.io.snapshot import code_digest
 from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
 

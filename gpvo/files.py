@@ -1,10 +1,12 @@
-"""Files written whole or not at all, and by one writer at a time."""
+"""Files written whole or not at all, by one writer at a time; JSON written and read without NaN."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ try:
     import fcntl
 except ImportError:  # Windows: two writers there are not told of one another.
     fcntl = None  # type: ignore[assignment]
+
+_MAX_BYTES = 50_000_000
 
 
 @contextmanager
@@ -43,6 +47,12 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
     """Write a text file whole or not at all; lines end as in ``text``. Raises as :func:`replacing`."""
     with replacing(path) as temporary:
@@ -54,12 +64,6 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 class FolderLock:
@@ -89,3 +93,61 @@ class FolderLock:
 
     def __del__(self) -> None:
         self.release()
+
+
+def plain(value: Any, other: Callable[[Any], Any] = str) -> Any:
+    """A value as JSON knows it: arrays as lists, NaN and infinity as null; ``other``: what becomes of the rest, by
+    default its text, as of paths and enums."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v, other) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist(), other)
+    if isinstance(value, (list, tuple)):
+        return [plain(v, other) for v in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if value is None:
+        return None
+    return str(value) if isinstance(value, str) else other(value)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a document under a temporary name, then put it in place."""
+    write_text(path, json.dumps(plain(document), indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a document. Raises SourceError where the file is missing, too large, or not a JSON object."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise SourceError("is larger than 50 MB", where=path)
+        document = parse_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+    except (ValueError, RecursionError) as error:
+        raise SourceError(f"is damaged: {str(error).splitlines()[0]}", where=path) from None
+    if not isinstance(document, dict):
+        raise SourceError("is damaged: no JSON object", where=path)
+    return document
+
+
+def parse_json(text: str) -> Any:
+    """What a text of JSON says. Raises ValueError where it is none, or a number is not finite or beyond 64 bits."""
+    return json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no number of JSON")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) > 20:  # of 64 bits: a longer one overflows where it becomes a float
+        raise ValueError(f"{text[:20]}... is no number of JSON")
+    return int(text)
