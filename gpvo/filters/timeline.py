@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpvo.doubt import Doubt
 from gpvo.filters.eskf import ErrorStateFilter, Innovation
 from gpvo.filters.gate import Gate, Wait
 from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V
-from gpvo.online.observer import LONGEST_STEP_S, Doubt, follows
+from gpvo.online.observer import LONGEST_STEP_S, follows
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.

@@ -48,6 +48,20 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     return np.asarray(good & (least[:, 0] > -1e-9))
 
 
+def upper(C: Array) -> Array:
+    """(..., n (n + 1) / 2) elements of symmetric matrices (..., n, n) on and above the diagonal, row by row."""
+    i, j = np.triu_indices(C.shape[-1])
+    return np.asarray(C[..., i, j])
+
+
+def from_upper(elements: Array, n: int) -> Array:
+    """(..., n, n) symmetric matrices: the inverse of :func:`upper`."""
+    i, j = np.triu_indices(n)
+    C = np.empty((*elements.shape[:-1], n, n))
+    C[..., i, j] = C[..., j, i] = elements
+    return C
+
+
 def scaled_root(C: Array) -> Array:
     """L (..., n, n) with ``L L^T = C``, C positive semi-definite: the symmetric root of the correlation, times sigma.
 

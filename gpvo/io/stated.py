@@ -16,7 +16,7 @@ import numpy as np
 from gpvo.errors import SourceError
 from gpvo.files import write_text
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite
+from gpvo.geometry.covariance import from_upper, is_positive_definite, upper
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
 from gpvo.types import IMPORTED, Array, Status, VoLog, VoRecord
@@ -28,14 +28,13 @@ _LINES = (
     "# tangent: translation, rotation [m, rad]; right perturbation, axes of this frame; lost motions: nan",
     "# t tx ty tz qx qy qz qw c00 c01 c02 c03 c04 c05 c11 ... c55 t_from",
 )
-_UPPER = np.triu_indices(6)
 
 
 def write_stated(path: Path, log: VoLog, T_world_cam: Array, covariance: Array) -> None:
     """Poses (N, 4, 4) of a log's frames and covariances (N, 6, 6) of its motions, NaN where unknown; whole or not at
     all."""
     lines = (
-        f"{tum_line(r.t_ns, T)} {' '.join(f'{c:.9g}' for c in C[_UPPER])} {ns_to_seconds_text(r.t_prev_ns)}"
+        f"{tum_line(r.t_ns, T)} {' '.join(f'{c:.9g}' for c in upper(C))} {ns_to_seconds_text(r.t_prev_ns)}"
         for r, T, C in zip(log, T_world_cam, covariance, strict=True)
     )
     write_text(path, "\n".join([*_LINES, *lines]) + "\n", "ascii")
@@ -71,14 +70,12 @@ def _stamp(path: Path, text: str) -> int:
         raise SourceError(str(error), where=path) from None
 
 
-def _record(path: Path, trajectory: Trajectory, start: int, end: int, upper: Sequence[str]) -> VoRecord:
+def _record(path: Path, trajectory: Trajectory, start: int, end: int, elements: Sequence[str]) -> VoRecord:
     T, t_ns = trajectory.T_world_body, trajectory.t_ns
-    C = np.zeros((6, 6))
     try:
-        C[_UPPER] = [float(c) for c in upper]
+        C = from_upper(np.array([float(c) for c in elements]), 6)
     except ValueError:
         raise SourceError(f"the covariance at {t_ns[end] * 1e-9:.9f} s holds no numbers", where=path) from None
-    C += np.triu(C, 1).T
     lost = bool(np.isnan(C).all())
     if not lost and not is_positive_definite(C):
         raise SourceError(f"the covariance at {t_ns[end] * 1e-9:.9f} s is not positive definite", where=path)

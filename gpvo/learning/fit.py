@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
+from gpvo.dataset.splits import group_folds
 from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_coefficients, learn_domain
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
-from gpvo.learning.rows import Rows, group_folds, significant_gain, simplest_sufficient
+from gpvo.learning.rows import Rows, significant_gain, simplest_sufficient
 from gpvo.online.base import OF_MOTION, BaseVariance, base_columns, parts
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.projected import ProjectedGP
-from gpvo.online.stored import different_arrays
+from gpvo.online.stored import BASE
 from gpvo.stats.student_t import negative_log_likelihood
 from gpvo.types import Array
 
@@ -80,7 +81,8 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     base, arrays = model, dict(model.to_arrays())
     if variance.gp is not None:
         base, _ = assemble(rows, alone.base, columns, (), None, alone.oof)
-        arrays |= different_arrays(base.to_arrays(), arrays)
+        own = base.to_arrays().items()
+        arrays |= {BASE + n: a for n, a in own if n not in arrays or not np.array_equal(a, arrays[n])}
     choices = {"base": str(choice), "inputs": name, "inputs_nll": losses, "grouped_by": rows.grouped_by}
     return Learned(model, base, arrays, choices, calibration)
 

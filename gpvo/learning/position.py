@@ -14,7 +14,7 @@ from gpvo.learning.methods import METHODS, thesis_statement
 from gpvo.learning.scores import average, empty, score
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.learning.train import TrainedModel, header_of_sets
-from gpvo.online.features import THESIS, resolve, units
+from gpvo.online.features import THESIS, known_columns, resolve
 
 
 def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
@@ -34,7 +34,7 @@ def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: b
         "horizon": "from the first frame",
         "frame": "first camera",
         "features": list(names),
-        "units": list(units(names)),
+        "units": [known_columns()[name] for name in names],
         "training_domain": {n: [lo, hi] for n, lo, hi in zip(names, low, high)},
         "scores": {f["held_out"]: f["methods"] for f in folds},
     }

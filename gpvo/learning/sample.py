@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import ModelError
+from gpvo.geometry.covariance import from_upper, upper
 from gpvo.types import Array
-
-_UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class TrainingSample:
         out: dict[str, NDArray[Any]] = {"sample.X": self.X.astype(np.float32), "sample.sequence": self.sequence}
         out["sample.dt_s"] = self.dt_s
         if self.geometry is not None:
-            out["sample.geometry"] = self.geometry[:, _UPPER[0], _UPPER[1]]
+            out["sample.geometry"] = upper(self.geometry)
         return out
 
     @classmethod
@@ -48,12 +47,7 @@ class TrainingSample:
         sizes_fit = X.ndim == 2 and X.shape[1] == n_features and sequence.shape == dt_s.shape == (len(X),) != (0,)
         if not sizes_fit or (packed is not None and packed.shape != (len(X), 21)):
             raise ModelError("the model's sample of training rows does not fit its features", cure="train it again")
-        if packed is None:
-            return cls(X, sequence, dt_s, None)
-        geometry = np.empty((len(X), 6, 6))
-        geometry[:, _UPPER[0], _UPPER[1]] = packed
-        geometry[:, _UPPER[1], _UPPER[0]] = packed
-        return cls(X, sequence, dt_s, geometry)
+        return cls(X, sequence, dt_s, None if packed is None else from_upper(packed, 6))
 
 
 SAMPLE_ROWS = 1024

@@ -84,8 +84,8 @@ class ThesisModel(Stored):
         count = sum(name.startswith(_PREFIX) and name.endswith(".log_noise_offset") for name in arrays)
         gps = tuple(NoisyGP.from_arrays(arrays, f"{_PREFIX}{j}.") for j in range(count))
         model = cls.from_arrays(arrays, _PREFIX, columns=columns, gps=gps)
-        fit = all(gp.latent.n_inputs == len(columns) == len(model.centre) for gp in gps)
-        if not fit or sum(gp.latent.n_outputs for gp in gps) != len(model.scale):
+        fit = all(len(gp.latent.centre) == len(columns) == len(model.centre) for gp in gps)
+        if not fit or sum(len(gp.latent.offset) for gp in gps) != len(model.scale):
             raise ModelError("the model file's thesis arrays do not fit together")
         return model
 

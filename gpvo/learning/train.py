@@ -28,7 +28,7 @@ from gpvo.learning.scores import average, empty, score, stated_and_actual
 from gpvo.learning.thesis import fit_thesis
 from gpvo.online import modelfile
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.features import units
+from gpvo.online.features import known_columns
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
 from gpvo.stats.bootstrap import Interval, sequence_bootstrap
@@ -276,7 +276,7 @@ def _header(
         "tangent": "translation then rotation, right perturbation, m and rad",
         "horizon": "one motion" if config.target == "frame" else config.target,
         "features": list(model.columns),
-        "units": list(units(model.columns)),
+        "units": [known_columns()[name] for name in model.columns],
         "inputs": [] if learned.choices["inputs"] == NONE else [model.columns[i] for i in model.inputs],
         "base_method": model.base.method,
         "training_domain": {n: [lo, hi] for n, lo, hi in zip(model.columns, low.tolist(), high.tolist())},

@@ -57,12 +57,8 @@ class BaseVariance(Stored):
         """Feature columns that it needs, in order."""
         return base_columns(self.method, self.residual)
 
-    def __call__(self, columns: Array, dt_s: Array) -> Array:
-        """(n, 6) variance from (n, c) values of its columns and the durations of the motions (n,)."""
-        return np.asarray((parts(columns, dt_s) * self.theta).sum(-1))
-
-    def both(self, columns: Array, dt_s: Array) -> tuple[Array, Array]:
-        """The same, and the plain variance, (n, 6) each."""
+    def __call__(self, columns: Array, dt_s: Array) -> tuple[Array, Array]:
+        """(n, 6) variance, and the plain one, from (n, c) values of its columns and durations of the motions (n,)."""
         terms = parts(columns, dt_s)
         return (terms * self.theta).sum(-1), (terms * self.theta_plain).sum(-1)
 

@@ -71,7 +71,7 @@ class ErrorModel(Stored):
         check_related(arrays, len(columns))
         if unknown := set(model.base.columns) - set(columns):
             raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")
-        if (model.gp.n_inputs, model.gp.n_outputs) != (len(model.inputs), 6):
+        if (len(model.gp.centre), len(model.gp.offset)) != (len(model.inputs), 6):
             raise ModelError("the model file's GP does not fit its inputs and the six axes")
         return model
 
@@ -83,7 +83,7 @@ class ErrorModel(Stored):
         """
         X = np.where(np.abs(X) < LARGEST, X, np.nan)
         duration, columns = self._duration(X, dt_s), self._base_columns(X)
-        base, plain = (np.maximum(v, LEAST_VAR) for v in self.base.both(columns, duration))
+        base, plain = (np.maximum(v, LEAST_VAR) for v in self.base(columns, duration))
         place = self._locate(X, base, duration)
         known, total = self._variances(place, base, plain)
         variance = within(total * self.factor, self.velocities.largest_error_var(columns[:, :6], duration))
@@ -108,7 +108,7 @@ class ErrorModel(Stored):
     def locate(self, X: Array, dt_s: Array | None = None) -> DomainCheck:
         """Where rows X (n, d) lie, given how well their motions are known."""
         duration = self._duration(X, dt_s)
-        return self._locate(X, self.base(self._base_columns(X), duration), duration)
+        return self._locate(X, self.base(self._base_columns(X), duration)[0], duration)
 
     def _locate(self, X: Array, base: Array, duration: Array) -> DomainCheck:
         return self.domain.locate(X, feature_noise(self._motion_noise, base, duration))

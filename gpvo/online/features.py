@@ -45,10 +45,6 @@ class FeatureGroup:
     start: Callable[[StereoCamera | None], Step]
 
 
-def _count(value: int) -> float:
-    return float(value) if value >= 0 else math.nan
-
-
 def _stateless(values: Callable[[VoRecord, float], Sequence[float]]) -> Callable[[StereoCamera | None], Step]:
     """A group without memory; ``values`` gets the record and the focal length [px] (NaN where there is no camera)."""
 
@@ -60,7 +56,8 @@ def _stateless(values: Callable[[VoRecord, float], Sequence[float]]) -> Callable
 
 
 def _counts(r: VoRecord, _: float) -> Sequence[float]:
-    return (*(_count(n) for n in (r.n_detected, r.n_stereo, r.n_tracked, r.n_inliers)), r.inlier_ratio)
+    counts = (r.n_detected, r.n_stereo, r.n_tracked, r.n_inliers)
+    return (*(float(n) if n >= 0 else math.nan for n in counts), r.inlier_ratio)
 
 
 def _seen(r: VoRecord, focal: float) -> Sequence[float]:
@@ -230,11 +227,6 @@ def known_columns() -> dict[str, str]:
     return {c.name: c.unit for of_name in groups().values() for group in of_name for c in group.columns}
 
 
-def units(names: Sequence[str]) -> tuple[str, ...]:
-    """Unit of each column."""
-    return tuple(known_columns()[n] for n in names)
-
-
 class FeatureStream:
     """Features of one run, frame by frame.
 
@@ -253,7 +245,8 @@ class FeatureStream:
         unknown = set(self.names) - known_columns().keys()
         if unknown:
             raise GpvoError(
-                f"unknown features: {', '.join(sorted(unknown))}", cure="install the package that defines them"
+                f"features are needed that are not installed: {', '.join(sorted(unknown))}",
+                cure="install the package that defines them, or update gpvo",
             )
 
     def step(self, record: VoRecord) -> Array:

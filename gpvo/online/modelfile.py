@@ -89,12 +89,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
 def _check_document(document: Any, path: Path) -> None:
     if not isinstance(document, dict) or document.get("kind") != KIND:
         raise ModelError("is not a gpvo model file", where=path)
-    schema = document.get("schema")
-    if not isinstance(schema, int) or schema < 1:
-        raise ModelError("has a damaged header", where=path)
-    if schema > SCHEMA:
-        what = f"was written by a newer gpvo (schema {schema}, this one reads up to {SCHEMA})"
-        raise ModelError(what, where=path, cure="update gpvo")
+    check_version("schema", document.get("schema"), SCHEMA, path)
     if not isinstance(document.get("header"), dict) or not isinstance(document.get("digest"), str):
         raise ModelError("has a damaged header", where=path)
     document["printable"] = _printable(document["header"])
@@ -102,6 +97,15 @@ def _check_document(document: Any, path: Path) -> None:
         _check_header(document["header"])
     except ModelError as problem:
         raise ModelError(problem.what, where=path) from None
+
+
+def check_version(name: str, found: Any, newest: int, path: Path | None = None) -> None:
+    """Raise ModelError where a file is of a later version of something than can be read."""
+    if not isinstance(found, int) or found < 1:
+        raise ModelError("has a damaged header", where=path)
+    if found > newest:
+        what = f"was written by a newer gpvo ({name} {found}, this one reads up to {newest})"
+        raise ModelError(what, where=path, cure="update gpvo")
 
 
 def _is_number(value: Any) -> bool:

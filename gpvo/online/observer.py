@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
+from gpvo.doubt import Doubt
 from gpvo.errors import GpvoError
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
@@ -27,7 +28,6 @@ _LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 _FARTHEST_M = 1e5  # No motion between two frames is longer.
 _EYE = np.eye(4)
 _EYE.setflags(write=False)
-T = TypeVar("T")
 _PATTERN = re.compile(r"(window|length):([0-9]*\.?[0-9]+)(s|m)")
 
 
@@ -56,27 +56,6 @@ class Observer:
         if self._window is not None:
             judged = self._window.step(judged) if judged is not None else None
         return None if judged is None else (judged, self._stream.step(judged))
-
-
-class Doubt(Generic[T]):
-    """Holds what looks odd beside all before, a jump of a clock or of a reading, until ``enough`` in a row agree."""
-
-    def __init__(self, enough: int = 2) -> None:
-        self._enough, self._count = enough, 0
-        self._last: T | None = None
-
-    def is_settled_by(self, odd: T, agrees: Callable[[T, T], bool]) -> bool:
-        """Whether the next odd one is to be believed; ``agrees`` says whether it goes with the odd one before it."""
-        self._count = self._count + 1 if self._last is not None and agrees(self._last, odd) else 1
-        self._last = odd
-        if self._count < self._enough:
-            return False
-        self.clear()
-        return True
-
-    def clear(self) -> None:
-        """What came now is not odd."""
-        self._count, self._last = 0, None
 
 
 class Intake:

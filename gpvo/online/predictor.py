@@ -20,7 +20,6 @@ from gpvo.geometry import se3
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.features import known_columns
 from gpvo.online.guard import DEGRADED_BELOW, camera_problems
 from gpvo.online.observer import Observer
 from gpvo.online.stored import arrays_of_base
@@ -50,22 +49,6 @@ class Influence:
         return f"{value}: sigma x{self.on_translation:.2f} translation, x{self.on_rotation:.2f} rotation{far}"
 
 
-def _check_schema(header: Mapping[str, Any]) -> None:
-    """Refuse a model whose arrays mean what this version does not know; arrays it does not know are left alone."""
-    schema = header.get("model_schema", MODEL_SCHEMA)
-    if not isinstance(schema, int) or schema > MODEL_SCHEMA:
-        what = f"was written by a newer gpvo (model schema {schema}, this one reads up to {MODEL_SCHEMA})"
-        raise ModelError(what, cure="update gpvo")
-
-
-def _check_known(features: tuple[str, ...]) -> None:
-    """Refuse features that nobody here computes, such as those of a package that is not installed."""
-    unknown = [f for f in features if f not in known_columns()]
-    if unknown:
-        what = f"this model needs features that are not installed: {', '.join(unknown)}"
-        raise ModelError(what, cure="install the package that defines them, or update gpvo")
-
-
 class Predictor:
     """Predicts the error of VO's motions. One instance per run: it remembers what its features need.
 
@@ -73,7 +56,8 @@ class Predictor:
     """
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any], digest: str = "") -> None:
-        _check_schema(header)
+        # Arrays that mean what this version does not know are refused; those it does not know are left alone.
+        modelfile.check_version("model schema", header.get("model_schema", MODEL_SCHEMA), MODEL_SCHEMA)
         if header.get("target") == "position":
             raise ModelError(
                 "this model predicts the residual of a position, not the error of a motion",
@@ -87,7 +71,6 @@ class Predictor:
             self.camera = None if camera is None else StereoCamera(**camera)
         except (KeyError, TypeError, ValueError) as problem:
             raise ModelError(f"the model's header is incomplete: {problem}") from None
-        _check_known(self.features)
         self.model = ErrorModel.of_file(arrays, self.features, method, dt_s)
         self.target = str(target)
         self.reset()
@@ -167,7 +150,8 @@ class Predictor:
             return None
         record, x = self._last = seen
         if record.status is Status.START:
-            return self._at_rest(record)
+            # The first frame has no motion and hence no error to speak of.
+            return self._unmeasured(record, np.eye(6) * _NO_MOTION_VAR, 1.0, 1.0)
         method = self.model.base.method
         estimate = self.predict(x, record.covariances.get(method or ""), record.dt_s)
         return self._publish(record, estimate)
@@ -202,34 +186,21 @@ class Predictor:
 
     def explain(self, record: VoRecord | None = None) -> list[Influence]:
         """Which inputs drove the prediction of ``record`` (default: the last step), strongest first."""
-        if record is None or (self._last is not None and record.t_ns == self._last[0].t_ns):
-            if self._last is None:
-                raise ModelError("there is no prediction to explain yet", cure="call step first")
-            x, dt_s = self._last[1], self._last[0].dt_s
-        else:
+        seen = self._last
+        if record is not None and (seen is None or record.t_ns != seen[0].t_ns):
             seen = copy.deepcopy(self._observer).step(record)
-            if seen is None:
-                raise ModelError("the window of this record is not full", cure="call step with the records before it")
-            x, dt_s = seen[1], seen[0].dt_s
+        if seen is None:
+            raise ModelError("there is no prediction to explain yet", cure="call step with the records before")
+        x, dt_s = seen[1], seen[0].dt_s
         typical = np.tile(x, (len(x) + 1, 1))
         typical[np.arange(1, len(x) + 1), np.arange(len(x))] = self.model.domain.centre
         ln_sigma = np.log(self.predict(typical, dt_s=dt_s or self.model.dt_s).sigma)
         gain = ln_sigma[0] - ln_sigma[1:]
         outside = self.model.domain.outside(x)
         unit = self.header.get("units") or [""] * len(x)
-        factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1))
+        factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1)).tolist()
         order = np.argsort(-np.abs(gain).sum(1), kind="stable")
-        return [
-            Influence(
-                feature=self.features[i],
-                value=float(x[i]),
-                unit=unit[i],
-                on_translation=float(factors[i, 0]),
-                on_rotation=float(factors[i, 1]),
-                outside=float(outside[i]),
-            )
-            for i in order
-        ]
+        return [Influence(self.features[i], float(x[i]), unit[i], *factors[i], float(outside[i])) for i in order]
 
     def _publish(self, record: VoRecord, prediction: Prediction) -> Prediction:
         """The prediction for a record in flight: the adapted scale, the record's status, and what is lost."""
@@ -284,10 +255,6 @@ class Predictor:
             jump = xi - slip.expected * dt_s
             variance = lost_variance(dt_s, slip.age_s, slip.expected, self._rate_var, jump)
         return np.maximum(variance, _NO_MOTION_VAR)
-
-    def _at_rest(self, record: VoRecord) -> Prediction:
-        """The first frame has no motion and hence no error to speak of."""
-        return self._unmeasured(record, np.eye(6) * _NO_MOTION_VAR, 1.0, 1.0)
 
     def _unmeasured(self, record: VoRecord, white: Array, confidence: float, in_domain: float) -> Prediction:
         return Prediction(

@@ -50,16 +50,6 @@ class ProjectedGP(Stored):
         zeros, one = np.zeros((len(offset), 1)), np.zeros((1, 1))
         return cls(one[0], np.ones(1), one, one, zeros, zeros, zeros[:, 0], offset)
 
-    @property
-    def n_inputs(self) -> int:
-        """d."""
-        return int(self.points.shape[1])
-
-    @property
-    def n_outputs(self) -> int:
-        """D."""
-        return int(self.weights.shape[0])
-
     def kernel(self, X: ArrayLike) -> Array:
         """(n, m) unit kernel between the rows of X (n, d) and the points."""
         u = (np.asarray(X, dtype=np.float64) - self.centre) / self.lengthscale

@@ -71,11 +71,6 @@ def arrays_of_base(arrays: _Arrays) -> dict[str, NDArray[Any]]:
     return kept | {name.removeprefix(BASE): a for name, a in arrays.items() if name.startswith(BASE)}
 
 
-def different_arrays(own: _Arrays, others: _Arrays) -> dict[str, NDArray[Any]]:
-    """The arrays of a base ``own`` that differ from ``others``, by their names in a file."""
-    return {BASE + name: a for name, a in own.items() if name not in others or not np.array_equal(a, others[name])}
-
-
 @dataclass(frozen=True)
 class ArraySpec:
     """What one array must be.
@@ -123,63 +118,51 @@ def _is_semidefinite(C: NDArray[Any]) -> bool:
     return bool((diagonal >= 0).all()) and is_positive_definite(C + np.diag(1e-6 * diagonal + 1e-30))
 
 
-def _positive(*shape: int | str) -> ArraySpec:
-    return ArraySpec(shape, low=_NARROWEST)
-
-
-def _not_negative(*shape: int | str) -> ArraySpec:
-    return ArraySpec(shape, low=0.0)
-
-
-def _ln(*shape: int | str) -> ArraySpec:
-    return ArraySpec(shape, low=-60.0, high=60.0)
-
-
 _ARRAYS: dict[str, ArraySpec] = {
     "inputs": ArraySpec(("inputs",), low=0, kind="iu"),
-    "factor": _positive(6),
+    "factor": ArraySpec((6,), low=_NARROWEST),
     "outside_power": ArraySpec((1,), low=0.0, high=10.0),
-    "high": _ln(6),
+    "high": ArraySpec((6,), low=-60.0, high=60.0),
     "correlation": ArraySpec((3, 6, 6), semidefinite=True, unit_diagonal=True),
     "geometry_weight": ArraySpec((1,), low=0.0, high=1.0),
     "share": ArraySpec((3, 6), low=0.0, high=1.0),
-    "growth": _ln(2, 6),
+    "growth": ArraySpec((2, 6), low=-60.0, high=60.0),
     "level": ArraySpec((6,), low=-1e3, high=1e3),
-    "ln_speed": _ln(1),
-    "bias_tau_s": _not_negative(6),
+    "ln_speed": ArraySpec((1,), low=-60.0, high=60.0),
+    "bias_tau_s": ArraySpec((6,), low=0.0),
     "typical_ln_det": ArraySpec((1,), low=-1e4, high=1e4),
     "usual_rate_var": ArraySpec((6,), low=1e-24),
-    "rate_change_var": _not_negative(6, 6),
+    "rate_change_var": ArraySpec((6, 6), low=0.0),
     "calibration_patterns": ArraySpec((6, 6, 6), low=-1e6, high=1e6),
-    "calibration_tau_s": _positive(6),
+    "calibration_tau_s": ArraySpec((6,), low=_NARROWEST),
     "nu": ArraySpec((1,), low=0.0, high=1e6),
-    "theta": _not_negative(6, 5),
-    "theta_plain": _not_negative(6, 5),
-    "domain.scale": _positive("features"),
+    "theta": ArraySpec((6, 5), low=0.0),
+    "theta_plain": ArraySpec((6, 5), low=0.0),
+    "domain.scale": ArraySpec(("features",), low=_NARROWEST),
     "domain.whitening": ArraySpec(("features", "features")),
-    "domain.radius": _not_negative(1),
+    "domain.radius": ArraySpec((1,), low=0.0),
     "domain.may_miss": ArraySpec(("features",), kind="b"),
     "domain.*": ArraySpec(("features",)),
     "thesis.columns": ArraySpec(("d",), low=0, high=3, kind="iu"),
-    "thesis.spread": _positive("d"),
-    "thesis.scale": _not_negative("D"),
+    "thesis.spread": ArraySpec(("d",), low=_NARROWEST),
+    "thesis.scale": ArraySpec(("D",), low=0.0),
     "thesis.centre": ArraySpec(("d",)),
     "method.constant": ArraySpec((6, 6), semidefinite=True),
-    "method.*.scale": _not_negative(6),
+    "method.*.scale": ArraySpec((6,), low=0.0),
     "sample.X": ArraySpec(("n", "features"), gaps=True),
     "sample.sequence": ArraySpec(("n",), low=0, kind="iu"),
     "sample.dt_s": ArraySpec(("n",), low=1e-9),
     "sample.geometry": ArraySpec(("n", 21), gaps=True),
     # Gaussian processes, wherever they stand.
-    "*.lengthscale": _positive("d"),
+    "*.lengthscale": ArraySpec(("d",), low=_NARROWEST),
     "*.points": ArraySpec(("m", "d")),
     "*.weights": ArraySpec(("D", "r")),
     "*.reduction": ArraySpec(("D", "r"), low=-1e-3),
-    "*.signal_var": _not_negative("D"),
+    "*.signal_var": ArraySpec(("D",), low=0.0),
     "*.projection": ArraySpec(("r", "m")),
     "*.centre": ArraySpec(("d",)),
     "*.offset": ArraySpec(("D",)),
-    "*.log_noise_offset": _ln("D"),
+    "*.log_noise_offset": ArraySpec(("D",), low=-60.0, high=60.0),
 }
 
 

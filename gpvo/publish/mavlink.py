@@ -19,13 +19,13 @@ import numpy as np
 from gpvo.errors import GpvoError, MissingExtraError
 from gpvo.files import replacing
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import upper
 from gpvo.geometry.se3 import R_FRD_FLU, rotate_covariance
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 
 COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LOCAL_FRD, _BODY_FRD, _ESTIMATOR_VISION = 20, 12, 2
-_UPPER = np.triu_indices(6)
 # ``in_domain`` three training standard deviations outside: there the model knows nothing of use.
 _OUTSIDE_BELOW = 0.01
 
@@ -67,7 +67,7 @@ def upper_triangle(covariance: Array | None) -> list[float]:
         return [float("nan")] + [0.0] * 20
     if not np.isfinite(covariance).all():
         raise ValueError("a covariance must be finite everywhere, or None")
-    return [float(v) for v in covariance[_UPPER]]
+    return [float(v) for v in upper(covariance)]
 
 
 class Sender:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.dataset.splits import group_folds
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
-from gpvo.learning.rows import group_folds
 
 
 def drawn(n_groups: int, seed: int, *, nu: float = np.inf, level: float = 0.5):
