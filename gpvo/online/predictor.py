@@ -198,9 +198,10 @@ class Predictor:
         gain = ln_sigma[0] - ln_sigma[1:]
         outside = self.model.domain.outside(x)
         unit = self.header.get("units") or [""] * len(x)
-        factors = np.exp(np.stack([gain[:, :3].mean(1), gain[:, 3:].mean(1)], 1)).tolist()
+        on_translation, on_rotation = (np.exp(gain[:, b].mean(1)).tolist() for b in (slice(0, 3), slice(3, 6)))
         order = np.argsort(-np.abs(gain).sum(1), kind="stable")
-        return [Influence(self.features[i], float(x[i]), unit[i], *factors[i], float(outside[i])) for i in order]
+        columns = self.features, x.tolist(), unit, on_translation, on_rotation, outside.tolist()
+        return [Influence(*(column[i] for column in columns)) for i in order]
 
     def _publish(self, record: VoRecord, prediction: Prediction) -> Prediction:
         """The prediction for a record in flight: the adapted scale, the record's status, and what is lost."""
