@@ -46,6 +46,10 @@ def live(
     calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the images.")] = (
         None
     ),
+    base_frame: Annotated[
+        str | None,
+        typer.Option(help="Publish the odometry of this frame of the robot, placed by /tf_static and /tf."),
+    ] = None,
     pose_covariance: Annotated[str, typer.Option(help="accumulated since the start, or the last increment.")] = (
         "accumulated"
     ),
@@ -78,6 +82,7 @@ def live(
             truth=truth,
             truth_type=POSE_TYPE_NAMES[one_of("--truth-type", truth_type, POSE_TYPE_NAMES)],
             calibration=calibration,
+            base_frame=base_frame,
             replay=replay,
             fast=fast,
             wire=_one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1),

@@ -15,7 +15,7 @@ from gpvo.io.images import Image8, decode_grey8, to_grey8
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import no_pair
 
-# name: (type, channels, blue first)
+# Names of sensor_msgs/image_encodings.hpp: (type, channels, blue first)
 _ENCODINGS: dict[str, tuple[str, int, bool]] = {
     "mono8": ("u1", 1, True),
     "8uc1": ("u1", 1, True),
@@ -26,15 +26,31 @@ _ENCODINGS: dict[str, tuple[str, int, bool]] = {
     "8uc3": ("u1", 3, True),
     "rgba8": ("u1", 4, False),
     "bgra8": ("u1", 4, True),
+    "8uc4": ("u1", 4, True),
     "rgb16": ("u2", 3, False),
     "bgr16": ("u2", 3, True),
+    "16uc3": ("u2", 3, True),
+    "rgba16": ("u2", 4, False),
+    "bgra16": ("u2", 4, True),
+    "16uc4": ("u2", 4, True),
 }
 # OpenCV names the pattern by its second row and column.
 _BAYER = {
-    "bayer_rggb8": cv2.COLOR_BayerBG2GRAY,
-    "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2GRAY,
-    "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
+    "bayer_rggb": cv2.COLOR_BayerBG2GRAY,
+    "bayer_bggr": cv2.COLOR_BayerRG2GRAY,
+    "bayer_gbrg": cv2.COLOR_BayerGR2GRAY,
+    "bayer_grbg": cv2.COLOR_BayerGB2GRAY,
+}
+_ENCODINGS |= {f"{name}{bits}": (f"u{bits // 8}", 1, True) for name in _BAYER for bits in (8, 16)}
+# Of YUV the brightness alone: (bytes from one to the next, first of them); where it is a plane, it comes first.
+_LUMA = {
+    "uyvy": (2, 1),
+    "yuv422": (2, 1),
+    "yuyv": (2, 0),
+    "yuv422_yuy2": (2, 0),
+    "nv12": (1, 0),
+    "nv21": (1, 0),
+    "nv24": (1, 0),
 }
 # Pairs arrive within a few messages of one another; beyond that a message has lost its partner.
 _WAITING = 12
@@ -46,18 +62,17 @@ def decode_message(message: Any, bits: int = 16) -> Image8 | None:
     if not hasattr(message, "encoding"):
         return decode_grey8(raw, bits)
     name = str(message.encoding).lower()
-    kind, channels, bgr = _ENCODINGS.get(name, ("u1", 1, True))
-    if name not in _ENCODINGS and name not in _BAYER:
-        return None
+    stride, first = _LUMA.get(name, (1, 0))
+    kind, channels, bgr = ("u1", 1, True) if name in _LUMA else _ENCODINGS.get(name, ("", 0, True))
     height, width, step = int(message.height), int(message.width), int(message.step)
-    row = width * channels * int(kind[1])
-    if not 0 < height <= 16384 or not 0 < width <= 16384 or step < row or len(raw) < height * step:
+    row = width * channels * int(kind[1:] or 0) * stride
+    if not 0 < height <= 16384 or not 0 < width <= 16384 or not 0 < row <= step or len(raw) < height * step:
         return None
-    packed = np.ascontiguousarray(raw[: height * step].reshape(height, step)[:, :row])
+    packed = np.ascontiguousarray(raw[: height * step].reshape(height, step)[:, first:row:stride])
     pixels: NDArray[Any] = packed.view((">" if message.is_bigendian else "<") + kind)
-    if name in _BAYER:
-        return np.asarray(cv2.cvtColor(packed, _BAYER[name]), dtype=np.uint8)
-    pixels = pixels.astype(kind[0] + kind[1], copy=False).reshape(height, width, channels)
+    pixels = pixels.astype(kind, copy=False).reshape(height, width, channels)
+    if name.startswith("bayer_"):
+        pixels = np.asarray(cv2.cvtColor(pixels, _BAYER[name.rstrip("0123456789")]))
     return to_grey8(pixels, bgr=bgr, bits=bits)
 
 

@@ -42,12 +42,14 @@ class DdsWire:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
 
-    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None], *, kept: bool = False) -> None:
         """Deliver every message of a topic from a thread of its own."""
         from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
         from cyclonedds.sub import DataReader
+        from cyclonedds.util import duration
 
-        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(_READER_DEPTH))
+        lasting = (Policy.Reliability.Reliable(duration(seconds=1)), Policy.Durability.TransientLocal)
+        qos = Qos(Policy.History.KeepLast(_READER_DEPTH), *(lasting if kept else (Policy.Reliability.BestEffort,)))
         reader: Any = DataReader(self._participant, self._topic(topic, msgtype), qos=qos)
         waiting = WaitSet(self._participant)
         waiting.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))

@@ -159,6 +159,8 @@ class Engine:
         return message
 
     def _adapt(self, truth: LateTruth, message: Any) -> None:
+        if self._builder is None:  # nothing was published that it could judge
+            return
         for t_ns, xi in truth.take(message, self.stage.T_body_cam):
             self.predictor.observe(xi, t_ns)
             self.counts["truth"] += 1
@@ -229,9 +231,7 @@ class Engine:
         if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:
             share = 100 * float(np.mean(self._inside))
             out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain")
-        if self.stage.counts["uncalibrated"]:
-            out += [] if self.stage.camera else ["images come, but no calibration: no CameraInfo beside them"]
-        return out
+        return out + self.stage.problems()
 
     def _is_bad(self, problems: list[str]) -> bool:
         return (self.last is not None and self.last.status is Status.LOST) or any("no usable" in p for p in problems)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from math import inf
@@ -90,14 +90,26 @@ class StampWatch:
 class Mailbox:
     """Raw messages between a transport's threads and the engine's; of a full lane (topic) the oldest is dropped.
 
-    ``dropped``: how many, by topic. ``put`` never waits.
+    ``dropped``: how many, by topic, since it was opened. ``put`` never waits.
     """
 
     def __init__(self, depth: int = 10) -> None:
         self._lanes: dict[str, deque[tuple[int, str, bytes]]] = {}
         self._depth = depth
         self._ready = threading.Condition()
+        self._is_open = True
         self.dropped: Counter[str] = Counter()
+
+    def close(self) -> None:
+        """What comes from here on is not for use, and not counted as dropped."""
+        self._is_open = False
+
+    def open(self, keep: Container[str] = ()) -> None:
+        """Forget what came while it was closed, but for the lanes ``keep``."""
+        with self._ready:
+            for topic in [] if self._is_open else [t for t in self._lanes if t not in keep]:
+                self._lanes[topic].clear()
+            self._is_open = True
 
     def put(self, topic: str, data: bytes, depth: int | None = None) -> None:
         """Add a message that has just arrived."""
@@ -105,7 +117,7 @@ class Mailbox:
             lane = self._lanes.setdefault(topic, deque())
             if len(lane) >= (depth or self._depth):
                 lane.popleft()
-                self.dropped[topic] += 1
+                self.dropped[topic] += self._is_open
             lane.append((time.monotonic_ns(), topic, data))
             self._ready.notify()
 

@@ -15,21 +15,27 @@ from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import GpvoError
 from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, open_bag
 from gpvo.io.bags import info_topic
-from gpvo.live.engine import Engine, EngineSettings
+from gpvo.live.base_frame import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage
+from gpvo.live.engine import Engine, EngineSettings, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.outputs import ODOMETRY, POSE, FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
 from gpvo.live.replay import odometry_topic, replay
-from gpvo.live.stages import PoseStage, Stage, StereoStage
+from gpvo.live.stages import PoseStage, Stage
+from gpvo.live.stereo_stage import StereoStage
 from gpvo.online.predictor import Predictor
 
 WIRES = ("zenoh", "dds", "ros2", "ros1")
-_IMU_DEPTH = 400
+_DEPTHS = {IMU_TYPE: 400, TF_TYPE: 100}
+_LASTING = (INFO_TYPE, TF_TYPE)  # what was said holds until it is said anew; a recording may lack it
 
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """What ``gpvo live`` was asked. ``wire``: one of :data:`WIRES`; ``address``: where its router or peer is."""
+    """What ``gpvo live`` was asked. ``wire``: one of :data:`WIRES`; ``address``: where its router or peer is.
+
+    ``base_frame``: whose odometry is published, of a frame that ROS's transforms join to the source's.
+    """
 
     model: Path
     stereo: tuple[str, str] | None = None
@@ -39,6 +45,7 @@ class LiveSettings:
     truth: str | None = None
     truth_type: str = POSE
     calibration: Path | None = None
+    base_frame: str | None = None
     replay: Path | None = None
     fast: bool = False
     wire: str | None = None
@@ -64,36 +71,123 @@ def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) 
     if settings.wire is None and settings.replay is None:
         raise GpvoError("there is no source", cure=f"give --replay BAG, or one of --{', --'.join(WIRES)}")
     wire = open_wire(settings.wire, settings.address, settings.domain) if settings.wire else None
+    stop = threading.Event()
     try:
-        return serve(settings, wire, threading.Event(), tell or _tell)
+        with ending_by_signal(stop):
+            live = Live(settings, wire, tell or _tell)
+            live.run(stop)
+            return {"counts": live.close()}
     finally:
         if wire is not None:
             wire.close()
 
 
-def serve(
-    settings: LiveSettings, wire: Wire | None, stop: threading.Event, tell: Callable[[str], None]
-) -> dict[str, Any]:
-    """The same over an open ``wire`` (none: a recording), until ``stop``."""
-    stage = make_stage(settings)
-    outputs: list[Any] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
+class Live:
+    """Engine and outputs of ``settings`` over an open ``wire`` (none: a recording), subscribed but not yet running.
+
+    Whatever can be refused is refused here. A managed node of ROS 2 is configured when it holds one of these, active
+    between ``start`` and ``stop``, and cleaned up by ``close``.
+
+    Raises
+    ------
+    GpvoError
+        Where an option, the model, the calibration or the recording cannot be used.
+    """
+
+    def __init__(self, settings: LiveSettings, wire: Wire | None, tell: Callable[[str], None]) -> None:
+        stage = make_stage(settings)
+        truth = None if settings.truth is None else LateTruth(settings.truth)
+        predictor, outputs = Predictor.load(settings.model), _outputs(settings, wire)
+        self.engine = Engine(stage, predictor, outputs, settings.engine, tell, truth)
+        self._settings, self._wire, self._tell = settings, wire, tell
+        self._topics = topics_in(stage, settings)
+        self._mailbox = Mailbox(settings.depth)
+        self._ending, self._has_run = threading.Event(), False
+        self._thread: threading.Thread | None = None
+        if settings.replay is None:
+            self._subscribe()
+
+    def run(self, stop: threading.Event) -> None:
+        """Use what arrives until ``stop`` or the end of the recording.
+
+        A second time begins anew, across an unknown motion: what arrived between the two is not used.
+        """
+        if self._has_run:
+            self.engine.stage.reset()
+        self._has_run = True
+        for arrival in self._arrivals(stop):
+            self.engine.take(arrival)
+        self._mailbox.close()
+
+    def start(self) -> None:
+        """Run in a thread, until ``stop``."""
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self.run, args=(self._ending,), name="gpvo-live", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, if there is one, after the message in hand."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def close(self) -> dict[str, int]:
+        """Stop, use what waits, save the state, close the outputs; returns the counts."""
+        self.stop()
+        self.engine.close()
+        return {k: n for source in self.engine.sources for k, n in sorted(source.items()) if n}
+
+    def _subscribe(self) -> None:
+        assert self._wire is not None
+        self._mailbox.close()
+        self.engine.sources.append(self._mailbox.dropped)
+        for topic, kind in self._topics.items():
+            depth = _DEPTHS.get(kind, self._settings.depth)
+
+            def deliver(name: str, data: bytes, n: int = depth) -> None:
+                self._mailbox.put(name, data, n)
+
+            self._wire.subscribe(topic, kind, deliver, kept=topic == TF_STATIC)
+
+    def _arrivals(self, stop: threading.Event) -> Iterator[Arrival | None]:
+        path, wire, topics = self._settings.replay, self._wire, self._topics
+        if path is not None:
+            with open_bag(path) as reader:
+                present = set(reader.topics)
+            wanted = [t for t, kind in topics.items() if kind not in _LASTING or t in present]
+            return replay(path, wanted, stop, fast=self._settings.fast)
+        assert wire is not None
+        self._mailbox.open([t for t, kind in topics.items() if kind in _LASTING])
+        self._tell(f"listening to {', '.join(topics)}")
+        return arrivals(self._mailbox, lambda t, data: decode(wire, data, topics[t]), stop, self.engine.counts)
+
+
+def _outputs(settings: LiveSettings, wire: Wire | None) -> list[Output]:
+    outputs: list[Output] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
     if settings.px4:
         if wire is None or wire.ros1:
             raise GpvoError("--px4 speaks DDS", cure="add --dds or --ros2")
         outputs.append(Px4Output(wire))
     outputs += [MavlinkOutput(settings.mavlink)] if settings.mavlink else []
     outputs += [FileOutput(settings.out)] if settings.out else []
-    truth = None if settings.truth is None else LateTruth(settings.truth)
-    engine = Engine(stage, Predictor.load(settings.model), outputs, settings.engine, tell, truth)
-    with ending_by_signal(stop):
-        for arrival in _arrivals(settings, stage, engine, wire, stop):
-            engine.take(arrival)
-        engine.close()
-    return {"counts": {k: n for source in engine.sources for k, n in sorted(source.items()) if n}}
+    return outputs
 
 
 def make_stage(settings: LiveSettings) -> Stage:
-    """The stage that was asked for: images where topics of images are named, else poses."""
+    """The stage that was asked for: images where topics of images are named, else poses; of another frame if named."""
+    stage = _source_stage(settings)
+    if settings.base_frame is None:
+        return stage
+    if isinstance(stage, PoseStage) and settings.pose_type != ODOMETRY:
+        raise GpvoError(
+            "--base-frame needs to know whose poses come, and their messages do not name a frame",
+            cure="use a topic of nav_msgs/Odometry",
+        )
+    return BaseFrameStage(stage, settings.base_frame)
+
+
+def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
     if settings.stereo is not None:
         if settings.odometry is not None:
             raise GpvoError("--stereo and --odometry exclude each other", cure="choose one")
@@ -108,12 +202,15 @@ def make_stage(settings: LiveSettings) -> Stage:
 
 def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     """Topics to subscribe to, with their types."""
+    if isinstance(stage, BaseFrameStage):
+        return topics_in(stage.inner, settings) | dict.fromkeys(TF_TOPICS, TF_TYPE)
+    truth = {settings.truth: settings.truth_type} if settings.truth else {}
     if isinstance(stage, PoseStage):
-        return {stage.topic: settings.pose_type}
+        return {stage.topic: settings.pose_type, **truth}
     assert isinstance(stage, StereoStage)
     images = {t: IMAGE_TYPES["compressed" in t] for t in (stage.left, stage.right)}
     infos = {} if stage.camera is not None else {info_topic(t): INFO_TYPE for t in images}
-    return {**images, **infos, **({stage.imu: IMU_TYPE} if stage.imu else {})}
+    return {**images, **infos, **({stage.imu: IMU_TYPE} if stage.imu else {}), **truth}
 
 
 def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
@@ -131,32 +228,6 @@ def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
 
         return Ros1Wire() if name == "ros1" else Ros2Wire()
     raise GpvoError(f"unknown transport '{name}'", cure=f"choose {', '.join(WIRES)}")
-
-
-def _arrivals(
-    settings: LiveSettings, stage: Stage, engine: Engine, wire: Wire | None, stop: threading.Event
-) -> Iterator[Arrival | None]:
-    topics = topics_in(stage, settings) | ({settings.truth: settings.truth_type} if settings.truth else {})
-    if settings.replay is not None:
-        with open_bag(settings.replay) as reader:
-            present = set(reader.topics)
-        wanted = [t for t, kind in topics.items() if kind != INFO_TYPE or t in present]
-        return replay(settings.replay, wanted, stop, fast=settings.fast)
-    assert wire is not None
-    return listen(wire, topics, engine, stop, settings.depth)
-
-
-def listen(
-    wire: Wire, topics: dict[str, str], engine: Engine, stop: threading.Event, depth: int = 10
-) -> Iterator[Arrival | None]:
-    """Subscribe to topics, with their types, and yield what arrives until ``stop``."""
-    mailbox = Mailbox(depth)
-    engine.sources.append(mailbox.dropped)
-    for topic, kind in topics.items():
-        lane_depth = _IMU_DEPTH if kind == IMU_TYPE else depth
-        wire.subscribe(topic, kind, lambda name, data, n=lane_depth: mailbox.put(name, data, n))  # type: ignore[misc]
-    engine.tell(f"listening to {', '.join(topics)}")
-    return arrivals(mailbox, lambda topic, data: decode(wire, data, topics[topic]), stop, engine.counts)
 
 
 @contextmanager

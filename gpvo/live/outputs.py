@@ -21,14 +21,15 @@ Send = Callable[[bytes], None]
 class Wire(Protocol):
     """A transport of serialised ROS messages. ``store``: rosbags' types of the messages as they travel.
 
-    ``subscribe`` calls ``deliver(topic, bytes)`` from any thread; ``advertise`` gives the function that sends.
+    ``subscribe`` calls ``deliver(topic, bytes)`` from any thread, with ``kept`` also for what publishers keep for those
+    who come late (ROS 2: transient local; ROS 1: latched); ``advertise`` gives the function that sends.
     ``ros1``: headers carry a sequence number, and bytes are ROS 1's.
     """
 
     store: Any
     ros1: bool
 
-    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None], *, kept: bool = False) -> None:
         """Deliver every message of a topic from now on."""
 
     def advertise(self, topic: str, msgtype: str) -> Send:

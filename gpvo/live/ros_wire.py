@@ -10,12 +10,13 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gpvo.errors import GpvoError
+from gpvo.live.base_frame import TF_TYPE
 from gpvo.live.outputs import Send
 
-_DEPTH = 10
+_DEPTH, _KEPT = 10, 100
 
 
 def message_class(msgtype: str) -> Any:
@@ -38,6 +39,7 @@ class Ros2Wire:
 
         self.store = get_typestore(Stores.ROS2_JAZZY)
         self._thread: threading.Thread | None = None
+        self._undo: list[Callable[[], object]] = []
         if node is None:
             rclpy.init()
             node = rclpy.create_node("gpvo")
@@ -45,20 +47,33 @@ class Ros2Wire:
             self._thread.start()
         self._node = node
 
-    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None], *, kept: bool = False) -> None:
         """Deliver every message of a topic."""
-        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
+        reliable, local = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
+        lasting = QoSProfile(depth=_KEPT, reliability=reliable, durability=local)
+        qos = lasting if kept else qos_profile_sensor_data
         kind = message_class(msgtype)
-        self._node.create_subscription(kind, topic, lambda b: deliver(topic, b), qos_profile_sensor_data, raw=True)
+        made = self._node.create_subscription(kind, topic, lambda b: deliver(topic, b), qos, raw=True)
+        self._undo.append(lambda: self._node.destroy_subscription(made))
 
     def advertise(self, topic: str, msgtype: str) -> Send:
         """Announce a topic."""
         publisher = self._node.create_publisher(message_class(msgtype), topic, _DEPTH)
-        return lambda data: publisher.publish(data)
+        self._undo.append(lambda: self._node.destroy_publisher(publisher))
+
+        def send(data: bytes) -> None:
+            if self._node.context.ok():  # a signal may have ended it
+                publisher.publish(data)
+
+        return send
 
     def close(self) -> None:
-        """End the node, if it is of our own making."""
+        """End every subscription and topic, and the node, if it is of our own making."""
+        for undo in self._undo:
+            undo()
+        self._undo.clear()
         if self._thread is not None:
             import rclpy
 
@@ -79,10 +94,10 @@ class Ros1Wire:
         if not rosgraph.is_master_online():
             place = os.environ.get("ROS_MASTER_URI", "")
             raise GpvoError(f"no ROS master at '{place}'", cure="start roscore, or set ROS_MASTER_URI")
-        self.store = get_typestore(Stores.ROS1_NOETIC)
+        self.store = ros1_types()
         rospy.init_node("gpvo", anonymous=True, disable_signals=True)
 
-    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None], *, kept: bool = False) -> None:
         """Deliver every message of a topic, whatever type its publisher says it has."""
         import rospy
 
@@ -111,6 +126,13 @@ class Ros1Wire:
         import rospy
 
         rospy.signal_shutdown("gpvo live has ended")
+
+
+def ros1_types() -> Any:
+    """rosbags' types of ROS 1, with the transforms that it leaves out."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_TYPE))
+    return store
 
 
 def _raw(kind: Any) -> Any:

@@ -21,6 +21,8 @@ from gpvo.live.outputs import Send
 
 _QOS_PUBLISHER = "::,10:,:,:,,"  # reliable, volatile, keep last 10: what differs from the default is written
 _QOS_SUBSCRIBER = "2::,10:,:,:,,"  # best effort
+_KEPT = 100
+_QOS_KEPT = f":1:,{_KEPT}:,:,:,,"  # transient local
 
 
 def dds_name(msgtype: str) -> str:
@@ -57,13 +59,26 @@ class ZenohWire:
         self._encoding = zenoh.Encoding("application/cdr")
         zid = self._session.zid()
         self._root = f"@ros2_lv/{domain}/{zid}/0"
-        self._held = [self._session.liveliness().declare_token(f"{self._root}/0/NN/%/%/{node}")]
+        self._held: list[Any] = [self._session.liveliness().declare_token(f"{self._root}/0/NN/%/%/{node}")]
 
-    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None]) -> None:
+    def subscribe(self, topic: str, msgtype: str, deliver: Callable[[str, bytes], None], *, kept: bool = False) -> None:
         """Deliver every message of a topic, whatever hash its publisher knows the type by."""
-        self._announce("MS", topic, msgtype, _QOS_SUBSCRIBER)
+        self._announce("MS", topic, msgtype, _QOS_KEPT if kept else _QOS_SUBSCRIBER)
         key = f"{self._domain}/{topic.strip('/')}/{dds_name(msgtype)}/*"
-        self._held.append(self._session.declare_subscriber(key, lambda s: deliver(topic, bytes(s.payload))))
+
+        def taken(sample: Any) -> None:
+            deliver(topic, bytes(sample.payload))
+
+        if not kept:
+            self._held.append(self._session.declare_subscriber(key, taken))
+            return
+        # As rmw_zenoh subscribes to what is transient local: its publishers answer from a cache.
+        from zenoh import ext
+
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=_KEPT)
+        self._held.append(
+            ext.declare_advanced_subscriber(self._session, key, taken, history=history, subscriber_detection=True)
+        )
 
     def advertise(self, topic: str, msgtype: str) -> Send:
         """Announce a topic; messages carry a sequence number, the time of sending and the publisher's identity."""

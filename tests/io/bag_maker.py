@@ -77,10 +77,10 @@ class BagMaker:
         q = se3.rotation_to_quaternion_xyzw(T[:3, :3])
         return [float(v) for v in T[:3, 3]], self.type("geometry_msgs/msg/Quaternion")(*(float(v) for v in q))
 
-    def transform(self, topic: str, t_ns: int, T: np.ndarray) -> None:
+    def transform(self, topic: str, t_ns: int, T: np.ndarray, parent: str = "world", child: str = "body") -> None:
         p, q = self._pose(T)
         body = self.type("geometry_msgs/msg/Transform")(self.type("geometry_msgs/msg/Vector3")(*p), q)
-        message = self.type("geometry_msgs/msg/TransformStamped")(self.header(t_ns, "world"), "body", body)
+        message = self.type("geometry_msgs/msg/TransformStamped")(self.header(t_ns, parent), child, body)
         self.add(topic, message, t_ns)
 
     def pose_with_covariance(self, topic: str, t_ns: int, T: np.ndarray, cov: np.ndarray) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sequences as seq
@@ -9,6 +11,7 @@ from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
+from gpvo.io.bag_images import decode_message
 from gpvo.io.bag_reader import pose_of
 from gpvo.io.foreign import read_foreign
 from gpvo.io.foreign_records import to_records
@@ -64,18 +67,59 @@ def test_cameras_that_never_meet(tmp_path):
         list(open_source(path, tolerance_s=1e-4))
 
 
-@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "bgra8", "mono16", "8UC1", "bayer_rggb8"])
-def test_encodings(tmp_path, encoding):
+GREY = np.random.default_rng(0).integers(20, 235, (24, 32), dtype=np.uint8)
+# The same grey picture in every encoding.
+ENCODED = {
+    **dict.fromkeys(("mono8", "8UC1"), GREY),
+    **{name: np.repeat(GREY[:, :, None], 3, axis=2) for name in ("rgb8", "bgr8", "8UC3")},
+    **{name: np.repeat(GREY[:, :, None], 4, axis=2) for name in ("rgba8", "bgra8", "8UC4")},
+    **{name: GREY.astype(np.uint16) << 8 for name in ("mono16", "16UC1")},
+    **{name: np.repeat(GREY[:, :, None].astype(np.uint16) << 8, 3, axis=2) for name in ("rgb16", "bgr16", "16UC3")},
+    **{name: np.repeat(GREY[:, :, None].astype(np.uint16) << 8, 4, axis=2) for name in ("rgba16", "bgra16", "16UC4")},
+    **{name: np.stack([GREY, np.full_like(GREY, 128)], axis=2) for name in ("yuyv", "yuv422_yuy2")},
+    **{name: np.stack([np.full_like(GREY, 128), GREY], axis=2) for name in ("uyvy", "yuv422")},
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODED)
+@pytest.mark.parametrize("padding", [0, 7])
+def test_encodings(encoding, padding):
+    rows = np.ascontiguousarray(ENCODED[encoding]).view(np.uint8).reshape(len(GREY), -1)
+    maker = BagMaker(ros1=False)
+    maker.image("/i", 0, np.pad(rows, ((0, 0), (0, padding))), encoding)
+    [(_, _, message)] = maker.messages
+    image = decode_message(replace(message, width=GREY.shape[1]))
+    np.testing.assert_array_equal(image, GREY)
+    for broken in ({"step": 3}, {"data": message.data[:-1]}, {"width": 0}, {"encoding": f"{encoding}?"}):
+        assert decode_message(replace(message, **{"width": GREY.shape[1], **broken})) is None
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21", "nv24"])
+def test_planes_of_brightness_come_before_those_of_colour(encoding):
+    maker = BagMaker(ros1=False)
+    maker.image("/i", 0, GREY, encoding)
+    [(_, _, message)] = maker.messages
+    colour = np.zeros(GREY.size * (2 if encoding == "nv24" else 1) // (1 if encoding == "nv24" else 2), dtype=np.uint8)
+    np.testing.assert_array_equal(decode_message(replace(message, data=np.r_[message.data, colour])), GREY)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(("pattern", "red"), [("rggb", (0, 0)), ("bggr", (1, 1)), ("gbrg", (1, 0)), ("grbg", (0, 1))])
+def test_bayer_patterns(pattern, red, bits):
+    """A red picture is as bright as red is, wherever the pattern puts it."""
+    mosaic = np.zeros((24, 32), dtype=f"u{bits // 8}")
+    mosaic[red[0] :: 2, red[1] :: 2] = 200 << (bits - 8)
+    maker = BagMaker(ros1=False)
+    maker.image("/i", 0, mosaic, f"bayer_{pattern}{bits}")
+    image = decode_message(maker.messages[0][2])
+    np.testing.assert_allclose(image[4:-4, 4:-4], 0.299 * 200, atol=2)
+
+
+def test_a_bag_of_colour_images(tmp_path):
     maker = BagMaker(ros1=True)
     for k, t in enumerate(seq.stamps(3)):
-        image = seq.grey(k)
-        channels = {"rgb8": 3, "bgr8": 3, "bgra8": 4}.get(encoding, 1)
-        if channels > 1:
-            image = np.repeat(image[:, :, None], channels, axis=2)
-        if encoding == "mono16":
-            image = image.astype(np.uint16) * 256
         for side, tx in (("left", 0.0), ("right", -6.0)):
-            maker.image(f"/{side}/image_raw", t, image, encoding)
+            maker.image(f"/{side}/image_raw", t, np.repeat(seq.grey(k)[:, :, None], 3, axis=2), "bgr8")
             maker.camera_info(f"/{side}/camera_info", t, tx)
     source = open_source(maker.write(tmp_path / "a.bag"))
     assert [k for _, k in seq.frames_of(source)] == [0, 1, 2]

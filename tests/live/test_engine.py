@@ -18,7 +18,8 @@ from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
 from gpvo.live.late_truth import LateTruth
-from gpvo.live.stages import PoseStage, StereoStage
+from gpvo.live.stages import PoseStage
+from gpvo.live.stereo_stage import StereoStage
 from gpvo.publish.odometry import OdometryBuilder
 from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog

@@ -14,7 +14,7 @@ from gpvo.io import open_source
 from gpvo.io.images import read_grey8
 from gpvo.live.intake import Arrival
 from gpvo.live.replay import replay
-from gpvo.live.stages import StereoStage
+from gpvo.live.stereo_stage import StereoStage
 from gpvo.types import StereoFrame, VoRecord
 from gpvo.vo.config import VoConfig
 from gpvo.vo.odometry import StereoOdometry

@@ -19,7 +19,9 @@ from gpvo.live.intake import Arrival
 from gpvo.publish.odometry import Odometry
 from ros1_tools import SYSTEM_PYTHON, needs_live_ros1, with_gpvo
 from shim_bags import TOPIC, engine, flight, flown, save_model
-from wire_peers import Rows, ends, live, place, publish, reader, running
+from test_base_frame import TRANSFORMS, based, tf, tf_message
+from wire_peers import Rows, ends, live, place, reader, running
+from wire_publishers import latched, publish
 
 needs_zenoh = pytest.mark.skipif(
     importlib.util.find_spec("zenoh_ros2_sdk") is None, reason="needs eclipse-zenoh and zenoh-ros2-sdk"
@@ -47,11 +49,11 @@ def expected(messages: int) -> tuple[list[Arrival], list[Odometry]]:
     return arrivals, [o for o in kept.frames if o.twist_body is not None]
 
 
-def check(got: Rows, want: list[Odometry]) -> None:
+def check(got: Rows, want: list[Odometry], child: str = "base_link") -> None:
     """Every message arrived, with the numbers of the offline path."""
     assert [g["t"] for g in got] == [o.t_ns for o in want]
     for ours, theirs in zip(got, want, strict=True):
-        assert (ours["frame"], ours["child"]) == ("odom", "base_link")
+        assert (ours["frame"], ours["child"]) == ("odom", child)
         assert ours["x"] == pytest.approx(theirs.T_odom_body[0, 3], abs=1e-9)
         np.testing.assert_allclose(ours["pose"], theirs.pose_covariance.reshape(36), rtol=1e-9, atol=1e-15)
         assert theirs.twist_covariance is not None
@@ -71,6 +73,25 @@ def test_the_shim_is_listed_and_read_by_others(wire: str, tmp_path: Path) -> Non
         publish(at, TOPIC, arrivals, tmp_path)
         check(rows(), want)
         assert ends(process)["frames_start"] == 1
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_transforms_that_were_sent_before_the_start_place_the_base(wire: str, tmp_path: Path) -> None:
+    here, kept, _ = based()
+    arrivals = flown(*flight(n=20))
+    for arrival in [tf(*TRANSFORMS), *arrivals]:
+        here.take(arrival)
+    want = [o for o in kept.frames if o.twist_body is not None]
+    model = save_model(tmp_path / "m.gpvo")
+    with (
+        place(wire) as at,
+        latched(at, tf_message(TRANSFORMS), tmp_path),
+        live(at, "--odometry", TOPIC, "--base-frame", "chassis", "--model", str(model)) as process,
+        reader(at, len(want), tmp_path) as (_, rows),
+    ):
+        publish(at, TOPIC, arrivals, tmp_path)
+        check(rows(), want, child="chassis")
+        assert "unplaced" not in ends(process)
 
 
 @needs_dds

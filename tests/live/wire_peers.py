@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gpvo.live.outputs import ODOMETRY, Wire
+from gpvo.live.outputs import ODOMETRY
 from ros1_tools import SYSTEM_PYTHON, environment, ros_master, with_gpvo
 from rosbags.typesys import Stores, get_typestore
 
@@ -180,57 +180,6 @@ for topic, m, t in rosbag.Bag(sys.argv[1]).read_messages(["/gpvo/odometry"]):
     print(json.dumps({"t": m.header.stamp.to_nsec(), "frame": m.header.frame_id, "child": m.child_frame_id,
                       "x": m.pose.pose.position.x, "pose": list(m.pose.covariance), "twist": list(m.twist.covariance)}))
 """
-
-BAG_PUBLISHER = """
-import sys, rosbag, rospy
-from nav_msgs.msg import Odometry
-rospy.init_node("vio", anonymous=True, disable_signals=True)
-out = rospy.Publisher(sys.argv[2], Odometry, queue_size=1000)
-while out.get_num_connections() == 0:
-    rospy.sleep(0.05)
-for _, m, _ in rosbag.Bag(sys.argv[1]).read_messages():
-    out.publish(m)
-    rospy.sleep(0.02)
-rospy.sleep(0.5)
-"""
-
-
-def publish(at: Place, topic: str, arrivals: list[Any], folder: Path) -> None:
-    """Another odometry, at its pace: ``nav_msgs/Odometry`` messages of any typestore."""
-    if at.wire == "ros1":
-        from rosbags.rosbag1 import Writer
-
-        store = get_typestore(Stores.ROS1_NOETIC)
-        with Writer(folder / "vio.bag") as writer:
-            connection = writer.add_connection(topic, ODOMETRY, typestore=store)
-            for k, a in enumerate(arrivals):
-                data = store.serialize_ros1(_same(store.types, a.message, k), ODOMETRY)
-                writer.write(connection, a.received_ns, data)
-        command = [SYSTEM_PYTHON, "-c", BAG_PUBLISHER, str(folder / "vio.bag"), topic]
-        subprocess.run(command, env=environment(ROS_MASTER_URI=at.address), check=True, timeout=60)
-        return
-    from gpvo.live.job import open_wire
-
-    wire: Wire = open_wire(at.wire, at.address, int(at.address) if at.wire == "dds" else 0)
-    try:
-        send = wire.advertise(topic, ODOMETRY)
-        time.sleep(0.5)
-        for a in arrivals:
-            send(bytes(wire.store.serialize_cdr(_same(wire.store.types, a.message), ODOMETRY)))
-            time.sleep(0.02)
-        time.sleep(0.5)
-    finally:
-        wire.close()
-
-
-def _same(types: Any, message: Any, seq: int | None = None) -> Any:
-    """The message rebuilt of another typestore's classes; ``seq``: for ROS 1, whose headers have a number."""
-    if not hasattr(message, "__msgtype__"):
-        return message
-    names = [f for f in message.__dataclass_fields__ if f != "__msgtype__"]
-    numbered = {"seq": seq} if seq is not None and message.__msgtype__ == "std_msgs/msg/Header" else {}
-    return types[message.__msgtype__](**numbered, **{n: _same(types, getattr(message, n), seq) for n in names})
-
 
 ZENOH_READER = """
 import json, os, sys, time

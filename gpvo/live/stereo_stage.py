@@ -1,0 +1,159 @@
+"""From pairs of images, and an IMU, to VO records through gpvo's own odometry."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from gpvo.cameras.projections import CameraInfo, rig_from_camera_info
+from gpvo.cameras.rectify import Rectifier
+from gpvo.cameras.rig import StereoRig
+from gpvo.io.bag_images import PairQueue, decode_message
+from gpvo.io.bag_reader import stamp_ns
+from gpvo.io.bags import camera_info_of, info_topic
+from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.io.images import Image8
+from gpvo.io.source import SourceReport
+from gpvo.io.stamps import PAIR_TOLERANCE_S
+from gpvo.live.intake import Arrival, Sequence, StampWatch
+from gpvo.live.stages import Taken
+from gpvo.types import Array, ImuLog, StereoCamera, StereoFrame
+from gpvo.vo.odometry import StereoOdometry
+
+_IMU_KEPT = 4000
+_PAIRS_KEPT = 10  # while no CameraInfo has come
+
+
+class StereoStage:
+    """Pairs of images through :class:`gpvo.vo.odometry.StereoOdometry`, with an IMU where one is named.
+
+    ``rig``: the calibration; without it pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits
+    for the first IMU sample after it, or for the next pair.
+    """
+
+    method = "pointing_matching"
+
+    def __init__(self, left: str, right: str, imu: str | None = None, rig: StereoRig | None = None) -> None:
+        self.topic, self.left, self.right, self.imu = left, left, right, imu
+        self.counts: Counter[str] = Counter()
+        self._infos: dict[str, CameraInfo] = {}
+        self._rectifier: Rectifier | None = None
+        self._odometry: StereoOdometry | None = None
+        self._t_last_ns = 0
+        self.camera: StereoCamera | None = None
+        self.T_body_cam, self.T_source_cam = T_FLU_OPTICAL, np.eye(4)
+        self._shift_ns = 0
+        if rig is not None:
+            self._calibrate(rig)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next pair."""
+        self._report = SourceReport()
+        self._pairs = PairQueue(self.left, round(PAIR_TOLERANCE_S * 1e9), self._report)
+        self._watch = StampWatch()
+        self._samples: deque[tuple[int, Array]] = deque(maxlen=_IMU_KEPT)
+        self._waiting: deque[tuple[int, Any, Any, int]] = deque(maxlen=_PAIRS_KEPT)  # with time of arrival
+        self._restart()
+
+    def take(self, arrival: Arrival) -> Iterator[Taken]:
+        """A record for each pair that is complete, with the IMU's samples since the one before."""
+        topic, message = arrival.topic, arrival.message
+        if topic == self.imu:
+            self._take_imu(message)
+        elif topic in (self.left, self.right):
+            missing = self._report.missing
+            pair = self._pairs.push(topic, message)
+            self.counts["unpaired"] += self._report.missing - missing
+            if pair is not None:
+                if self._rectifier is not None:
+                    yield from self.flush()
+                elif len(self._waiting) == _PAIRS_KEPT:
+                    self.counts["uncalibrated"] += 1
+                self._waiting.append((*pair, arrival.received_ns))
+        elif topic in (info_topic(self.left), info_topic(self.right)):
+            self._take_info(topic, message)
+        late = self._samples[-1][0] if self._samples else 0
+        is_calibrated = self._rectifier is not None
+        if self._waiting and is_calibrated and (self.imu is None or late >= self._waiting[-1][0]):
+            yield from self.flush()
+
+    def flush(self) -> Iterator[Taken]:
+        """The pairs that wait, with what the IMU has said so far."""
+        while self._waiting:
+            yield from self._step(*self._waiting.popleft())
+
+    def problems(self) -> list[str]:
+        """Images that nobody says the calibration of."""
+        if self.camera is not None or not self.counts["uncalibrated"]:
+            return []
+        return ["images come, but no calibration: no CameraInfo beside them"]
+
+    def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:
+        if self._rectifier is None or self.camera is None:
+            self.counts["uncalibrated"] += 1
+            return
+        images = [decode_message(m) for m in (left, right)]
+        if not all(_fits(i, c) for i, c in zip(images, (self._rectifier.rig.left, self._rectifier.rig.right))):
+            self.counts["unreadable"] += 1
+            return
+        seen = self._watch.see(t_ns)
+        self.counts[seen.value] += 1
+        if seen.dropped:
+            return
+        if seen is Sequence.RESTART:
+            self._restart()
+        begins = self._odometry is None
+        if self._odometry is None:
+            self._odometry = StereoOdometry(self.camera, mask=self._rectifier.mask)
+        assert images[0] is not None
+        assert images[1] is not None
+        frame = StereoFrame(t_ns, *self._rectifier.apply(images[0], images[1]))
+        record = self._odometry.step(frame, None if begins else self._imu_since(t_ns))
+        self._t_last_ns = t_ns
+        yield Taken(record, begins, received_ns)
+
+    def _restart(self) -> None:
+        self._odometry, self._t_last_ns = None, 0
+
+    def _take_info(self, topic: str, message: Any) -> None:
+        if self._rectifier is not None:
+            return
+        self._infos[topic] = camera_info_of(message, topic, topic)
+        names = [info_topic(t) for t in (self.left, self.right)]
+        if all(n in self._infos for n in names):
+            rectified = all("rect" in t for t in (self.left, self.right))
+            self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
+
+    def _calibrate(self, rig: StereoRig) -> None:
+        self._rectifier = Rectifier(rig)
+        self.camera = self._rectifier.camera
+        self._shift_ns = round(rig.timeshift_cam_imu_s * 1e9)
+        self.T_source_cam = self._rectifier.T_left_cam
+        place = self._rectifier.mounting.T_body_cam
+        self.T_body_cam = T_FLU_OPTICAL if place is None else place
+
+    def _take_imu(self, message: Any) -> None:
+        w, a = message.angular_velocity, message.linear_acceleration
+        row = np.array([w.x, w.y, w.z, a.x, a.y, a.z])
+        t_ns = stamp_ns(message) - self._shift_ns
+        if not np.isfinite(row).all() or (self._samples and 0 <= self._samples[-1][0] - t_ns < 10**9):
+            self.counts["imu_dropped"] += 1
+            return
+        self._samples.append((t_ns, row))
+
+    def _imu_since(self, t_ns: int) -> ImuLog | None:
+        chosen = [s for s in self._samples if self._t_last_ns < s[0] <= t_ns]
+        while self._samples and self._samples[0][0] <= t_ns:
+            self._samples.popleft()
+        if not chosen:
+            return None
+        data = np.array([row for _, row in chosen])
+        return ImuLog(np.array([t for t, _ in chosen], dtype=np.int64), data[:, :3], data[:, 3:])
+
+
+def _fits(image: Image8 | None, lens: Any) -> bool:
+    return image is not None and image.shape == (lens.height, lens.width)

@@ -1,0 +1,105 @@
+"""The node's parameters, which are the options of ``gpvo live``; nothing here needs ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gpvo.errors import GpvoError
+from gpvo.live.engine import EngineSettings
+from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings
+from gpvo.types import VEHICLES, Vehicle
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Its default, which also says its type; what it is; its range, both ends included, or the texts it may be."""
+
+    default: str | int | float | bool
+    description: str
+    range: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+
+
+PARAMETERS = {
+    "autostart": Parameter(True, "Configure and activate at the start; false leaves that to a lifecycle manager."),
+    "model": Parameter("", "Error model of this camera, or of this odometry: a .gpvo file."),
+    "odometry": Parameter("", "Topic of another odometry, to be republished with an honest covariance ..."),
+    "odometry_type": Parameter("odometry", "Type of that topic.", choices=tuple(POSE_TYPE_NAMES)),
+    "left": Parameter("", "... or topics of a stereo pair, raw or rectified, whole or compressed."),
+    "right": Parameter("", "The other topic of the pair."),
+    "imu": Parameter("", "Topic of the IMU, beside a stereo pair."),
+    "calibration": Parameter("", "Calibration file of the pair; default: CameraInfo beside the images."),
+    "base_frame": Parameter(
+        "", "Publish the odometry of this frame, placed by /tf_static and /tf; default: the source's own."
+    ),
+    "truth": Parameter("", "Topic of ground truth that comes late: adapts the covariance."),
+    "truth_type": Parameter("pose", "Type of that topic.", choices=tuple(POSE_TYPE_NAMES)),
+    "topic": Parameter("/gpvo/odometry", "Topic on which the odometry is published."),
+    "pose_topic": Parameter("", "Also publish PoseWithCovarianceStamped here."),
+    "pose_covariance": Parameter(
+        "accumulated",
+        "Covariance of the pose: since the start, or of the last motion.",
+        choices=("accumulated", "increment"),
+    ),
+    "mavlink": Parameter("", "Also send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD."),
+    "px4": Parameter(False, "Also publish px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS."),
+    "state": Parameter("", "File to save the state in, and to take it up from."),
+    "vehicle": Parameter("any", "What carries the camera.", choices=tuple(VEHICLES)),
+    "max_acceleration": Parameter(0.0, "Largest acceleration [m/s^2]; 0: the vehicle's.", (0.0, 1e4)),
+    "max_turn": Parameter(0.0, "Largest angular acceleration [rad/s^2]; 0: the vehicle's.", (0.0, 1e5)),
+    "depth": Parameter(10, "Length of the queue of a topic; older messages are dropped.", (2, 1000)),
+}
+
+
+def settings_of(given: Mapping[str, Any]) -> LiveSettings:
+    """What ``gpvo live`` would have been asked, from parameters; empty texts are not given.
+
+    Raises
+    ------
+    GpvoError
+        Where they contradict each other, or a text is none of its choices.
+    """
+    values = {**{name: p.default for name, p in PARAMETERS.items()}, **given}
+    p: dict[str, Any] = {name: value if value != "" else None for name, value in values.items()}
+    if p["model"] is None:
+        raise GpvoError("the parameter 'model' is empty", cure="name a .gpvo file")
+    if (p["left"] is None) != (p["right"] is None):
+        raise GpvoError("one of the parameters 'left' and 'right' is empty")
+    for name, parameter in PARAMETERS.items():
+        if parameter.choices and p[name] not in parameter.choices:
+            raise GpvoError(f"the parameter '{name}' is '{p[name]}'", cure=f"choose {', '.join(parameter.choices)}")
+    known = VEHICLES[p["vehicle"]]
+    vehicle = Vehicle(p["max_acceleration"] or known.max_acceleration_mps2, p["max_turn"] or known.max_turn_radps2)
+    return LiveSettings(
+        model=Path(p["model"]),
+        stereo=None if p["left"] is None else (p["left"], p["right"]),
+        imu=p["imu"],
+        odometry=p["odometry"],
+        pose_type=POSE_TYPE_NAMES[p["odometry_type"]],
+        truth=p["truth"],
+        truth_type=POSE_TYPE_NAMES[p["truth_type"]],
+        calibration=None if p["calibration"] is None else Path(p["calibration"]),
+        base_frame=p["base_frame"],
+        wire="ros2",
+        mavlink=p["mavlink"],
+        px4=p["px4"],
+        topic=p["topic"],
+        pose_topic=p["pose_topic"],
+        depth=p["depth"],
+        engine=EngineSettings(
+            increment=p["pose_covariance"] == "increment",
+            state=None if p["state"] is None else Path(p["state"]),
+            vehicle=vehicle,
+        ),
+    )
+
+
+def typed(name: str, text: str) -> str | int | float | bool:
+    """The text of a launch argument as its parameter's type; KeyError or ValueError where it is none."""
+    kind = type(PARAMETERS[name].default)
+    if kind is bool:
+        return {"true": True, "false": False}[text.lower()]
+    return kind(text)
