@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
-from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, settings_of
+from gpvo.cli.twin import GapOption, Replicates, Seed, ToleranceOption, say_simulated, settings_of
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def evaluate(
     replicates: Replicates = 8,
     tolerance: ToleranceOption = "none",
     gap: GapOption = None,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed of the twins.")] = 0,
+    seed: Seed = 1,
     json_: Json = False,
 ) -> None:
     """Score the trajectory and every stated covariance.
@@ -207,30 +207,22 @@ def _with_twins(
     from tempfile import TemporaryDirectory
 
     from gpvo.cli.twin import make_all
-    from gpvo.evaluation.by_twins import by_twins, with_twins
-    from gpvo.evaluation.document import document
+    from gpvo.evaluation.by_twins import by_twins
     from gpvo.io.run import read_run
 
     documents, found = [], []
     for run in runs:
         with TemporaryDirectory(prefix="gpvo-twins-") as folder:
             twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
-        if run.truth is not None:
-            own = [with_twins(run, twins, predictor, options)]
-            documents += document(own)["runs"]
-        else:
-            about, own = by_twins(run, twins, predictor, options)
-            documents.append(about)
+        about, own = by_twins(run, twins, predictor, options)
+        documents.append(about)
         found += own
     return documents, found
 
 
 def _print(d: dict[str, Any]) -> None:
     if about := d.get("simulated_truth"):
-        say(
-            f"{d['run']} has no ground truth: means over {about['twins']} twins, whose truth is simulated"
-            f" (tolerance {about['tolerance_name']})"
-        )
+        say_simulated(about)
     say(
         f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {d['path_length_m']:.1f} m;"
         f" ATE {d['ate_rmse_m']:.3g} m,"

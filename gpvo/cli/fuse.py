@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from gpvo.cli.output import Json, one_of, print_json, say
-
-if TYPE_CHECKING:
-    from gpvo.filters.study import Comparison
+from gpvo.cli.twin import (
+    GapOption,
+    Replicates,
+    Seed,
+    ToleranceOption,
+    in_place_of_runs_without_truth,
+    say_simulated,
+    settings_of,
+)
 
 
 def fuse(
@@ -27,8 +34,15 @@ def fuse(
     gate: Annotated[
         str, typer.Option(help="What happens to a measurement beyond 3 sigma: discard or inflate.")
     ] = "discard",
-    mean: Annotated[str, typer.Option(hidden=True)] = "",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
+    twins: Annotated[
+        bool,
+        typer.Option("--twins", help="Use twins of runs without ground truth: simulated again from their tracks."),
+    ] = False,
+    replicates: Replicates = 8,
+    tolerance: ToleranceOption = "none",
+    gap: GapOption = None,
+    seed: Seed = 1,
     plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
     json_: Json = False,
@@ -46,8 +60,6 @@ def fuse(
 
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
-    if mean:
-        print("gpvo: --mean changes nothing any more: a model states no mean of the error", file=sys.stderr)
     if plot is not None:
         from gpvo.evaluation.fusion_plot import plot_fusion, require_picture
 
@@ -56,19 +68,24 @@ def fuse(
     settings = FusionSettings(
         policies=wanted,
         model=model,
-        training=tuple(train or ()),
         use_imu=not no_imu,
         options=FuseOptions(
             init="static" if init == "static" else "truth",
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),
         ),
     )
-    report = fuse_runs(
-        runs,
-        settings,
-        tell=_teller(),
-        on_run=lambda fused: write_log(log / f"{fused.name}_{fused.policy}.csv", fused) if log else None,
-    )
+    judging = settings_of(replicates, tolerance, seed, gap) if twins else None
+    teaching = replace(judging, seed=0) if judging else None
+    with (
+        in_place_of_runs_without_truth(runs, judging) as flown,
+        in_place_of_runs_without_truth(train or [], teaching) as taught,
+    ):
+        report = fuse_runs(
+            flown,
+            replace(settings, training=tuple(taught)),
+            tell=_teller(),
+            on_run=lambda fused: write_log(log / f"{fused.name}_{fused.policy}.csv", fused) if log else None,
+        )
     for warning in report.warnings:
         print(f"gpvo: {warning}", file=sys.stderr)
     if plot is not None:
@@ -76,14 +93,16 @@ def fuse(
     if json_:
         print_json(document(report))
         return
+    for about in report.simulated_truth:
+        say_simulated(about)
     print(table(report.study))
     if LEARNED in report.study.scores:
         print()
         against = [report.study.compare(LEARNED, p) for p in report.study.scores if p != LEARNED]
         known = [compared for compared in against if compared.gain_percent == compared.gain_percent]
         for compared in known:
-            say(_line(compared))
-        if not all(_has_interval(compared) for compared in known):
+            say(str(compared))
+        if any(compared.difference_m.high == float("inf") for compared in known):
             say("Fewer than three runs give no interval.")
 
 
@@ -135,18 +154,6 @@ def publish(
     else:
         for line in str(result).splitlines():
             say(line)
-
-
-def _has_interval(compared: Comparison) -> bool:
-    return compared.difference_m.high < float("inf")
-
-
-def _line(compared: Comparison) -> str:
-    """A comparison in words; over fewer than three runs it has no interval."""
-    if _has_interval(compared):
-        return str(compared)
-    change = f"ATE {compared.difference_m.mean:+.4f} m, gain {compared.gain_percent:.1f} %"
-    return f"{compared.policy} less {compared.against}: {change}"
 
 
 def _teller() -> Callable[[str], None] | None:

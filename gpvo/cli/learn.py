@@ -92,10 +92,8 @@ def train(
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
     if statements is not None:
         _check_statements(runs, settings, update)
-    with in_place_of_runs_without_truth(
-        runs if twins else [], settings_of(replicates, tolerance, seed, gap), jobs
-    ) as found:
-        paths = found if twins else runs
+    drawn = settings_of(replicates, tolerance, seed, gap) if twins else None
+    with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         trained = _with_origin(_train(paths, settings, update), paths)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)

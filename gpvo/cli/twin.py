@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, new_table, print_json, progress, show
+from gpvo.cli.output import Json, new_table, print_json, progress, say, show
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -32,6 +32,10 @@ GapOption = Annotated[
         "--gap",
         help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
     ),
+]
+
+Seed = Annotated[
+    int, typer.Option(min=0, help="Random seed of the twins. Not that of 'gpvo train': a model is judged by others.")
 ]
 
 
@@ -117,11 +121,22 @@ def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int 
     return made
 
 
+def say_simulated(about: Mapping[str, Any]) -> None:
+    """The line above every table that twins are the truth of."""
+    name, twins, tolerance = about["of"], about["twins"], about["tolerance_name"]
+    say(f"{name} has no ground truth: means over {twins} twins, whose truth is simulated (tolerance {tolerance})")
+
+
 @contextmanager
-def in_place_of_runs_without_truth(paths: list[Path], settings: TwinSettings, jobs: int = 1) -> Iterator[list[Path]]:
-    """Runs with truth, and twins of the others, kept for as long as the context is open."""
+def in_place_of_runs_without_truth(
+    paths: list[Path], settings: TwinSettings | None, jobs: int = 1
+) -> Iterator[list[Path]]:
+    """Runs with truth, and twins of the others, kept for as long as the context is open; no twins without settings."""
     from gpvo.io.run import read_run
 
+    if settings is None:
+        yield paths
+        return
     without = [p for p in paths if read_run(p).truth is None]
     with TemporaryDirectory(prefix="gpvo-twins-") as folder:
         yield [p for p in paths if p not in without] + make_all(without, Path(folder), settings, jobs)

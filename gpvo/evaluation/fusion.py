@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
+from gpvo.evaluation.by_twins import on_smooth_path
 from gpvo.evaluation.evaluate import distinct
 from gpvo.filters.metrics import Scores, nis_interval
 from gpvo.filters.policies import (
@@ -28,6 +30,7 @@ from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, stu
 from gpvo.io.run import Run, read_run
 from gpvo.learning.check import check
 from gpvo.online.predictor import Predictor
+from gpvo.twin.replicate import simulated_truth
 from gpvo.types import IMPORTED, Array, TruthLog
 
 
@@ -39,7 +42,8 @@ def load_predictor(path: str | Path) -> Predictor:
 
 
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
-    """A run as the filters take it, with the model's predictions, else those stored in the run.
+    """A run as the filters take it, with the model's predictions, else those stored in the run; a twin on a
+    path that a vehicle can fly, with an IMU of this path.
 
     Raises GpvoError where there is an IMU but nobody says how it sits to the camera, or the run is empty.
     """
@@ -56,7 +60,7 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         if not valid.any():
             raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
     predictions = predictor.replay(run.log) if predictor else run.predictions_of_motions
-    return Flight(
+    flight = Flight(
         name=run.name,
         records=run.log.records,
         imu=imu,
@@ -66,6 +70,10 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         predictions=predictions,
         truth_sigma=truth_sigma,
     )
+    if about := run.meta.get("twin"):
+        require_sane(flight)
+        return on_smooth_path(flight, (about["seed"], about["replicate"], 31))
+    return flight
 
 
 def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
@@ -138,11 +146,12 @@ class Trace:
 
 @dataclass(frozen=True)
 class FusionReport:
-    """The study with its traces and the warnings about the inputs."""
+    """The study with its traces, the warnings about the inputs, and which runs are twins, of what."""
 
     study: Study
     traces: tuple[Trace, ...]
     warnings: tuple[str, ...]
+    simulated_truth: Sequence[Mapping[str, Any]] = ()
 
 
 def fuse_runs(
@@ -186,14 +195,7 @@ def fuse_runs(
         if on_run:
             on_run(fused)
 
-    result = study(
-        flights,
-        policies,
-        options,
-        constants=constants,
-        progress=tell,
-        on_run=keep,
-    )
+    result = study(flights, policies, options, constants=constants, progress=tell, on_run=keep)
     rows = {
         name: tuple(score or unscored.get((flight.name, name)) for flight, score in zip(flights, row, strict=True))
         for name, row in result.scores.items()
@@ -201,7 +203,8 @@ def fuse_runs(
     failed = [f"{name} is left out: {_why_not(name, constants)}" for name, row in rows.items() if not any(row)]
     if len(failed) == len(rows):
         raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
-    return FusionReport(replace(result, scores=rows), tuple(traces), tuple(warnings + failed))
+    origin = simulated_truth([run.meta for run in runs])
+    return FusionReport(replace(result, scores=rows), tuple(traces), tuple(warnings + failed), origin)
 
 
 def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:

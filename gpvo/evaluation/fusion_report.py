@@ -56,6 +56,7 @@ def document(report: FusionReport) -> dict[str, Any]:
         "comparisons": [_comparison(result, LEARNED, other) for other in others],
         "constants": None if result.constants is None else asdict(result.constants),
         "warnings": list(report.warnings),
+        "simulated_truth": list(report.simulated_truth),
     }
 
 

@@ -5,6 +5,7 @@ Those of one run fly side by side, as members of one filter: they cost little mo
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -123,10 +124,8 @@ class Comparison:
 
     def __str__(self) -> str:
         d = self.difference_m
-        return (
-            f"{self.policy} less {self.against}: ATE {d.mean:+.4f} m [{d.low:+.4f}, {d.high:+.4f}], "
-            f"gain {self.gain_percent:.1f} %"
-        )
+        interval = f" [{d.low:+.4f}, {d.high:+.4f}]" if d.high < np.inf else ""
+        return f"{self.policy} less {self.against}: ATE {d.mean:+.4f} m{interval}, gain {self.gain_percent:.1f} %"
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ def has_noise(flight: Flight, policy: Policy) -> bool:
 
 
 def table(study: Study) -> str:
-    """Mean of every policy that could run and, of several runs, its ATE on each; at most 80 columns for six runs."""
+    """Mean of every policy that could run and, of several runs, its ATE on each; at most 80 columns."""
     names = [name for name, scores in study.scores.items() if any(scores)]
     columns = (
         ("ATE m", "ate_rmse_m", 4, 7),
@@ -212,9 +211,13 @@ def table(study: Study) -> str:
     if len(study.runs) == 1:
         return "\n".join(lines)
     runs = ", ".join(f"{i + 1}: {run}" for i, run in enumerate(study.runs))
-    lines += ["", f"ATE m on {runs}", " " * 20 + "".join(f"{i + 1:>10}" for i in range(len(study.runs)))]
-    for name in names:
-        lines.append(f"{name:<20}" + "".join(_cell(v, 4, 10) for v in study.column(name, "ate_rmse_m")))
+    lines += ["", *textwrap.wrap(f"ATE m on {runs}", 80)]
+    for begin in range(0, len(study.runs), 6):
+        some = range(begin, min(begin + 6, len(study.runs)))
+        lines.append(" " * 20 + "".join(f"{i + 1:>10}" for i in some))
+        for name in names:
+            ate_m = study.column(name, "ate_rmse_m")
+            lines.append(f"{name:<20}" + "".join(_cell(ate_m[i], 4, 10) for i in some))
     return "\n".join(lines)
 
 

@@ -23,7 +23,7 @@ _KNOTS_PER_S = 25.0
 
 @dataclass(frozen=True)
 class Path3:
-    """``position`` is a quintic spline of time [s]; ``attitude(t)`` gives ``R_world_body`` (N, 3, 3), body FLU."""
+    """``position`` is a spline of time [s]; ``attitude(t)`` gives ``R_world_body`` (N, 3, 3), body FLU."""
 
     position: BSpline
     attitude: Callable[[Array], Array]

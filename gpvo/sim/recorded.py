@@ -82,9 +82,7 @@ def read_recording(file: Path, duration_s: float, rest_s: float = 3.0) -> Record
         )
     grid = np.arange(0.0, needed + 0.3, _STEP_S)
     poses = _resample(clock, T_world_body, np.minimum(grid, clock[-1]))
-    p = gaussian_filter1d(poses[:, :3, 3], 5.0, axis=0, mode="nearest")
-    turned = _continuous(se3.rotation_to_quaternion_xyzw(poses[:, :3, :3] @ poses[0, :3, :3].T))
-    turned = gaussian_filter1d(turned, 5.0, axis=0, mode="nearest")
+    p, turned = _smoothed(poses[:, :3, 3], poses[:, :3, :3] @ poses[0, :3, :3].T)
     return Recording(p - (p.max(0) + p.min(0)) / 2, turned)
 
 
@@ -101,6 +99,14 @@ def _read(path: Path) -> tuple[Array, Array]:
     return (recorded.t_ns - recorded.t_ns[0]) * 1e-9, recorded.T_world_body
 
 
+def smooth_path(t_s: Array, T_world_body: Array) -> Path3:
+    """A path near poses (N, 4, 4) at times ``t_s`` (N,) from 0 on that a vehicle can fly: smoothed likewise."""
+    grid = np.arange(0.0, t_s[-1] + 0.3, _STEP_S)
+    poses = _resample(t_s, T_world_body, np.minimum(grid, t_s[-1]))
+    place, turn = (make_interp_spline(grid, v, k=5) for v in _smoothed(poses[:, :3, 3], poses[:, :3, :3]))
+    return Path3(place, lambda u: se3.from_quaternion(np.zeros((len(u), 3)), turn(u))[:, :3, :3], float(t_s[-1]))
+
+
 def longest_flight_s(length_s: float, rest_s: float = 3.0) -> float:
     """Duration [s] of the longest flight that a trajectory of a length in time allows, in tenths."""
     return float(np.floor(10 * (length_s + rest_s + RAMP_S / 2)) / 10)
@@ -114,6 +120,13 @@ def _resample(clock: Array, T: Array, at: Array) -> Array:
     j = np.clip(np.searchsorted(clock, at), 1, len(clock) - 1)
     share = (at - clock[j - 1]) / np.maximum(clock[j] - clock[j - 1], 1e-9)
     return se3.interpolate(T[j - 1], T[j], np.clip(share, 0, 1))
+
+
+def _smoothed(position: Array, R: Array) -> tuple[Array, Array]:
+    """Positions (N, 3) and quaternions (N, 4), x y z w, of poses every 0.02 s, without jitter."""
+    both = position, _continuous(se3.rotation_to_quaternion_xyzw(R))
+    smooth = (gaussian_filter1d(v, 0.1 / _STEP_S, axis=0, mode="nearest") for v in both)
+    return next(smooth), next(smooth)
 
 
 def _continuous(q_xyzw: Array) -> Array:

@@ -56,9 +56,8 @@ def estimate(path: Path) -> Original:
     frame = np.searchsorted(t_ns, tracks.t_ns)
     if len(frame) == 0 or frame.max() >= len(t_ns) or not (t_ns[frame] == tracks.t_ns).all():
         raise SourceError("its tracks are not of its frames", where=path / "tracks.parquet", cure="run it again")
-    _, track = np.unique(tracks.track, return_inverse=True)
-    first = np.zeros(len(track), bool)
-    first[np.unique(track, return_index=True)[1]] = True
+    _, begins, track = np.unique(tracks.track, return_index=True, return_inverse=True)
+    first = np.isin(np.arange(len(track)), begins)
     _refuse_too_few(frame[tracks.is_inlier & ~first], len(t_ns), path)
     repeats = np.array(["frozen" in r.reason for r in run.log])
     camera = run.log.camera

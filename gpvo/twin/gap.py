@@ -69,11 +69,18 @@ def read_gap(text: str) -> Gap:
     return gap
 
 
-def widened(record: VoRecord, truth: TruthLog, factor: Sequence[float] | Array) -> VoRecord:
-    """A record whose error is ``factor`` (6,) times as large; the truth holds its two stamps."""
+def restated(
+    record: VoRecord, truth: TruthLog, factor: Sequence[float] | Array = (1.0,) * 6, onto: TruthLog | None = None
+) -> VoRecord:
+    """A record whose error is ``factor`` (6,) times as large, of a vehicle that flew ``onto`` in place of ``truth``;
+    these hold its two stamps."""
     if not record.usable:
         return record
-    i, j = np.searchsorted(truth.t_ns, [record.t_prev_ns, record.t_ns])
-    T_true = se3.inverse(truth.T_world_cam[i]) @ truth.T_world_cam[j]
+    T_true, T_onto = (_motion(record, t) for t in (truth, onto or truth))
     xi = se3.log(se3.inverse(T_true) @ record.T_prev_cur)
-    return replace(record, T_prev_cur=T_true @ se3.exp(np.asarray(factor) * xi))
+    return replace(record, T_prev_cur=T_onto @ se3.exp(np.asarray(factor) * xi))
+
+
+def _motion(record: VoRecord, truth: TruthLog) -> Array:
+    i, j = np.searchsorted(truth.t_ns, [record.t_prev_ns, record.t_ns])
+    return se3.inverse(truth.T_world_cam[i]) @ truth.T_world_cam[j]

@@ -34,12 +34,10 @@ _CHOOSING = 6
 
 
 @dataclass(frozen=True)
-class Structure:
-    """What was fitted: ``T_world_cam`` (F, 4, 4); ``points_world`` (N, 3) [m]; of each observation its ``residual_px``
-    (M, 3), measured minus projected, and ``weight`` (M,), 0 for outliers; ``sigma_px`` (F,) noise of each frame."""
+class Structure(Estimate):
+    """What was fitted, and of each observation its ``residual_px`` (M, 3), measured minus projected, and ``weight``
+    (M,), 0 for outliers; ``sigma_px`` (F,) noise of each frame."""
 
-    T_world_cam: Array
-    points_world: Array
     residual_px: Array
     weight: Array
     sigma_px: Array
@@ -87,14 +85,12 @@ def adjust(
         if iteration > (_CHOOSING if robust else 0) and cost - after <= tolerance * cost:
             converged = True
             break
-    residual = seen.uvd - seen.camera.project(now.in_camera(seen))
-    return Structure(now.T_world_cam, now.points_world, residual, weight, sigma, iteration, converged)
+    return Structure(now.T_world_cam, now.points_world, now.misfit_px(seen), weight, sigma, iteration, converged)
 
 
 def _robust_weights(seen: Observations, now: Estimate, sigma: Array) -> tuple[Array, Array]:
     """Weights (M,) and noise of each frame (F,) [px] from the residuals as they are."""
-    m2 = ((seen.uvd - seen.camera.project(now.in_camera(seen))) @ WHITEN.T) ** 2
-    m2 = m2.sum(axis=1)
+    m2 = ((now.misfit_px(seen) @ WHITEN.T) ** 2).sum(axis=1)
     usual = float(np.median(m2[seen.trusted])) if seen.trusted.any() else 1.0
     starts = np.searchsorted(seen.frame, np.arange(len(sigma) + 1))
     variance = np.full(len(sigma), usual)
@@ -109,8 +105,7 @@ def _robust_weights(seen: Observations, now: Estimate, sigma: Array) -> tuple[Ar
 
 
 def _cost(seen: Observations, now: Estimate, root_weight: Array) -> float:
-    z = (seen.uvd - seen.camera.project(now.in_camera(seen))) @ WHITEN.T
-    return float((root_weight**2 * (z**2).sum(axis=1)).sum())
+    return float((root_weight**2 * ((now.misfit_px(seen) @ WHITEN.T) ** 2).sum(axis=1)).sum())
 
 
 def without_loose_frames(structure: Structure, seen: Observations, t_ns: NDArray[np.int64]) -> Structure:

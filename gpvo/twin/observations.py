@@ -80,6 +80,10 @@ class Estimate:
         P[:, 2] = np.maximum(P[:, 2], _MIN_DEPTH_M)
         return P
 
+    def misfit_px(self, seen: Observations) -> Array:
+        """(M, 3) what was measured, less the landmark projected."""
+        return seen.uvd - seen.camera.project(self.in_camera(seen))
+
     def uvd(self, chart: Chart, seen: Observations) -> Array:
         """(N, 3) the landmarks in their own views."""
         T = se3.inverse(self.T_world_cam[seen.frame[chart.view]])

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.rig import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
 from gpvo.errors import GpvoError
-from gpvo.geometry import se3
 from gpvo.io.source import SourceReport
 from gpvo.io.toml import read_toml
 from gpvo.runner import run as run_odometry
 from gpvo.twin.estimate import Original, estimate
-from gpvo.twin.gap import Gap, widened
+from gpvo.twin.gap import Gap, restated
 from gpvo.twin.noise import draw_signs
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
 from gpvo.vo.rig_error import N_TERMS, RigError, principal_errors
@@ -105,13 +104,10 @@ def _projected(original: Original, settings: TwinSettings, replicate: int) -> tu
     Baseline and focal length are drawn from the tolerance; what displaces the right image from what odometry found of
     its rig, mean and covariance; where it looked for nothing (without self-calibration), as a turn from the tolerance.
     """
-    seen, s, known = original.seen, original.structure, original.rig
+    seen, known = original.seen, original.rig
     e, camera = rig_errors(settings)[replicate], seen.camera
     tolerance = replace(settings.tolerance, rotation_rad=0.0) if known.covariance.any() else settings.tolerance
-    T = se3.inverse(s.T_world_cam)[seen.frame]
-    P = np.einsum("mij,mj->mi", T[:, :3, :3], s.points_world[seen.track]) + T[:, :3, 3]
-    P[:, 2] = np.maximum(P[:, 2], 0.05)
-    left, right = TrueRig.of(camera, tolerance, e[:RIG_ERRORS]).pixels(P)
+    left, right = TrueRig.of(camera, tolerance, e[:RIG_ERRORS]).pixels(original.structure.in_camera(seen))
     drawn = replace(known, mean=known.mean + np.append(principal_errors(known, camera) @ e[2:], np.zeros(N_TERMS)))
     displaced_d, displaced_row = RigError(camera, drawn, learn=False).errors(
         np.stack([left[:, 0], left[:, 1], left[:, 0] - right[:, 0]], axis=1)
@@ -154,7 +150,7 @@ def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: 
 
     def amend(record: VoRecord) -> VoRecord:
         assert truth is not None
-        return widened(conditions.amend(record), truth, factor)
+        return restated(conditions.amend(record), truth, factor)
 
     run_odometry(source, out / source.name, original.config, amend=amend, meta={"twin": about})
     return out / source.name
