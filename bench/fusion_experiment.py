@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from gpvo.dataset.build import build_run
-from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, load_predictor, trace_of
+from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, trace_of
 from gpvo.evaluation.fusion_plot import save
 from gpvo.evaluation.fusion_report import document
 from gpvo.files import write_json, write_text
@@ -26,6 +26,7 @@ from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets
+from gpvo.online.predictor import Predictor
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -78,7 +79,7 @@ def experiment(
     options = FuseOptions(history_s=0.0)
     constants = constants_of(training)
     constants = replace(constants, best=fit_scalars([flight_of(r) for r in training], constants, options))
-    predictor = load_predictor(model)
+    predictor = Predictor.load(model).require_motions(model)
     flights = [flight_of(r, predictor) for r in test]
     if hindsight:
         constants = replace(constants, hindsight=fit_scalars(flights, constants, options))

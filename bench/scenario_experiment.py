@@ -17,11 +17,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from gpvo.dataset.build import TrainingSet, build_run
+from gpvo.dataset.build import TrainingSet, build_run, predictions_of
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
-from gpvo.evaluation.evaluate import judged, predictions_by_stamp
+from gpvo.evaluation.evaluate import judged
 from gpvo.evaluation.statements import statements
 from gpvo.files import write_json
 from gpvo.io.run import Run, read_run
@@ -96,7 +96,7 @@ def _score_flight(run: Run, predictor: Predictor) -> dict[str, list[float]]:
     """NEES per motion and by horizon, its median over the motions, NLL, and final error, by method."""
     if run.truth is None:
         raise GpvoError("has no ground truth to judge by", where=run.path)
-    predictions = predictions_by_stamp(run, predictor)
+    predictions = predictions_of(run, predictor)
     log = judged(run.log, predictions)
     T_true, known = interpolate_truth(run.truth, log.t_ns)
     errors = motion_errors(log, run.truth)

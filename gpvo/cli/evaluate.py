@@ -160,9 +160,7 @@ def _loaded(runs: list[Path], model: Path | None, truth: Path | None) -> tuple[l
     from gpvo.online.predictor import Predictor
     from gpvo.types import TruthLog
 
-    predictor = None if model is None else Predictor.load(model)
-    if predictor is not None:
-        predictor.require_motions(model)
+    predictor = None if model is None else Predictor.load(model).require_motions(model)
     loaded = [read_run(path) for path in runs]
     if truth is not None:
         trajectory = read_tum(truth)

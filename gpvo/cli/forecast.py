@@ -41,8 +41,7 @@ def forecast(
 
     if out is not None and out.suffix not in (".parquet", ".csv"):
         raise GpvoError("does not have the suffix of a table", where=out, cure="end it in .parquet or .csv")
-    predictor = Predictor.load(model)
-    predictor.require_motions(model)
+    predictor = Predictor.load(model).require_motions(model)
     found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
     if out is not None:
         _write(out, found)

@@ -9,7 +9,7 @@ from typing import Any
 from gpvo.cli.files import import_log
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import evaluate_run
-from gpvo.evaluation.trajectory import pose_document
+from gpvo.evaluation.trajectory import nees_document
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run import read_run
 from gpvo.types import IMPORTED
@@ -30,17 +30,9 @@ def nees_of_bag(
             evaluation = evaluate_run(read_run(Path(folder) / "run"))
     except GpvoError as error:
         return {"poses": None, "motions": None, "problem": str(error)}
-    stated = evaluation.consistency.get(IMPORTED)
-    motions = None
-    if stated is not None:
-        blocks = {
-            name: {"nees_dof": i.mean, "interval": [i.low, i.high], "median": stated.nees_dof_median[name]}
-            for name, i in stated.nees_dof.items()
-            if i is not None
-        }
-        motions = {"count": stated.count, **blocks}
+    motions = nees_document(evaluation.consistency.get(IMPORTED))
     problem = None if motions or evaluation.poses else "no covariance is stated that could be judged"
-    return {"poses": pose_document(evaluation.poses), "motions": motions, "problem": problem}
+    return {"poses": nees_document(evaluation.poses), "motions": motions, "problem": problem}
 
 
 def lines(found: dict[str, Any]) -> list[str]:

@@ -20,8 +20,9 @@ from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer
+from gpvo.online.predictor import Predictor
 from gpvo.online.slip import REASON, SlipDetector, flag_slips
-from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import Array, Prediction, Status, StereoCamera, TruthLog, VoLog, VoRecord
 
 MIN_ROWS = 30
 
@@ -209,3 +210,11 @@ def _v_t(records: Sequence[VoRecord]) -> dict[str, Array]:
     names = dict.fromkeys(m for r in records for m in r.v_t)
     missing = np.full((3, 3), np.nan)
     return {m: np.array([r.v_t.get(m, missing) for r in records]).reshape(-1, 3, 3) for m in names}
+
+
+def predictions_of(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
+    """By time stamp, what a model predicts of the motions of a run, or without one what is stored with the run.
+
+    Raises ModelError where the model predicts something else than the error of a motion.
+    """
+    return run.predictions_of_motions if predictor is None else predictor.require_motions().replay(run.log)

@@ -12,7 +12,7 @@ import numpy as np
 
 from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon
 from gpvo.evaluation.evaluate import Evaluation
-from gpvo.evaluation.trajectory import pose_document
+from gpvo.evaluation.trajectory import nees_document
 from gpvo.evaluation.verdict import verdict
 from gpvo.files import write_text
 from gpvo.io.tables import write_csv
@@ -109,7 +109,7 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "fixed_rotation": None if e.turned is None else asdict(e.turned),
         "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},
         "segments": [asdict(s) for s in t.segments],
-        "poses": pose_document(e.poses),
+        "poses": nees_document(e.poses),
         "verdict": asdict(verdict(e)),
         "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
     }

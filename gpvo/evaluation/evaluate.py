@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.build import align_rotation
+from gpvo.dataset.build import align_rotation, predictions_of
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
 from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
@@ -88,7 +88,7 @@ def evaluate_run(
     """
     options = options or EvaluateOptions()
     truth, offset_s = _truth(run, options)
-    predictions = predictions_by_stamp(run, predictor)
+    predictions = predictions_of(run, predictor)
     run = replace(run, log=judged(run.log, predictions))
     log = run.log
     T_true, known = interpolate_truth(truth, log.t_ns)
@@ -129,14 +129,6 @@ def evaluate_run(
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None,
     )
-
-
-def predictions_by_stamp(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:
-    """Predictions of a model over the run's log, or those stored with the run."""
-    if predictor is None:
-        return run.predictions_of_motions
-    predictor.require_motions()
-    return predictor.replay(run.log)
 
 
 def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gpvo.dataset.build import predictions_of
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
@@ -34,13 +35,6 @@ from gpvo.twin.replicate import simulated_truth
 from gpvo.types import IMPORTED, Array, TruthLog
 
 
-def load_predictor(path: str | Path) -> Predictor:
-    """A model that predicts the error of single motions."""
-    predictor = Predictor.load(path)
-    predictor.require_motions(path)
-    return predictor
-
-
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
     """A run as the filters take it, with the model's predictions, else those stored in the run; a twin on a
     path that a vehicle can fly, with an IMU of this path.
@@ -59,7 +53,6 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         poses, valid = interpolate_truth(run.truth, run.log.t_ns)
         if not valid.any():
             raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
-    predictions = predictor.replay(run.log) if predictor else run.predictions_of_motions
     flight = Flight(
         name=run.name,
         records=run.log.records,
@@ -67,7 +60,7 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         T_imu_cam=run.mounting.T_imu_cam if imu is not None else None,
         T_world_cam=poses,
         truth_valid=valid,
-        predictions=predictions,
+        predictions=predictions_of(run, predictor),
         truth_sigma=truth_sigma,
     )
     if about := run.meta.get("twin"):
@@ -170,7 +163,7 @@ def fuse_runs(
     unknown = [p for p in settings.policies if p not in known]
     if unknown:
         raise GpvoError(f"unknown policy '{unknown[0]}'", cure=f"choose from {', '.join(known)}")
-    predictor = None if settings.model is None else load_predictor(settings.model)
+    predictor = None if settings.model is None else Predictor.load(settings.model).require_motions(settings.model)
     runs = [read_run(path) for path in paths]
     if not settings.policies:
         imported = any(IMPORTED in run.log.methods for run in runs)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from gpvo import __version__
+from gpvo.dataset.build import predictions_of
 from gpvo.dataset.errors import MotionErrors
 from gpvo.evaluation import curves, panels
 from gpvo.evaluation.document import document
-from gpvo.evaluation.evaluate import Evaluation, judged, predictions_by_stamp
+from gpvo.evaluation.evaluate import Evaluation, judged
 from gpvo.evaluation.matches import MatchPicture
 from gpvo.evaluation.panels import spread
 from gpvo.evaluation.statements import statements
@@ -144,7 +145,7 @@ def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
 
     Raises ModelError if the model predicts something else than the error of a motion.
     """
-    predictions = predictions_by_stamp(run, predictor)
+    predictions = predictions_of(run, predictor)
     run = replace(run, log=judged(run.log, predictions))
     T_est, noiseless = run.log.trajectory(), np.zeros(6)
     none = np.zeros((0, 4, 4))

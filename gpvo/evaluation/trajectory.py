@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.evaluation.consistency import Consistency
 from gpvo.filters.metrics import ate_rmse, umeyama
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import Interval, block_bootstrap
@@ -215,12 +216,13 @@ def pose_consistency(log: VoLog, T_est: Array, T_true: Array, known: NDArray[np.
     )
 
 
-def pose_document(found: PoseConsistency | None) -> dict[str, object] | None:
-    """The same for scripts: by block the mean, its 95 % ``interval`` and the ``median``."""
+def nees_document(found: PoseConsistency | Consistency | None) -> dict[str, object] | None:
+    """NEES of poses or of motions for scripts: by block the mean, its 95 % ``interval`` and the ``median``."""
     if found is None:
         return None
     blocks = {
         name: {"nees_dof": i.mean, "interval": [i.low, i.high], "median": found.nees_dof_median[name]}
         for name, i in found.nees_dof.items()
+        if i is not None
     }
     return {"count": found.count, **blocks}

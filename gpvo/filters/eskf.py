@@ -12,7 +12,7 @@ flight, many where one run is filtered under many noise settings.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from gpvo.accumulation import first_jitter, from_end, independent_part, persiste
 from gpvo.filters import kernels
 from gpvo.filters import measurement as me
 from gpvo.filters.gate import Gate
-from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu
+from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu, Innovation
 from gpvo.filters.propagation import (
     BA,
     BG,
@@ -44,24 +44,6 @@ _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _EYE = np.eye(JOINT)
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
-
-
-@dataclass(frozen=True)
-class Innovation:
-    """One update: ``residual`` (B, 6), its covariance ``S`` (B, 6, 6), ``nis`` (B,), whether it passed and was used
-    (B,), and whether it failed and the filter more than the measurement has to answer for it (B,)."""
-
-    residual: Array
-    S: Array
-    nis: Array
-    passed: NDArray[np.bool_]
-    used: NDArray[np.bool_]
-    own_fault: NDArray[np.bool_]
-
-    def of_member(self, b: int) -> Innovation:
-        """The same of one member."""
-        one = slice(b, b + 1)
-        return Innovation(**{name: getattr(self, name)[one] for name in self.__dataclass_fields__})
 
 
 class ErrorStateFilter:

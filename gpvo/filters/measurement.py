@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.accumulation import carry, from_start
 from gpvo.filters import kernels
@@ -84,3 +85,21 @@ def residual(R_rel: Array, t_rel: Array, T_est: Array, mean: Array) -> Array:
     R = Rt @ (R_est @ R_m)
     t = Rt @ (R_est @ t_m[:, :, None] + t_est - t_rel[:, :, None])
     return kernels.motion_log(R, t[:, :, 0])
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """One update: ``residual`` (B, 6), its covariance ``S`` (B, 6, 6), ``nis`` (B,), whether it passed and was used
+    (B,), and whether it failed and the filter more than the measurement has to answer for it (B,)."""
+
+    residual: Array
+    S: Array
+    nis: Array
+    passed: NDArray[np.bool_]
+    used: NDArray[np.bool_]
+    own_fault: NDArray[np.bool_]
+
+    def of_member(self, b: int) -> Innovation:
+        """The same of one member."""
+        one = slice(b, b + 1)
+        return Innovation(**{name: getattr(self, name)[one] for name in self.__dataclass_fields__})

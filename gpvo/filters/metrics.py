@@ -57,11 +57,6 @@ def ate_rmse(estimate: Array, truth: Array) -> float:
     return float(np.sqrt(((estimate @ R.T + t - truth) ** 2).sum(1).mean()))
 
 
-def path_length(positions: Array) -> float:
-    """Length [m] of a polyline (N, 3)."""
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-
-
 def position_nees(estimate: Array, truth: Array, covariance: Array) -> Array:
     """NEES per degree of freedom (N,) of positions (N, 3) with covariances (N, 3, 3)."""
     return nees(truth - estimate, covariance) / 3.0

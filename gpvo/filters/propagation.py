@@ -15,12 +15,14 @@ Euler rule and here for the trapezoid.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpvo.filters import kernels
-from gpvo.types import Array, ImuNoise
+from gpvo.geometry import se3
+from gpvo.types import Array, ImuNoise, VoRecord
 
 P, V, TH, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 CORE = 15
@@ -155,3 +157,20 @@ def process_noise(densities: Densities, dt: float) -> Array:
             Q[slow, slow] += np.eye(3) * (q * dt**3 / 3.0)
             Q[slow, fast] = Q[fast, slow] = np.eye(3) * (q * dt * dt / 2.0)
     return Q
+
+
+def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNoise:
+    """How much the vehicle's velocity and turn rate walk, from the log itself: robust spread of their changes.
+
+    VO's own noise is in these changes too, which errs on the wide side.
+    """
+    usable = [r for r in records if r.usable and r.dt_s > 0]
+    if len(usable) < 3:
+        return ConstantVelocityNoise()
+    dt = np.array([r.dt_s for r in usable])
+    twist = se3.log(np.array([r.T_prev_cur for r in usable])) / dt[:, None]
+    change = np.abs(np.diff(twist, axis=0)) / np.sqrt(dt[1:, None])
+    # 1.4826 times the median absolute value is the standard deviation of a Gaussian; the mean of heavy tails.
+    linear, angular = change[:, :3].max(axis=1), change[:, 3:].max(axis=1)
+    sigma = [max(1.4826 * float(np.median(c)), float(np.quantile(c, 0.9)) / 2, 1e-3) for c in (linear, angular)]
+    return ConstantVelocityNoise(acceleration=sigma[0], angular_acceleration=sigma[1])

@@ -15,7 +15,7 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate
 from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, ConstantVelocityNoise, Nominal
+from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, ConstantVelocityNoise, Nominal, constant_velocity_noise
 from gpvo.filters.start import Start, StartSigmas, StaticTest, from_rest, from_truth, heading
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
@@ -265,7 +265,7 @@ def _score(
     truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
     est, imu, C = T_cam[valid], T_imu[valid], covariance[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
-    path = metrics.path_length(truth_cam[:, :3, 3])
+    path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
     counted = (t_ns[valid] - t_ns[0]) > score_gap_s * 1e9
     finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
@@ -284,20 +284,3 @@ def _score(
         diverged=metrics.diverged(error, path),
         frames=int(valid.sum()),
     )
-
-
-def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNoise:
-    """How much the vehicle's velocity and turn rate walk, from the log itself: robust spread of their changes.
-
-    VO's own noise is in these changes too, which errs on the wide side.
-    """
-    usable = [r for r in records if r.usable and r.dt_s > 0]
-    if len(usable) < 3:
-        return ConstantVelocityNoise()
-    dt = np.array([r.dt_s for r in usable])
-    twist = se3.log(np.array([r.T_prev_cur for r in usable])) / dt[:, None]
-    change = np.abs(np.diff(twist, axis=0)) / np.sqrt(dt[1:, None])
-    # 1.4826 times the median absolute value is the standard deviation of a Gaussian; the mean of heavy tails.
-    linear, angular = change[:, :3].max(axis=1), change[:, 3:].max(axis=1)
-    sigma = [max(1.4826 * float(np.median(c)), float(np.quantile(c, 0.9)) / 2, 1e-3) for c in (linear, angular)]
-    return ConstantVelocityNoise(acceleration=sigma[0], angular_acceleration=sigma[1])

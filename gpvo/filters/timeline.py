@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.doubt import Doubt
-from gpvo.filters.eskf import ErrorStateFilter, Innovation
+from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate, Wait
+from gpvo.filters.measurement import Innovation
 from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V

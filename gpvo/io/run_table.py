@@ -245,12 +245,8 @@ def velocity_from(columns: Mapping[str, NDArray[Any]]) -> Array | None:
 
 def imu_columns(imu: ImuLog) -> dict[str, NDArray[Any]]:
     """IMU samples as columns."""
-    out: dict[str, NDArray[Any]] = {"t_ns": imu.t_ns}
-    for i, axis in enumerate(_AXES):
-        out[f"gyro_{axis}_radps"] = imu.gyro_radps[:, i]
-    for i, axis in enumerate(_AXES):
-        out[f"acc_{axis}_mps2"] = imu.acc_mps2[:, i]
-    return out
+    gyro = {f"gyro_{axis}_radps": imu.gyro_radps[:, i] for i, axis in enumerate(_AXES)}
+    return {"t_ns": imu.t_ns, **gyro, **{f"acc_{axis}_mps2": imu.acc_mps2[:, i] for i, axis in enumerate(_AXES)}}
 
 
 def imu_from(columns: Mapping[str, NDArray[Any]]) -> ImuLog:

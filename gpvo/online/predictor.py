@@ -110,14 +110,15 @@ class Predictor:
         self._stated: dict[int, tuple[Array, Array] | None] = {}
         self._rate_var = np.zeros(6)
 
-    def require_motions(self, where: str | PathLike[str] | None = None) -> None:
-        """Raise ModelError, one line, where the model (file ``where``) predicts the error over windows of motions."""
+    def require_motions(self, where: str | PathLike[str] | None = None) -> Predictor:
+        """Itself; ModelError, one line, where the model (file ``where``) predicts the error over windows of motions."""
         if self.target != "frame":
             raise ModelError(
                 f"this model predicts the error over {self.target}, not that of each motion",
                 where=where,
                 cure="train with --target frame; gpvo train itself scores the others",
             )
+        return self
 
     def replay(self, log: VoLog) -> dict[int, Prediction]:
         """Predictions for a recorded run, by time stamp and in order; begins anew with its camera."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError
 from gpvo.files import write_text
 from gpvo.io.run import Run, read_run
@@ -82,7 +83,8 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     settings = replace(settings, to=_target(settings))
     _require(settings)
     run = read_run(path)
-    predictions = predictions_of(run, settings.model)
+    model = settings.model
+    predictions = predictions_of(run, None if model is None else Predictor.load(model).require_motions(model))
     odometry = odometry_of(run, predictions, settings)
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
     verdicts = consumers.check(odometry, consumer) if settings.check else []
@@ -91,15 +93,6 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     source = "the model" if settings.model or predictions else settings.method
     lost = sum(not o.tracked for o in odometry)
     return Published(run.name, settings.to, out, count, lost, source, consumer if settings.check else None, verdicts)
-
-
-def predictions_of(run: Run, model: Path | None) -> dict[int, Prediction]:
-    """What a model file predicts of every motion, else what is stored with the run."""
-    if model is None:
-        return run.predictions_of_motions
-    predictor = Predictor.load(model)
-    predictor.require_motions(model)
-    return predictor.replay(run.log)
 
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:

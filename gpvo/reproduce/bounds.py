@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
-from gpvo.dataset.build import TrainingSet, build_run, observe
+from gpvo.dataset.build import TrainingSet, build_run, observe, predictions_of
 from gpvo.dataset.errors import interpolate_truth
-from gpvo.evaluation.evaluate import predictions_by_stamp
 from gpvo.evaluation.statements import corrected, statements
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
@@ -230,7 +229,7 @@ def _motion(run: Run, gp: methods.Statement) -> Bounds:
 
 
 def _learned(run: Run, predictor: Predictor) -> Bounds:
-    predictions = predictions_by_stamp(run, predictor)
+    predictions = predictions_of(run, predictor)
     bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
     learned = next(s for s in statements(bare, predictions) if s.method == "learned")
     assert learned.errors is not None

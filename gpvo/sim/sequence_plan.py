@@ -8,7 +8,7 @@ import numpy as np
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.sim import rover, vehicles
+from gpvo.sim import vehicles
 from gpvo.sim.episodes import Episode, draw_episodes
 from gpvo.sim.imu import Motion
 from gpvo.sim.paths import Path3
@@ -52,7 +52,7 @@ def move(scenario: Scenario, path: Path3, world: World) -> Motion:
     if scenario.vehicle == "rover":
         if world.ground is None:
             raise GpvoError(f"the world '{scenario.world}' has no ground to drive on", cure="vehicle = quadrotor")
-        return rover.drive(path, world.ground)
+        return vehicles.drive(path, world.ground)
     return path.motion(vehicles.RATE_HZ)
 
 

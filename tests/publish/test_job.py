@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError, ModelError
-from gpvo.evaluation.fusion import load_predictor
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
-from gpvo.publish.job import PublishSettings, odometry_of, predictions_of, publish_run
+from gpvo.publish.job import PublishSettings, odometry_of, publish_run
 from gpvo.types import Prediction, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
@@ -98,7 +98,7 @@ def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) 
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
         publish_run(predicted, replace(GEOMETRY, model=model))
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
-        load_predictor(model)
+        Predictor.load(model).require_motions(model)
 
 
 def test_a_run_of_poses_alone_needs_a_model(predicted: Path, tmp_path: Path) -> None:

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.sim import paths
+from gpvo.sim import paths, vehicles
 from gpvo.sim.imu import exact_imu
 from gpvo.sim.vehicles import LUNAR_GRAVITY_MPS2
 from gpvo.sim.worlds import HeightGrid
 
-rover = pytest.importorskip("gpvo.sim.rover")
 pytest.importorskip("mujoco")
 CELL = 0.2
 
@@ -26,7 +25,7 @@ def line(duration_s: float = 14.0, speed: float = 1.0) -> paths.Path3:
 
 @pytest.fixture(scope="module")
 def driven():
-    return rover.drive(line(), ground())
+    return vehicles.drive(line(), ground())
 
 
 def test_it_rests_then_drives(driven):
@@ -62,10 +61,10 @@ def test_imu_agrees_with_motion(driven):
 
 
 def test_same_drive_twice():
-    first, second = (rover.drive(line(4.0), ground()) for _ in range(2))
+    first, second = (vehicles.drive(line(4.0), ground()) for _ in range(2))
     assert np.array_equal(first.position_m, second.position_m)
 
 
 def test_what_it_cannot_drive_is_refused():
     with pytest.raises(GpvoError, match="the rover (tips over|loses its path)"):
-        rover.drive(line(8.0, 4.0), ground(relief_m=1.5))
+        vehicles.drive(line(8.0, 4.0), ground(relief_m=1.5))
