@@ -1,4 +1,4 @@
-"""``gpvo predict, check, export``: what a trained model does."""
+"""``gpvo predict, check, forecast, export``: what a trained model does."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, print_json
+from gpvo.cli.output import Json, new_table, print_json, say, show
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
+    from gpvo.evaluation.forecast import Forecast
     from gpvo.types import Prediction
+
+_LINES = 11  # of the table of a forecast
 
 Model = Annotated[Path, typer.Argument(help="Model file.")]
 
@@ -112,3 +115,125 @@ def export(
     target = out or model.with_name(model.stem + SUFFIXES[chosen])
     export_model(model, target, chosen, prefix=prefix)
     print(f"{target}: {target.stat().st_size} bytes")
+
+
+def forecast(
+    model: Model,
+    path: Annotated[Path, typer.Option("--path", help="Planned poses, TUM lines at any spacing.")],
+    frame: Annotated[
+        str, typer.Option(help="Frame of the poses: cam (left camera, z forward) or body (FLU, camera forward).")
+    ] = "cam",
+    draws: Annotated[
+        int,
+        typer.Option(min=1, max=1000, help="Simulated flights along the plan, each in different conditions."),
+    ] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
+    plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over the distance.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Every pose, as .parquet or .csv.")] = None,
+    json_: Json = False,
+) -> None:
+    """Predict the covariance along a planned path.
+
+    Example: gpvo forecast errors.gpvo --path plan.tum --plot plan.png
+    """
+    from gpvo.evaluation.forecast import forecast as run_forecast
+    from gpvo.evaluation.forecast import read_plan
+    from gpvo.online.predictor import Predictor
+
+    if out is not None and out.suffix not in (".parquet", ".csv"):
+        raise GpvoError("does not have the suffix of a table", where=out, cure="end it in .parquet or .csv")
+    predictor = Predictor.load(model).require_motions(model)
+    found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
+    if out is not None:
+        _write_forecast(out, found)
+    if plot is not None:
+        _draw_forecast(plot, found, path.name)
+    if json_:
+        print_json(_forecast_document(found, model, path, frame))
+    else:
+        _print_forecast(found, path)
+
+
+def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
+    """The result as scripts read it: SI units, positions in the axes of the plan's world, 1 sigma."""
+    rows = [_row(f, k) for k in _stops(len(f.plan.t_s))]
+    return {
+        "schema": 1,
+        "model": str(model),
+        "path": str(path),
+        "frame": frame,
+        "rate_hz": 1.0 / f.plan.step_s,
+        "duration_s": float(f.plan.t_s[-1]),
+        "length_m": float(f.plan.distance_m[-1]),
+        "draws": f.draws,
+        "outside_domain": f.outside_share,
+        "outside": [o.__dict__ for o in f.outside],
+        "predicted_final_error_m": float(f.sigma_m[-1]),
+        "predicted_final_error_independent_m": f.independent_m,
+        "final_sigma_m": dict(zip("xyz", f.position_sigma_m[-1].tolist(), strict=True)),
+        "final_mean_error_m": dict(zip("xyz", f.mean_error_m[-1].tolist(), strict=True)),
+        "along": rows,
+    }
+
+
+def _stops(n: int) -> list[int]:
+    """Poses for a short table, evenly in time, the last among them."""
+    from numpy import linspace
+
+    return sorted({int(k) for k in linspace(0, n - 1, min(n, _LINES)).round()})
+
+
+def _row(f: Forecast, k: int) -> dict[str, float]:
+    sigma = dict(zip(("sigma_x_m", "sigma_y_m", "sigma_z_m"), f.position_sigma_m[k].tolist(), strict=True))
+    return {
+        "t_s": float(f.plan.t_s[k]),
+        "distance_m": float(f.plan.distance_m[k]),
+        **sigma,
+        "sigma_m": float(f.sigma_m[k]),
+    }
+
+
+def _print_forecast(f: Forecast, path: Path) -> None:
+    p = f.plan
+    say(f"{path}: {p.t_s[-1]:.1f} s, {p.distance_m[-1]:.1f} m, {len(p.t_s) - 1} motions at {1 / p.step_s:.3g} Hz")
+    say(f"{100 * f.outside_share:.0f} % of the plan lies outside the training domain")
+    for o in f.outside:
+        a, b = o.planned, o.trained
+        say(
+            f"  {o.feature}: planned {a[0]:.3g} to {a[1]:.3g}, trained {b[0]:.3g} to {b[1]:.3g}"
+            f" ({100 * o.share:.0f} % beyond)"
+        )
+    table = new_table("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
+    for k in _stops(len(p.t_s)):
+        row = _row(f, k)
+        table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
+    show(table)
+    say("1 sigma of the position since the first pose, in the axes of the plan's world")
+    if f.mean[-1].any():
+        x, y, z = f.mean_error_m[-1]
+        say(f"expected error at the end: {x:.3g}, {y:.3g}, {z:.3g} m")
+
+
+def _write_forecast(out: Path, f: Forecast) -> None:
+    """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
+    from gpvo.io.parquet import write_table
+    from gpvo.io.tables import write_csv
+
+    position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
+    columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}
+    columns |= {f"{a}_m": position[:, i] for i, a in enumerate("xyz")}
+    columns |= {f"sigma_{a}_m": sigma[:, i] for i, a in enumerate("xyz")}
+    columns |= {"sigma_m": f.sigma_m, "in_domain": [1.0, *f.in_domain]}
+    columns |= {f"cov_{i}_{j}": f.covariance[:, i, j] for i in range(6) for j in range(i, 6)}
+    if out.suffix == ".parquet":
+        write_table(out, columns)
+    else:
+        write_csv(out, columns)
+
+
+def _draw_forecast(plot: Path, f: Forecast, title: str) -> None:
+    from gpvo.evaluation import plots
+    from gpvo.files import replacing
+
+    with replacing(plot) as temporary:
+        plots.forecast(f, title).savefig(temporary, dpi=110, format="png")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -26,7 +27,7 @@ from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.scores import score
 from gpvo.learning.store import card_path, config_of, folds_path, picture_path, rows_path, save_model, update
-from gpvo.learning.train import _slips, train_sets
+from gpvo.learning.train import TrainedModel, _slips, train_sets
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.predictor import Predictor
@@ -38,6 +39,12 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import CliRunner
 
 QUICK = TrainConfig(features="velocity,rotation,n_inliers")
+
+
+@cache
+def _of_three() -> TrainedModel:
+    """Trained and judged once on three short flights."""
+    return train_sets(training_sets(range(3), n=120), QUICK)
 
 
 def _said(predictor, s):
@@ -195,10 +202,9 @@ def test_rows_of_another_target_are_refused():
 
 
 def test_table_has_every_row_and_every_key(tmp_path):
-    sets = training_sets(range(3), n=120)
-    trained = train_sets(sets, QUICK)
+    trained = _of_three()
     folds = trained.table["folds"]
-    assert [f["held_out"] for f in folds] == [s.name for s in sets]
+    assert [f["held_out"] for f in folds] == [s.name for s in trained.sets]
     for fold in folds:
         assert tuple(fold["methods"]) == METHODS
         for method in METHODS:
@@ -217,7 +223,7 @@ def test_table_has_every_row_and_every_key(tmp_path):
     # The picture: in each of two panels a curve per sequence, near the diagonal on errors as stated.
     assert "(m.gpvo.svg)" in card
     root = ElementTree.fromstring(picture_path(tmp_path / "m.gpvo").read_text())
-    assert len([e for e in root.iter() if e.tag.endswith("polyline")]) == 2 * len(sets)
+    assert len([e for e in root.iter() if e.tag.endswith("polyline")]) == 2 * len(trained.sets)
     for fold in folds:
         for pairs in fold["stated_and_actual"].values():
             stated, actual = np.array(pairs).T
@@ -248,7 +254,7 @@ def test_the_row_base_is_the_model_with_its_gp_at_the_mean_function(tmp_path):
 
 def test_update_adds_flights(tmp_path):
     path = tmp_path / "m.gpvo"
-    save_model(train_sets(training_sets(range(3), n=120), QUICK, judge=False), path)
+    save_model(_of_three(), path)
     run = _as_run(*make_run(9, n=120), "flight9")
     more = update(path, [run], QUICK, judge=False)
     assert [s.name for s in more.sets] == ["flight0", "flight1", "flight2", "flight9"]
@@ -293,7 +299,7 @@ def test_an_update_keeps_the_settings_of_the_model(tmp_path):
 
 def test_a_model_of_positions_is_not_updated(tmp_path):
     path = tmp_path / "m.gpvo"
-    save_model(train_sets(training_sets(range(3), n=120), QUICK, judge=False), path)
+    save_model(_of_three(), path)
     with pytest.raises(GpvoError, match="train again"):
         _train([tmp_path], asdict(replace(QUICK, target="position")), path)
 
@@ -444,8 +450,7 @@ def test_the_table_says_what_slips_would_cost(capsys):
 @pytest.mark.slow
 def test_folds_on_a_dask_cluster_of_two_processes():
     distributed = pytest.importorskip("distributed")
-    sets = training_sets(range(3), n=120)
-    here = train_sets(sets, QUICK).table["folds"]
+    sets, here = _of_three().sets, _of_three().table["folds"]
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         config = replace(QUICK, backend="dask", scheduler=cluster.scheduler_address)
         there = train_sets(sets, config).table["folds"]
