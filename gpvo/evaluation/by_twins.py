@@ -22,6 +22,7 @@ from gpvo.filters.start import StartSigmas
 from gpvo.geometry import se3
 from gpvo.io.run import Run
 from gpvo.learning.config import TrainConfig
+from gpvo.learning.scores import average
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
 from gpvo.sim.imu import ImuModel, measured_imu
@@ -63,7 +64,7 @@ def by_twins(
     for k, twin in enumerate(twins):
         others = [t for j, t in enumerate(twins) if j != k]
         found.append(evaluate_run(twin, predictor, options, [_statement(twin.log, others)]))
-    mean = _mean([document([e])["runs"][0] for e in found])
+    mean = average([document([e])["runs"][0] for e in found])
     return {**mean, "run": run.name, "simulated_truth": {"twins": len(twins), **twins[0].meta["twin"]}}, found
 
 
@@ -96,20 +97,6 @@ def on_smooth_path(twin: Flight, seed: Sequence[int]) -> Flight:
 
 def _statement(log: VoLog, twins: Sequence[Run]) -> Statement:
     return plain_statement(log, METHOD, twin_covariance(log, twins))
-
-
-def _mean(values: Sequence[Any]) -> Any:
-    """Documents of one form averaged number by number; None where none has a number, text from the first."""
-    values = [v for v in values if v is not None] or [None]
-    first = values[0]
-    if isinstance(first, dict):
-        return {key: _mean([v[key] for v in values if key in v]) for key in first}
-    if isinstance(first, (list, tuple)):
-        return [_mean(entries) for entries in zip(*values)]
-    numbers = [v for v in values if isinstance(v, (int, float)) and np.isfinite(v)]
-    if len(set(numbers)) == 1:
-        return numbers[0]
-    return float(np.mean(numbers)) if numbers else first
 
 
 def twin_covariance(log: VoLog, twins: Sequence[Run]) -> Array:

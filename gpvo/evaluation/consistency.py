@@ -15,18 +15,19 @@ from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
 from gpvo.stats.bootstrap import Interval, block_bootstrap
 from gpvo.stats.consistency import (
+    BLOCKS,
     by_difficulty,
     correlation_gain,
     coverage,
     crps_gaussian,
     energy_score,
     nees,
+    nees_by_block,
     nees_median,
     nll_per_dim,
 )
 from gpvo.types import Array, MotionError, VoLog
 
-BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
 HORIZONS_M = (1.0, 10.0, 100.0)
 _MAX_WINDOWS = 60
 # Times that are sums of a frame period must not miss the round number.
@@ -111,8 +112,7 @@ def consistency(
     index, d = errors.index[stated], statement.dof
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
     noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
-    per_block = {n: nees(e[:, b], C[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items() if b.stop <= d}
-    with_noise = {n: nees(e[:, b], (C + noise)[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items() if b.stop <= d}
+    per_block, with_noise = nees_by_block(e, C), nees_by_block(e, C + noise)
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     crps = crps_gaussian(e, sigma)
     covered = [float(c) for c in coverage(e, sigma)]

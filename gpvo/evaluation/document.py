@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.evaluation.consistency import BLOCKS, HORIZONS_M, Consistency, Horizon
+from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.trajectory import nees_document
 from gpvo.evaluation.verdict import verdict
@@ -20,6 +20,7 @@ from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import METHODS
 from gpvo.online.features import AXES
 from gpvo.stats.bootstrap import sequence_bootstrap
+from gpvo.stats.consistency import BLOCKS
 from gpvo.types import Array, Status
 
 _UNITS = ("translation_m", "rotation_rad")

@@ -15,7 +15,6 @@ from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
 from gpvo.evaluation.by_twins import on_smooth_path
 from gpvo.evaluation.evaluate import distinct
-from gpvo.filters.metrics import Scores, nis_interval
 from gpvo.filters.policies import (
     CONSTANT_BEST,
     CONSTANT_HINDSIGHT,
@@ -179,25 +178,18 @@ def fuse_runs(
     learned = any(f.predictions for f in flights)
     policies = make_policies(constants, names=settings.policies, learned=learned)
     traces: list[Trace] = []
-    unscored: dict[tuple[str, str], Scores] = {}
 
     def keep(flight: Flight, fused: FusedRun) -> None:
         traces.append(trace_of(flight, fused))
-        if fused.scores is None:
-            unscored[flight.name, fused.policy] = _without_truth(fused)
         if on_run:
             on_run(fused)
 
     result = study(flights, policies, options, constants=constants, progress=tell, on_run=keep)
-    rows = {
-        name: tuple(score or unscored.get((flight.name, name)) for flight, score in zip(flights, row, strict=True))
-        for name, row in result.scores.items()
-    }
-    failed = [f"{name} is left out: {_why_not(name, constants)}" for name, row in rows.items() if not any(row)]
-    if len(failed) == len(rows):
+    failed = [f"{name} is left out: {_why_not(name, constants)}" for name, row in result.scores.items() if not any(row)]
+    if len(failed) == len(result.scores):
         raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
     origin = simulated_truth([run.meta for run in runs])
-    return FusionReport(replace(result, scores=rows), tuple(traces), tuple(warnings + failed), origin)
+    return FusionReport(result, tuple(traces), tuple(warnings + failed), origin)
 
 
 def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:
@@ -209,23 +201,6 @@ def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:
         raise GpvoError(error.what, where=run.path, cure=error.cure) from None
     unjudged = [] if run.truth is not None else ["no ground truth: nothing to score"]
     return [f"{flight.name}: {line}" for line in (*findings, *unjudged)]
-
-
-def _without_truth(fused: FusedRun) -> Scores:
-    """What a run without truth can still say: NIS and rejections."""
-    measured, unknown = fused.nis[np.isfinite(fused.nis)] / 6.0, float("nan")
-    return Scores(
-        ate_rmse_m=unknown,
-        final_error_m=unknown,
-        drift_percent=unknown,
-        nees_position=unknown,
-        nees_attitude=unknown,
-        nis_dof=float(measured.mean()) if len(measured) else unknown,
-        nis_interval=nis_interval(measured),
-        rejected=fused.counts["rejected"],
-        diverged=None,
-        frames=0,
-    )
 
 
 def _why_not(policy: str, constants: Constants | None) -> str:

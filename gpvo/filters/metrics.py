@@ -75,6 +75,18 @@ def diverged(errors_m: Array, path_m: float) -> bool:
     return bool(errors_m.max(initial=0.0) > max(DIVERGED_M, DIVERGED_PATH_SHARE * path_m))
 
 
-def nis_interval(nis_dof: Array) -> Interval:
-    """Mean NIS per degree of freedom of one run with its block-bootstrap interval."""
-    return block_bootstrap(nis_dof)
+def without_truth(nis: Array, rejected: int) -> Scores:
+    """What a run can say by itself: NIS (n,) of its updates, NaN where there was none, and rejections."""
+    measured, unknown = nis[np.isfinite(nis)] / 6.0, float("nan")
+    return Scores(
+        ate_rmse_m=unknown,
+        final_error_m=unknown,
+        drift_percent=unknown,
+        nees_position=unknown,
+        nees_attitude=unknown,
+        nis_dof=float(measured.mean()) if len(measured) else unknown,
+        nis_interval=block_bootstrap(measured),
+        rejected=rejected,
+        diverged=None,
+        frames=0,
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -108,7 +108,7 @@ class FusedRun:
     steps: Sequence[Step]
     nis: Array
     counts: Mapping[str, int]
-    scores: metrics.Scores | None
+    scores: metrics.Scores
     note: str = ""
 
 
@@ -242,9 +242,9 @@ def _member(
     nis = np.array([np.nan if s.innovation is None else s.innovation.nis[0] for s in ordered])
     failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
     counts = {**timeline.counts, "rejected": failed}
-    scores = None
+    scores = metrics.without_truth(nis, failed)
     if flight.has_truth:
-        scores = _score(flight, t_ns, T_imu, T_cam, covariance, nis, failed, options.score_gap_s)
+        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores, options.score_gap_s)
     return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, note)
 
 
@@ -254,10 +254,10 @@ def _score(
     T_imu: Array,
     T_cam: Array,
     covariance: Array,
-    nis: Array,
-    rejected: int,
+    known: metrics.Scores,
     score_gap_s: float,
 ) -> metrics.Scores:
+    """What is ``known`` without truth, and what the truth tells."""
     index = {r.t_ns: i for i, r in enumerate(flight.records)}
     rows = np.array([index[int(t)] for t in t_ns])
     valid = np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]
@@ -271,16 +271,13 @@ def _score(
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
     position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])
     attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9] + own[1])
-    measured = nis[np.isfinite(nis)] / 6.0
-    return metrics.Scores(
+    return replace(
+        known,
         ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),
         final_error_m=float(error[-1]),
         drift_percent=float(100.0 * error[-1] / path) if path > _SHORTEST_PATH_M else float("nan"),
         nees_position=float(position.mean()) if len(position) else float("nan"),
         nees_attitude=float(attitude.mean()) if len(attitude) else float("nan"),
-        nis_dof=float(measured.mean()) if len(measured) else float("nan"),
-        nis_interval=metrics.nis_interval(measured),
-        rejected=rejected,
         diverged=metrics.diverged(error, path),
         frames=int(valid.sum()),
     )

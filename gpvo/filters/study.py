@@ -58,8 +58,8 @@ def grid_scores(
     for flight in flights:
         if progress:
             progress(flight.name)
-        scores = [run.scores for run in fuse_flight(flight, policy, replace(options, history_s=0.0), batch=len(grid))]
-        total += [np.nan if s is None else s.ate_rmse_m for s in scores]
+        fused = fuse_flight(flight, policy, replace(options, history_s=0.0), batch=len(grid))
+        total += [run.scores.ate_rmse_m for run in fused]
     return np.where(np.isfinite(total), total / max(len(flights), 1), np.inf)
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from gpvo.stats.consistency import coverage, crps_gaussian, nees, nees_median, nll_per_dim
+from gpvo.stats.consistency import BLOCKS, coverage, crps_gaussian, nees_by_block, nees_median, nll_per_dim
 from gpvo.types import Array
-
-_BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
 
 
 def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) -> dict[str, Any]:
@@ -29,14 +28,12 @@ def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) ->
     error, mean, covariance = error[known], mean[known], covariance[known]
     residual = error - mean
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    per_block = {
-        n: nees(residual[:, b], covariance[:, b, b]) / (b.stop - b.start) for n, b in _BLOCKS.items() if b.stop <= d
-    }
+    per_block = nees_by_block(residual[:, :d], covariance)
     crps = crps_gaussian(residual[:, :d], sigma)
     level = coverage(residual[:, :d], sigma)
     return {
-        "nees_dof": {n: _mean(per_block.get(n)) for n in _BLOCKS},
-        "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in _BLOCKS},
+        "nees_dof": {n: None if n not in per_block else float(per_block[n].mean()) for n in BLOCKS},
+        "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in BLOCKS},
         "coverage": {str(k + 1): float(c) for k, c in enumerate(level)},
         "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if d == 6 else None,
         "nll_stated_per_dim": float(np.mean(nll_per_dim(residual, covariance, nu))) if d == 6 else None,
@@ -65,8 +62,8 @@ def stated_and_actual(error: Array, mean: Array, covariance: Array) -> dict[str,
 def empty() -> dict[str, Any]:
     """The same document where nothing could be computed."""
     return {
-        "nees_dof": dict.fromkeys(_BLOCKS),
-        "nees_dof_median": dict.fromkeys(_BLOCKS),
+        "nees_dof": dict.fromkeys(BLOCKS),
+        "nees_dof_median": dict.fromkeys(BLOCKS),
         "coverage": dict.fromkeys("123"),
         "nll_per_dim": None,
         "nll_stated_per_dim": None,
@@ -77,17 +74,18 @@ def empty() -> dict[str, Any]:
     }
 
 
-def average(scores: list[dict[str, Any]]) -> dict[str, Any]:
-    """Field by field mean over sequences, of those that have the field; None where none has."""
-    out: dict[str, Any] = {}
-    for key in scores[0]:
-        values = [s[key] for s in scores]
-        out[key] = average(values) if isinstance(values[0], dict) else _mean([v for v in values if v is not None])
-    return out
-
-
-def _mean(values: Any) -> float | None:
-    return None if values is None or len(values) == 0 else float(np.mean(values))
+def average(values: Sequence[Any]) -> Any:
+    """Documents of one form averaged number by number; None where none has a number, text from the first."""
+    values = [v for v in values if v is not None] or [None]
+    first = values[0]
+    if isinstance(first, dict):
+        return {key: average([v[key] for v in values if key in v]) for key in first}
+    if isinstance(first, (list, tuple)):
+        return [average(entries) for entries in zip(*values)]
+    numbers = [v for v in values if isinstance(v, (int, float)) and np.isfinite(v)]
+    if len(set(numbers)) == 1:
+        return numbers[0]
+    return float(np.mean(numbers)) if numbers else first
 
 
 def _rmse(error: Array, d: int) -> dict[str, float | None]:

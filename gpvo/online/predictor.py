@@ -71,9 +71,9 @@ class Predictor:
             self.camera = None if camera is None else StereoCamera(**camera)
         except (KeyError, TypeError, ValueError) as problem:
             raise ModelError(f"the model's header is incomplete: {problem}") from None
-        self.model = ErrorModel.of_file(arrays, self.features, method, dt_s)
         self.target = str(target)
         self.reset()
+        self.model = ErrorModel.of_file(arrays, self.features, method, dt_s)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Predictor:

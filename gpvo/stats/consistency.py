@@ -38,6 +38,16 @@ def nees(error: Array, covariance: Array) -> Array:
     return (whiten(error, covariance) ** 2).sum(-1)
 
 
+BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
+"""Of the tangent vector."""
+
+
+def nees_by_block(error: Array, covariance: Array) -> dict[str, Array]:
+    """NEES per degree of freedom (n,) of each of :data:`BLOCKS` that errors (n, 6), or (n, 3) of translations, hold."""
+    held = ((name, b) for name, b in BLOCKS.items() if b.stop <= error.shape[-1])
+    return {name: nees(error[:, b], covariance[:, b, b]) / (b.stop - b.start) for name, b in held}
+
+
 def nees_median(d: int, nu: float = math.inf) -> float:
     """Median of the NEES of a d-variate t with ``nu`` degrees of freedom and the stated second moment: by summing up
     its density over the squared distance."""
