@@ -1,6 +1,6 @@
 """How honest the shim is on anyone's odometry: each sequence left out, and each system left out.
 
-``python -m bench.shim_experiment FOLDER -o DIR [--only within,across] [--systems A,B,C]``
+``python -m bench.shim_experiment FOLDER -o DIR [--only within,across] [--systems A,B,C] [--features NAMES]``
 
 ``FOLDER`` holds ``SEQUENCE/SYSTEM.tum``, poses of a body by some systems on some sequences, and
 ``SEQUENCE/truth.tum``. ``within``: a model of one system's other sequences. ``across``: a model of all sequences of the
@@ -28,25 +28,28 @@ from gpvo.learning.methods import method_arrays
 from gpvo.learning.scores import score
 from gpvo.learning.train import TrainedModel, estimate_set, train_sets
 
-CONFIG = TrainConfig(features="velocity,rotation")
+FEATURES = "velocity,rotation"
 
 
-def run(folder: Path, out: Path, only: Sequence[str], systems: Sequence[str] | None = None) -> dict[str, Any]:
+def run(
+    folder: Path, out: Path, only: Sequence[str], systems: Sequence[str] | None = None, features: str = FEATURES
+) -> dict[str, Any]:
     """The document of both experiments; ``shim.json`` in ``out``. Raises SourceError where a log cannot be read."""
+    config = TrainConfig(features=features)
     names = systems or sorted({p.stem for p in folder.glob("*/*.tum")} - {"truth"})
     runs = {s: [imported(p, out / "runs") for p in sorted(folder.glob(f"*/{s}.tum"))] for s in names}
-    sets = {s: [replace(CONFIG.rows_of(read_run(p)), name=p.name) for p in paths] for s, paths in runs.items()}
+    sets = {s: [replace(config.rows_of(read_run(p)), name=p.name) for p in paths] for s, paths in runs.items()}
     found: dict[str, Any] = {}
     for system in names:
         if "within" in only:
             keep = out / "folds"
             keep.mkdir(parents=True, exist_ok=True)
-            trained = train_sets(sets[system], replace(CONFIG, keep=str(keep)))
+            trained = train_sets(sets[system], replace(config, keep=str(keep)))
             rows = [_row(f["held_out"], f["methods"], f["in_domain"]) for f in trained.table["folds"]]
             found.setdefault("within", {})[system] = _told(f"{system}, other sequences", rows)
         if "across" in only and len(names) > 1:
             others = [replace(s, name=f"{o}/{s.name}") for o in names if o != system for s in sets[o]]
-            rows = _judged(train_sets(others, CONFIG, judge=False), others, sets[system], runs[system])
+            rows = _judged(train_sets(others, config, judge=False), others, sets[system], runs[system])
             found.setdefault("across", {})[system] = _told(f"{system}, other systems", rows)
         write_json(out / "shim.json", found)
     return found
@@ -113,8 +116,15 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--only", default="within,across")
     parser.add_argument("--systems")
+    parser.add_argument("--features", default=FEATURES)
     given = parser.parse_args()
-    run(given.folder, given.out, given.only.split(","), given.systems.split(",") if given.systems else None)
+    run(
+        given.folder,
+        given.out,
+        given.only.split(","),
+        given.systems.split(",") if given.systems else None,
+        given.features,
+    )
 
 
 if __name__ == "__main__":
