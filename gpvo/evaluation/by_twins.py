@@ -91,7 +91,7 @@ def on_smooth_path(twin: Flight, seed: Sequence[int]) -> Flight:
         return flown
     sigmas, noise = StartSigmas(), imu.noise or DEFAULT_IMU_NOISE
     model = ImuModel(noise, bias_gyro_radps=sigmas.gyro_bias_radps, bias_acc_mps2=sigmas.acc_bias_mps2)
-    motion = path.motion(1e9 / float(np.median(np.diff(imu.t_ns))))
+    motion = path.motion(1e9 / float(np.median(np.diff(np.unique(imu.t_ns)))))
     return replace(flown, imu=measured_imu(motion, model, np.random.default_rng(seed), int(t_ns[0]))[0])
 
 

@@ -70,14 +70,6 @@ def test_the_table_says_that_truth_is_simulated_and_fits_80_columns(flown):
     assert "         7\n" in table
 
 
-@pytest.mark.slow
-def test_constants_of_a_run_without_truth_are_those_of_other_twins_of_it(flown):
-    told = json.loads(fused(flown[1], "--train", flown[1], "--twins", "--replicates", 2, "--json"))
-    assert told["mean"]["constant_best"]["ate_rmse_m"] <= told["mean"]["constant"]["ate_rmse_m"] * 1.5
-    assert len(told["runs"]) == 2
-    assert told["mean"]["learned"] is None
-
-
 def test_the_imu_of_a_twin_flew_its_path(flown, tmp_path):
     twins = [read_run(p) for p in make_twins(flown[1], tmp_path, TwinSettings(replicates=2))]
     one, again, other = (flight_of(t) for t in (twins[0], twins[0], twins[1]))
