@@ -33,6 +33,7 @@ def run(
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
     min_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is lost; at least 4.")] = 8,
     weak_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is degraded.")] = 20,
+    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion for itself.")] = 2,
     vehicle: flags.VehicleName = "any",
     max_acceleration: flags.MaxAcceleration = None,
     max_turn: flags.MaxTurn = None,
@@ -92,6 +93,7 @@ def run(
         "sigma_m_px": sigma_m,
         "min_inliers": min_inliers,
         "weak_inliers": weak_inliers,
+        "window": window,
     }
     if self_calibration is not None:
         shorthand["self_calibration"] = self_calibration

@@ -39,6 +39,7 @@ class VoConfig:
     sigma_pairs_px: tuple[tuple[float, float], ...] = ()  # further pairs, each stated as a method of its own
     self_calibration: bool = True  # estimate what the calibration has wrong between the cameras
     persistent_noise: bool = True  # estimate the error of disparity that a point keeps while it is followed
+    window: int = 2  # frames adjusted together; 2: each motion for itself
     seed: int = 0
 
     @property
@@ -91,6 +92,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "sigma_px": (1e-6, 100),
     "sigma_p_px": (1e-6, 100),
     "sigma_m_px": (1e-6, 100),
+    "window": (2, 20),
     "seed": (0, 2**31 - 1),
 }
 _SWITCH = {"on": True, "true": True, "off": False, "false": False}

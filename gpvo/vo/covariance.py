@@ -8,6 +8,7 @@ lateral variance is 2 to 10 times too small when the rotation is estimated too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,11 +108,19 @@ def covariances_by_method(
     sigma_m_px: float,
     sigma_pairs_px: tuple[tuple[float, float], ...] = (),
     moved: Transfer | None = None,
+    information: Callable[[Array], Array] | None = None,
 ) -> dict[str, MotionCovariance]:
     """Every requested method and pair of sigmas over the same inliers, sharing the derivatives.
 
-    ``moved``: the transfer of the same points by the same motion, if at hand.
+    ``moved``: the transfer of the same points by the same motion, if at hand. ``information``: (6, 6) of the motion for
+    a (3, 3) covariance of a measurement, where it is known from more than two frames; a sphere knows two.
     """
+
+    def stated(S_uvd: Array) -> MotionCovariance:
+        if information is not None:
+            return _from_information(information(S_uvd), T_prev_cur[:3, :3])
+        return motion_covariance(T_prev_cur, uvd_prev, camera, S_uvd, moved=moved)
+
     moved = moved or transfer(T_prev_cur, uvd_prev, camera)
     S = {
         "triangulation": triangulation_pixel_covariance(sigma_px),
@@ -123,8 +132,7 @@ def covariances_by_method(
             near = (uvd_prev[:, 2] > 0.5) & (uvd_cur[:, 2] > 0.5)
             out[method] = spherical_covariance(T_prev_cur, uvd_prev[near], uvd_cur[near], camera, S["triangulation"])
         else:
-            out[method] = motion_covariance(T_prev_cur, uvd_prev, camera, S[method], moved=moved)
+            out[method] = stated(S[method])
     for p, m in sigma_pairs_px:
-        S_pair = pointing_matching_pixel_covariance(p, m)
-        out[pair_method(p, m)] = motion_covariance(T_prev_cur, uvd_prev, camera, S_pair, moved=moved)
+        out[pair_method(p, m)] = stated(pointing_matching_pixel_covariance(p, m))
     return out

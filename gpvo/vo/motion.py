@@ -18,8 +18,8 @@ from gpvo.types import Array, StereoCamera
 from gpvo.vo.points import PointNoise
 
 # Quantiles of chi-square with 3 degrees of freedom.
-_CHI2_3_MEDIAN = 2.366
-_CHI2_3_999 = 16.266
+CHI2_3_MEDIAN = 2.366
+CHI2_3_999 = 16.266
 
 
 @dataclass(frozen=True)
@@ -268,8 +268,8 @@ def _robust_weights(m2: Array, in_front: NDArray[np.bool_]) -> tuple[NDArray[np.
     # Floor: below a fiftieth of a pixel the residual is rounding, and everything would look like an outlier.
     # Six of the residuals' degrees of freedom went to the motion.
     freedom = max(1.0 - 2.0 / max(int(in_front.sum()), 1), 1 / 3)
-    scale2 = max(float(np.median(m2[in_front])) / _CHI2_3_MEDIAN / freedom if in_front.any() else 1.0, 0.02**2)
+    scale2 = max(float(np.median(m2[in_front])) / CHI2_3_MEDIAN / freedom if in_front.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
-    keep = in_front & (ratio < _CHI2_3_999)
+    keep = in_front & (ratio < CHI2_3_999)
     distance = np.sqrt(np.maximum(ratio, 1e-12))
     return keep, float(np.sqrt(scale2)), np.minimum(1.0, 3.2 / distance)

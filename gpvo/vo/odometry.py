@@ -23,6 +23,7 @@ from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained
 from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
 from gpvo.vo.state import State
+from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
 
@@ -56,6 +57,7 @@ class StereoOdometry:
             self.rig_error = RigError(camera, known)
         else:
             self.rig_error = RigError(camera, known or RigState.exact(), learn=False)
+        self._window = Window(camera, self.config.window, self.rig_error)
         self._frontend: Frontend | None = None
         self._sigmas = SigmaEstimator(self.config.sigma_p_px, self.config.sigma_m_px)
         self._noise = NoiseEstimator()
@@ -107,6 +109,7 @@ class StereoOdometry:
         record = self._record(frame.t_ns, guess, matches, motion, verdict, choice.otherwise)
         clock.lap("covariance")
         is_reference, counts = self._advance(record, matches, motion, tells=choice.tells)
+        self._window.advance(is_reference)
         clock.lap("reference")
         sensed = self._imu.with_later(ImuMoments.of(imu))
         self._imu = ImuMoments.of(None) if is_reference else sensed
@@ -203,8 +206,7 @@ class StereoOdometry:
         close = among & agrees(T_prev_cur, matches, camera, 2 * config.ransac_threshold_px)
         if close.sum() < config.min_inliers:
             return None
-        uvd_prev, uvd_cur = matches.uvd_prev[close], matches.uvd_cur[close]
-        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=self._noise.value)
+        motion = refine(T_prev_cur, matches.uvd_prev[close], matches.uvd_cur[close], camera, noise=self._noise.value)
         if motion is None:
             return None
         inliers = np.zeros(len(close), bool)
@@ -237,9 +239,11 @@ class StereoOdometry:
         if self._sigmas.estimates:
             self._sigmas.design.update(motion, white, self.camera)
         sigma_p_px, sigma_m_px = self._sigmas.values
+        adjusted = self._window.adjust(self._raw, motion)
+        T_prev_cur = motion.T_prev_cur if adjusted is None else adjusted.T_ref[-1]
         by_method = covariances_by_method(
             config.methods,
-            motion.T_prev_cur,
+            T_prev_cur,
             motion.uvd_prev,
             matches.uvd_cur[motion.inliers],
             self.camera,
@@ -248,15 +252,15 @@ class StereoOdometry:
             sigma_m_px=sigma_m_px,
             sigma_pairs_px=config.sigma_pairs_px,
             moved=white.moved,
+            information=None if adjusted is None else adjusted.information,
         )
-        unknown = otherwise
         if config.self_calibration:
             row_error = matches.row_error[motion.inliers]
-            unknown = otherwise + self.rig_error.update(motion, white, row_error, config.min_disparity_px)
+            otherwise = otherwise + self.rig_error.update(motion, white, row_error, config.min_disparity_px)
         return replace(
             record,
-            T_prev_cur=motion.T_prev_cur,
-            covariances={m: c.full + unknown for m, c in by_method.items()},
+            T_prev_cur=T_prev_cur,
+            covariances={m: c.full + otherwise for m, c in by_method.items()},
             v_t={m: c.v_t for m, c in by_method.items()},
         )
 

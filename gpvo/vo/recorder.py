@@ -27,7 +27,7 @@ class TrackRecorder:
         if record.t_ns == record.t_prev_ns:
             return None
         matches = followed.matches
-        before, now = _keys(matches.uvd_prev), _keys(matches.uvd_cur)
+        before, now = keys(matches.uvd_prev), keys(matches.uvd_cur)
         new = np.array([k not in self._reference for k in before], dtype=bool)
         track = np.array([self._reference.setdefault(k, self._begun + i) for i, k in enumerate(before)], dtype=np.int64)
         self._begun += len(before)
@@ -43,5 +43,6 @@ class TrackRecorder:
         )
 
 
-def _keys(uvd: Array) -> list[bytes]:
+def keys(uvd: Array) -> list[bytes]:
+    """What tells measurements (N, 3) apart: their bytes."""
     return [row.tobytes() for row in np.ascontiguousarray(uvd, dtype=np.float64)]
