@@ -4,7 +4,7 @@
 
 ``DATA`` is the folder of real data that the tests read. Each set is trained and judged as ``gpvo train`` does it, each
 sequence left out in turn; the table is the paired difference of ``learned`` less ``base`` by sequence. ``poses alone``:
-the same flights as a log that holds nothing but the odometry's poses.
+the same flights as a log that holds nothing but the odometry's poses. What ``DIR/gain.json`` holds is not judged again.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Any
 
 from gpvo.cli.files import import_log
 from gpvo.dataset.build import TrainingSet, build
-from gpvo.files import write_json
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
+from gpvo.files import read_json, write_json
 from gpvo.io.run import Run, read_run
 from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
@@ -143,12 +143,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--flights", type=int, default=8)
     parser.add_argument("--duration", type=float, default=60.0, help="of a simulated flight [s]")
     given = parser.parse_args(arguments)
-    place, rows = Place(given.data, given.out, given.flights, given.duration), []
+    place, kept = Place(given.data, given.out, given.flights, given.duration), given.out / "gain.json"
+    rows = read_json(kept)["sets"] if kept.is_file() else {}
     for name in given.only.split(","):
-        rows.append(judge(name, place))
-        print(rows[-1], file=sys.stderr, flush=True)
-        write_json(given.out / "gain.json", {"schema": 1, "sets": rows})
-    print(markdown(rows))
+        if name not in rows:
+            rows[name] = judge(name, place)
+            print(rows[name], file=sys.stderr, flush=True)
+            write_json(kept, {"schema": 1, "sets": rows})
+    print(markdown(list(rows.values())))
 
 
 if __name__ == "__main__":
