@@ -18,9 +18,9 @@ from typing import Any
 
 from gpvo.cli.files import import_log
 from gpvo.dataset.build import TrainingSet, build
+from gpvo.files import read_json, write_json
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
-from gpvo.files import read_json, write_json
 from gpvo.io.run import Run, read_run
 from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
