@@ -44,11 +44,11 @@ def assemble(
     gp: ProjectedGP | None,
     variance: Array,
 ) -> tuple[ErrorModel, dict[str, Any]]:
-    """Parts, correlation and calibration by the out-of-fold ``variance`` (n, 6); then everything in one place.
+    """The finished error model: parts, correlations and scale fitted to the errors, given their ``variance``
+    (n, 6).
 
-    ``base``, and ``gp`` of ``inputs`` where there is one: what states the variance of another sequence.
-
-    Errors of the camera's calibration have a part of their own where the poses of flights ask for it.
+    ``base``, and ``gp`` on ``inputs`` if there is one: what will state the variance of a new sequence. Errors of the
+    camera's calibration get a part of their own if that makes the poses of left-out flights likelier.
     """
     error = rows.error
     scale = fit_scale(error / np.sqrt(variance), rows.group)
@@ -82,8 +82,8 @@ def assemble(
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Out of fold, of all rows: ``error`` (n, 6), its ``variance`` (n, 6) right by the axis, features ``X`` (n, d), the
-    geometric covariance (n, 6, 6), and ``patterns`` where calibration has a part of its own."""
+    """All rows, out of fold: ``error`` (n, 6), its ``variance`` (n, 6), calibrated for each axis, features ``X``
+    (n, d), the geometric covariance (n, 6, 6), and ``patterns`` if calibration has a part of its own."""
 
     rows: Rows
     error: Array
@@ -93,13 +93,13 @@ class _Residuals:
     patterns: Patterns | None = None
 
     def _folds(self) -> list[tuple[NDArray[np.bool_], Array]]:
-        """Rows (n,) of each fold, and the patterns of the other flights."""
+        """Rows (n,) of each fold, and the patterns learned from the other flights."""
         assert self.patterns is not None
         return [(self.patterns.fold == k, patterns) for k, patterns in enumerate(self.patterns.without)]
 
     def of_calibration(self) -> tuple[Array | None, Array, Array]:
-        """The root (n, 6, 6) of what a wrong calibration has of the variance, by the patterns of other flights; what is
-        left of the variance, and of the errors."""
+        """Root (n, 6, 6) of the covariance due to a wrong calibration, by the patterns of other flights; the variance
+        and the errors that remain without it."""
         if self.patterns is None:
             return None, self.variance, self.error
         twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.error), 6, 6)), self.variance.copy()
@@ -108,8 +108,8 @@ class _Residuals:
         return root, rest, self.error - self.patterns.error
 
     def divided(self, model: ErrorModel) -> tuple[Array, Array]:
-        """Covariances (n, 3, 6, 6) of jitter, white and bias, the bias without that of calibration, and the root
-        (n, 6, 6) of the latter, by the patterns of the other flights."""
+        """Covariances (n, 3, 6, 6) of jitter, white noise and bias, and the root (n, 6, 6) of that due to calibration,
+        which is not in the bias, by the patterns of the other flights."""
         if self.patterns is None:
             return _covariances(model.division.split(self.variance, model.twist(self.X), self.geometry))
         parts, root = np.empty((len(self.error), 3, 6, 6)), np.empty((len(self.error), 6, 6))
@@ -122,15 +122,15 @@ class _Residuals:
 
 
 def _covariances(e: MotionError) -> tuple[Array, Array]:
-    """Of the parts that a division makes of errors, (n, 3, 6, 6), and the root (n, 6, 6) of the calibration."""
+    """Covariances (n, 3, 6, 6) of the parts of an error, and the root (n, 6, 6) of that due to calibration."""
     bias = e.persistent_root[..., :6]
     return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
 
 
 @dataclass(frozen=True)
 class _Consistent:
-    """A model that is right of poses and of all six axes together, the factors of both, and how likely the poses of
-    each sequence are by it (S,)."""
+    """A model calibrated for poses and for all six axes jointly, with the factors of both, and its loss on the poses of
+    each sequence (S,)."""
 
     model: ErrorModel
     added: float
@@ -139,8 +139,8 @@ class _Consistent:
 
 
 def _most_likely(model: ErrorModel, of: _Residuals) -> _Consistent:
-    """The model made right, with as much of the geometry's correlation as makes poses and motions likeliest; none where
-    the geometry is mostly unknown."""
+    """The calibrated model, with the share of the geometry's correlations under which poses and motions are likeliest;
+    none if the geometry is mostly unknown."""
     if of.geometry is None or np.isfinite(of.geometry).all(axis=(1, 2)).mean() < _LEAST_KNOWN:
         return _consistent(model, of)
     tried = [_consistent(_with_division(model, geometry_weight=np.array([w])), of) for w in _WEIGHTS]
@@ -148,7 +148,7 @@ def _most_likely(model: ErrorModel, of: _Residuals) -> _Consistent:
 
 
 def _consistent(model: ErrorModel, of: _Residuals) -> _Consistent:
-    """The model made right of poses and of all six axes together."""
+    """The model, calibrated for poses and for all six axes jointly."""
     parts, root = of.divided(model)
     factor = fit_joint_factor(of.error, _whole(parts, root), of.rows.group)
     added = added_factor(*_motions(model, of, parts * factor, root * np.sqrt(factor)), model.division.share)
@@ -175,12 +175,12 @@ def _with_division(model: ErrorModel, **changed: Array) -> ErrorModel:
 
 
 def _whole(parts: Array, root: Array) -> Array:
-    """(n, 6, 6) covariances of motions from those of their parts and the root of the calibration."""
+    """(n, 6, 6) covariances of motions, from those of their parts and the root due to calibration."""
     return np.asarray(parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2))
 
 
 def _motions(model: ErrorModel, of: _Residuals, parts: Array, root: Array) -> tuple[list[Motions], Array]:
-    """All chains with what is stated of them, and the correlations (2, 6) of bias and calibration from one motion to
+    """All chains with their stated covariances, and the correlations (2, 6) of bias and calibration from one motion to
     the next."""
     T_prev_cur = of.rows.motions()
     chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
@@ -192,8 +192,8 @@ _Found = tuple[Parts, _Consistent]
 
 
 def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Found) -> _Found:
-    """The same with a part of wrong calibration, where by the patterns of other flights the poses are likelier, beyond
-    chance."""
+    """The same with a part for a wrong calibration, if the patterns of other flights make the poses likelier by a
+    significant gain."""
     patterns = learn_patterns(of.rows, of.error, of.variance)
     if patterns is None:
         return plain
@@ -204,7 +204,7 @@ def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Found) -> _Found
 
 
 def _division_of(of: _Residuals) -> tuple[Division, Parts]:
-    """How errors add up, yet without the geometry's correlation."""
+    """How errors add up, without the geometry's correlations so far."""
     rows = of.rows
     v_mps = rows.select(TWIST_COLUMNS[:3])
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
@@ -230,7 +230,7 @@ def _division_of(of: _Residuals) -> tuple[Division, Parts]:
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
-    """(n,) how far each row, with the noise of its features, lies from what the other groups know."""
+    """(n,) distance of each row, given the noise of its features, from the domain of the other groups."""
     out = np.zeros(len(X))
     labels = np.unique(group)
     for g in labels if len(labels) > 1 else ():

@@ -1,5 +1,4 @@
-"""What is known before a GP learns anything, from training rows: the base variance, how fast the vehicle is, and where
-the rows lie."""
+"""What training rows say before a GP learns from them: the base variance, the speeds of the vehicle, and the domain."""
 
 from __future__ import annotations
 

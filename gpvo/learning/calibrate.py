@@ -26,8 +26,11 @@ _POWERS = (1.0, 1.25, 1.5, 2.0)
 
 @dataclass(frozen=True)
 class Scale:
-    """The scale of the variance of a new group, a random effect. ``factor`` (D,) on what is stated; ``spread`` (D,):
-    standard deviation of the log scale between groups; ``by_group`` (G, D): the scale of each."""
+    """The scale of the variance of a new group, a random effect.
+
+    ``factor`` (D,) on the stated variance; ``spread`` (D,): standard deviation of the log scale between groups;
+    ``by_group`` (G, D): the scale of each.
+    """
 
     factor: Array
     spread: Array
@@ -54,11 +57,11 @@ def fit_scale(z: Array, group: NDArray) -> Scale:
 
 
 def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
-    """Power of the growth (see ``guard.growth``) with the ``distance`` (n,) from what the other groups knew.
+    """Power of the growth (see ``guard.growth``) with the ``distance`` (n,) from the domain of the other groups.
 
-    ``square`` (n,): mean over the axes of the squared normalised residuals. One is expected, and never less is
-    taken: other surroundings differ in more than flights of one kind can show. The rows of a group outside count as
-    five at most, as they go together.
+    ``square`` (n,): mean over the axes of the squared normalised residuals. The power is at least one, the expected
+    value: other surroundings differ in more ways than flights of one kind can show. The rows of a group outside count
+    as five at most, as they are correlated.
     """
     outside = distance > _OUTSIDE
     d, q, g = distance[outside], square[outside], group[outside]
@@ -73,13 +76,13 @@ def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
 
 
 def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
-    """One more factor, so that the NEES of all six axes together is right for a new group."""
+    """One more factor, which makes the joint NEES of all six axes right for a new group."""
     squared = nees(error, covariance) / error.shape[1]
     return float(Scale.of_new_group(np.array([[robust_mean(squared[group == g])] for g in np.unique(group)])).factor[0])
 
 
 def robust_mean(values: Array) -> float:
-    """Mean with the upper half per cent drawn in to the quantile there."""
+    """Mean, with the upper half per cent replaced by the quantile there."""
     return float(np.minimum(values, np.quantile(values, 0.995)).mean())
 
 

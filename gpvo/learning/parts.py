@@ -1,11 +1,11 @@
 """How errors add up over a distance: jitter, white and bias, from the errors summed over 1, 2, 5, ... frames.
 
-Of a motion's variance v a share is jitter (n_k - n_(k-1), that of the frames it joins), a share white, a share a
-first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). Above the typical speed what
-adds up may grow with it, as it does so by landmarks that come and go along the path. The bias may grow faster than the
-noise: that of triangulated points goes with the variance of the noise, so its own variance with the square (G. Sibley,
-L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)). How the axes go
-together in each part is told by the correlations of the sums.
+The variance v of a motion is divided into jitter (n_k - n_(k-1), of the two frames it joins), white noise, and a
+first-order Gauss-Markov bias (A. Gelb, "Applied Optimal Estimation" (1974), section 3.8). Above the typical speed, the
+parts that add up may grow with speed, because landmarks come and go faster. The bias may grow faster than the noise:
+the bias of triangulated points is proportional to the variance of the noise, so its own variance grows with the square
+(G. Sibley, L. Matthies, G. Sukhatme, "Bias reduction and filter convergence for long range stereo" (2007)). The
+correlations of the sums tell how the axes are correlated in each part.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _TAU_FRAMES = (4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
 _NOISE_GROWTHS = (0.0, 0.5, 1.0)
 _SPEED_GROWTHS = (1.0, 2.0)
 _WORTH = 20.0
-"""By so much the log-likelihood of a block must rise for what is not expected; the spans all count the same errors."""
+"""Gain in log-likelihood that a block must show for an unexpected shape; all spans count the same errors."""
 _MOST_WINDOWS = 1000
 _MOST_COUNT = 60.0
-"""A span counts by its windows, up to this: short spans have many, but say the same over and over."""
+"""A span's weight is its number of windows, up to this: short spans have many, but they tell the same thing."""
 MOST_ROWS = 100_000
 _MIN_SHARE = 1e-6
 _REWEIGHTINGS, _REDIVISIONS = 6, 3
@@ -39,7 +39,7 @@ _MOST_RATIO = 16.0
 
 @dataclass(frozen=True)
 class Parts:
-    """``share`` (3, D): jitter, white, bias of each axis at the typical log variance ``level`` (D,), summing to one.
+    """``share`` (3, D): of jitter, white noise and bias on each axis at the typical log variance ``level`` (D,).
 
     ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.division.divide`).
     ``tau_s`` (D,): of the bias. ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over
@@ -57,11 +57,11 @@ class Parts:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Of one block of d axes, W windows of all spans, one after the other, of R motions together.
+    """W windows of all spans, one after the other, with R motions in all, of one block of d axes.
 
-    Squared sums (d, W), what is known to add up besides (d, W) and what a window counts (W,); the motions' stated
-    variances (d, R), their logs above the typical level (d, R) and those of the speed (R,). ``spans``: windows and
-    motions of each span.
+    Squared sums (d, W), other variance known to add up (d, W), weights of the windows (W,); stated variances of the
+    motions (d, R), their logs above the typical level (d, R), and those of the speed (R,). ``spans``: numbers of
+    windows and motions of each span.
     """
 
     square: Array
@@ -88,7 +88,8 @@ class _Windows:
         return 0.5 * np.concatenate([x[:, :, 0] + x[:, :, -1] for x in self.split(each)], axis=1)
 
     def carried(self, amplitude: Array, phi: float) -> Array:
-        """(d, R) what each motion has of biases of ``amplitude`` (d, R) that last from those before in its window."""
+        """(d, R) share of each motion in biases of ``amplitude`` (d, R) that persist from earlier motions of its
+        window."""
         given = self.split(amplitude)
         told = [lfilter([0.0, phi], [1.0, -phi], x, axis=2) if x.shape[2] > 1 else np.zeros_like(x) for x in given]
         return np.concatenate([x.reshape(len(x), -1) for x in told], axis=1)
@@ -142,10 +143,8 @@ _Choice = tuple[_Shape, _Fit]
 
 
 def _choose(windows: Sequence[_Windows]) -> tuple[float, list[_Shape]]:
-    """The time constant [frames] of all blocks, and the shape of each.
-
-    Sideways errors go with the turns that undo them; with time constants of their own they would part on the way.
-    """
+    """The time constant [frames] of all blocks, and the shape of each. Sideways errors are correlated with the
+    rotations that undo them; with time constants of their own, the two would drift apart along the way."""
     tried: dict[float, list[_Choice]] = {}
 
     def loss(tau: float) -> float:
@@ -158,7 +157,7 @@ def _choose(windows: Sequence[_Windows]) -> tuple[float, list[_Shape]]:
 
 
 def _best(windows: _Windows, tau: float) -> _Choice:
-    """The best shape of a block. Expected are shares that do not change."""
+    """The best shape of a block. By default the shares are constant."""
     tried = [(s, _fit_shape(windows, s)) for s in (_Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
     by_noise = min(tried, key=_loss)[0].by_noise
     others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS)
@@ -186,10 +185,10 @@ def _windows(given: Sequence[Chains], spans: NDArray[np.int64], block: slice, le
 
 
 def _fit_shape(windows: _Windows, shape: _Shape, widen: Array | None = None) -> _Fit:
-    """Shares for one shape, by the likelihood of squared sums, times ``widen`` (S, d) where given.
+    """Shares for one shape, by the likelihood of squared sums, times ``widen`` (S, d) if given.
 
-    A squared sum has the deviation of what is stated of it; so the fit is reweighted by its own statement, because
-    weights by what is seen would favour statements that are too small.
+    The standard deviation of a squared sum is its own stated variance (times root two). So the fit is reweighted by
+    what it states itself: weights by the observed squares would favour statements that are too small.
     """
     d, sizes = len(windows.square), [w for w, _ in windows.spans]
     widen = np.ones((len(sizes), d)) if widen is None else widen
@@ -228,7 +227,7 @@ def _terms(w: _Windows, gains: tuple[Array, Array] | None, tau: float, share: Ar
 
 
 def _solve(A: Array, square: Array, weight: Array) -> Array:
-    """Shares (3, d), not negative and of sum one, that explain squared sums (d, W) best; white where nothing shows."""
+    """Shares (3, d), non-negative with sum one, that explain squared sums (d, W) best; white noise if nothing shows."""
     J, B, rest = A[0] - A[1], A[2] - A[1], square - A[1]
     least = 1e-9 * (weight * A[1] ** 2).sum(axis=1)
     wJ, wB = weight * J, weight * B
@@ -258,12 +257,12 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
 
 
 def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
-    """(3, 6, 6) correlations of jitter, white and bias, from those of the errors summed over each span.
+    """(3, 6, 6) correlations of jitter, white noise and bias, from those of the errors summed over each span.
 
-    Each sum is over its own stated deviation: among the motions that it sums the worst decide, as they do of the pose,
-    and their axes may go together more closely than those of the others.
-    Of each pair of axes three numbers are sought whose mixture, by what each part contributes to the sum, is the
-    correlation seen over every span; all are drawn towards that of single motions, as few windows show little.
+    Each sum is divided by its own stated deviation: the worst of the motions in it dominate it, as they dominate the
+    pose, and their axes may be more strongly correlated than those of the others. For each pair of axes three numbers
+    are sought whose mixture, weighted by what each part contributes to the sum, is the correlation observed over every
+    span; all are shrunk towards that of single motions, as few windows show little.
     """
     part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
     whole = part.sum(axis=2).T
@@ -280,7 +279,7 @@ def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float)
 
 
 def _scaled_sums(error: Chains, sigma: Chains, m: int) -> Array:
-    """(w, D) sums over m motions, over their stated deviation were they independent; each axis of unit mean square."""
+    """(w, D) sums over m motions, over their stated deviation if independent; each axis has unit mean square."""
     pairs = [(e, s) for es, ss in zip(error, sigma) for e, s in zip(es, ss) if len(e) >= m]
     z = np.concatenate([moving_sums(e, m) / np.sqrt(moving_sums(s**2, m)) for e, s in pairs])
     return np.asarray(z / np.sqrt((z**2).mean(axis=0)))

@@ -76,14 +76,14 @@ class _Sums:
 
 
 def _sums(error: Sequence[Array], variance: Sequence[Array], twist: Sequence[Array]) -> _Sums:
-    """Over :data:`_WINDOW` motions, so that only what lasts adds up."""
+    """Over :data:`_WINDOW` motions, so that only persistent errors add up."""
     e, v, t = (np.concatenate([cut(c, _WINDOW).sum(axis=1) for c in chains]) for chains in (error, variance, twist))
     return _Sums(e, np.sqrt(v), t)
 
 
 def _clear(flights: Sequence[_Sums], step_s: float) -> NDArray[np.bool_]:
-    """(6,) which velocities add up to ten times as much as VO's own errors of them: what goes with any other goes with
-    errors."""
+    """(6,) which velocities add up to ten times as much as VO's own errors in them: an error that seems to follow any
+    other velocity may just follow that error."""
     moved, wrong = (_rms(np.concatenate(x)) for x in ([f.twist for f in flights], [f.error for f in flights]))
     return np.asarray(moved * step_s > _CLEAR * wrong)
 
@@ -94,8 +94,8 @@ def _rms(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What a flight says of its K in a least squares sense: ``gram`` (6, c, c) and ``moment`` (6, c) of each axis, sum
-    of squares ``square`` (6,), number of windows."""
+    """What a flight says about its K, in the least-squares sense: ``gram`` (6, c, c) and ``moment`` (6, c) of each
+    axis, sum of squares ``square`` (6,), number of windows."""
 
     gram: Array
     moment: Array
@@ -103,7 +103,8 @@ class _Evidence:
     count: int
 
     def posterior(self, S: Array, noise: Array) -> tuple[Array, Array]:
-        """Mean (6 c,) and covariance of ``vec K``, whose covariance over flights is S, by windows of a noise (6,)."""
+        """Mean (6 c,) and covariance of ``vec K`` for a flight, given the covariance S over flights and the noise (6,)
+        of a window."""
         c = self.gram.shape[-1]
         P = np.asarray(np.linalg.inv(S), dtype=np.float64)
         for i in range(_D):
@@ -112,7 +113,7 @@ class _Evidence:
         return C @ (self.moment / noise[:, None]).ravel(), C
 
     def residual(self, mean: Array, C: Array) -> Array:
-        """(6,) expected sum of squares that K leaves."""
+        """(6,) expected sum of squares that K does not explain."""
         c = self.gram.shape[-1]
         K, blocks = mean.reshape(_D, c), C.reshape(_D, c, _D, c)
         own = np.einsum("iaib->iab", blocks) + K[:, :, None] * K[:, None, :]
@@ -138,7 +139,7 @@ class _Unit:
         return cls(error, twist[clear], clear)
 
     def evidence(self, f: _Sums) -> _Evidence:
-        """Of a flight, each window by its stated deviation."""
+        """Of a flight; each window is divided by its stated deviation."""
         weight = (self.error / f.sigma) ** 2
         e, t = f.error / self.error, f.twist[:, self.clear] / self.twist
         gram = np.einsum("wi,wa,wb->iab", weight, t, t)
@@ -161,7 +162,7 @@ class _Unit:
 
 
 def _spread(evidence: Sequence[_Evidence]) -> tuple[Array, Array]:
-    """Covariance of ``vec K`` over the flights, drawn towards its diagonal, and noise (6,) of the windows."""
+    """Covariance of ``vec K`` over the flights, shrunk towards its diagonal, and noise (6,) of the windows."""
     n = _D * evidence[0].gram.shape[-1]
     S, noise, count = _BEGIN_VAR * np.eye(n), np.ones(_D), sum(e.count for e in evidence)
     for _ in range(_ROUNDS):

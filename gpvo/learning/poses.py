@@ -42,11 +42,11 @@ class Motions:
 
 
 def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
-    """The factor on white and bias, the jitter being what is left of each motion, by which poses are likeliest.
+    """Factor on white noise and bias (jitter is the remainder of each motion) under which poses are likeliest.
 
     ``share`` (3, D) of the parts; ``phi`` (2, D): correlation of bias and calibration from one motion to the next.
-    Spans of ten motions and more count alike, as they count the same errors; and so do sequences. The factor is drawn
-    towards 1, and is 1 unless its gain is beyond chance. No axis is left without jitter.
+    Spans of ten and more motions count alike, as they contain the same errors, and so do sequences. The factor is
+    shrunk towards 1, and is 1 unless its gain is significant. Every axis keeps some jitter.
     """
     spans = _spans(chains, phi, _LONG)
     if not spans:
@@ -63,13 +63,13 @@ def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
 
 
 def pose_losses(chains: Sequence[Motions], phi: Array) -> Array:
-    """(S,) mean negative log-likelihood of a sequence's motions, and of its poses after ten of them and more, without
-    its constant; all spans count alike."""
+    """(S,) mean negative log-likelihood, without its constant, of the motions of each sequence and of its poses after
+    ten and more of them; all spans count alike."""
     return _losses(_spans(chains, phi, (1, *_LONG)), 1.0)
 
 
 def _spans(chains: Sequence[Motions], phi: Array, spans: Sequence[int]) -> list[_Poses]:
-    """The poses over each of the spans that has windows enough."""
+    """The poses over each span that has enough windows."""
     return [_Poses.over(chains, m, phi) for m in spans if _count(chains, m) >= _LEAST_WINDOWS]
 
 
@@ -78,7 +78,7 @@ def _losses(spans: Sequence[_Poses], factor: float) -> Array:
 
 
 def with_added(share: Array, factor: float) -> Array:
-    """(3, D) shares with white and bias times the factor, the jitter being what is left."""
+    """(3, D) shares with white noise and bias times the factor; jitter is the remainder."""
     added = share[1:] * factor
     return np.vstack([1.0 - added.sum(axis=0), added])
 
@@ -110,8 +110,8 @@ class _Poses:
         return cls(error, jitter, added, at_ends, belongs / np.maximum(belongs.sum(axis=0), 1.0))
 
     def losses(self, factor: float) -> Array:
-        """(S,) negative log-likelihood of each sequence, without its constant; 0 of one without a window. Gross errors
-        count as those of four sigma."""
+        """(S,) negative log-likelihood of each sequence, without its constant; 0 for one without a window. Gross errors
+        count as four sigma."""
         C = self.jitter + self.at_ends + factor * (self.added - self.at_ends)
         squared = np.minimum(nees(self.error, C), _MOST_NEES * 6.0)
         return np.asarray((0.5 * (np.linalg.slogdet(C)[1] + squared)) @ self.belongs)
@@ -136,6 +136,6 @@ def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array
 
 
 def _roots(C: Array) -> Array:
-    """Roots of covariances (w, m, 6, 6) that have one correlation."""
+    """Roots of covariances (w, m, 6, 6) that share one correlation matrix."""
     sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
     return sigma[..., None] * scaled_root(C[0, 0]) / sigma[0, 0][:, None]

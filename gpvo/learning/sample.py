@@ -75,7 +75,7 @@ def draw_sample(sets: Sequence[TrainingSet], columns: Sequence[str], method: str
 
 
 def _leading_on(s: TrainingSet) -> NDArray[np.int64]:
-    """Rows from whose end the next motion starts; all where there are hardly any, as with overlapping windows."""
+    """Rows from whose end the next motion starts; all rows if there are hardly any, as with overlapping windows."""
     starts = s.t_ns[1:] - np.round(s.dt_s[1:] * 1e9).astype(np.int64)
     rows = np.flatnonzero(np.abs(starts - s.t_ns[:-1]) < 1000)
     return rows if len(rows) >= _LEAST_PER_SEQUENCE else np.arange(len(s))

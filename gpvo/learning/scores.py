@@ -1,4 +1,4 @@
-"""Scores of one statement of uncertainty on one sequence: the columns of the training table."""
+"""Scores of one stated uncertainty on one sequence: the columns of the training table."""
 
 from __future__ import annotations
 

@@ -30,17 +30,18 @@ class SpanVariances:
     doubt: Array
 
     def widening(self, tau: float) -> Array:
-        """(S, D) by how much more is to be stated of a sequence not seen, errors being correlated over ``tau`` frames.
+        """(S, D) factor on the stated variance of an unseen sequence, errors being correlated over ``tau`` frames.
 
-        What is squared over an uncertain variance ``v`` is, on average, too large by ``1 + var(v) / v^2``. Sums over
-        more than two time constants add up from shorter ones, which are known better: they share the doubt of those.
+        A square over an uncertain variance ``v`` is too large by ``1 + var(v) / v^2`` on average. Sums over more than
+        two time constants consist of shorter ones, which are known better, and have the relative doubt of those.
         """
         last = max(int((self.spans <= 2.0 * tau).sum()) - 1, 0)
         return np.asarray(1.0 + self.doubt[np.minimum(np.arange(len(self.spans)), last)])
 
 
 def at_most(values: Chains, limit: int) -> Chains:
-    """Up to so many rows, equally many of each sequence from its beginning: every place and scenario has its say."""
+    """Up to so many rows, equally many from the beginning of each sequence, so that every place and scenario is
+    represented."""
     out = []
     for chains in values:
         kept, left = [], max(limit // len(values), 1)
@@ -78,7 +79,7 @@ def span_variances(z: Chains) -> SpanVariances:
 
 
 def by_block(values: Array) -> Array:
-    """(D,) each block of three axes at its mean, as three axes show better than one by how much sequences differ."""
+    """(D,) each block of three axes at its mean: three axes show better than one how much sequences differ."""
     out = values.copy()
     for start in range(0, len(out), 3):
         out[start : start + 3] = out[start : start + 3].mean()

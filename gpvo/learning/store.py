@@ -48,7 +48,7 @@ def check_writable(path: Path) -> None:
 
 def save_model(trained: TrainedModel, path: str | Path) -> None:
     """``path``, ``path.md`` with its picture ``path.svg``, and ``path.rows.parquet``; each whole or not at all. Kept
-    folds are done with."""
+    folds are then deleted."""
     path = Path(path)
     check_writable(path)
     write_sets(rows_path(path), trained.sets)
@@ -90,7 +90,8 @@ def update(
     judge: bool = True,
     tell: Callable[[str], None] = lambda _: None,
 ) -> TrainedModel:
-    """The model at ``path`` with more sequences. A run of a name it knows replaces that sequence; ``tell`` hears so."""
+    """The model at ``path``, trained anew with more sequences. A run with a known name replaces that sequence, and
+    ``tell`` is told so."""
     old = training_rows(path)
     if old[0].target != config.target:
         raise ModelError(f"learns the target '{old[0].target}', not '{config.target}'", where=path)

@@ -33,7 +33,7 @@ _SINGLE = ("projection",)
 
 @dataclass(frozen=True)
 class NoisyGP(Stored):
-    """A GP of what is measured: ``latent``, and a noise that is everywhere the same, ``log_noise_offset`` (D,)."""
+    """A GP of a measured quantity: ``latent``, and noise that is the same everywhere, ``log_noise_offset`` (D,)."""
 
     latent: ProjectedGP
     log_noise_offset: Array
@@ -41,7 +41,7 @@ class NoisyGP(Stored):
     parts: ClassVar = {"latent": (ProjectedGP, "mean.")}
 
     def predict(self, X: ArrayLike) -> tuple[Array, Array]:
-        """Mean and variance (n, D) of what is measured at rows X (n, d)."""
+        """Mean and variance (n, D) of the measured quantity at rows X (n, d)."""
         mean, variance = self.latent.evaluate(X)
         return mean, variance + np.exp(self.log_noise_offset)
 

@@ -198,7 +198,7 @@ def estimate_set(model: ErrorModel, s: TrainingSet) -> Prediction:
 
 
 def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Array) -> dict[str, Any]:
-    """Gross errors caught, and missed though nobody expected them; good motions flagged; and NEES/dof with the caught
+    """Gross errors caught, and those missed although unexpected; good motions flagged; and NEES/dof with the caught
     ones counted in."""
     length, lost_length = (np.linalg.norm(xi[:, :3], axis=1) for xi in (s.Y, s.lost_xi))
     stated = np.sqrt(np.trace(estimate.covariance[:, :3, :3], axis1=1, axis2=2))
@@ -251,7 +251,7 @@ def training_digest(sets: Sequence[TrainingSet]) -> str:
 
 
 def header_of_sets(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
-    """What the header of every kind of model says of its training."""
+    """What the header of every kind of model says about its training."""
     cameras = [s.camera for s in sets if s.camera is not None]
     return {
         "model_schema": 1,
