@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from gpvo.cameras.rig import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.io.source import SourceReport
 from gpvo.io.toml import read_toml
+from gpvo.parallel import map_jobs
 from gpvo.runner import run as run_odometry
 from gpvo.twin.estimate import Original, estimate
 from gpvo.twin.gap import Gap, restated
@@ -123,7 +123,7 @@ def _drawn_noise(original: Original, rng: np.random.Generator) -> Array:
 
 
 def make_twins(
-    path: Path, out: Path, settings: TwinSettings, *, jobs: int = 1, on_twin: Callable[[], None] | None = None
+    path: Path, out: Path, settings: TwinSettings, *, jobs: int = 1, on_twin: Callable[[], None] = lambda: None
 ) -> list[Path]:
     """Twins of one run as run folders ``out/NAME-twinK``, by the odometry and the settings of the run.
 
@@ -133,13 +133,8 @@ def make_twins(
         As :func:`gpvo.twin.estimate.estimate`.
     """
     original = estimate(path)
-    work = (delayed(_make_twin)(original, settings, k, out) for k in range(settings.replicates))
-    made = []
-    for target in Parallel(n_jobs=jobs, return_as="generator")(work):
-        made.append(target)
-        if on_twin is not None:
-            on_twin()
-    return made
+    work = [(original, settings, k, out) for k in range(settings.replicates)]
+    return map_jobs(_make_twin, work, jobs=jobs, on_done=on_twin)
 
 
 def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path) -> Path:
