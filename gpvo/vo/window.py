@@ -1,7 +1,7 @@
 """Several frames adjusted together: a sliding-window bundle adjustment, the setting ``window``.
 
 It is :func:`gpvo.vo.motion.refine` over more than two frames. The points of a motion move in the (u, v, d) of its
-reference, and the frames before the reference in which they were seen too say more of where they are:
+reference, and the frames before the reference in which they were seen too say more of where they are::
 
     min  sum_i |x_i + p_i - m_i|^2_S + sum_ij w_ij |f(T_ref_j, x_i) + p_i - m_ij|^2_S + p_i^2 / q
 
