@@ -133,7 +133,7 @@ def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:
     from dataclasses import replace
 
     from gpvo.files import read_json
-    from gpvo.twin.replicate import simulated_truth
+    from gpvo.twin.gap import simulated_truth
 
     origin = simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained

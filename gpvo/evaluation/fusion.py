@@ -13,7 +13,6 @@ from gpvo.dataset.build import predictions_of
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
-from gpvo.evaluation.by_twins import on_smooth_path
 from gpvo.evaluation.evaluate import distinct
 from gpvo.filters.policies import (
     CONSTANT_BEST,
@@ -30,7 +29,7 @@ from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, stu
 from gpvo.io.run import Run, read_run
 from gpvo.learning.check import check
 from gpvo.online.predictor import Predictor
-from gpvo.twin.replicate import simulated_truth
+from gpvo.twin.gap import simulated_truth
 from gpvo.types import IMPORTED, Array, TruthLog
 
 
@@ -63,6 +62,9 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
         truth_sigma=truth_sigma,
     )
     if about := run.meta.get("twin"):
+        # Only twins need the simulator.
+        from gpvo.evaluation.twin_flight import on_smooth_path
+
         require_sane(flight)
         return on_smooth_path(flight, (about["seed"], about["replicate"], 31))
     return flight

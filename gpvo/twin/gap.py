@@ -1,11 +1,14 @@
-"""The gap to reality: by how much real errors exceed what twins predict, learnt where truth exists."""
+"""Which runs are twins, and their gap to reality: by how much real errors exceed what twins predict, learnt where truth
+exists."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
@@ -84,3 +87,14 @@ def restated(
 def _motion(record: VoRecord, truth: TruthLog) -> Array:
     i, j = np.searchsorted(truth.t_ns, [record.t_prev_ns, record.t_ns])
     return se3.inverse(truth.T_world_cam[i]) @ truth.T_world_cam[j]
+
+
+def simulated_truth(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Which of some runs, by their ``run.json``, are twins: of what, how many, with which tolerance."""
+    found: dict[str, dict[str, Any]] = {}
+    for about in (m["twin"] for m in metas if m.get("twin")):
+        kept = {k: about[k] for k in ("of", "tolerance_name", "tolerance", "gap")}
+        key = json.dumps(kept)
+        kept["seed"] = about["seed"]
+        found.setdefault(key, {**kept, "twins": 0})["twins"] += 1
+    return list(found.values())

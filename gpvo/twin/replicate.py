@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -149,17 +148,6 @@ def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: 
 
     run_odometry(source, out / source.name, original.config, amend=amend, meta={"twin": about})
     return out / source.name
-
-
-def simulated_truth(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Which of some runs, by their ``run.json``, are twins: of what, how many, with which tolerance."""
-    found: dict[str, dict[str, Any]] = {}
-    for about in (m["twin"] for m in metas if m.get("twin")):
-        kept = {k: about[k] for k in ("of", "tolerance_name", "tolerance", "gap")}
-        key = json.dumps(kept)
-        kept["seed"] = about["seed"]
-        found.setdefault(key, {**kept, "twins": 0})["twins"] += 1
-    return list(found.values())
 
 
 def read_tolerance(text: str) -> tuple[str, Tolerance]:

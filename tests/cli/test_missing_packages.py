@@ -69,6 +69,14 @@ def test_what_flies_needs_numpy_and_safetensors_alone() -> None:
     assert done.stdout == "frame\n", done.stderr
 
 
+@pytest.mark.parametrize("command", ["evaluate", "fuse"])
+def test_a_model_is_judged_without_what_trains_it(command: str) -> None:
+    absent = ("torch", "gpytorch", "sklearn", "numba", "mujoco", "embreex", "rosbags")
+    model = str(ROOT / "models" / "tunnel.gpvo")
+    code, said = call(absent, command, str(ROOT / "data" / "unseen"), "--model", model, "--json")
+    assert code == 0, said
+
+
 def test_odometry_runs_to_the_end_with_its_extra_alone(tmp_path: Path) -> None:
     rng, n = np.random.default_rng(0), 40
     landmarks = rng.uniform([-4, -3, 3], [4, 3, 25], (300, 3))

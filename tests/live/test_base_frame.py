@@ -104,11 +104,11 @@ def test_a_mounting_that_moves_is_told_and_the_first_place_stays() -> None:
 def test_a_tree_joins_frames_over_their_common_ancestor_and_refuses_what_cannot_be() -> None:
     tree = FrameTree()
     assert tree.transform("a", "b") is None
-    tree.take(tf_message([("/root", "/a", T_BASE_MAST), ("root", "b", T_MAST_SOURCE)]))
+    tree.take(tf_message([("/hub", "/a", T_BASE_MAST), ("hub", "b", T_MAST_SOURCE)]))
     T_a_b = tree.transform("a", "b")
     assert T_a_b is not None
     np.testing.assert_allclose(T_a_b, se3.inverse(T_BASE_MAST) @ T_MAST_SOURCE, atol=1e-12)
-    good = tf_message([("root", "b", np.eye(4))])
+    good = tf_message([("hub", "b", np.eye(4))])
     [transform] = good.transforms
     q, v = type(transform.transform.rotation), type(transform.transform.translation)
     absurd = [
@@ -116,14 +116,14 @@ def test_a_tree_joins_frames_over_their_common_ancestor_and_refuses_what_cannot_
         replace(transform, transform=replace(transform.transform, rotation=q(np.nan, 0.0, 0.0, 1.0))),
         replace(transform, transform=replace(transform.transform, translation=v(1e200, 0.0, 0.0))),
         replace(transform, transform=replace(transform.transform, translation=v(0.0, np.inf, 0.0))),
-        replace(transform, child_frame_id="root"),
+        replace(transform, child_frame_id="hub"),
     ]
     tree.take(replace(good, transforms=absurd))
     assert tree.refused == len(absurd)
     np.testing.assert_array_equal(tree.transform("a", "b"), T_a_b)
-    tree.take(tf_message([("b", "root", np.eye(4))]))  # a ring: it ends all the same
+    tree.take(tf_message([("b", "hub", np.eye(4))]))  # a ring: it ends all the same
     assert tree.transform("a", "elsewhere") is None
-    tree.take(tf_message([("root", f"f{k}", np.eye(4)) for k in range(2000)]))
+    tree.take(tf_message([("hub", f"f{k}", np.eye(4)) for k in range(2000)]))
     assert tree.refused > 1000
 
 

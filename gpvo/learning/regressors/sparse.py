@@ -7,6 +7,7 @@ is the log marginal likelihood itself and the posterior the exact one.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -42,7 +43,7 @@ TIGHT, TIGHT_EXACT = 0.05, 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnPoints:
+class OnPoints(ABC):
     """What all regressors here share: they learn, each in its own way, from data of unit variance, and close with the
     best posterior of all rows on inducing points.
 
@@ -59,9 +60,9 @@ class OnPoints:
     """Whether signal and noise variances are learnt anew on all rows in the end."""
 
     @property
+    @abstractmethod
     def name(self) -> str:
         """By which it is chosen."""
-        raise NotImplementedError
 
     def fit(self, X: Array, Y: Array, *, seed: int = 0) -> FittedGP:
         """See :class:`~gpvo.learning.regressors.Regressor`."""
@@ -78,9 +79,9 @@ class OnPoints:
             relearn = self.relearns and self.hyper is None
             return close(Xs, Ys, scaling, hyper, points, self.name, relearn=relearn)
 
+    @abstractmethod
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array | None]:
         """Standardised hyperparameters, and points over the length scales where they are learnt too."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
