@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 
@@ -14,7 +15,10 @@ def main() -> None:
             raise
         print(f"gpvo: the command line needs the package '{error.name}' (pip install typer rich)", file=sys.stderr)
         sys.exit(2)
-    run()
+    try:
+        run()
+    finally:  # all is written: Ctrl-C while Python winds down its worker processes would print a traceback
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 if __name__ == "__main__":

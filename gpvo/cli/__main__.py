@@ -1,5 +1,5 @@
 """``python -m gpvo.cli``."""
 
-from gpvo.cli import main
+from gpvo.__main__ import main
 
 main()
