@@ -28,7 +28,7 @@ from gpvo.learning.methods import method_arrays
 from gpvo.learning.scores import score
 from gpvo.learning.train import TrainedModel, estimate_set, train_sets
 
-FEATURES = "velocity,rotation"
+FEATURES = "velocity,rotation,agility"
 
 
 def run(
