@@ -110,7 +110,7 @@ def measure(wire: str, source: list[str], options: tuple[str, ...], seconds: flo
 
 def _wires() -> list[str]:
     have = [name for name, package in (("zenoh", "zenoh"), ("dds", "cyclonedds")) if importlib.util.find_spec(package)]
-    probe = [_SYSTEM_PYTHON, "-c", "import rospy, nav_msgs.msg, sensor_msgs.msg, diagnostic_msgs.msg, numpy"]
+    probe = [_SYSTEM_PYTHON, "-c", "import rospy, netifaces, nav_msgs.msg, sensor_msgs.msg, diagnostic_msgs.msg, numpy"]
     if shutil.which("rosmaster") and Path(_SYSTEM_PYTHON).exists():
         have += ["ros1"] * (subprocess.run(probe, env=_environment("ros1", ""), capture_output=True).returncode == 0)
     return have
