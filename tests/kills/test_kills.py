@@ -28,17 +28,19 @@ KILLS = int(os.environ.get("GPVO_KILLS", "24"))
 TABLES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "config.toml",
           "predictions.parquet", "tracks.parquet", "calibration_state.json")  # fmt: skip
 GPVO = [sys.executable, "-m", "gpvo.cli"]
-# A reproduction of one row, without images: smaller than the command line offers.
+# A reproduction of one row, without images: smaller than the command line offers, and interrupted as it is.
 REPRODUCE = """
-import sys
+import signal, sys
 from pathlib import Path
-from gpvo.reproduce.experiments import Plan
-from gpvo.reproduce.run import reproduce
-training = {"images": 0, "points": 2}
 try:
+    from gpvo.reproduce.experiments import Plan
+    from gpvo.reproduce.run import reproduce
+    training = {"images": 0, "points": 2}
     reproduce(Plan(seeds=0, points_seeds=2, training=training, duration_s=5.0, only=("4.3",)), Path(sys.argv[1]))
-except KeyboardInterrupt:  # as the command line does
+except KeyboardInterrupt:
     sys.exit(130)
+finally:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 """
 
 
