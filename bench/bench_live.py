@@ -27,6 +27,7 @@ import numpy as np
 import psutil
 from gpvo.dataset.build import build
 from gpvo.geometry import se3
+from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online import modelfile
@@ -168,7 +169,8 @@ def _process(environment: dict[str, str], *command: str, ready: str | None = Non
 
 def _shim_model(folder: Path) -> Path:
     """A model of an odometry that flies as the publisher does."""
-    rng, T_true, sets = np.random.default_rng(0), np.array([pose(k / 20) for k in range(600)]), []
+    rng, sets = np.random.default_rng(0), []
+    T_true = np.array([pose(k / 20) for k in range(600)]) @ T_FLU_OPTICAL
     for k in range(2):
         noise = se3.exp(1e-3 * rng.standard_normal((len(T_true) - 1, 6)))
         motions = se3.inverse(T_true[:-1]) @ T_true[1:] @ noise
