@@ -17,12 +17,11 @@ from gpvo.dataset.build import build_run
 from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, trace_of
 from gpvo.evaluation.fusion_plot import save
 from gpvo.evaluation.fusion_report import document
-from gpvo.files import write_json, write_text
+from gpvo.files import markdown_table, write_json, write_text
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions
 from gpvo.filters.study import Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run
-from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model
 from gpvo.learning.train import train_sets

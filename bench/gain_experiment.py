@@ -18,11 +18,10 @@ from typing import Any
 
 from gpvo.cli.files import import_log
 from gpvo.dataset.build import TrainingSet, build
-from gpvo.files import read_json, write_json
+from gpvo.files import markdown_table, read_json, write_json
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run import Run, read_run
-from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.runner import run as run_vo

@@ -23,9 +23,8 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.consistency import HORIZONS_M, consistency
 from gpvo.evaluation.evaluate import judged
 from gpvo.evaluation.statements import statements
-from gpvo.files import write_json
+from gpvo.files import markdown_table, write_json
 from gpvo.io.run import Run, read_run
-from gpvo.io.tables import markdown_table
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor

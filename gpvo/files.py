@@ -1,19 +1,22 @@
-"""Files written whole or not at all, by one writer at a time; JSON written and read without NaN."""
+"""Files written whole or not at all, by one writer at a time: JSON without NaN, settings as TOML, tables as CSV."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import os
+import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpvo.errors import SourceError
+from gpvo.errors import GpvoError, SourceError
 
 try:
     import fcntl
@@ -21,6 +24,8 @@ except ImportError:  # Windows: two writers there are not told of one another.
     fcntl = None  # type: ignore[assignment]
 
 _MAX_BYTES = 50_000_000
+_MAX_TOML_BYTES = 200_000
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @contextmanager
@@ -151,3 +156,75 @@ def _whole(text: str) -> int:
     if len(text) > 20:  # of 64 bits: a longer one overflows where it becomes a float
         raise ValueError(f"{text[:20]}... is no number of JSON")
     return int(text)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Settings of a file. Raises GpvoError where it cannot be read."""
+    try:
+        if path.stat().st_size > _MAX_TOML_BYTES:
+            raise GpvoError("is larger than 200 kB: no settings", where=path)
+        return parse_toml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as problem:
+        raise GpvoError(f"cannot be read as TOML: {problem}", where=path) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """What a text of TOML says. Raises ValueError where it is none."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as tomllib  # type: ignore[no-redef,import-not-found,unused-ignore]
+    return tomllib.loads(text)
+
+
+def write_toml(path: Path, settings: Mapping[str, Any]) -> None:
+    """Write settings; nested mappings become tables, and what is None is left out."""
+    write_text(path, to_toml(settings))
+
+
+def to_toml(settings: Mapping[str, Any]) -> str:
+    """Settings as TOML text."""
+    return "\n".join(_toml_lines(plain(settings), ())) + "\n"
+
+
+def _toml_lines(table: dict[str, Any], parents: tuple[str, ...]) -> list[str]:
+    lines = [
+        f"{_toml_key(k)} = {_toml_value(v)}" for k, v in table.items() if v is not None and not isinstance(v, dict)
+    ]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            names = (*parents, _toml_key(key))
+            lines += ["", f"[{'.'.join(names)}]", *_toml_lines(value, names)]
+    return lines
+
+
+def _toml_key(name: str) -> str:
+    return name if _BARE.fullmatch(name) else json.dumps(name)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml_value(v) for v in value if v is not None) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in value.items() if v is not None) + "}"
+    if isinstance(value, (int, float)):
+        return repr(value)
+    return json.dumps(str(value))
+
+
+def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
+    """Write columns of one length with their names; None and NaN are left empty, other numbers exact."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    plain = (c.tolist() if hasattr(c, "tolist") else c for c in columns.values())
+    writer.writerows([None if v != v else v for v in row] for row in zip(*plain, strict=True))
+    write_text(path, stream.getvalue())
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table in Markdown."""
+    cells = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(v.replace("|", "\\|") for v in row) + " |" for row in cells]

@@ -1,12 +1,16 @@
-"""The same jobs on this machine's cores or on a Dask cluster."""
+"""The same jobs on this machine's cores or on a Dask cluster; items made ahead in a thread."""
 
 from __future__ import annotations
 
+import queue
+import threading
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 from gpvo.errors import GpvoError, MissingExtraError
+
+T = TypeVar("T")
 
 
 def map_jobs(
@@ -60,3 +64,48 @@ def _on_dask(
     with client:
         futures = [client.submit(function, *arguments, pure=False) for arguments in jobs_arguments]
         return list(client.gather(futures))
+
+
+def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """The same items, made ahead in one background thread; at most ``depth`` wait.
+
+    An exception in the thread is raised here; the thread ends when the consumer stops.
+    """
+    waiting: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=depth)
+    stop = threading.Event()
+
+    def put(entry: tuple[str, Any]) -> None:
+        while not stop.is_set():
+            try:
+                waiting.put(entry, timeout=0.1)
+                return
+            except queue.Full:
+                continue
+
+    def work() -> None:
+        try:
+            for item in items:
+                put(("item", item))
+                if stop.is_set():
+                    return
+            put(("end", None))
+        except BaseException as error:
+            put(("error", error))
+        finally:
+            # A generator's files belong to this thread: close them here, not wherever it is collected.
+            if isinstance(items, Generator):
+                items.close()
+
+    thread = threading.Thread(target=work, name="gpvo-decode", daemon=True)
+    thread.start()
+    try:
+        while True:
+            what, value = waiting.get()
+            if what == "end":
+                return
+            if what == "error":
+                raise value
+            yield value
+    finally:
+        stop.set()
+        thread.join()

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
-from gpvo.files import write_json
+from gpvo.files import read_toml, write_json
 from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
-from gpvo.io.toml import read_toml
 from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo.config import VoConfig, make_config
 from gpvo.vo.frontend import Followed

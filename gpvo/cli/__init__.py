@@ -25,7 +25,6 @@ from gpvo.cli import (
     live,
     model,
     output,
-    reproduce,
     run,
     score,
     selftest,
@@ -76,7 +75,7 @@ for command in (
     fuse.publish,
     live.live,
     live.doctor,
-    reproduce.reproduce,
+    selftest.reproduce,
     selftest.selftest,
 ):
     app.command(command.__name__.rstrip("_"))(common.with_common_options(command))

@@ -87,7 +87,7 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
 
     Raises GpvoError: one line for what is no table of a command, no option of it, or no value for it.
     """
-    from gpvo.io.toml import read_toml
+    from gpvo.files import read_toml
 
     found = read_toml(path)
     words: list[str] = []

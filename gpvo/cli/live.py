@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -139,9 +139,7 @@ def doctor(
     if wire is None:
         found = examine_bag(Path(source), topic)
         if truth is not None:
-            from gpvo.cli.judging import lines, nees_of_bag
-
-            judged = {t: nees_of_bag(Path(source), t, truth, truth_topic, align) for t in found if t != truth_topic}
+            judged = {t: _nees_of_bag(Path(source), t, truth, truth_topic, align) for t in found if t != truth_topic}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
         found = {source: examine_topic(wire, source, kind, seconds, address, domain)}
@@ -157,7 +155,7 @@ def doctor(
         for finding in findings:
             for line in str(finding).splitlines():
                 say(f"  {line}")
-        for line in lines(judged[name]) if name in judged else ():
+        for line in _lines(judged[name]) if name in judged else ():
             say(f"  {line}")
 
 
@@ -166,3 +164,56 @@ def _one_wire(**given: bool) -> str | None:
     if len(chosen) > 1:
         raise GpvoError(f"--{' and --'.join(chosen)} exclude each other", cure="choose one")
     return chosen[0] if chosen else None
+
+
+def _nees_of_bag(
+    bag: Path, topic: str, truth: Path, truth_topic: str | None = None, align: str = "none"
+) -> dict[str, Any]:
+    """NEES per degree of freedom of the ``poses`` and of the ``motions`` that a topic states covariances of.
+
+    Each is None, or by block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; ``problem`` is
+    the reason where nothing could be judged. ``truth``: anything that ``gpvo import --truth`` reads, of the same body.
+    """
+    from tempfile import TemporaryDirectory
+
+    from gpvo.cli.files import import_log
+    from gpvo.evaluation.evaluate import evaluate_run
+    from gpvo.evaluation.trajectory import nees_document
+    from gpvo.io.foreign import read_foreign
+    from gpvo.io.run import read_run
+    from gpvo.types import IMPORTED
+
+    try:
+        with TemporaryDirectory(prefix="gpvo-") as folder:
+            given = read_foreign(truth, topic=truth_topic, complete=True)
+            import_log(read_foreign(bag, topic=topic), given, Path(folder) / "run", frame="body", align=align)
+            evaluation = evaluate_run(read_run(Path(folder) / "run"))
+    except GpvoError as error:
+        return {"poses": None, "motions": None, "problem": str(error)}
+    motions = nees_document(evaluation.consistency.get(IMPORTED))
+    problem = None if motions or evaluation.poses else "no covariance is stated that could be judged"
+    return {"poses": nees_document(evaluation.poses), "motions": motions, "problem": problem}
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    """The same in words, one line for each."""
+    if found["problem"]:
+        return [f"NEES: not known: {found['problem']}"]
+    out = []
+    for what in ("poses", "motions"):
+        if about := found[what]:
+            by_block = {name: block for name, block in about.items() if name != "count"}
+            joint = by_block.pop("joint")
+            low, high = joint["interval"]
+            each = ", ".join(f"{name} {block['nees_dof']:.3g}" for name, block in by_block.items())
+            out.append(
+                f"NEES per degree of freedom of {about['count']} {what}: {joint['nees_dof']:.3g}"
+                f" [{low:.3g}, {high:.3g}], {each}: {_meaning(low, high)}"
+            )
+    return out
+
+
+def _meaning(low: float, high: float) -> str:
+    if low > 1.0:
+        return "too sure"
+    return "too timid" if high < 1.0 else "right, as far as this truth tells"

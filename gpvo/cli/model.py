@@ -216,8 +216,8 @@ def _print_forecast(f: Forecast, path: Path) -> None:
 
 def _write_forecast(out: Path, f: Forecast) -> None:
     """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
+    from gpvo.files import write_csv
     from gpvo.io.parquet import write_table
-    from gpvo.io.tables import write_csv
 
     position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
     columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}

@@ -144,14 +144,14 @@ def _show_list(json_: bool) -> None:
 
 def _assignment(text: str) -> tuple[str, Any]:
     """``key=value`` with a TOML value; what is no TOML is text."""
-    from gpvo.io.toml import tomllib
+    from gpvo.files import parse_toml
 
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise GpvoError(f"--set '{text}' is not key=value", cure="such as --set noise_sigma=0.05")
     try:
-        return key.strip(), tomllib.loads(f"v = {value}")["v"]
-    except tomllib.TOMLDecodeError:
+        return key.strip(), parse_toml(f"v = {value}")["v"]
+    except ValueError:
         return key.strip(), value.strip()
 
 

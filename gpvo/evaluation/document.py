@@ -14,8 +14,7 @@ from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.trajectory import nees_document
 from gpvo.evaluation.verdict import verdict
-from gpvo.files import write_text
-from gpvo.io.tables import write_csv
+from gpvo.files import write_csv, write_text
 from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import METHODS
 from gpvo.online.features import AXES

@@ -1,14 +1,12 @@
-"""Decoding images to 8 bit grey, and sequences of image pairs that lie in files."""
+"""Decoding images to 8 bit grey, and sequences of image pairs that lie in files; whether left and right are swapped."""
 
 from __future__ import annotations
 
-import queue
-import threading
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -18,17 +16,26 @@ from gpvo.cameras.imagesize import image_size, is_decodable
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.order import OrderCheck
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import check_interval, in_order, usual_interval
+from gpvo.parallel import prefetched
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _MAX_IMAGE_BYTES = 500_000_000
 _MAX_HEAD_BYTES = 1 << 20  # Thumbnails and colour profiles stand before the size.
+# Are left and right swapped? Points in front of both cameras lie further right in the left image.
+_FEATURES = 600
+# Exchanged images are rectified by the other lens' numbers: rows then differ by twice the pitch between the cameras.
+_MAX_ROW_SHARE = 0.06
+_MAX_ROW_SPREAD_PX = 3.0
+_MIN_DISPARITY_PX = 1.0
+_MAX_DISTANCE_BITS = 40
+_MIN_MATCHES = 25
+_MIN_RATIO = 5.0
+_FRAMES = 5
 
 Image8 = NDArray[np.uint8]
-T = TypeVar("T")
 
 
 def to_grey8(image: NDArray[Any], *, bgr: bool = True, bits: int = 16) -> Image8:
@@ -76,51 +83,6 @@ def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
     return to_grey8(image, bits=bits)
-
-
-def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
-    """The same items, made ahead in one background thread; at most ``depth`` wait.
-
-    An exception in the thread is raised here; the thread ends when the consumer stops.
-    """
-    waiting: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=depth)
-    stop = threading.Event()
-
-    def put(entry: tuple[str, Any]) -> None:
-        while not stop.is_set():
-            try:
-                waiting.put(entry, timeout=0.1)
-                return
-            except queue.Full:
-                continue
-
-    def work() -> None:
-        try:
-            for item in items:
-                put(("item", item))
-                if stop.is_set():
-                    return
-            put(("end", None))
-        except BaseException as error:
-            put(("error", error))
-        finally:
-            # A generator's files belong to this thread: close them here, not wherever it is collected.
-            if isinstance(items, Generator):
-                items.close()
-
-    thread = threading.Thread(target=work, name="gpvo-decode", daemon=True)
-    thread.start()
-    try:
-        while True:
-            what, value = waiting.get()
-            if what == "end":
-                return
-            if what == "error":
-                raise value
-            yield value
-    finally:
-        stop.set()
-        thread.join()
 
 
 @dataclass(frozen=True)
@@ -185,7 +147,7 @@ class ImageSource(ABC):
 
     def __iter__(self) -> Iterator[StereoFrame]:
         self.report = report = self._fresh_report()
-        frames = self._frames(report)
+        frames = _not_swapped(self._frames(report), self.path)
         return prefetched(frames) if self._prefetch else frames
 
     def remark(self, text: str) -> None:
@@ -198,12 +160,9 @@ class ImageSource(ABC):
         return replace(self.known, notes=list(self.known.notes))
 
     def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
-        order = OrderCheck(self.path)
         for raw in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
-            frame = StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
-            order.see(frame)
-            yield frame
+            yield StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
         if report.frames == 0:
             raise SourceError("not one readable image pair", where=self.path)
 
@@ -281,3 +240,48 @@ def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
                 where=path,
                 cure="use the calibration of this resolution, or scale its intrinsics",
             )
+
+
+def _not_swapped(frames: Iterable[StereoFrame], where: object) -> Iterator[StereoFrame]:
+    """The frames of a sequence. Of the first, one that shows the right order settles it; SourceError at the second
+    whose points lie behind the cameras."""
+    unclear, swapped = _FRAMES, 0
+    for frame in frames:
+        if unclear:
+            sign = disparity_sign(frame)
+            unclear = 0 if sign > 0 else unclear - 1
+            swapped += sign < 0
+            if swapped >= 2:
+                raise SourceError(
+                    "left and right images are swapped: matched points have negative disparity",
+                    where=where,
+                    cure="exchange the two image folders or topics",
+                )
+        yield frame
+
+
+def disparity_sign(frame: StereoFrame) -> int:
+    """+1 or -1 where nearly all matches of a rectified frame have a disparity of that sign, else 0."""
+    orb = cv2.ORB.create(nfeatures=_FEATURES)
+    key_l, des_l = orb.detectAndCompute(frame.left, None)
+    key_r, des_r = orb.detectAndCompute(frame.right, None)
+    if des_l is None or des_r is None or len(key_l) < _MIN_MATCHES or len(key_r) < _MIN_MATCHES:
+        return 0
+    uv_l, uv_r = (np.array([k.pt for k in keys]) for keys in (key_l, key_r))
+    bits_l, bits_r = (np.unpackbits(d, axis=1).astype(np.float32) for d in (des_l, des_r))
+    # Hamming distance of bit vectors as inner products; other rows are out of reach.
+    distance = bits_l.sum(1)[:, None] + bits_r.sum(1)[None, :] - 2.0 * bits_l @ bits_r.T
+    distance[np.abs(uv_l[:, None, 1] - uv_r[None, :, 1]) > _MAX_ROW_SHARE * frame.left.shape[0]] = np.inf
+    best_r, best_l = distance.argmin(axis=1), distance.argmin(axis=0)
+    own = np.arange(len(uv_l))
+    mutual = (best_l[best_r] == own) & (distance[own, best_r] < _MAX_DISTANCE_BITS)
+    shift = uv_l[mutual] - uv_r[best_r[mutual]]
+    if len(shift) < _MIN_MATCHES:
+        return 0
+    d = shift[np.abs(shift[:, 1] - np.median(shift[:, 1])) < _MAX_ROW_SPREAD_PX, 0]
+    front, behind = int((d > _MIN_DISPARITY_PX).sum()), int((d < -_MIN_DISPARITY_PX).sum())
+    if front >= _MIN_MATCHES and front > _MIN_RATIO * behind:
+        return 1
+    if behind >= _MIN_MATCHES and behind > _MIN_RATIO * front:
+        return -1
+    return 0

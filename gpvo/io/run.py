@@ -24,14 +24,13 @@ import numpy as np
 
 from gpvo import __version__
 from gpvo.errors import SourceError
-from gpvo.files import write_json
+from gpvo.files import write_json, write_toml
 from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
 from gpvo.io.run_folder import SCHEMA, is_finished
 from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
 from gpvo.io.snapshot import save_snapshot
-from gpvo.io.toml import write_toml
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
-from gpvo.io.tables import markdown_table
+from gpvo.files import markdown_table
 
 
 def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -> str:

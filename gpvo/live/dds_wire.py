@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from gpvo.errors import require
 from gpvo.live.outputs import Send
 from gpvo.live.zenoh_wire import dds_name
-from gpvo.publish import px4
+from gpvo.publish import ros
 
 _DEPTH, _READER_DEPTH = 10, 100
 # A reader that has stopped acknowledging would hold the end of the process for a second, cyclonedds' default.
@@ -119,7 +119,7 @@ def idl_type(msgtype: str) -> Any:
     from cyclonedds.idl import make_idl_struct
 
     store = get_typestore(Stores.ROS2_JAZZY)
-    px4.register(store)
+    ros.register_px4(store)
     fields = store.fielddefs[msgtype][1]
     name = dds_name(msgtype)
     return make_idl_struct(name.rsplit("::", 1)[1], name, {field: _idl_field(kind) for field, kind in fields})

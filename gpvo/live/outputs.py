@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from gpvo.errors import GpvoError
 from gpvo.live.engine import Health
-from gpvo.publish import px4, ros
+from gpvo.publish import ros
 from gpvo.publish.mavlink import Link
 from gpvo.publish.odometry import Odometry
 
@@ -93,12 +93,12 @@ class Px4Output:
     """``px4_msgs/VehicleOdometry`` for a flight controller that listens by uXRCE-DDS; a lost frame is NaN."""
 
     def __init__(self, wire: Wire) -> None:
-        px4.register(wire.store)
-        self._wire, self._send = wire, wire.advertise(px4.TOPIC, px4.TYPE)
+        ros.register_px4(wire.store)
+        self._wire, self._send = wire, wire.advertise(ros.PX4_TOPIC, ros.PX4_TYPE)
 
     def odometry(self, odometry: Odometry) -> None:
         """Send one frame."""
-        self._send(encode(self._wire, px4.vehicle_odometry(odometry, self._wire.store.types)))
+        self._send(encode(self._wire, ros.vehicle_odometry(odometry, self._wire.store.types)))
 
     def health(self, health: Health) -> None:
         """It is carried as the message's quality."""

@@ -1,6 +1,6 @@
 """MAVLink 2 for flight controllers: ODOMETRY, VISION_SPEED_ESTIMATE and HEARTBEAT, to a file, UDP or serial.
 
-FRD and NED live in this module and :mod:`gpvo.publish.px4` alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w,
+FRD and NED live in this module and :mod:`gpvo.publish.ros` alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w,
 x, y, z, upper triangles row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
 """
 

@@ -1,4 +1,5 @@
 """``nav_msgs/Odometry`` in ROS 1 bags, ROS 2 sqlite3 bags and MCAP, by the ``rosbags`` library; no ROS needed.
+And PX4's ``px4_msgs/VehicleOdometry``.
 
 REP 103: quaternion x, y, z, w; covariance row-major 6x6, order (x, y, z, rotation about X, Y, Z) in fixed axes; pose
 in ``header.frame_id``, twist in ``child_frame_id``. Lost frames are not written: a receiver would fuse them.
@@ -19,14 +20,32 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.publish.mavlink import frd, quality
 from gpvo.publish.odometry import Odometry
 
 TOPIC = "/gpvo/odometry"
 _TYPE = "nav_msgs/msg/Odometry"
+PX4_TOPIC = "/fmu/in/vehicle_visual_odometry"
+PX4_TYPE = "px4_msgs/msg/VehicleOdometry"
+_POSE_FRAME_FRD, _VELOCITY_FRAME_BODY_FRD = 2, 3
+_PX4_DEFINITION = """uint64 timestamp
+uint64 timestamp_sample
+uint8 pose_frame
+float32[3] position
+float32[4] q
+uint8 velocity_frame
+float32[3] velocity
+float32[3] angular_velocity
+float32[3] position_variance
+float32[3] orientation_variance
+float32[3] velocity_variance
+uint8 reset_counter
+int8 quality
+"""
 
 
 def odometry_message(odometry: Odometry, types: dict[str, Any], *, seq: int | None = None) -> Any:
@@ -142,3 +161,43 @@ odom0_twist_rejection_threshold: 3.0
     if ros1:
         return head + parameters
     return f"{head}ekf_filter_node:\n  ros__parameters:\n{textwrap.indent(parameters, '    ')}"
+
+
+def register_px4(store: Any) -> None:
+    """Teach a typestore of rosbags the message, once."""
+    if PX4_TYPE not in store.fielddefs:
+        store.register(get_types_from_msg(_PX4_DEFINITION, PX4_TYPE))
+
+
+def vehicle_odometry(odometry: Odometry, types: dict[str, Any]) -> Any:
+    """``px4_msgs/VehicleOdometry`` for PX4 over uXRCE-DDS, on ``/fmu/in/vehicle_visual_odometry``.
+
+    Pose in FRD of arbitrary heading, velocity in the body's FRD, diagonals alone; what is unknown is NaN, and a lost
+    frame NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; the agent turns Unix time
+    into the flight controller's.
+    """
+    pose, twist = frd(odometry)
+    nan = np.full(6, np.nan)
+    # FLU and FRD differ in signs, which variances have not.
+    known = np.diagonal(odometry.pose_covariance) if odometry.tracked else nan
+    velocity = nan if odometry.twist_covariance is None else np.diagonal(odometry.twist_covariance)
+    t_us = odometry.t_ns // 1000
+    return types[PX4_TYPE](
+        timestamp=t_us,
+        timestamp_sample=t_us,
+        pose_frame=_POSE_FRAME_FRD,
+        position=_float32(pose[:3]),
+        q=_float32(pose[3:]),
+        velocity_frame=_VELOCITY_FRAME_BODY_FRD,
+        velocity=_float32(twist[:3]),
+        angular_velocity=_float32(twist[3:]),
+        position_variance=_float32(known[:3]),
+        orientation_variance=_float32(known[3:]),
+        velocity_variance=_float32(velocity[:3]),
+        reset_counter=odometry.reset_counter,
+        quality=quality(odometry),
+    )
+
+
+def _float32(values: Any) -> np.ndarray:
+    return np.asarray(values, dtype=np.float32)

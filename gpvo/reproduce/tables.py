@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gpvo.io.tables import markdown_table
+from gpvo.files import markdown_table
 
 MODES = {"images": "images", "points": "points only", "real": "real"}
 _THESIS = ("rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "residual_m", "residual_over_rmse")

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gpvo.cameras.rig import Tolerance
 from gpvo.errors import GpvoError
-from gpvo.io.toml import read_toml
+from gpvo.files import read_toml
 from gpvo.sim.points import SCENARIOS, PointsScenario
 from gpvo.sim.rig import CAMERAS, camera_rig
 

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.files import FolderLock, write_json
+from gpvo.files import FolderLock, to_toml, write_json
 from gpvo.geometry.se3 import path_length_m
-from gpvo.io.toml import to_toml
 from gpvo.sim import imu, routes, sequence_files, sequence_plan, vehicles
 from gpvo.sim.episodes import Episode
 from gpvo.sim.eye import Eye, optical_flow

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.rig import RIG_ERRORS, TOLERANCES, Tolerance, TrueRig
 from gpvo.errors import GpvoError
+from gpvo.files import read_toml
 from gpvo.io.source import SourceReport
-from gpvo.io.toml import read_toml
 from gpvo.parallel import map_jobs
 from gpvo.runner import run as run_odometry
 from gpvo.twin.estimate import Original, estimate

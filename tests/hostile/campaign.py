@@ -93,7 +93,7 @@ def read_planned_path(path: Path) -> None:
 
 
 def read_settings(path: Path) -> None:
-    from gpvo.io.toml import read_toml
+    from gpvo.files import read_toml
 
     read_toml(path)
 

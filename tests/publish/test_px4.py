@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.publish import px4
+from gpvo.publish import ros
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Status
 from rosbags.typesys import Stores, get_typestore
@@ -28,8 +28,8 @@ FRAME = Odometry(
 
 def test_left_becomes_right_and_up_becomes_down() -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
-    px4.register(store)
-    m = px4.vehicle_odometry(FRAME, store.types)
+    ros.register_px4(store)
+    m = ros.vehicle_odometry(FRAME, store.types)
     assert (m.pose_frame, m.velocity_frame, m.quality, m.timestamp) == (2, 3, 50, 10**15)
     T = FRAME.T_odom_body
     np.testing.assert_allclose(m.position, [T[0, 3], -T[1, 3], -T[2, 3]], rtol=1e-6)
@@ -44,9 +44,9 @@ def test_left_becomes_right_and_up_becomes_down() -> None:
 
 def test_a_lost_frame_is_nan_with_quality_minus_one() -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
-    px4.register(store)
+    ros.register_px4(store)
     lost = replace(FRAME, tracked=False, twist_body=None, twist_covariance=None, status=Status.LOST)
-    m = px4.vehicle_odometry(lost, store.types)
+    m = ros.vehicle_odometry(lost, store.types)
     assert m.quality == -1
     for name in ("position", "q", "velocity", "position_variance", "velocity_variance"):
         assert np.isnan(getattr(m, name)).all()
