@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 from gpvo.dataset.build import build_run
-from gpvo.evaluation.fusion import FusionReport, Trace, constants_of, flight_of, trace_of
-from gpvo.evaluation.fusion_plot import save
-from gpvo.evaluation.fusion_report import document
+from gpvo.evaluation.flights import constants_of, flight_of
+from gpvo.evaluation.fusion import FusionReport, Trace, document, trace_of
+from gpvo.evaluation.plots import save
 from gpvo.files import markdown_table, write_json, write_text
 from gpvo.filters.policies import LEARNED, POLICIES, LearnedPolicy
 from gpvo.filters.run import Flight, FusedRun, FuseOptions

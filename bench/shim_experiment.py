@@ -24,8 +24,7 @@ from gpvo.io.foreign import read_foreign
 from gpvo.io.run import read_run
 from gpvo.learning.check import check
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.methods import method_arrays
-from gpvo.learning.scores import score
+from gpvo.learning.methods import method_arrays, score
 from gpvo.learning.train import TrainedModel, estimate_set, train_sets
 
 FEATURES = "velocity,rotation,agility"

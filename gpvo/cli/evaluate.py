@@ -15,7 +15,7 @@ from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation
-    from gpvo.evaluation.matches import MatchPicture
+    from gpvo.evaluation.pictures import MatchPicture
     from gpvo.io.run import Run
     from gpvo.online.predictor import Predictor
     from gpvo.twin.replicate import TwinSettings
@@ -126,7 +126,7 @@ def report(
 
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
-    from gpvo.evaluation.matches import match_pictures
+    from gpvo.evaluation.pictures import match_pictures
     from gpvo.io import open_source
     from gpvo.runner import config_of
 
@@ -172,8 +172,7 @@ def _evaluate(
     runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions, unjudged: bool = False
 ) -> list[Evaluation]:
     """``unjudged``: runs without truth are shown and not refused."""
-    from gpvo.evaluation.evaluate import evaluate_run
-    from gpvo.evaluation.report import unjudged_run
+    from gpvo.evaluation.evaluate import evaluate_run, unjudged_run
 
     loaded, predictor = _loaded(runs, model, truth)
     if predictor is not None and model is not None:

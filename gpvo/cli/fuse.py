@@ -51,8 +51,7 @@ def fuse(
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
-    from gpvo.evaluation.fusion import FusionSettings, fuse_runs
-    from gpvo.evaluation.fusion_report import document, write_log
+    from gpvo.evaluation.fusion import FusionSettings, document, fuse_runs, write_log
     from gpvo.filters.gate import Gate
     from gpvo.filters.policies import LEARNED
     from gpvo.filters.run import FuseOptions
@@ -61,7 +60,7 @@ def fuse(
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
     if plot is not None:
-        from gpvo.evaluation.fusion_plot import plot_fusion, require_picture
+        from gpvo.evaluation.plots import plot_fusion, require_picture
 
         require_picture(plot)  # before the work, not after it
     wanted = tuple(p.strip() for p in policies.split(",") if p.strip())

@@ -108,7 +108,7 @@ def run(
     predictor = None if model is None else Predictor.load(model)
     show = None
     if view or record_view is not None:
-        from gpvo.evaluation.live_view import LiveView
+        from gpvo.evaluation.pictures import LiveView
 
         show = LiveView(sequence.camera, str(sequence.name), record_view).show
     inside: list[bool] = []

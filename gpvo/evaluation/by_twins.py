@@ -17,7 +17,7 @@ from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run
 from gpvo.evaluation.statements import Statement, plain_statement
 from gpvo.io.run import Run
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.scores import average
+from gpvo.learning.methods import average
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
 from gpvo.twin.gap import SPAN

@@ -20,10 +20,13 @@ from gpvo.evaluation.consistency import Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import (
     PoseConsistency,
+    RelativeError,
+    Statistics,
     TrajectoryErrors,
     pose_consistency,
     trajectory_errors,
 )
+from gpvo.geometry import se3
 from gpvo.io.run import Run
 from gpvo.online.predictor import Predictor
 from gpvo.types import Array, Prediction, Status, TruthLog, VoLog
@@ -68,6 +71,22 @@ class Evaluation:
     odd: Sequence[Stretch] = ()
     in_domain: float | None = None
     poses: PoseConsistency | None = None
+
+    @property
+    def shown(self) -> Statement | None:
+        """The statement to draw bounds of: ``learned`` if there is one, else ``triangulation``, else any full one."""
+        full = {s.method: s for s in self.statements if s.errors is not None}
+        return full.get("learned") or full.get("triangulation") or next(iter(full.values()), None)
+
+    @property
+    def shown_method(self) -> str:
+        """Its name for a caption."""
+        return "no method" if self.shown is None else self.shown.method
+
+    @property
+    def t_s(self) -> Array:
+        """(N,) seconds since the first frame."""
+        return (self.run.log.t_ns - self.run.log.t_ns[0]) * 1e-9
 
     def __str__(self) -> str:
         t = self.trajectory
@@ -127,8 +146,39 @@ def evaluate_run(
         unscored=int(log.usable.sum() - scored.usable.sum()),
         odd=odd_stretches(scored, truth),
         poses=pose_consistency(log, T_est, T_true, known),
-        in_domain=float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None,
+        in_domain=_in_domain(predictions),
     )
+
+
+def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
+    """An evaluation without errors: no frame is covered by truth, and no method has a score.
+
+    Raises ModelError if the model predicts something else than the error of a motion.
+    """
+    predictions = predictions_of(run, predictor)
+    run = replace(run, log=judged(run.log, predictions))
+    T_est, noiseless = run.log.trajectory(), np.zeros(6)
+    none = np.zeros((0, 4, 4))
+    of_none = RelativeError(Statistics.of(np.zeros(0)), Statistics.of(np.zeros(0)))
+    length = float(se3.path_length_m(T_est[:, :3, 3])[-1])
+    return Evaluation(
+        run=run,
+        errors=MotionErrors(np.zeros(0, np.int64), np.zeros((0, 6)), none, none, np.zeros(0)),
+        trajectory=TrajectoryErrors(length, np.nan, np.nan, np.nan, of_none, of_none, of_none, ()),
+        statements=tuple(statements(run.log, predictions, predictor)),
+        consistency={},
+        covered=np.zeros(len(run.log), bool),
+        T_est=T_est,
+        T_true=np.full_like(T_est, np.nan),
+        truth_sigma=noiseless,
+        truth_sigma_stated=noiseless,
+        time_offset_s=0.0,
+        in_domain=_in_domain(predictions),
+    )
+
+
+def _in_domain(predictions: Mapping[int, Prediction]) -> float | None:
+    return float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None
 
 
 def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:

@@ -1,116 +1,33 @@
-"""Run folders through the filters: load, predict, fuse under every policy, report."""
+"""Run folders through the filters: load, predict, fuse under every policy; and what ``gpvo fuse`` writes for machines,
+the JSON document and a log of innovations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gpvo.dataset.build import predictions_of
-from gpvo.dataset.errors import interpolate_truth, motion_errors
-from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
-from gpvo.filters.policies import (
-    CONSTANT_BEST,
-    CONSTANT_HINDSIGHT,
-    LEARNED,
-    POLICIES,
-    STATED,
-    constant_from_errors,
-)
+from gpvo.evaluation.flights import constants_in, constants_of, flight_of, start_sigmas
+from gpvo.files import write_text
+from gpvo.filters.gate import chi2_quantile
+from gpvo.filters.metrics import Scores
+from gpvo.filters.policies import CONSTANT_BEST, CONSTANT_HINDSIGHT, LEARNED, POLICIES, STATED
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, begin
 from gpvo.filters.sanity import require_sane
-from gpvo.filters.start import StartSigmas, slope_sigma
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run, read_run
 from gpvo.learning.check import check
 from gpvo.online.predictor import Predictor
 from gpvo.twin.gap import simulated_truth
-from gpvo.types import IMPORTED, Array, TruthLog
+from gpvo.types import IMPORTED, Array
 
-
-def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
-    """A run as the filters take it, with the model's predictions, else those stored in the run; a twin on a
-    path that a vehicle can fly, with an IMU of this path.
-
-    Raises GpvoError where there is an IMU but nobody says how it sits to the camera, or the run is empty.
-    """
-    if len(run.log) < 2:
-        raise GpvoError(f"holds {len(run.log)} records: nothing to fuse", where=run.path)
-    imu = run.imu if use_imu else None
-    if imu is not None and run.mounting.T_imu_cam is None:
-        raise GpvoError("has an IMU but no T_imu_cam in rig.json", where=run.path, cure="add it, or use --no-imu")
-    poses = valid = None
-    truth_sigma = (0.0, 0.0)
-    if run.truth is not None:
-        truth_sigma = (run.truth.sigma_translation_m, run.truth.sigma_rotation_rad)
-        poses, valid = interpolate_truth(run.truth, run.log.t_ns)
-        if not valid.any():
-            raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
-    flight = Flight(
-        name=run.name,
-        records=run.log.records,
-        imu=imu,
-        T_imu_cam=run.mounting.T_imu_cam if imu is not None else None,
-        T_world_cam=poses,
-        truth_valid=valid,
-        predictions=predictions_of(run, predictor),
-        truth_sigma=truth_sigma,
-    )
-    if about := run.meta.get("twin"):
-        # Only twins need the simulator.
-        from gpvo.evaluation.twin_flight import on_smooth_path
-
-        require_sane(flight)
-        return on_smooth_path(flight, (about["seed"], about["replicate"], 31))
-    return flight
-
-
-def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
-    """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope."""
-    base = StartSigmas()
-    position = max((r.truth.sigma_translation_m for r in runs if r.truth), default=0.0)
-    velocity = max((_slope_sigma(r, r.truth) for r in runs if r.truth), default=0.0)
-    rotation = max((r.truth.sigma_rotation_rad for r in runs if r.truth), default=0.0)
-    return replace(
-        base,
-        position_m=max(base.position_m, position),
-        velocity_mps=max(base.velocity_mps, velocity),
-        tilt_rad=max(base.tilt_rad, rotation),
-        yaw_rad=max(base.yaw_rad, rotation),
-    )
-
-
-def _slope_sigma(run: Run, truth: TruthLog) -> float:
-    return slope_sigma(truth.sigma_translation_m, float(np.median(np.diff(run.log.t_ns))) * 1e-9)
-
-
-def constants_of(runs: Sequence[Run]) -> Constants:
-    """Per-axis mean squares of the motions' errors over training runs, each run with equal weight."""
-    squares, dt = [], []
-    for run in runs:
-        if run.truth is None:
-            raise GpvoError("has no ground truth to train a constant on", where=run.path)
-        errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
-        if not len(errors.index):
-            raise GpvoError("has no motion with ground truth at both ends", where=run.path)
-        squares.append(constant_from_errors(errors.xi))
-        dt.append(float(np.median(errors.dt_s)))
-    return Constants(np.mean(squares, axis=0), float(np.median(dt)))
-
-
-def constants_in(predictor: Predictor) -> Constants | None:
-    """The constants that a model file carries, None where it has none."""
-    covariance = predictor.arrays.get("method.constant")
-    if covariance is None or covariance.shape != (6, 6):
-        return None
-    best = predictor.header.get("constant_best")
-    scalars = None if best is None else (float(best[0]), float(best[1]))
-    return Constants(np.diagonal(covariance).copy(), predictor.model.dt_s, scalars)
+_AXES = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
 
 
 @dataclass(frozen=True)
@@ -261,3 +178,101 @@ def trace_of(flight: Flight, fused: FusedRun) -> Trace:
         sigma_m=np.sqrt(np.trace(fused.covariance[:, :3, :3], axis1=1, axis2=2)),
         nis_dof=fused.nis / 6.0,
     )
+
+
+def write_log(path: Path, fused: FusedRun) -> None:
+    """A line per record: what was done with it, NIS, innovation and its standard deviation per axis (camera frame)."""
+    header = ["t_ns", "outcome", "nis", *(f"innovation_{a}" for a in _AXES), *(f"sigma_{a}" for a in _AXES)]
+    lines = [",".join(header)]
+    for step in fused.steps:
+        values = [np.nan] * 13
+        if step.innovation is not None:
+            sigma = np.sqrt(np.diagonal(step.innovation.S[0]))
+            values = [step.innovation.nis[0], *step.innovation.residual[0], *sigma]
+        lines.append(",".join([str(step.t_ns), step.outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+    write_text(path, "\n".join(lines) + "\n", "ascii")
+
+
+def document(report: FusionReport) -> dict[str, Any]:
+    """The machine-readable result of ``gpvo fuse``; a policy that could not run is null."""
+    result = report.study
+    names = list(result.scores)
+    runs = [
+        {"run": run, "policies": {name: _score(result.scores[name][i]) for name in names}}
+        for i, run in enumerate(result.runs)
+    ]
+    others = [n for n in names if n != LEARNED] if LEARNED in names else []
+    return {
+        "schema": 1,
+        "runs": runs,
+        "mean": {name: _mean(result, name, report.traces) for name in names},
+        "comparisons": [_comparison(result, LEARNED, other) for other in others],
+        "constants": None if result.constants is None else asdict(result.constants),
+        "warnings": list(report.warnings),
+        "simulated_truth": list(report.simulated_truth),
+    }
+
+
+def _score(scores: Scores | None) -> dict[str, Any] | None:
+    if scores is None:
+        return None
+    return {
+        "ate_rmse_m": scores.ate_rmse_m,
+        "final_error_m": scores.final_error_m,
+        "drift_percent": scores.drift_percent,
+        "nees_dof": scores.nees_dof,
+        "nis_dof": scores.nis_dof,
+        "nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high],
+        "rejected": scores.rejected,
+        "diverged": scores.diverged,
+    }
+
+
+def _mean(result: Study, name: str, traces: Sequence[Trace]) -> dict[str, Any] | None:
+    if all(s is None for s in result.scores[name]):
+        return None
+    keys = ("ate_rmse_m", "final_error_m", "drift_percent", "nis_dof", "rejected")
+    out: dict[str, Any] = {key: result.mean(name, key) for key in keys}
+    nees = {part: result.mean(name, f"nees_{part}") for part in ("position", "attitude")}
+    out["nis_in_band_percent"] = nis_in_band_percent([t for t in traces if t.policy == name])
+    return {**out, "nees_dof": nees, "diverged": result.diverged(name)}
+
+
+def _comparison(result: Study, policy: str, against: str) -> dict[str, Any] | None:
+    compared = result.compare(policy, against)
+    if not np.isfinite(compared.gain_percent):
+        return None
+    d = compared.difference_m
+    return {
+        "policy": policy,
+        "against": against,
+        "gain_percent": compared.gain_percent,
+        "ate_difference_m": d.mean,
+        "interval_m": [d.low, d.high],
+    }
+
+
+def nis_over_runs(traces: Sequence[Trace]) -> tuple[Array, NDArray[np.int64]]:
+    """Mean NIS per degree of freedom over runs at each step of the shortest, and how many runs measured there."""
+    length = min((len(t.t_s) for t in traces), default=0)
+    nis = np.array([t.nis_dof[:length] for t in traces]).reshape(len(traces), length)
+    known = np.isfinite(nis).sum(axis=0)
+    return np.where(known > 0, np.nansum(nis, axis=0) / np.maximum(known, 1), np.nan), known
+
+
+def nis_in_band_percent(traces: Sequence[Trace]) -> float:
+    """Share of the steps whose mean NIS lies in the 95 % chi-square band of as many runs: 95 where all is right."""
+    mean, known = nis_over_runs(traces)
+    bands = {int(n): nis_band(int(n)) for n in np.unique(known) if n > 0}
+    inside = [bands[int(n)][0] <= m <= bands[int(n)][1] for m, n in zip(mean, known, strict=True) if n > 0]
+    return 100.0 * float(np.mean(inside)) if inside else float("nan")
+
+
+def nis_band(runs: int, level: float = 0.95, dof: int = 6) -> tuple[float, float]:
+    """Where the mean NIS per degree of freedom over so many runs should lie at each time step."""
+    total = dof * runs
+    return chi2_quantile((1 - level) / 2, total) / total, chi2_quantile((1 + level) / 2, total) / total

@@ -7,15 +7,18 @@ path. NaN is None, a gap.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Any
+from statistics import NormalDist
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.evaluation import curves
 from gpvo.evaluation.evaluate import Evaluation
+from gpvo.evaluation.statements import Statement
 from gpvo.geometry.se3 import R_FLU_OPTICAL
+from gpvo.stats import consistency
 from gpvo.stats.series import allan_deviation, autocorrelation
 from gpvo.types import Array, Status
 
@@ -37,37 +40,10 @@ def colour(method: str) -> str:
 MAX_POINTS = 500
 _BLACK, _RED, _GREEN = "#1b1b1b", "#d62728", "#2ca02c"
 _SIX = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
+_LEVELS: Array = np.linspace(0.02, 0.98, 49)
+_HALF_WIDTHS: Array = np.array([NormalDist().inv_cdf(0.5 + p / 2) for p in _LEVELS])
+_NEES_WINDOW_S = 0.5
 _SHADES = {Status.DEGRADED: "#ffbf00", Status.LOST: _RED}
-
-
-def groups(e: Evaluation) -> list[dict[str, Any]]:
-    """Titled groups of panels, in the order of the page: ``{"title", "note", "panels"}``."""
-    statement = curves.best_statement(e)
-    method = "no method" if statement is None else statement.method
-    return [
-        {"title": "Top and side view", "note": f"Green: 3-sigma ellipses of {method}.", "panels": views(e)},
-        {
-            "title": "Error of each motion and its bound",
-            "note": f"Line: error. Green: three standard deviations as stated by {method}.",
-            "panels": errors(e),
-        },
-        {
-            "title": "What each method states",
-            "note": "The standard deviation of each motion, per axis.",
-            "panels": stated(e),
-        },
-        {
-            "title": "Is it honest?",
-            "note": "Overconfident where the curve is below the diagonal, and where NEES (mean over 0.5 s) is above 1.",
-            "panels": [*reliability(e), *nees(e)] if len(e.errors.index) else [],
-        },
-        {
-            "title": "How errors are correlated in time",
-            "note": "A dip at the first lag shows shared pixel noise; a flat or rising Allan deviation shows a bias.",
-            "panels": memory(e),
-        },
-        {"title": "What odometry saw", "note": "Amber: degraded frames. Red: lost frames.", "panels": inputs(e)},
-    ]
 
 
 def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
@@ -88,8 +64,7 @@ def views(e: Evaluation) -> list[Panel]:
     to_plane, names = level(e)
     origin = (e.T_true[e.covered] if e.covered.any() else e.T_est)[0, :3, 3]
     p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
-    statement = curves.best_statement(e)
-    stated = None if statement is None else statement.pose_covariance(e.run.log)
+    stated = None if e.shown is None else e.shown.pose_covariance(e.run.log)
     bounds = np.zeros((0, 6, 6)) if stated is None else stated
     keep, panels = spread(len(p)), []
     told = {name: _rounded(values[keep]) for name, values in _along(e, stated).items()}
@@ -111,7 +86,7 @@ def views(e: Evaluation) -> list[Panel]:
 
 def _along(e: Evaluation, stated: Array | None) -> dict[str, Array]:
     """What the pointer shows of each pose of the path, with units: (N,) each."""
-    out = {"time [s]": (e.run.log.t_ns - e.run.log.t_ns[0]) * 1e-9}
+    out = {"time [s]": e.t_s}
     if e.covered.any():
         off = np.linalg.norm(e.T_est[:, :3, 3] - e.T_true[:, :3, 3], axis=1)
         out["off by [m]"] = np.where(e.covered, off, np.nan)
@@ -122,7 +97,7 @@ def _along(e: Evaluation, stated: Array | None) -> dict[str, Array]:
 
 def errors(e: Evaluation) -> list[Panel]:
     """The error of each motion and what is stated of it, axis by axis."""
-    statement, t, panels = curves.best_statement(e), curves.error_times_s(e), []
+    statement, t, panels = e.shown, e.t_s[e.errors.index], []
     if not len(t):
         return []
     for k, axis in enumerate(AXES):
@@ -149,33 +124,50 @@ def errors(e: Evaluation) -> list[Panel]:
 
 def stated(e: Evaluation) -> list[Panel]:
     """What each method states of every motion, translation and rotation."""
-    t = (e.run.log.t_ns - e.run.log.t_ns[0]) * 1e-9
+    t = e.t_s
     lines: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
     for s in (s for s in e.statements if s.errors is not None):
-        for of_kind, sigma in zip(lines, curves.stated_sigma(s)):
-            keep = spread(len(t))
-            of_kind.append(_line(t[keep], 1e3 * sigma[keep], s.method, colour(s.method), _width(e, s.method)))
+        variance, keep = np.diagonal(s.covariance, axis1=1, axis2=2), spread(len(t))
+        for of_kind, block in zip(lines, (slice(0, 3), slice(3, 6))):
+            sigma = np.sqrt(variance[:, block].mean(axis=1))
+            of_kind.append(_of_method(e, s, t[keep], 1e3 * sigma[keep]))
     names = ("translation [mm]", "rotation [mrad]")
     return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
 
 
 def reliability(e: Evaluation) -> list[Panel]:
-    """Share of errors inside against the stated probability, of every method."""
-    lines = [
-        _line(curves.LEVELS, curves.reliability(e, s), s.method, colour(s.method), _width(e, s.method))
-        for s in curves.full_statements(e)
-    ]
+    """Share of errors inside the stated central interval, all axes together, against its probability."""
+    lines = []
+    if not len(e.errors.index):
+        return []
+    for s, error, C, _ in _stated_errors(e):
+        z = np.abs(error) / np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+        lines.append(_of_method(e, s, _LEVELS, np.array([(z <= width).mean() for width in _HALF_WIDTHS])))
     lines.append({**_line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
     return [_panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])]
 
 
 def nees(e: Evaluation) -> list[Panel]:
-    """NEES per degree of freedom over time, of every method."""
+    """Joint NEES per degree of freedom over time, averaged over half a second around each motion."""
     lines = []
-    for s in curves.full_statements(e):
-        t, values = curves.nees_over_time(e, s)
-        lines.append(_line(*_thin(t, values), s.method, colour(s.method), _width(e, s.method)))
+    if not len(e.errors.index):
+        return []
+    for s, error, C, t in _stated_errors(e):
+        values = consistency.nees(error, C) / s.dof
+        ones = np.ones(min(len(values), max(1, round(_NEES_WINDOW_S / max(float(np.median(e.errors.dt_s)), 1e-3)))))
+        smooth = np.convolve(values, ones, mode="same") / np.convolve(np.ones(len(values)), ones, mode="same")
+        lines.append(_of_method(e, s, *_thin(t, np.maximum(smooth, 1e-3))))
     return [_panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)]
+
+
+def _stated_errors(e: Evaluation) -> Iterator[tuple[Statement, Array, Array, Array]]:
+    """Of each method that speaks of all six axes of at least two motions with truth: itself, the errors about its mean
+    (K, 6), the covariances (K, 6, 6) and the times [s] of these motions."""
+    index = e.errors.index
+    for s in e.statements:
+        known = np.isfinite(s.covariance[index]).all(axis=(1, 2))
+        if s.errors is not None and known.sum() >= 2:
+            yield s, (e.errors.xi - s.mean[index])[known], s.covariance[index][known], e.t_s[e.errors.index][known]
 
 
 def memory(e: Evaluation) -> list[Panel]:
@@ -196,7 +188,7 @@ def memory(e: Evaluation) -> list[Panel]:
 def inputs(e: Evaluation) -> list[Panel]:
     """Points, disparity and image over time, with the frames that were degraded or lost."""
     log = e.run.log
-    t, shades = (log.t_ns - log.t_ns[0]) * 1e-9, _shades(e)
+    t, shades = e.t_s, _shades(e)
     wanted = {
         "points": {"n_stereo": "matched in stereo", "n_tracked": "followed", "n_inliers": "inliers"},
         "disparity [px]": {"disparity_p10_px": "10 %", "disparity_p50_px": "median", "disparity_p90_px": "90 %"},
@@ -214,7 +206,7 @@ def inputs(e: Evaluation) -> list[Panel]:
 
 def _shades(e: Evaluation) -> list[dict[str, Any]]:
     """Stretches of time that were degraded or lost; each frame reaches back to the one before."""
-    t = (e.run.log.t_ns - e.run.log.t_ns[0]) * 1e-9
+    t = e.t_s
     out: list[dict[str, Any]] = []
     for k, record in enumerate(e.run.log):
         tint = _SHADES.get(record.status)
@@ -235,10 +227,9 @@ def _line(x: Array, y: Array, name: str, tint: str, width: float = 1.3) -> dict[
     return {"x": _rounded(x), "y": _rounded(y), "name": name, "colour": tint, "width": width}
 
 
-def _width(e: Evaluation, method: str) -> float:
-    """The method that the page is about stands out."""
-    shown = curves.best_statement(e)
-    return 2.4 if shown is not None and shown.method == method else 1.2
+def _of_method(e: Evaluation, s: Statement, x: Array, y: Array) -> dict[str, Any]:
+    """A method's line; the method that the page is about stands out."""
+    return _line(x, y, s.method, colour(s.method), 2.4 if s.method == e.shown_method else 1.2)
 
 
 def _ring(C: Array) -> Array:
@@ -268,3 +259,41 @@ def _thin(x: Array, y: Array) -> tuple[Array, Array]:
 def _rounded(values: Array) -> list[float | None]:
     """Five digits are more than a screen shows."""
     return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=np.float64).tolist()]
+
+
+class Drawing(NamedTuple):
+    """Panels that stand together: in a group of the page, and as a figure of a ``name`` where it has one, under a
+    ``title`` that may name the ``{method}`` whose bounds are shown. ``shared``: one axis of time for each column."""
+
+    of: Callable[[Evaluation], list[Panel]]
+    name: str = ""
+    title: str = ""
+    size: tuple[float, float] = (10, 4)
+    columns: int = 1
+    shared: bool = False
+
+
+GROUPS: dict[tuple[str, str], tuple[Drawing, ...]] = {
+    ("Top and side view", "Green: 3-sigma ellipses of {method}."): (
+        Drawing(views, "trajectory", "top and side view, 3-sigma ellipses of {method}", (9, 9)),
+    ),
+    ("Error of each motion and its bound", "Line: error. Green: three standard deviations as stated by {method}."): (
+        Drawing(errors, "errors", "error per motion and 3-sigma bound of {method}", (10, 7), 2, True),
+    ),
+    ("What each method states", "The standard deviation of each motion, per axis."): (Drawing(stated),),
+    (
+        "Is it honest?",
+        "Overconfident where the curve is below the diagonal, and where NEES (mean over 0.5 s) is above 1.",
+    ): (
+        Drawing(reliability, "reliability", "stated probability, and share inside", (5.5, 5)),
+        Drawing(nees, "nees", "1 is right, above is overconfident", (10, 3.5)),
+    ),
+    (
+        "How errors are correlated in time",
+        "A dip at the first lag shows shared pixel noise; a flat or rising Allan deviation shows a bias.",
+    ): (Drawing(memory, "memory", "how the error remembers", (10, 4), 2),),
+    ("What odometry saw", "Amber: degraded frames. Red: lost frames."): (
+        Drawing(inputs, "inputs", "what odometry saw; amber is degraded, red is lost", (10, 5.5), 1, True),
+    ),
+}
+"""What is drawn of a run, in the order of the page: by title and note of a group."""

@@ -1,48 +1,38 @@
-"""Figures of one run: of the panels that the page draws by itself; and of a forecast."""
+"""Figures: of one run, the panels that the page draws by itself; of a forecast; of what filters made of runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
-from gpvo.evaluation import curves, panels
+from gpvo.errors import GpvoError
+from gpvo.evaluation import panels
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.forecast import Forecast
-from gpvo.evaluation.panels import Panel, colour
+from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
+from gpvo.evaluation.panels import Drawing, Panel, colour
 from gpvo.files import replacing
 from gpvo.types import Array
 
 
-def picture(
-    e: Evaluation,
-    of: Callable[[Evaluation], list[Panel]],
-    title: str,
-    *,
-    size: tuple[float, float],
-    columns: int = 1,
-    shared: bool = False,
-) -> Figure:
-    """Panels of a run column by column, under a ``title`` that may name the ``{method}`` whose bounds are shown.
-
-    ``shared``: one axis of time for each column.
-    """
-    figure, drawn = Figure(figsize=size, layout="constrained"), of(e)
-    rows = max(-(-len(drawn) // columns), 1)
-    grid = figure.subplots(rows, columns, sharex="col" if shared else False, squeeze=False)
+def picture(e: Evaluation, of: Drawing) -> Figure:
+    """Panels of a run column by column, under their title."""
+    figure, drawn = Figure(figsize=of.size, layout="constrained"), of.of(e)
+    rows = max(-(-len(drawn) // of.columns), 1)
+    grid = figure.subplots(rows, of.columns, sharex="col" if of.shared else False, squeeze=False)
     for k, panel in enumerate(drawn):
         _draw(grid[k % rows, k // rows], panel)
-    for ax in grid[:-1].flat if shared else ():
+    for ax in grid[:-1].flat if of.shared else ():
         ax.set_xlabel("")
-    statement = curves.best_statement(e)
-    method = "no method" if statement is None else statement.method
-    figure.suptitle(f"{e.run.name}: {title.format(method=method)}")
+    figure.suptitle(f"{e.run.name}: {of.title.format(method=e.shown_method)}")
     return figure
 
 
@@ -79,23 +69,8 @@ def _legend(ax: Axes, columns: int = 1) -> None:
 
 
 FIGURES: dict[str, Callable[[Evaluation], Figure]] = {
-    "trajectory": partial(
-        picture, of=panels.views, title="top and side view, 3-sigma ellipses of {method}", size=(9, 9)
-    ),
-    "errors": partial(
-        picture, of=panels.errors, title="error per motion and 3-sigma bound of {method}", size=(10, 7), columns=2,
-        shared=True,
-    ),
-    "reliability": partial(
-        picture, of=panels.reliability, title="stated probability, and share inside", size=(5.5, 5)
-    ),
-    "memory": partial(picture, of=panels.memory, title="how the error remembers", size=(10, 4), columns=2),
-    "nees": partial(picture, of=panels.nees, title="1 is right, above is overconfident", size=(10, 3.5)),
-    "inputs": partial(
-        picture, of=panels.inputs, title="what odometry saw; amber is degraded, red is lost", size=(10, 5.5),
-        shared=True,
-    ),
-}  # fmt: skip
+    d.name: partial(picture, of=d) for drawings in panels.GROUPS.values() for d in drawings if d.name
+}
 
 
 def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]:
@@ -147,3 +122,71 @@ def _ellipse(centre: Array, C: Array) -> Ellipse:
     width, height = 2 * 3 * np.sqrt(np.maximum(values, 0))
     angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
     return Ellipse((centre[0], centre[1]), width, height, angle=angle, fill=False, ec="#2ca02c", lw=0.8)
+
+
+def require_picture(path: Path) -> None:
+    """Raise GpvoError where the name's ending is no format that can be drawn."""
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
+
+
+def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
+    """Draw the first run's path and errors and all runs' innovations to an image file."""
+    target = Path(path)
+    require_picture(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    save(figure_of(traces), target)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write to an image file, whole or not at all."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120, bbox_inches="tight", format=path.suffix[1:].lower())
+
+
+def figure_of(traces: Sequence[Trace]) -> Figure:
+    """The figure, one colour per policy."""
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    above, middle, below = figure.subplots(3, 1)
+    first = [t for t in traces if t.run == traces[0].run] if traces else []
+    _fused_paths(above, first)
+    _fused_errors(middle, first)
+    _innovations(below, traces)
+    return figure
+
+
+def _fused_paths(axes: Axes, traces: Sequence[Trace]) -> None:
+    if traces and traces[0].truth is not None:
+        axes.plot(traces[0].truth[:, 0], traces[0].truth[:, 1], color="black", lw=2, label="truth")
+    for trace in traces:
+        axes.plot(trace.position[:, 0], trace.position[:, 1], lw=1, label=trace.policy)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=traces[0].run if traces else "")
+    axes.set_aspect("equal", "datalim")
+    axes.legend(fontsize=8)
+
+
+def _fused_errors(axes: Axes, traces: Sequence[Trace]) -> None:
+    for trace in traces:
+        (line,) = axes.plot(trace.t_s, trace.error_m, lw=1, label=trace.policy)
+        axes.plot(trace.t_s, 3 * trace.sigma_m, color=line.get_color(), lw=0.7, ls="--")
+    axes.set(
+        xlabel="time [s]", ylabel="position error [m]", title="error, and three sigma of the filter's own (dashed)"
+    )
+
+
+def _innovations(axes: Axes, traces: Sequence[Trace]) -> None:
+    """Mean NIS over runs at each step, which should stay inside the chi-square band."""
+    runs = len({t.run for t in traces})
+    for policy in dict.fromkeys(t.policy for t in traces):
+        rows = [t for t in traces if t.policy == policy]
+        mean, _ = nis_over_runs(rows)
+        axes.plot(rows[0].t_s[: len(mean)], mean, lw=0.8, label=policy)
+    if runs:
+        axes.axhspan(*nis_band(runs), color="grey", alpha=0.3)
+    axes.set_yscale("log")
+    axes.set(
+        xlabel="time [s]",
+        ylabel="NIS / 6",
+        title=f"innovations, mean over {runs} run(s), with the 95 % chi-square band",
+    )

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gpvo import __version__
-from gpvo.dataset.build import predictions_of
-from gpvo.dataset.errors import MotionErrors
-from gpvo.evaluation import curves, panels
+from gpvo.evaluation import panels
 from gpvo.evaluation.document import document
-from gpvo.evaluation.evaluate import Evaluation, judged
-from gpvo.evaluation.matches import MatchPicture
+from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.panels import spread
-from gpvo.evaluation.statements import statements
-from gpvo.evaluation.trajectory import RelativeError, Statistics, TrajectoryErrors
 from gpvo.evaluation.verdict import HONEST
 from gpvo.files import write_text
-from gpvo.geometry import se3
-from gpvo.io.run import Run
-from gpvo.online.predictor import Predictor
 from gpvo.types import Array
+
+if TYPE_CHECKING:
+    from gpvo.evaluation.pictures import MatchPicture
 
 _MAX_POINTS = 600
 
@@ -50,16 +44,12 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
     environment.filters["tone"] = _tone
     runs = []
     for entry, evaluation in zip(document(evaluations)["runs"], evaluations, strict=True):
-        groups = [group for group in panels.groups(evaluation) if group["panels"]]
-        for group in groups:
-            group["panels"] = [_embedded(panel) for panel in group["panels"]]
-        statement = curves.best_statement(evaluation)
         runs.append(
             {
                 "data": entry,
-                "groups": groups,
+                "groups": _groups(evaluation),
                 "scene": _embedded(scene(evaluation)),
-                "bounds_of": "no method" if statement is None else statement.method,
+                "bounds_of": evaluation.shown_method,
                 "verdict": _worded(entry["verdict"], bool(evaluation.covered.any())),
                 "camera": _camera(evaluation),
                 "judged": bool(evaluation.covered.any()),
@@ -70,6 +60,16 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
     )
 
 
+def _groups(e: Evaluation) -> list[dict[str, Any]]:
+    """What is drawn, where there is something: titled groups of panels."""
+    out = []
+    for (title, note), drawings in panels.GROUPS.items():
+        drawn = [_embedded(panel) for d in drawings for panel in d.of(e)]
+        if drawn:
+            out.append({"title": title, "note": note.format(method=e.shown_method), "panels": drawn})
+    return out
+
+
 def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
     to_plane, _ = panels.level(e)
@@ -78,7 +78,7 @@ def scene(e: Evaluation) -> dict[str, Any]:
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T
     path = true if len(true) else est
     centre = (path.max(0) + path.min(0)) / 2
-    statement = curves.best_statement(e)
+    statement = e.shown
     ellipsoids: list[dict[str, Any]] = []
     if statement is not None and (bounds := statement.pose_covariance(e.run.log)) is not None:
         for k in np.unique(np.linspace(0, len(e.T_est) - 1, 10).astype(int))[1:]:
@@ -135,33 +135,3 @@ def _tone(nees: float | None) -> str:
 
 def _number(value: float | None) -> str:
     return "–" if value is None or not np.isfinite(value) else f"{value:.3g}"
-
-
-_NAN = float("nan")
-
-
-def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
-    """An evaluation without errors: no frame is covered by truth, and no method has a score.
-
-    Raises ModelError if the model predicts something else than the error of a motion.
-    """
-    predictions = predictions_of(run, predictor)
-    run = replace(run, log=judged(run.log, predictions))
-    T_est, noiseless = run.log.trajectory(), np.zeros(6)
-    none = np.zeros((0, 4, 4))
-    of_none = RelativeError(Statistics.of(np.zeros(0)), Statistics.of(np.zeros(0)))
-    length = float(se3.path_length_m(T_est[:, :3, 3])[-1])
-    return Evaluation(
-        run=run,
-        errors=MotionErrors(np.zeros(0, np.int64), np.zeros((0, 6)), none, none, np.zeros(0)),
-        trajectory=TrajectoryErrors(length, _NAN, _NAN, _NAN, of_none, of_none, of_none, ()),
-        statements=tuple(statements(run.log, predictions, predictor)),
-        consistency={},
-        covered=np.zeros(len(run.log), bool),
-        T_est=T_est,
-        T_true=np.full_like(T_est, _NAN),
-        truth_sigma=noiseless,
-        truth_sigma_stated=noiseless,
-        time_offset_s=0.0,
-        in_domain=float(np.mean([p.in_domain > 0.5 for p in predictions.values()])) if predictions else None,
-    )

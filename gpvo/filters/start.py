@@ -22,7 +22,7 @@ class StartSigmas:
     """Standard deviations of the initial state, one per axis of each block.
 
     Where the vehicle starts and heads is the origin of what is estimated, and so nearly exact by definition; which way
-    is up is not. Truth's own noise comes on top (``gpvo.evaluation.fusion.start_sigmas``).
+    is up is not. Truth's own noise comes on top (``gpvo.evaluation.flights.start_sigmas``).
     """
 
     position_m: float = 1e-4

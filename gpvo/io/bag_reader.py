@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.io.imu import make_imu
+from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
 
 Stamps = NDArray[np.int64]

@@ -14,10 +14,17 @@ from gpvo.cameras.yamlfile import calibration_text, read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.images import FileSource, PairFiles
-from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, text_lines
-from gpvo.io.trajectory import BATCH_ESTIMATE, MOTION_CAPTURE, TruthNoise, carry, check_overlap, read_euroc_csv
+from gpvo.io.trajectory import (
+    BATCH_ESTIMATE,
+    MOTION_CAPTURE,
+    TruthNoise,
+    carry,
+    check_overlap,
+    read_euroc_csv,
+    read_imu_csv,
+)
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.

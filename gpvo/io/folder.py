@@ -12,10 +12,9 @@ from gpvo.cameras.kalibr import read_imu_noise
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
-from gpvo.io.imu import read_imu_csv
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns
-from gpvo.io.trajectory import UNKNOWN, TruthNoise, carry, check_overlap, read_times, read_tum
+from gpvo.io.trajectory import UNKNOWN, TruthNoise, carry, check_overlap, read_imu_csv, read_times, read_tum
 
 _FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("left/data", "right/data"))
 _SIDE = re.compile(r"(?P<stem>.*?)[_-]?(?P<side>left|right|cam0|cam1|l|r)$", re.IGNORECASE)

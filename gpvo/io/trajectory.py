@@ -1,4 +1,5 @@
-"""Trajectory files: TUM, KITTI and EuRoC CSV, read strictly; and what they say carried to the camera, as its truth."""
+"""Trajectory files, TUM, KITTI and EuRoC CSV, read strictly; what they say carried to the camera, as its truth; and the
+IMU samples beside them."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry import se3
-from gpvo.io.stamps import integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
-from gpvo.types import Array, TruthLog
+from gpvo.io.stamps import growing, integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
+from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
@@ -102,18 +103,15 @@ def read_times(path: str | Path) -> NDArray[np.int64]:
 
 def write_tum(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) -> None:
     """Write TUM lines, stamps and values with nine decimals."""
-    _write(Path(path), (tum_line(t, T) for t, T in zip(t_ns, T_world_body, strict=True)))
+    lines = (tum_line(t, T) + "\n" for t, T in zip(t_ns, T_world_body, strict=True))
+    with replacing(Path(path)) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(lines)
 
 
 def tum_line(t_ns: int, T_world_body: Array) -> str:
     """One TUM line, without the line end."""
     q = se3.rotation_to_quaternion_xyzw(T_world_body[:3, :3])
     return " ".join([ns_to_seconds_text(int(t_ns)), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
-
-
-def _write(path: Path, lines: Iterator[str]) -> None:
-    with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
-        file.writelines(line + "\n" for line in lines)
 
 
 def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]]:
@@ -252,3 +250,46 @@ def check_overlap(truth: TruthLog, t_ns: NDArray[np.int64], path: Path) -> None:
             where=path,
             cure="is it the truth of this sequence, and of the same clock?",
         )
+
+
+def read_imu_csv(
+    path: Path,
+    *,
+    shift_s: float = 0.0,
+    noise: ImuNoise | None = None,
+    remark: Callable[[str], None] | None = None,
+) -> ImuLog:
+    """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order.
+
+    ``shift_s``: ``t_imu = t_cam + shift``, taken off so that the stamps are of the camera's clock. Lines that repeat
+    or go back in time are dropped, which ``remark`` is told. Raises SourceError, naming file and line.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, fields in _fields(path, ","):
+        try:
+            stamps.append(integer_ns(fields[0]))
+            rows.append([float(f) for f in fields[1:7]])
+            if len(rows[-1]) != 6 or not np.isfinite(rows[-1]).all():
+                raise ValueError
+        except ValueError:
+            raise SourceError(f"line {number}: expected t[ns] and six finite numbers, gyro first", where=path) from None
+    if not stamps:
+        raise SourceError("holds no IMU samples", where=path)
+    return make_imu(np.array(stamps, dtype=np.int64), np.array(rows), shift_s=shift_s, noise=noise, remark=remark)
+
+
+def make_imu(
+    t_ns: np.ndarray,
+    gyro_acc: np.ndarray,
+    *,
+    shift_s: float = 0.0,
+    noise: ImuNoise | None = None,
+    remark: Callable[[str], None] | None = None,
+) -> ImuLog:
+    """An :class:`ImuLog` of samples (N, 6), gyro first; those that repeat or go back in time are dropped."""
+    keep = growing(t_ns)
+    if remark is not None and not keep.all():
+        remark(f"{int((~keep).sum())} of {len(t_ns)} IMU samples repeat or go back in time: dropped")
+    t = t_ns[keep] - round(shift_s * 1e9)
+    return ImuLog(t_ns=t, gyro_radps=gyro_acc[keep, :3], acc_mps2=gyro_acc[keep, 3:], noise=noise)

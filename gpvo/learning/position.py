@@ -10,8 +10,7 @@ import numpy as np
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import leave_one_out
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.methods import METHODS, thesis_statement
-from gpvo.learning.scores import average, empty, score
+from gpvo.learning.methods import METHODS, average, empty, score, thesis_statement
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.learning.train import TrainedModel, header_of_sets
 from gpvo.online.features import THESIS, known_columns, resolve

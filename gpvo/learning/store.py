@@ -13,8 +13,7 @@ from gpvo.dataset.table import CHUNK_ROWS, StoredSets, read_sets, write_sets
 from gpvo.errors import ModelError
 from gpvo.files import write_text
 from gpvo.io.run_read import Run
-from gpvo.learning.card import model_card
-from gpvo.learning.cardplot import stated_against_actual
+from gpvo.learning.card import model_card, stated_against_actual
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import TrainedModel, TrainingSet, train_sets, training_digest
 from gpvo.online import modelfile

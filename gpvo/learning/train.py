@@ -21,10 +21,18 @@ from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
-from gpvo.learning.methods import METHODS, method_arrays, simple_statements, thesis_statement
+from gpvo.learning.methods import (
+    METHODS,
+    average,
+    empty,
+    method_arrays,
+    score,
+    simple_statements,
+    stated_and_actual,
+    thesis_statement,
+)
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
-from gpvo.learning.scores import average, empty, score, stated_and_actual
 from gpvo.learning.thesis import fit_thesis
 from gpvo.online import modelfile
 from gpvo.online.estimate import ErrorModel

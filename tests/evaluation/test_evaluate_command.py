@@ -18,8 +18,7 @@ from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run, write_run
 from gpvo.io.trajectory import write_tum
-from gpvo.learning.methods import METHODS, thesis_statement
-from gpvo.learning.scores import score
+from gpvo.learning.methods import METHODS, score, thesis_statement
 from gpvo.learning.store import save_model
 from gpvo.learning.thesis import fit_thesis
 from gpvo.online import modelfile

@@ -19,7 +19,7 @@ from gpvo.types import MotionError, Status, StereoCamera
 
 
 def test_without_rerun_one_line_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gpvo.evaluation.live_view import LiveView
+    from gpvo.evaluation.pictures import LiveView
 
     real = builtins.__import__
 
@@ -35,7 +35,7 @@ def test_without_rerun_one_line_names_the_cure(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_run_lands_in_the_file(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra gpvo[viz]")
-    from gpvo.evaluation.live_view import LiveView
+    from gpvo.evaluation.pictures import LiveView
 
     flight = simulate_points("tunnel-clean", 0, duration_s=5.0, rate_hz=10.0).save(tmp_path / "flight.npz")
     source = open_source(flight)
@@ -48,7 +48,7 @@ def test_a_run_lands_in_the_file(tmp_path: Path) -> None:
 
 def test_the_path_goes_on_over_a_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where VO begins anew after darkness the pose is a guess, and what is drawn later is of it and of its doubt."""
-    from gpvo.evaluation.live_view import LiveView
+    from gpvo.evaluation.pictures import LiveView
 
     viewer = MagicMock()
     monkeypatch.setitem(sys.modules, "rerun", viewer)

@@ -169,7 +169,7 @@ def _embedded(page: str) -> list[dict]:
 
 
 def test_every_panel_is_on_the_page(evaluation, page):
-    wanted = [panel for group in panels.groups(evaluation) for panel in group["panels"]]
+    wanted = [panel for drawings in panels.GROUPS.values() for drawing in drawings for panel in drawing.of(evaluation)]
     assert _embedded(page)[1:] == wanted
     labels = {panel["y"] for panel in wanted}
     assert labels >= {"x [mm]", "rot z [mrad]", "share of errors inside", "NEES / dof", "autocorrelation", "points"}

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from evaluation_runs import make_run
-from gpvo.evaluation.evaluate import Evaluation, evaluate_run
-from gpvo.evaluation.report import render, unjudged_run
+from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
+from gpvo.evaluation.report import render
 from gpvo.io.run import Run
 from gpvo.types import Mounting, VoLog
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.evaluation.fusion import start_sigmas
+from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
 from gpvo.filters.run import FuseOptions, begin, fuse_flight

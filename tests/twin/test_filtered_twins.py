@@ -8,7 +8,7 @@ import pytest
 from gpvo.cli import app
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError
-from gpvo.evaluation.fusion import flight_of
+from gpvo.evaluation.flights import flight_of
 from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.io.run import read_run, write_run

@@ -1,0 +1,133 @@
+"""Runs as filters take them: with what is predicted of them, the truth's noise, and constants from their errors; a twin
+on a path that a vehicle can fly, with an IMU of this path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gpvo.dataset.build import predictions_of
+from gpvo.dataset.errors import interpolate_truth, motion_errors
+from gpvo.dataset.rest import without_wandering_truth
+from gpvo.errors import GpvoError
+from gpvo.filters.policies import constant_from_errors
+from gpvo.filters.propagation import DEFAULT_IMU_NOISE
+from gpvo.filters.run import Flight, vertical_in_world
+from gpvo.filters.sanity import require_sane
+from gpvo.filters.start import StartSigmas, slope_sigma
+from gpvo.filters.study import Constants
+from gpvo.geometry import se3
+from gpvo.io.run import Run
+from gpvo.online.predictor import Predictor
+from gpvo.twin.gap import restated
+from gpvo.types import TruthLog
+
+
+def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
+    """A run as the filters take it, with the model's predictions, else those stored in the run; a twin on a
+    path that a vehicle can fly, with an IMU of this path.
+
+    Raises GpvoError where there is an IMU but nobody says how it sits to the camera, or the run is empty.
+    """
+    if len(run.log) < 2:
+        raise GpvoError(f"holds {len(run.log)} records: nothing to fuse", where=run.path)
+    imu = run.imu if use_imu else None
+    if imu is not None and run.mounting.T_imu_cam is None:
+        raise GpvoError("has an IMU but no T_imu_cam in rig.json", where=run.path, cure="add it, or use --no-imu")
+    poses = valid = None
+    truth_sigma = (0.0, 0.0)
+    if run.truth is not None:
+        truth_sigma = (run.truth.sigma_translation_m, run.truth.sigma_rotation_rad)
+        poses, valid = interpolate_truth(run.truth, run.log.t_ns)
+        if not valid.any():
+            raise GpvoError("ground truth and frames do not overlap in time", where=run.path)
+    flight = Flight(
+        name=run.name,
+        records=run.log.records,
+        imu=imu,
+        T_imu_cam=run.mounting.T_imu_cam if imu is not None else None,
+        T_world_cam=poses,
+        truth_valid=valid,
+        predictions=predictions_of(run, predictor),
+        truth_sigma=truth_sigma,
+    )
+    if about := run.meta.get("twin"):
+        require_sane(flight)
+        return on_smooth_path(flight, (about["seed"], about["replicate"], 31))
+    return flight
+
+
+def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
+    """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope."""
+    base = StartSigmas()
+    position = max((r.truth.sigma_translation_m for r in runs if r.truth), default=0.0)
+    velocity = max((_slope_sigma(r, r.truth) for r in runs if r.truth), default=0.0)
+    rotation = max((r.truth.sigma_rotation_rad for r in runs if r.truth), default=0.0)
+    return replace(
+        base,
+        position_m=max(base.position_m, position),
+        velocity_mps=max(base.velocity_mps, velocity),
+        tilt_rad=max(base.tilt_rad, rotation),
+        yaw_rad=max(base.yaw_rad, rotation),
+    )
+
+
+def _slope_sigma(run: Run, truth: TruthLog) -> float:
+    return slope_sigma(truth.sigma_translation_m, float(np.median(np.diff(run.log.t_ns))) * 1e-9)
+
+
+def constants_of(runs: Sequence[Run]) -> Constants:
+    """Per-axis mean squares of the motions' errors over training runs, each run with equal weight."""
+    squares, dt = [], []
+    for run in runs:
+        if run.truth is None:
+            raise GpvoError("has no ground truth to train a constant on", where=run.path)
+        errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
+        if not len(errors.index):
+            raise GpvoError("has no motion with ground truth at both ends", where=run.path)
+        squares.append(constant_from_errors(errors.xi))
+        dt.append(float(np.median(errors.dt_s)))
+    return Constants(np.mean(squares, axis=0), float(np.median(dt)))
+
+
+def constants_in(predictor: Predictor) -> Constants | None:
+    """The constants that a model file carries, None where it has none."""
+    covariance = predictor.arrays.get("method.constant")
+    if covariance is None or covariance.shape != (6, 6):
+        return None
+    best = predictor.header.get("constant_best")
+    scalars = None if best is None else (float(best[0]), float(best[1]))
+    return Constants(np.diagonal(covariance).copy(), predictor.model.dt_s, scalars)
+
+
+def on_smooth_path(twin: Flight, seed: Sequence[int]) -> Flight:
+    """A twin as filters take it. Its path, as odometry found it, jitters as no vehicle does: its motions keep their
+    errors on the path smoothed. And the run's IMU flew another: readings become those of this path, upright by the
+    run's IMU, with that one's rate, the noise that it states, and biases as large as filters expect."""
+    # Only twins need the simulator.
+    from gpvo.sim.imu import ImuModel, measured_imu
+    from gpvo.sim.recorded import smooth_path
+
+    imu, t_ns = twin.imu, np.array([r.t_ns for r in twin.records], np.int64)
+    assert twin.T_world_cam is not None
+    T_world_imu, t_s = twin.T_world_imu, (t_ns - t_ns[0]) * 1e-9
+    if imu is not None:
+        up = vertical_in_world(imu, t_ns, T_world_imu)
+        tilt = np.cross(up, [0.0, 0.0, 1.0])
+        turn = np.arctan2(np.linalg.norm(tilt), up[2]) * tilt / max(float(np.linalg.norm(tilt)), 1e-12)
+        T_world_imu = se3.exp(np.append(np.zeros(3), turn)) @ T_world_imu
+    path = smooth_path(t_s, T_world_imu)
+    T_world_cam = se3.from_rt(path.attitude(t_s), path.position(t_s))
+    if twin.T_imu_cam is not None:
+        T_world_cam = T_world_cam @ twin.T_imu_cam
+    before, after = TruthLog(t_ns, twin.T_world_cam), TruthLog(t_ns, T_world_cam)
+    records = [restated(r, before, onto=after) for r in twin.records]
+    flown = replace(twin, records=records, T_world_cam=T_world_cam)
+    if imu is None:
+        return flown
+    sigmas, noise = StartSigmas(), imu.noise or DEFAULT_IMU_NOISE
+    model = ImuModel(noise, bias_gyro_radps=sigmas.gyro_bias_radps, bias_acc_mps2=sigmas.acc_bias_mps2)
+    motion = path.motion(1e9 / float(np.median(np.diff(np.unique(imu.t_ns)))))
+    return replace(flown, imu=measured_imu(motion, model, np.random.default_rng(seed), int(t_ns[0]))[0])
