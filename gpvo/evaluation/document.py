@@ -111,17 +111,13 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "segments": [asdict(s) for s in t.segments],
         "poses": nees_document(e.poses),
         "verdict": asdict(verdict(e)),
-        "methods": {m: _method_document(e.consistency.get(m)) for m in _methods_of(e)},
+        "methods": {m: _method_document(e.consistency.get(m)) for m in dict.fromkeys((*METHODS, *e.consistency))},
     }
 
 
 def _by_kind(sigma: Array) -> dict[str, float]:
     translation, rotation = np.sqrt((sigma.reshape(2, 3) ** 2).mean(axis=1))
     return {"translation_m": float(translation), "rotation_rad": float(rotation)}
-
-
-def _methods_of(e: Evaluation) -> list[str]:
-    return [*METHODS, *(m for m in e.consistency if m not in METHODS)]
 
 
 def _horizon(h: Horizon | None) -> dict[str, Any]:

@@ -62,9 +62,10 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
 def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
     """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope."""
     base = StartSigmas()
-    position = max((r.truth.sigma_translation_m for r in runs if r.truth), default=0.0)
-    velocity = max((_slope_sigma(r, r.truth) for r in runs if r.truth), default=0.0)
-    rotation = max((r.truth.sigma_rotation_rad for r in runs if r.truth), default=0.0)
+    known = [(r.truth, float(np.median(np.diff(r.log.t_ns))) * 1e-9) for r in runs if r.truth]
+    position = max((truth.sigma_translation_m for truth, _ in known), default=0.0)
+    velocity = max((slope_sigma(truth.sigma_translation_m, dt_s) for truth, dt_s in known), default=0.0)
+    rotation = max((truth.sigma_rotation_rad for truth, _ in known), default=0.0)
     return replace(
         base,
         position_m=max(base.position_m, position),
@@ -72,10 +73,6 @@ def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
         tilt_rad=max(base.tilt_rad, rotation),
         yaw_rad=max(base.yaw_rad, rotation),
     )
-
-
-def _slope_sigma(run: Run, truth: TruthLog) -> float:
-    return slope_sigma(truth.sigma_translation_m, float(np.median(np.diff(run.log.t_ns))) * 1e-9)
 
 
 def constants_of(runs: Sequence[Run]) -> Constants:

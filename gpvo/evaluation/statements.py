@@ -12,6 +12,7 @@ import numpy as np
 from gpvo.accumulation import along
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.learning.methods import simple_covariances
 from gpvo.learning.thesis import ThesisModel
 from gpvo.online.features import FeatureStream
 from gpvo.types import IMPORTED_POSE, Array, MotionError, Prediction, Status, VoLog
@@ -56,15 +57,15 @@ def statements(
     """
     out: list[Statement] = []
     arrays = predictor.arrays if predictor is not None else {}
-    if "method.constant" in arrays and arrays["method.constant"].shape == (6, 6):
-        out.append(plain_statement(log, "constant", arrays["method.constant"] * _frames_bridged(log)[:, None, None]))
-    for method in (m for m in log.methods if m != IMPORTED_POSE):
-        covariance = _where_stated(log.covariance(method))
-        out.append(plain_statement(log, method, covariance))
-        scale = arrays.get(f"method.{method}.scale")
-        if scale is not None:
-            out.append(plain_statement(log, f"{method}_scaled", _scaled(log, covariance, np.sqrt(scale))))
-        out.append(_translation_only(log, method))
+    covariances = {m: _where_stated(log.covariance(m)) for m in log.methods if m != IMPORTED_POSE}
+    v_t = {m: _translation_alone(log, m) for m in covariances}
+    for method, C in simple_covariances(arrays, covariances, v_t, len(log)).items():
+        if method == "constant":
+            C = C * _frames_bridged(log)[:, None, None]
+        elif method.endswith("_scaled"):
+            # The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands.
+            C = np.where(log.usable[:, None, None], C, covariances[method.removesuffix("_scaled")])
+        out.append(plain_statement(log, method, C))
     if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
         out.append(_thesis(log, ThesisModel.of_file(arrays)))
     if predictions and predictor is not None:
@@ -96,28 +97,27 @@ def _thesis(log: VoLog, model: ThesisModel) -> Statement:
     return replace(stated, mean=np.where(usable, mean, 0.0))
 
 
-def _scaled(log: VoLog, covariance: Array, root: Array) -> Array:
-    """The scale was fitted to measured motions; what is said of a lost one is no pixel noise and stands."""
-    return np.where(log.usable[:, None, None], covariance * np.outer(root, root), covariance)
-
-
 def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
-    """A method that takes motions as independent, without a mean: covariances (N, 6, 6), NaN where it says nothing."""
+    """A method that takes motions as independent, without a mean: covariances (N, 6, 6), NaN where it says nothing; or
+    (N, 3, 3) of translations alone, which do not add up to poses."""
+    mean = np.zeros((len(log), 6))
+    if covariance.shape[-1] == 3:
+        return Statement(method, mean, covariance, None)
     # A motion that nobody vouches for enters the sum with what was said of the one before.
     filled, last = [], np.eye(6) * 1e-6
     for C in covariance:
         last = C if np.isfinite(C).all() else last
         filled.append(last)
     errors = [MotionError.independent(C, dt_s=r.dt_s) for r, C in zip(log, filled, strict=True)]
-    return Statement(method, np.zeros((len(log), 6)), np.asarray(covariance), errors)
+    return Statement(method, mean, np.asarray(covariance), errors)
 
 
-def _translation_only(log: VoLog, method: str) -> Statement:
+def _translation_alone(log: VoLog, method: str) -> Array:
+    """(N, 3, 3) covariance of the translation."""
     missing = np.full((3, 3), np.nan)
     # V_T is in the axes of the reference camera, the error in those of the current one.
     turned = [r.T_prev_cur[:3, :3].T @ r.v_t.get(method, missing) @ r.T_prev_cur[:3, :3] for r in log]
-    covariance = _where_stated(np.array(turned).reshape(-1, 3, 3))
-    return Statement(f"{method}_vt", np.zeros((len(log), 6)), covariance, None)
+    return _where_stated(np.array(turned).reshape(-1, 3, 3))
 
 
 def _predicted(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:

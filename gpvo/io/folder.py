@@ -120,7 +120,7 @@ def _key(file: Path) -> str:
 def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceReport) -> dict[str, int]:
     """Stamp [ns] of each key."""
     numbers = {k: found[-1] for k in keys if (found := _DIGITS.findall(k))}
-    if len(numbers) == len(keys) and all(_is_stamp(n) for n in numbers.values()):
+    if len(numbers) == len(keys) and all("." in n or len(n) >= _STAMP_DIGITS for n in numbers.values()):
         try:
             return {k: seconds_text_to_ns(n) if "." in n else integer_ns(n) for k, n in numbers.items()}
         except ValueError as error:
@@ -135,10 +135,6 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
         where=path,
         cure="name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz",
     )
-
-
-def _is_stamp(number: str) -> bool:
-    return "." in number or len(number) >= _STAMP_DIGITS
 
 
 def _stamps_by_line(path: Path, keys: list[str], numbers: dict[str, str], known: SourceReport) -> dict[str, int]:

@@ -38,9 +38,7 @@ def read_tum(path: str | Path) -> Trajectory:
     Raises SourceError, naming file and line: wrong number of fields, NaN, stamps that do not grow, quaternions that are
     not unit.
     """
-    p = Path(path)
-    rows = _rows(p, None, exactly=8, stamp=seconds_text_to_ns, what="t tx ty tz qx qy qz qw")
-    return _from_rows(p, rows, q_columns=(3, 4, 5, 6))
+    return read_tum_with(Path(path), 0)[0]
 
 
 def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
@@ -49,7 +47,7 @@ def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
     Raises SourceError as :func:`read_tum`.
     """
     behind: list[list[str]] = []
-    what = f"t tx ty tz qx qy qz qw and {more} more"
+    what = "t tx ty tz qx qy qz qw" + (f" and {more} more" if more else "")
     rows = _rows(path, None, exactly=8 + more, stamp=seconds_text_to_ns, what=what, behind=behind)
     return _from_rows(path, rows, q_columns=(3, 4, 5, 6)), behind
 

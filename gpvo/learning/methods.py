@@ -4,19 +4,15 @@ what ``learned`` is compared with, and the columns of the training table."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.learning.thesis import ThesisModel
 from gpvo.stats.consistency import BLOCKS, coverage, crps_gaussian, nees_by_block, nees_median, nll_per_dim
 from gpvo.types import IMPORTED, Array
-
-Statement = Callable[[TrainingSet], tuple[Array, Array] | None]
-"""Mean (n, 6) and covariance (n, 6, 6) of a sequence; None where it lacks what the method needs."""
 
 GEOMETRIC = ("triangulation", "pointing_matching")
 STATED = (*GEOMETRIC, IMPORTED)
@@ -73,42 +69,26 @@ def method_arrays(sets: Sequence[TrainingSet]) -> dict[str, NDArray[Any]]:
     return out
 
 
-def simple_statements(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Statement]:
-    """All rows but ``gp_thesis``, ``base`` and ``learned``, from a model file's arrays."""
-    out: dict[str, Statement] = {"constant": _constant(arrays["method.constant"])}
-    for method in STATED:
-        out[method] = _stated(method, None)
+def simple_covariances(
+    arrays: Mapping[str, NDArray[Any]], covariances: Mapping[str, Array], v_t: Mapping[str, Array], n: int
+) -> dict[str, Array]:
+    """What all methods but ``gp_thesis``, ``base`` and ``learned`` state of n motions: (n, 6, 6), of ``_vt`` (n, 3, 3).
+
+    ``arrays``: of a model file. ``covariances`` (n, 6, 6) and ``v_t`` (n, 3, 3): what geometry says of them, by
+    method. A method that lacks what it needs is absent.
+    """
+    out, constant = {}, arrays.get("method.constant")
+    if constant is not None and constant.shape == (6, 6):
+        out["constant"] = np.broadcast_to(constant, (n, 6, 6))
+    for method in dict.fromkeys((*covariances, *v_t)):
         scale = arrays.get(f"method.{method}.scale")
-        out[f"{method}_scaled"] = _nothing if scale is None else _stated(method, scale)
-    return out | {f"{method}_vt": _translation_only(method) for method in GEOMETRIC}
-
-
-def _nothing(_: TrainingSet) -> None:
-    return None
-
-
-def _constant(C: Array) -> Statement:
-    return lambda s: (np.zeros_like(s.Y), np.broadcast_to(C, (len(s), 6, 6)))
-
-
-def _stated(method: str, scale: Array | None) -> Statement:
-    root = np.ones(6) if scale is None else np.sqrt(scale)
-
-    def state(s: TrainingSet) -> tuple[Array, Array] | None:
-        if method not in s.covariances:
-            return None
-        return np.zeros_like(s.Y), s.covariances[method] * np.outer(root, root)
-
-    return state
-
-
-def _translation_only(method: str) -> Statement:
-    return lambda s: (np.zeros_like(s.Y), s.v_t[method]) if method in s.v_t else None
-
-
-def thesis_statement(model: ThesisModel) -> Statement:
-    """What the thesis' model states of a sequence."""
-    return lambda s: model.predict(s.select(model.columns))
+        if method in covariances:
+            out[method] = covariances[method]
+        if method in covariances and scale is not None:
+            out[f"{method}_scaled"] = covariances[method] * np.outer(np.sqrt(scale), np.sqrt(scale))
+        if method in v_t:
+            out[f"{method}_vt"] = v_t[method]
+    return out
 
 
 def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.splits import leave_one_out
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.methods import METHODS, average, empty, score, thesis_statement
+from gpvo.learning.methods import METHODS, average, empty, score
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.learning.train import TrainedModel, header_of_sets
 from gpvo.online.features import THESIS, known_columns, resolve
@@ -21,8 +21,8 @@ def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: b
     model = _fit(sets, config)
     folds: list[dict[str, Any]] = []
     for held_out, others in leave_one_out(list(sets)) if judge and len(sets) > 1 else ():
-        stated = thesis_statement(_fit(others, config))(held_out)
-        assert stated is not None
+        fitted = _fit(others, config)
+        stated = fitted.predict(held_out.select(fitted.columns))
         methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(held_out.Y, *stated)}
         folds.append(
             {"held_out": held_out.name, "rows": len(held_out), "lost": held_out.counts["lost"], "methods": methods}

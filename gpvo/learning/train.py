@@ -27,9 +27,8 @@ from gpvo.learning.methods import (
     empty,
     method_arrays,
     score,
-    simple_statements,
+    simple_covariances,
     stated_and_actual,
-    thesis_statement,
 )
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
@@ -176,8 +175,9 @@ def _fold(
 ) -> dict[str, Any]:
     """All methods fitted without one sequence and scored on it; the fitted ones go into the file ``model``."""
     arrays, thesis = method_arrays(train_on), fit_thesis(train_on, seed=config.seed)
-    statements = {**simple_statements(arrays), "gp_thesis": thesis_statement(thesis)}
-    stated: dict[str, tuple[Any, ...] | None] = {name: state(held_out) for name, state in statements.items()}
+    simple = simple_covariances(arrays, held_out.covariances, held_out.v_t, len(held_out))
+    stated: dict[str, tuple[Any, ...]] = {name: (np.zeros_like(held_out.Y), C) for name, C in simple.items()}
+    stated["gp_thesis"] = thesis.predict(held_out.select(thesis.columns))
     learned = fit_model(train_on, config)
     if model is not None:
         fitted = {**learned.arrays, **arrays, **thesis.to_arrays()}
@@ -185,7 +185,7 @@ def _fold(
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
     stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)
-    methods = {name: empty() if (s := stated[name]) is None else score(held_out.Y, *s) for name in METHODS}
+    methods = {name: score(held_out.Y, *stated[name]) if name in stated else empty() for name in METHODS}
     return {
         "held_out": held_out.name,
         "rows": len(held_out),

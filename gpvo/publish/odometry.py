@@ -105,7 +105,7 @@ class OdometryBuilder:
         base = self._chain.get(record.t_prev_ns)
         if base is None:
             self._resets += bool(self._chain)
-            base = self._latest() or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
+            base = next(reversed(self._chain.values()), None) or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
             self._last = None
         if not record.usable or _status(record, prediction) is Status.LOST:
             return self._lost(record, prediction, base)
@@ -191,9 +191,6 @@ class OdometryBuilder:
             in_domain=None if prediction is None else float(prediction.in_domain),
             reset_counter=self._resets % 256,
         )
-
-    def _latest(self) -> _Chain | None:
-        return next(reversed(self._chain.values())) if self._chain else None
 
     def _remember(self, record: VoRecord, chain: _Chain) -> None:
         """Keep the reference and the newest frame; nothing else is ever started from."""

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
-from gpvo.dataset.build import TrainingSet, build_run, observe, predictions_of
+from gpvo.dataset.build import build_run, observe, predictions_of
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.evaluation.statements import corrected, statements
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run
-from gpvo.learning import methods
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online.features import THESIS
 from gpvo.online.predictor import Predictor
@@ -170,8 +169,8 @@ class BoundsJob:
         elif kind == "joint":
             found = [_joint(r, name) for r in runs]
         elif kind == "motion":
-            gp = methods.thesis_statement(fit_thesis(sets_of(self.training)))
-            found = [_motion(r, gp) for r in runs]
+            gps = fit_thesis(sets_of(self.training))
+            found = [_motion(r, gps) for r in runs]
         else:
             assert self.model is not None
             model = self.model.path(store)
@@ -213,11 +212,10 @@ def _position(run: Run, model: ThesisModel) -> Bounds:
     return bounds_of(run, *model.predict(X))
 
 
-def _motion(run: Run, gp: methods.Statement) -> Bounds:
+def _motion(run: Run, model: ThesisModel) -> Bounds:
     """A GP speaks of measured motions; a lost one is taken to be like the one before."""
-    s: TrainingSet = build_run(run, columns=THESIS)
-    stated = gp(s)
-    assert stated is not None
+    s = build_run(run, columns=THESIS)
+    stated = model.predict(s.select(model.columns))
     at = {int(t): k for k, t in enumerate(s.t_ns)}
     mean, errors, last = np.zeros((len(run.log), 6)), [], 1e-12 * np.eye(6)
     for k, record in enumerate(run.log):
