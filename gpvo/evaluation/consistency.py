@@ -13,19 +13,9 @@ from gpvo.dataset.errors import MotionErrors
 from gpvo.dataset.truth_noise import drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
+from gpvo.learning.methods import score
 from gpvo.stats.bootstrap import Interval, block_bootstrap
-from gpvo.stats.consistency import (
-    BLOCKS,
-    by_difficulty,
-    correlation_gain,
-    coverage,
-    crps_gaussian,
-    energy_score,
-    nees,
-    nees_by_block,
-    nees_median,
-    nll_per_dim,
-)
+from gpvo.stats.consistency import BLOCKS, by_difficulty, correlation_gain, energy_score, nees, nees_by_block
 from gpvo.types import Array, MotionError, VoLog
 
 HORIZONS_M = (1.0, 10.0, 100.0)
@@ -69,7 +59,7 @@ class Consistency:
     nees_dof: dict[str, Interval | None]
     nees_dof_median: dict[str, float | None]
     nees_dof_truth_noise: dict[str, float | None]
-    coverage: tuple[float, float, float]
+    coverage: tuple[float, ...]
     nll_per_dim: float | None
     nll_stated_per_dim: float | None
     nees_dof_median_stated: float
@@ -113,9 +103,7 @@ def consistency(
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
     noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
     per_block, with_noise = nees_by_block(e, C), nees_by_block(e, C + noise)
-    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    crps = crps_gaussian(e, sigma)
-    covered = [float(c) for c in coverage(e, sigma)]
+    scores = score(errors.xi[stated], statement.mean[index], C, statement.nu)
     quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
     progress = se3.path_length_m(T_true[:, :3, 3]), (log.t_ns - log.t_ns[0]) * 1e-9
@@ -127,14 +115,14 @@ def consistency(
         method=statement.method,
         count=int(stated.sum()),
         nees_dof={n: block_bootstrap(per_block[n]) if n in per_block else None for n in BLOCKS},
-        nees_dof_median={n: float(np.median(per_block[n])) if n in per_block else None for n in BLOCKS},
+        nees_dof_median=scores["nees_dof_median"],
         nees_dof_truth_noise={n: float(with_noise[n].mean()) if n in with_noise else None for n in BLOCKS},
-        coverage=(covered[0], covered[1], covered[2]),
-        nll_per_dim=float(nll_per_dim(e, C).mean()) if d == 6 else None,
-        nll_stated_per_dim=float(nll_per_dim(e, C, statement.nu).mean()) if d == 6 else None,
-        nees_dof_median_stated=nees_median(d, statement.nu) / d,
-        crps_translation_m=float(crps[:, :3].mean()),
-        crps_rotation_rad=float(crps[:, 3:].mean()) if d == 6 else None,
+        coverage=tuple(scores["coverage"].values()),
+        nll_per_dim=scores["nll_per_dim"],
+        nll_stated_per_dim=scores["nll_stated_per_dim"],
+        nees_dof_median_stated=scores["nees_dof_median_stated"],
+        crps_translation_m=scores["crps"]["translation_m"],
+        crps_rotation_rad=scores["crps"]["rotation_rad"],
         energy_translation_m=float(energy_score(e[:, :3], C[:, :3, :3]).mean()),
         energy_rotation_rad=float(energy_score(e[:, 3:], C[:, 3:, 3:]).mean()) if d == 6 else None,
         correlation_gain_nats=float(correlation_gain(e, C).mean()),

@@ -15,25 +15,6 @@ from gpvo.io.images import Image8, decode_grey8, to_grey8
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import no_pair
 
-# Names of sensor_msgs/image_encodings.hpp: (type, channels, blue first)
-_ENCODINGS: dict[str, tuple[str, int, bool]] = {
-    "mono8": ("u1", 1, True),
-    "8uc1": ("u1", 1, True),
-    "mono16": ("u2", 1, True),
-    "16uc1": ("u2", 1, True),
-    "rgb8": ("u1", 3, False),
-    "bgr8": ("u1", 3, True),
-    "8uc3": ("u1", 3, True),
-    "rgba8": ("u1", 4, False),
-    "bgra8": ("u1", 4, True),
-    "8uc4": ("u1", 4, True),
-    "rgb16": ("u2", 3, False),
-    "bgr16": ("u2", 3, True),
-    "16uc3": ("u2", 3, True),
-    "rgba16": ("u2", 4, False),
-    "bgra16": ("u2", 4, True),
-    "16uc4": ("u2", 4, True),
-}
 # OpenCV names the pattern by its second row and column.
 _BAYER = {
     "bayer_rggb": cv2.COLOR_BayerBG2GRAY,
@@ -41,16 +22,18 @@ _BAYER = {
     "bayer_gbrg": cv2.COLOR_BayerGR2GRAY,
     "bayer_grbg": cv2.COLOR_BayerGB2GRAY,
 }
-_ENCODINGS |= {f"{name}{bits}": (f"u{bits // 8}", 1, True) for name in _BAYER for bits in (8, 16)}
+_CHANNELS = {"mono": (1, True), "rgb": (3, False), "bgr": (3, True), "rgba": (4, False), "bgra": (4, True)}
+_CHANNELS |= dict.fromkeys(_BAYER, (1, True))
+# Names of sensor_msgs/image_encodings.hpp: (type, channels, blue first)
+_ENCODINGS: dict[str, tuple[str, int, bool]] = {}
+for _bits in (8, 16):
+    _ENCODINGS |= {f"{name}{_bits}": (f"u{_bits // 8}", *kind) for name, kind in _CHANNELS.items()}
+    _ENCODINGS |= {f"{_bits}uc{n}": (f"u{_bits // 8}", n, True) for n in (1, 3, 4)}
 # Of YUV the brightness alone: (bytes from one to the next, first of them); where it is a plane, it comes first.
 _LUMA = {
-    "uyvy": (2, 1),
-    "yuv422": (2, 1),
-    "yuyv": (2, 0),
-    "yuv422_yuy2": (2, 0),
-    "nv12": (1, 0),
-    "nv21": (1, 0),
-    "nv24": (1, 0),
+    **dict.fromkeys(("uyvy", "yuv422"), (2, 1)),
+    **dict.fromkeys(("yuyv", "yuv422_yuy2"), (2, 0)),
+    **dict.fromkeys(("nv12", "nv21", "nv24"), (1, 0)),
 }
 # Pairs arrive within a few messages of one another; beyond that a message has lost its partner.
 _WAITING = 12

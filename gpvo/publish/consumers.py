@@ -82,24 +82,25 @@ def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
     good = [o for o in odometry if o.twist_covariance is not None]
     if not good:
         raise GpvoError("no frame of this run has a motion to publish")
-    pose = np.array([np.diagonal(o.pose_covariance) for o in good])
-    twist = np.array([np.diagonal(o.twist_covariance) for o in good if o.twist_covariance is not None])
-    if consumer == "px4":
-        return _check_px4(np.sqrt(pose), np.sqrt(twist))
-    if consumer == "ardupilot":
-        return _check_ardupilot(pose, twist, good)
-    if consumer == "robot_localization":
-        return [
-            _verdict("twist", "variance floor", 1e-9, np.sqrt(twist).min(axis=1), "m/s, rad/s", floor=1e-9**0.5),
-            _verdict("pose", "variance floor", 1e-9, np.sqrt(pose).min(axis=1), "m, rad", floor=1e-9**0.5),
-        ]
-    if consumer == "fusioncore":
-        return _check_fusioncore(good)
-    raise GpvoError(f"unknown consumer '{consumer}'", cure=f"choose {', '.join(CONSUMERS)}")
+    checks = dict(zip(CONSUMERS, (_check_px4, _check_ardupilot, _check_robot_localization, _check_fusioncore)))
+    if consumer not in checks:
+        raise GpvoError(f"unknown consumer '{consumer}'", cure=f"choose {', '.join(CONSUMERS)}")
+    pose = np.array([o.pose_covariance for o in good])
+    return checks[consumer](pose, np.array([o.twist_covariance for o in good], dtype=np.float64))
+
+
+def _variances(covariances: Array) -> Array:
+    return np.diagonal(covariances, axis1=1, axis2=2)
+
+
+def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
+    pairs = (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad"))
+    smallest = ((quantity, np.sqrt(_variances(C)).min(axis=1), unit) for quantity, C, unit in pairs)
+    return [_verdict(q, "variance floor", 1e-9, sigma, unit, floor=1e-9**0.5) for q, sigma, unit in smallest]
 
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
-    p = Px4Parameters()
+    p, pose, twist = Px4Parameters(), np.sqrt(_variances(pose)), np.sqrt(_variances(twist))
     out = []
     for quantity, name, sigma, unit in (
         ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
@@ -112,26 +113,24 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
     return out
 
 
-def _check_fusioncore(good: Sequence[Odometry]) -> list[Verdict]:
+def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
     """No floor hides anything; what is lost are the correlations, which make some combinations of axes more certain.
 
     ``hidden_percent``: frames whose most certain combination of axes, in units of their sigmas, is taken for more than
     twice as uncertain as it is.
     """
     out = []
-    for quantity, unit in (("twist", "m/s, rad/s"), ("pose", "m, rad")):
-        C = np.array([o.pose_covariance if quantity == "pose" else o.twist_covariance for o in good], dtype=np.float64)
+    for quantity, C, unit in (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad")):
         sigma = np.array([fusioncore_sigmas(c) for c in C])
         correlated = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
-        low, middle, high = (float(q) for q in np.quantile(sigma.min(axis=1), [0.05, 0.5, 0.95]))
         advice = "It reads the diagonal alone, and its chi-square gate is as good as these sigmas; send no zeros"
         hidden = 100.0 * float(correlated.mean())
-        out.append(Verdict(quantity, "diagonal only", 0.0, hidden, (low, middle, high), unit, advice))
+        out.append(Verdict(quantity, "diagonal only", 0.0, hidden, _percentiles(sigma.min(axis=1)), unit, advice))
     return out
 
 
-def _check_ardupilot(pose: Array, twist: Array, good: Sequence[Odometry]) -> list[Verdict]:
-    p = ArduPilotParameters()
+def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
+    p, pose, twist = ArduPilotParameters(), _variances(pose), _variances(twist)
     out = []
     for quantity, name, old, new, unit in (
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
@@ -140,21 +139,18 @@ def _check_ardupilot(pose: Array, twist: Array, good: Sequence[Odometry]) -> lis
         value = getattr(p, name)
         out.append(_verdict(quantity, name, value, new, unit))
         out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit))
-    low, middle, high = np.quantile(np.sqrt(twist[:, :3]).max(axis=1), [0.05, 0.5, 0.95])
-    lever = "VISO_QUAL_MIN lets quality decide frame by frame; below 0 it would let lost frames in"
-    out.append(
-        Verdict(
-            "velocity",
-            "VISO_VEL_M_NSE",
-            p.VISO_VEL_M_NSE,
-            100.0,
-            (float(low), float(middle), float(high)),
-            "m/s",
-            "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request "
-            f"32478), or set VISO_VEL_M_NSE to {middle:.2g}; {lever}",
-        )
+    predicted = _percentiles(np.sqrt(twist[:, :3]).max(axis=1))
+    advice = (
+        "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request 32478), or "
+        f"set VISO_VEL_M_NSE to {predicted[1]:.2g}; VISO_QUAL_MIN lets quality decide frame by frame; below 0 it would "
+        "let lost frames in"
     )
-    return out
+    return [*out, Verdict("velocity", "VISO_VEL_M_NSE", p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
+
+
+def _percentiles(sigma: Array) -> tuple[float, float, float]:
+    low, middle, high = (float(q) for q in np.quantile(sigma, [0.05, 0.5, 0.95]))
+    return low, middle, high
 
 
 def _verdict(
@@ -170,14 +166,14 @@ def _verdict(
 ) -> Verdict:
     """``typical``: the quantile of the predicted sigma that the parameter should not exceed. A velocity's sigma has a
     usual level and its low end matters; a pose's grows from nothing, so its middle does."""
-    low, middle, high = (float(q) for q in np.quantile(sigma, [0.05, 0.5, 0.95]))
+    predicted = _percentiles(sigma)
     hidden = 100.0 * float((sigma < (value if floor is None else floor)).mean())
     advice = ""
     if hidden > 1.0 and floor is None:
         wanted = float(np.quantile(sigma, typical))
         if wanted >= value:
-            return Verdict(quantity, name, value, hidden, (low, middle, high), unit)
+            return Verdict(quantity, name, value, hidden, predicted, unit)
         advice = f"Set {name} to {max(wanted, minimum):.2g}"
         if wanted < minimum:
             advice += f", the smallest it accepts; a sigma of {wanted:.2g} {unit} stays hidden"
-    return Verdict(quantity, name, value, hidden, (low, middle, high), unit, advice)
+    return Verdict(quantity, name, value, hidden, predicted, unit, advice)
