@@ -16,8 +16,8 @@ from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog
-from gpvo.io.foreign_records import to_records
 from gpvo.io.run import write_run
+from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
 from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gpvo.types import Prediction
 
 _LINES = 11  # of the table of a forecast
+_TOLD = ("t_s", "distance_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_m")
 
 Model = Annotated[Path, typer.Argument(help="Model file.")]
 
@@ -156,7 +157,6 @@ def forecast(
 
 def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
     """The result as scripts read it: SI units, positions in the axes of the plan's world, 1 sigma."""
-    rows = [_row(f, k) for k in _stops(len(f.plan.t_s))]
     return {
         "schema": 1,
         "model": str(model),
@@ -172,25 +172,28 @@ def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict
         "predicted_final_error_independent_m": f.independent_m,
         "final_sigma_m": dict(zip("xyz", f.position_sigma_m[-1].tolist(), strict=True)),
         "final_mean_error_m": dict(zip("xyz", f.mean_error_m[-1].tolist(), strict=True)),
-        "along": rows,
+        "along": _rows(f),
     }
 
 
-def _stops(n: int) -> list[int]:
-    """Poses for a short table, evenly in time, the last among them."""
+def _columns(f: Forecast) -> dict[str, Any]:
+    """Every pose; its sigma per axis of the plan's world, and the covariance of its error, upper triangle, right
+    perturbation in cam."""
+    position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
+    columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}
+    columns |= {f"{a}_m": position[:, i] for i, a in enumerate("xyz")}
+    columns |= {f"sigma_{a}_m": sigma[:, i] for i, a in enumerate("xyz")}
+    columns |= {"sigma_m": f.sigma_m, "in_domain": [1.0, *f.in_domain]}
+    return columns | {f"cov_{i}_{j}": f.covariance[:, i, j] for i in range(6) for j in range(i, 6)}
+
+
+def _rows(f: Forecast) -> list[dict[str, float]]:
+    """A few poses for a short table, evenly in time, the last among them."""
     from numpy import linspace
 
-    return sorted({int(k) for k in linspace(0, n - 1, min(n, _LINES)).round()})
-
-
-def _row(f: Forecast, k: int) -> dict[str, float]:
-    sigma = dict(zip(("sigma_x_m", "sigma_y_m", "sigma_z_m"), f.position_sigma_m[k].tolist(), strict=True))
-    return {
-        "t_s": float(f.plan.t_s[k]),
-        "distance_m": float(f.plan.distance_m[k]),
-        **sigma,
-        "sigma_m": float(f.sigma_m[k]),
-    }
+    columns, n = _columns(f), len(f.plan.t_s)
+    stops = sorted({int(k) for k in linspace(0, n - 1, min(n, _LINES)).round()})
+    return [{name: float(columns[name][k]) for name in _TOLD} for k in stops]
 
 
 def _print_forecast(f: Forecast, path: Path) -> None:
@@ -204,8 +207,7 @@ def _print_forecast(f: Forecast, path: Path) -> None:
             f" ({100 * o.share:.0f} % beyond)"
         )
     table = new_table("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
-    for k in _stops(len(p.t_s)):
-        row = _row(f, k)
+    for row in _rows(f):
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
     show(table)
     say("1 sigma of the position since the first pose, in the axes of the plan's world")
@@ -215,20 +217,10 @@ def _print_forecast(f: Forecast, path: Path) -> None:
 
 
 def _write_forecast(out: Path, f: Forecast) -> None:
-    """One row per pose; covariance of the pose's error, upper triangle, right perturbation in cam."""
     from gpvo.files import write_csv
     from gpvo.io.parquet import write_table
 
-    position, sigma = f.plan.T_world_cam[:, :3, 3], f.position_sigma_m
-    columns: dict[str, Any] = {"t_s": f.plan.t_s, "distance_m": f.plan.distance_m}
-    columns |= {f"{a}_m": position[:, i] for i, a in enumerate("xyz")}
-    columns |= {f"sigma_{a}_m": sigma[:, i] for i, a in enumerate("xyz")}
-    columns |= {"sigma_m": f.sigma_m, "in_domain": [1.0, *f.in_domain]}
-    columns |= {f"cov_{i}_{j}": f.covariance[:, i, j] for i in range(6) for j in range(i, 6)}
-    if out.suffix == ".parquet":
-        write_table(out, columns)
-    else:
-        write_csv(out, columns)
+    (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(f))
 
 
 def _draw_forecast(plot: Path, f: Forecast, title: str) -> None:

@@ -21,9 +21,8 @@ from gpvo.evaluation.statements import corrected
 from gpvo.files import write_csv, write_json
 from gpvo.geometry import se3
 from gpvo.io.foreign import read_foreign
-from gpvo.io.foreign_records import to_records
 from gpvo.io.run_read import Run
-from gpvo.io.stated import read_stated, write_stated
+from gpvo.io.stated import read_stated, to_records, write_stated
 from gpvo.io.trajectory import read_tum, write_tum
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import TrainedModel, fold_model

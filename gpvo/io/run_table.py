@@ -43,6 +43,7 @@ _UPPER6 = tuple((i, j) for i in range(6) for j in range(i, 6))
 _ALL6 = tuple((i, j) for i in range(6) for j in range(6))
 _UPPER3 = tuple((i, j) for i in range(3) for j in range(i, 3))
 _METHOD = re.compile(r"(cov|vt)_([A-Za-z][A-Za-z0-9_]*)_00")
+_VELOCITY, _GYRO, _ACC = (tuple(p.format(a) for a in _AXES) for p in ("v_{}_mps", "gyro_{}_radps", "acc_{}_mps2"))
 _SIGMA6 = tuple(f"{a}_m" for a in _AXES) + tuple(f"r{a}_rad" for a in _AXES)
 _SHORT6 = tuple(a.rsplit("_", 1)[0] for a in _SIGMA6)
 
@@ -59,9 +60,7 @@ def pose_columns(T: Array) -> dict[str, NDArray[np.float64]]:
 
 def poses_from(columns: Mapping[str, NDArray[Any]]) -> Array:
     """(N, 4, 4) poses of :func:`pose_columns`."""
-    R = np.stack([columns[c] for c in _ROTATION], axis=-1).reshape(-1, 3, 3)
-    t = np.stack([columns[c] for c in _POSITION], axis=-1)
-    return se3.from_rt(R, t)
+    return se3.from_rt(_stacked(columns, _ROTATION).reshape(-1, 3, 3), _stacked(columns, _POSITION))
 
 
 _TRACK_COLUMNS = ("t_ns", "track", "u_px", "v_px", "d_px", "is_inlier")
@@ -188,14 +187,13 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     Raises KeyError or ValueError where a column is absent or a status unknown.
     """
     n = len(columns["t_ns"])
-    mean = np.stack([columns[f"mean_{a}"] for a in _SIGMA6], axis=-1)
-    epistemic = np.stack([columns[f"epistemic_var_{a}"] for a in _SHORT6], axis=-1)
+    mean = _stacked(columns, (f"mean_{a}" for a in _SIGMA6))
+    epistemic = _stacked(columns, (f"epistemic_var_{a}" for a in _SHORT6))
     tau, root = np.ones((n, 12)), np.zeros((n, 6, 12))
-    tau[:, :6] = np.stack([columns[f"bias_tau_{a}_s"] for a in _SHORT6], axis=-1)
+    tau[:, :6] = _stacked(columns, (f"bias_tau_{a}_s" for a in _SHORT6))
     if "root_calibration_00" in columns:
-        calibration = [columns[f"root_calibration_{i}{j}"] for i, j in _ALL6]
-        root[:, :, 6:] = np.stack(calibration, axis=-1).reshape(n, 6, 6)
-        tau[:, 6:] = np.stack([columns[f"calibration_tau_{a}_s"] for a in _SHORT6], axis=-1)
+        root[:, :, 6:] = _stacked(columns, (f"root_calibration_{i}{j}" for i, j in _ALL6)).reshape(n, 6, 6)
+        tau[:, 6:] = _stacked(columns, (f"calibration_tau_{a}_s" for a in _SHORT6))
     cov = _get_matrices(columns, "cov", _UPPER6, 6)
     jitter, bias = (cov.get(part, np.zeros((n, 6, 6))) for part in ("jitter", "bias"))
     white = cov["white"] if "white" in cov else cov["total"] - jitter - bias
@@ -233,27 +231,29 @@ def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:
     """Truth as columns."""
     out = {"t_ns": truth.t_ns, **pose_columns(truth.T_world_cam)}
     if truth.v_world_mps is not None:
-        out |= {f"v_{axis}_mps": truth.v_world_mps[:, i] for i, axis in enumerate(_AXES)}
+        out |= dict(zip(_VELOCITY, truth.v_world_mps.T))
     return out
 
 
 def velocity_from(columns: Mapping[str, NDArray[Any]]) -> Array | None:
     """Velocities of :func:`truth_columns`, None where there are none."""
-    names = [f"v_{axis}_mps" for axis in _AXES]
-    return np.stack([columns[n] for n in names], axis=-1) if all(n in columns for n in names) else None
+    return _stacked(columns, _VELOCITY) if columns.keys() >= set(_VELOCITY) else None
 
 
 def imu_columns(imu: ImuLog) -> dict[str, NDArray[Any]]:
     """IMU samples as columns."""
-    gyro = {f"gyro_{axis}_radps": imu.gyro_radps[:, i] for i, axis in enumerate(_AXES)}
-    return {"t_ns": imu.t_ns, **gyro, **{f"acc_{axis}_mps2": imu.acc_mps2[:, i] for i, axis in enumerate(_AXES)}}
+    return {"t_ns": imu.t_ns, **dict(zip(_GYRO, imu.gyro_radps.T)), **dict(zip(_ACC, imu.acc_mps2.T))}
 
 
 def imu_from(columns: Mapping[str, NDArray[Any]]) -> ImuLog:
     """IMU samples of :func:`imu_columns`, without their noise."""
-    gyro = np.stack([columns[f"gyro_{a}_radps"] for a in _AXES], axis=-1)
-    acc = np.stack([columns[f"acc_{a}_mps2"] for a in _AXES], axis=-1)
-    return ImuLog(t_ns=np.asarray(columns["t_ns"], dtype=np.int64), gyro_radps=gyro, acc_mps2=acc)
+    t_ns = np.asarray(columns["t_ns"], dtype=np.int64)
+    return ImuLog(t_ns=t_ns, gyro_radps=_stacked(columns, _GYRO), acc_mps2=_stacked(columns, _ACC))
+
+
+def _stacked(columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> Array:
+    """(n, len(names)) some of the columns."""
+    return np.stack([columns[name] for name in names], axis=-1)
 
 
 def _nulls(values: Iterable[float]) -> list[float | None]:

@@ -13,7 +13,7 @@ from statistics import median
 from typing import Any
 
 from gpvo.doubt import Doubt
-from gpvo.io.foreign_records import GAP_STEPS
+from gpvo.io.stated import GAP_STEPS
 
 BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""

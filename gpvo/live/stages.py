@@ -14,7 +14,7 @@ from gpvo.geometry.covariance import change_body, is_positive_definite, symmetri
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_reader import pose_of, stamp_ns
 from gpvo.io.foreign import T_FLU_OPTICAL
-from gpvo.io.foreign_records import UNKNOWN_RAD
+from gpvo.io.stated import UNKNOWN_RAD
 from gpvo.live.intake import Arrival, Sequence, StampWatch
 from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, StereoCamera, VoRecord
 

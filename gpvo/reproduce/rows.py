@@ -15,8 +15,8 @@ from gpvo import __version__, runner
 from gpvo.errors import GpvoError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
-from gpvo.io.foreign_records import to_records
 from gpvo.io.run import is_finished, write_run
+from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
 from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method_of
 from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Mode, Plan, Way, printed

@@ -80,7 +80,7 @@ def read_yaml(path: Path) -> None:
 
 def read_log(path: Path) -> None:
     from gpvo.io.foreign import read_foreign
-    from gpvo.io.foreign_records import to_records
+    from gpvo.io.stated import to_records
 
     log = read_foreign(path, None, rate_hz=10.0)
     assert all(np.isfinite(r.T_prev_cur).all() for r in to_records(log)[0]), "a motion that is none"

@@ -14,7 +14,7 @@ from gpvo.io import guess, open_source
 from gpvo.io.bag_images import decode_message
 from gpvo.io.bag_reader import pose_of
 from gpvo.io.foreign import read_foreign
-from gpvo.io.foreign_records import to_records
+from gpvo.io.stated import to_records
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
 

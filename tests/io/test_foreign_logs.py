@@ -8,7 +8,7 @@ from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, guess_format, read_foreign
-from gpvo.io.foreign_records import to_records
+from gpvo.io.stated import to_records
 from gpvo.io.trajectory import write_tum
 from gpvo.types import Status
 

@@ -13,7 +13,7 @@ from gpvo.files import write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
-from gpvo.io.foreign_records import to_records
+from gpvo.io.stated import to_records
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
