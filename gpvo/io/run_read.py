@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +99,8 @@ def read_predictions(path: str | Path) -> list[Prediction]:
     """Predictions of a Parquet file. Raises SourceError where it is damaged or holds something else."""
     p = Path(path)
     columns, _ = read_columns(p)
-    predictions: list[Prediction] = _guarded(p, lambda: run_table.predictions_from(columns))
+    with _guarded(p):
+        predictions = run_table.predictions_from(columns)
     if not predictions:
         return []
     numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
@@ -123,23 +127,28 @@ def read_tracks(path: str | Path) -> StereoTracks:
             where=p,
             cure="run the sequence again with 'gpvo run --keep-tracks'; an imported log has none",
         )
-    read = [_guarded(part, lambda part=part: run_table.tracks_from(read_columns(part)[0])) for part in parts]
+    read = []
+    for part in parts:
+        with _guarded(part):
+            read.append(run_table.tracks_from(read_columns(part)[0]))
     return StereoTracks.join(read)
 
 
 def _vehicle_of(meta: dict[str, Any], path: Path) -> Vehicle:
     """What carried the camera; any vehicle where an older run does not say."""
     known = meta.get("vehicle") or {}
-    vehicle: Vehicle = _guarded(path, lambda: Vehicle(**{k: float(v) for k, v in known.items()}))
+    with _guarded(path):
+        vehicle = Vehicle(**{k: float(v) for k, v in known.items()})
     if not all(v > 0 for v in vars(vehicle).values()):
         raise SourceError("its vehicle cannot move: an acceleration is not above 0", where=path)
     return vehicle
 
 
-def _guarded(path: Path, make: Any) -> Any:
-    """Turn a missing or malformed column into one line."""
+@contextmanager
+def _guarded(path: Path) -> Iterator[None]:
+    """Turns a missing or malformed column into one line."""
     try:
-        return make()
+        yield
     except KeyError as error:
         raise SourceError(f"lacks the column {error}", where=path, cure="was it made by gpvo?") from None
     except (ValueError, TypeError, OverflowError) as error:
@@ -161,8 +170,8 @@ def _read_log(path: Path, camera: StereoCamera | None) -> VoLog:
         )
     records = []
     for part in parts:
-        columns, _ = read_columns(part)
-        records += _guarded(part, lambda columns=columns: run_table.records_from(columns))
+        with _guarded(part):
+            records += run_table.records_from(read_columns(part)[0])
     log = VoLog(records, camera)
     check_log(log, path / "vo_log.parquet")
     return log
@@ -214,24 +223,20 @@ def _read_rig(path: Path) -> tuple[StereoCamera | None, Mounting]:
         _check_poses(T[None], path)
         return T
 
-    def make() -> tuple[StereoCamera | None, Mounting]:
-        raw = document.get("camera")
-        camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
-        return camera, Mounting(T_body_cam=pose("T_body_cam"), T_imu_cam=pose("T_imu_cam"))
-
     try:
-        result: tuple[StereoCamera | None, Mounting] = _guarded(path, make)
+        with _guarded(path):
+            raw = document.get("camera")
+            camera = None if raw is None else StereoCamera(**{k: raw[k] for k in field_names(StereoCamera)})
+            return camera, Mounting(T_body_cam=pose("T_body_cam"), T_imu_cam=pose("T_imu_cam"))
     except CalibrationError as problem:
         raise SourceError(problem.what, where=path) from None
-    return result
 
 
 def _read_truth(path: Path) -> TruthLog | None:
     if not path.is_file():
         return None
     columns, metadata = read_columns(path)
-
-    def make() -> TruthLog:
+    with _guarded(path):
         t, T = _stamps(columns), run_table.poses_from(columns)
         _check_poses(T, path)
         sigma_t, sigma_r = (float(metadata.get(k, 0.0)) for k in ("sigma_translation_m", "sigma_rotation_rad"))
@@ -240,28 +245,18 @@ def _read_truth(path: Path) -> TruthLog | None:
             raise SourceError("holds a velocity that is not finite", where=path)
         return TruthLog(t, T, sigma_t, sigma_r, v_world)
 
-    truth: TruthLog = _guarded(path, make)
-    return truth
-
 
 def _read_imu(path: Path) -> ImuLog | None:
     if not path.is_file():
         return None
     columns, metadata = read_columns(path)
-
-    def make() -> ImuLog:
-        import json
-
+    with _guarded(path):
         _stamps(columns)
         raw = run_table.imu_from(columns)
-        noise = None
-        if "noise" in metadata:
-            numbers = json.loads(metadata["noise"])
-            noise = ImuNoise(**{k: float(numbers[k]) for k in field_names(ImuNoise)})
-        return ImuLog(raw.t_ns, raw.gyro_radps, raw.acc_mps2, noise)
-
-    imu: ImuLog = _guarded(path, make)
-    return imu
+        if "noise" not in metadata:
+            return raw
+        numbers = json.loads(metadata["noise"])
+        return replace(raw, noise=ImuNoise(**{k: float(numbers[k]) for k in field_names(ImuNoise)}))
 
 
 def _stamps(columns: dict[str, NDArray[Any]]) -> NDArray[np.int64]:

@@ -76,6 +76,7 @@ class Sender:
     def __init__(self, system: int = 1, component: int = COMPONENT) -> None:
         self._dialect: Any = dialect()
         self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._next_beat_ns: int | None = None
 
     def odometry(self, odometry: Odometry) -> bytes:
         """ODOMETRY of one frame; a lost one is NaN throughout.
@@ -130,6 +131,18 @@ class Sender:
         )
         return self._packed(message)
 
+    def due(self, odometry: Odometry) -> list[bytes]:
+        """What is sent of one frame: a heartbeat where a second has passed, speed, then odometry.
+
+        ArduPilot's EKF3 takes one velocity in 20 ms, the first: the one whose covariance it reads comes first.
+        """
+        out: list[bytes | None] = []
+        if self._next_beat_ns is None or odometry.t_ns >= self._next_beat_ns:
+            out.append(self.heartbeat())
+            self._next_beat_ns = odometry.t_ns + 10**9
+        out += [self.speed(odometry), self.odometry(odometry)]
+        return [message for message in out if message is not None]
+
     def _packed(self, message: Any) -> bytes:
         packed: bytes = message.pack(self._link)
         # The sequence number is the link's: without it a receiver counts every message as lost.
@@ -137,23 +150,11 @@ class Sender:
         return packed
 
 
-def _messages(sender: Sender, odometry: Odometry) -> list[bytes]:
-    """What is sent of one frame: speed, then odometry.
-
-    ArduPilot's EKF3 takes one velocity in 20 ms, the first: the one whose covariance it reads comes first.
-    """
-    speed, pose = sender.speed(odometry), sender.odometry(odometry)
-    return [pose] if speed is None else [speed, pose]
-
-
 def stream(odometry: Iterable[Odometry], sender: Sender, emit: Callable[[int, bytes], None]) -> int:
     """Hand ``emit(t_ns, bytes)`` every message of a run: speed, odometry and a heartbeat a second; returns frames."""
-    next_beat, count = None, 0
+    count = 0
     for item in odometry:
-        if next_beat is None or item.t_ns >= next_beat:
-            emit(item.t_ns, sender.heartbeat())
-            next_beat = item.t_ns + 10**9
-        for message in _messages(sender, item):
+        for message in sender.due(item):
             emit(item.t_ns, message)
         count += 1
     return count
@@ -182,7 +183,6 @@ class Link:
 
     def __post_init__(self) -> None:
         self.sender = Sender(self.system)
-        self._next_beat = 0
         kind, _, rest = self.address.partition(":")
         place, _, number = rest.rpartition(":")
         if kind not in ("udp", "serial") or not place or not number.isdecimal():
@@ -193,10 +193,7 @@ class Link:
 
     def send(self, odometry: Odometry) -> None:
         """Send one frame now, and a heartbeat where one is due."""
-        if odometry.t_ns >= self._next_beat:
-            self._send(self.sender.heartbeat())
-            self._next_beat = odometry.t_ns + 10**9
-        for message in _messages(self.sender, odometry):
+        for message in self.sender.due(odometry):
             self._send(message)
 
 
