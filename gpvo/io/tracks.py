@@ -56,9 +56,8 @@ class TracksSource:
 
     def __init__(self, path: Path, *, truth_noise: TruthNoise | None = None) -> None:
         self.path, self.name = path, path.stem
-        data = load_arrays(path, _REQUIRED, _OPTIONAL)
-        self._data, self.report = data, SourceReport()
-        self._t_ns = np.rint(_shaped(data, "t_s", (None,), path, most=_MAX_STAMP_S) * 1e9).astype(np.int64)
+        self._data, self.report = load_arrays(path, _REQUIRED, _OPTIONAL), SourceReport()
+        self._t_ns = np.rint(self._array("t_s", None, most=_MAX_STAMP_S) * 1e9).astype(np.int64)
         self._observations()
         self.camera = self._make_camera()
         self.mask: NDArray[np.bool_] | None = None
@@ -90,12 +89,12 @@ class TracksSource:
 
     def _observations(self) -> None:
         """Sort the rows by frame and check them."""
-        d, path, n = self._data, self.path, len(self._t_ns)
-        frame = _shaped(d, "frame", (None,), path, most=2.0**53).astype(np.int64)
+        path, n = self.path, len(self._t_ns)
+        frame = self._array("frame", None, most=2.0**53).astype(np.int64)
         m = len(frame)
-        self._track = _shaped(d, "track", (m,), path, most=2.0**62).astype(np.int64)
-        self._uv_left = _shaped(d, "uv_left", (m, 2), path, most=_MAX_PX)
-        self._uv_right = _shaped(d, "uv_right", (m, 2), path, most=_MAX_PX)
+        self._track = self._array("track", m, most=2.0**62).astype(np.int64)
+        self._uv_left = self._array("uv_left", m, 2, most=_MAX_PX)
+        self._uv_right = self._array("uv_right", m, 2, most=_MAX_PX)
         if n == 0 or m == 0:
             raise SourceError("holds no observations", where=path)
         if frame.min() < 0 or frame.max() >= n:
@@ -104,12 +103,10 @@ class TracksSource:
         self._starts = np.searchsorted(frame[self._rows], np.arange(n + 1))
 
     def _make_camera(self) -> StereoCamera:
-        fx, fy, cx, cy, b = (
-            float(_shaped(self._data, k, (), self.path)) for k in ("fx", "fy", "cx", "cy", "baseline_m")
-        )
+        fx, fy, cx, cy, b = (float(self._array(k)) for k in ("fx", "fy", "cx", "cy", "baseline_m"))
         both = np.concatenate([self._uv_left, self._uv_right])
         if "width" in self._data and "height" in self._data:
-            width, height = (int(_shaped(self._data, k, (), self.path, most=MAX_SIDE_PX)) for k in ("width", "height"))
+            width, height = (int(self._array(k, most=MAX_SIDE_PX)) for k in ("width", "height"))
         else:
             # Not stated: large enough for every observation and for a principal point in the middle.
             width = max(int(np.ceil(both[:, 0].max())) + 1, round(2 * cx) + 1)
@@ -123,10 +120,8 @@ class TracksSource:
     def _body_cam(self) -> Array | None:
         if "R_cam_body" not in self._data:
             return None
-        R_cam_body = _shaped(self._data, "R_cam_body", (3, 3), self.path)
-        p = np.zeros(3)
-        if "p_body_cam_in_body_m" in self._data:
-            p = _shaped(self._data, "p_body_cam_in_body_m", (3,), self.path)
+        R_cam_body = self._array("R_cam_body", 3, 3)
+        p = self._array("p_body_cam_in_body_m", 3, absent=np.zeros(3))
         return check_pose(se3.from_rt(R_cam_body.T, p), "R_cam_body", self.path)
 
     def _make_imu(self) -> ImuLog | None:
@@ -135,10 +130,8 @@ class TracksSource:
             return self._full_imu()
         if "gyro_body_radps" not in self._data:
             return None
-        gyro = _shaped(self._data, "gyro_body_radps", (n, 3), self.path)
-        acc = np.full((n, 3), np.nan)
-        if "acc_body_mps2" in self._data:
-            acc = _shaped(self._data, "acc_body_mps2", (n, 3), self.path)
+        gyro = self._array("gyro_body_radps", n, 3)
+        acc = self._array("acc_body_mps2", n, 3, absent=np.full((n, 3), np.nan))
         keep = growing(self._t_ns)
         return ImuLog(self._t_ns[keep], gyro[keep], acc[keep])
 
@@ -150,22 +143,22 @@ class TracksSource:
         absent = [a for a in ("imu_gyro_radps", "imu_acc_mps2") if a not in self._data]
         if absent:
             raise SourceError(f"has 'imu_t_ns' but not {', '.join(absent)}", where=self.path)
-        gyro, acc = (_shaped(self._data, a, (k, 3), self.path) for a in ("imu_gyro_radps", "imu_acc_mps2"))
-        noise = ImuNoise(*_shaped(self._data, "imu_noise", (4,), self.path)) if "imu_noise" in self._data else None
+        gyro, acc = (self._array(a, k, 3) for a in ("imu_gyro_radps", "imu_acc_mps2"))
+        noise = ImuNoise(*self._array("imu_noise", 4)) if "imu_noise" in self._data else None
         keep = growing(t_ns)
         return ImuLog(t_ns[keep].astype(np.int64), gyro[keep], acc[keep], noise)
 
     def _make_truth(self, noise: TruthNoise | None) -> TruthLog | None:
         if "T_world_cam" not in self._data:
             return None
-        T = _shaped(self._data, "T_world_cam", (len(self._t_ns), 4, 4), self.path, finite=False)
+        T = self._array("T_world_cam", len(self._t_ns), 4, 4, finite=False)
         keep = growing(self._t_ns) & ~np.isnan(T[:, :3]).all(axis=(1, 2))
         if not keep.any():
             raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="leave it out: no truth")
         poses = [check_pose(T[k], f"'T_world_cam' row {k}", self.path) for k in np.flatnonzero(keep)]
         stated = ("sigma_translation_m", "sigma_rotation_rad")
         if noise is None and all(k in self._data for k in stated):
-            noise = TruthNoise(*(abs(float(_shaped(self._data, k, (), self.path, most=1e3))) for k in stated))
+            noise = TruthNoise(*(abs(float(self._array(k, most=1e3))) for k in stated))
         noise = noise or GPS_INS
         v_world = self._velocity(np.stack(poses), keep)
         return TruthLog(self._t_ns[keep], np.stack(poses), noise.translation_m, noise.rotation_rad, v_world)
@@ -175,13 +168,34 @@ class TracksSource:
         T_body_cam = self.mounting.T_body_cam
         if T_body_cam is None or not {"vel_body_mps", "gyro_body_radps"} <= set(self._data):
             return None
-        v, gyro = (
-            _shaped(self._data, name, (len(self._t_ns), 3), self.path)[keep]
-            for name in ("vel_body_mps", "gyro_body_radps")
-        )
+        v, gyro = (self._array(a, len(self._t_ns), 3)[keep] for a in ("vel_body_mps", "gyro_body_radps"))
         v_cam = (v + np.cross(gyro, T_body_cam[:3, 3])) @ T_body_cam[:3, :3]
         rotated: Array = np.einsum("nij,nj->ni", T_world_cam[:, :3, :3], v_cam)
         return rotated
+
+    def _array(
+        self, key: str, *shape: int | None, finite: bool = True, most: float = 1e12, absent: Array | None = None
+    ) -> Array:
+        """An array of the file as float64 of the given shape, no value beyond ``most``; None matches any length.
+        ``absent``: what stands for it where the file has none."""
+        if absent is not None and key not in self._data:
+            return absent
+        array = self._data[key]
+        fits = array.ndim == len(shape) and all(s is None or s == n for s, n in zip(shape, array.shape))
+        if not fits:
+            wanted = tuple("N" if s is None else s for s in shape)
+            raise SourceError(f"'{key}' has shape {array.shape}, expected {wanted}", where=self.path)
+        if array.dtype.kind not in "fiu":
+            raise SourceError(f"'{key}' holds {array.dtype}, not numbers", where=self.path)
+        out = array.astype(np.float64)
+        if finite and not np.isfinite(out).all():
+            first = int(np.argwhere(~np.isfinite(np.atleast_1d(out)))[0][0])
+            raise SourceError(f"'{key}' is NaN or infinite at row {first}", where=self.path, cure="drop that row")
+        if (np.abs(out) > most).any():
+            raise SourceError(
+                f"'{key}' holds {np.nanmax(np.abs(out)):.3g}, and {most:.3g} is the most", where=self.path
+            )
+        return out
 
 
 def load_arrays(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
@@ -223,29 +237,3 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any
         raise ValueError(f"'{entry.filename}' of {dtype} {shape} does not fit its {entry.file_size} bytes")
     with archive.open(entry) as file:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-
-
-def _shaped(
-    data: dict[str, NDArray[Any]],
-    key: str,
-    shape: tuple[int | None, ...],
-    path: Path,
-    *,
-    finite: bool = True,
-    most: float = 1e12,
-) -> Array:
-    """``data[key]`` as float64 of the given shape, no value beyond ``most``; None matches any length."""
-    array = data[key]
-    fits = array.ndim == len(shape) and all(s is None or s == n for s, n in zip(shape, array.shape))
-    if not fits:
-        wanted = tuple("N" if s is None else s for s in shape)
-        raise SourceError(f"'{key}' has shape {array.shape}, expected {wanted}", where=path)
-    if array.dtype.kind not in "fiu":
-        raise SourceError(f"'{key}' holds {array.dtype}, not numbers", where=path)
-    out = array.astype(np.float64)
-    if finite and not np.isfinite(out).all():
-        first = int(np.argwhere(~np.isfinite(np.atleast_1d(out)))[0][0])
-        raise SourceError(f"'{key}' is NaN or infinite at row {first}", where=path, cure="drop that row")
-    if (np.abs(out) > most).any():
-        raise SourceError(f"'{key}' holds {np.nanmax(np.abs(out)):.3g}, and {most:.3g} is the most", where=path)
-    return out
