@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.doubt import Doubt
+from gpvo.stats.series import Doubt
 from gpvo.types import Array, ImuLog
 
 MOST_RADPS, MOST_MPS2 = 30.0, 150.0

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpvo.doubt import Doubt
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.gate import Gate, Wait
 from gpvo.filters.measurement import Innovation
@@ -21,6 +20,7 @@ from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V
 from gpvo.online.observer import LONGEST_STEP_S, follows
+from gpvo.stats.series import Doubt
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.

@@ -12,8 +12,8 @@ from math import inf
 from statistics import median
 from typing import Any
 
-from gpvo.doubt import Doubt
 from gpvo.io.stated import GAP_STEPS
+from gpvo.stats.series import Doubt
 
 BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""

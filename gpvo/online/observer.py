@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.doubt import Doubt
 from gpvo.errors import GpvoError
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.online.features import FeatureStream
 from gpvo.online.slip import SlipDetector
+from gpvo.stats.series import Doubt
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, IMU_FIELDS, Array, Status, StereoCamera, Vehicle, VoRecord
 
 LONGEST_STEP_S = 60.0
