@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
@@ -58,25 +59,34 @@ _OPTIONS = {"config": (Config, None), "quiet": (Quiet, False), "verbose": (Verbo
 
 
 def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that also takes ``--config``, ``-q`` and ``-v``."""
+    """A command that also takes ``--config``, ``-q`` and ``-v``; of a dataclass each field is an option."""
 
     @wraps(function)
     def command(**given: Any) -> Any:
         quiet, verbose, _ = given.pop("quiet"), given.pop("verbose"), given.pop("config")
         with output.loudness(quiet=quiet, verbose=verbose):
             output.detail(", ".join(f"{k.rstrip('_')}={v}" for k, v in given.items() if isinstance(v, _PLAIN)))
+            for name, group in groups.items():
+                given[name] = group(**{f.name: given.pop(f.name) for f in fields(group)})
             return function(**given)
 
     hints = get_type_hints(function, include_extras=True)
-    own = [p.replace(annotation=hints[n]) for n, p in inspect.signature(function).parameters.items()]
-    own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
-    more = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-        for name, (kind, default) in _OPTIONS.items()
-    ]
+    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    own: list[inspect.Parameter] = []
+    for name, p in inspect.signature(function).parameters.items():
+        if name in groups:
+            kinds = get_type_hints(groups[name], include_extras=True)
+            own += [_option(f.name, kinds[f.name], f.default) for f in fields(groups[name])]
+        else:
+            own.append(_option(name, hints[name], p.default))
+    more = [_option(name, kind, default) for name, (kind, default) in _OPTIONS.items()]
     command.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in (*own, *more)}
     return command
+
+
+def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
 _PLAIN = (str, int, float, bool, list, Path)
@@ -139,24 +149,29 @@ TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth 
 TruthFrame = Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
 
-VehicleName = Annotated[
-    str, typer.Option("--vehicle", help="What carries the camera: car, rover, multirotor, handheld or any.")
-]
-MaxAcceleration = Annotated[float | None, typer.Option(help="Largest acceleration [m/s^2], in place of --vehicle's.")]
-MaxTurn = Annotated[float | None, typer.Option(help="Largest angular acceleration [rad/s^2], likewise.")]
 
+@dataclass(frozen=True)
+class VehicleOptions:
+    """What carries the camera."""
 
-def vehicle_of(kind: str, max_acceleration: float | None, max_turn: float | None) -> Vehicle:
-    """The bounds of a kind of vehicle, or those given in their place.
+    vehicle: Annotated[
+        str, typer.Option("--vehicle", help="What carries the camera: car, rover, multirotor, handheld or any.")
+    ] = "any"
+    max_acceleration: Annotated[
+        float | None, typer.Option(help="Largest acceleration [m/s^2], in place of --vehicle's.")
+    ] = None
+    max_turn: Annotated[float | None, typer.Option(help="Largest angular acceleration [rad/s^2], likewise.")] = None
 
-    Raises GpvoError where the kind is unknown or a bound is not above 0.
-    """
-    known = VEHICLES[one_of("--vehicle", kind, tuple(VEHICLES))]
-    bounds = (max_acceleration or known.max_acceleration_mps2, max_turn or known.max_turn_radps2)
-    for flag, value in zip(("--max-acceleration", "--max-turn"), (max_acceleration, max_turn)):
-        if value is not None and not 0 < value < math.inf:
-            raise GpvoError(f"{flag} is {value:g}", cure="give a number above 0")
-    return Vehicle(*bounds)
+    def bounds(self) -> Vehicle:
+        """Of the kind of vehicle, or those given in their place.
+
+        Raises GpvoError where the kind is unknown or a bound is not above 0.
+        """
+        known = VEHICLES[one_of("--vehicle", self.vehicle, tuple(VEHICLES))]
+        for flag, value in (("--max-acceleration", self.max_acceleration), ("--max-turn", self.max_turn)):
+            if value is not None and not 0 < value < math.inf:
+                raise GpvoError(f"{flag} is {value:g}", cure="give a number above 0")
+        return Vehicle(self.max_acceleration or known.max_acceleration_mps2, self.max_turn or known.max_turn_radps2)
 
 
 def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
-from gpvo.cli.twin import GapOption, Replicates, Seed, ToleranceOption, say_simulated, settings_of
+from gpvo.cli.twin import Seed, TwinOptions, say_simulated
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -21,24 +22,43 @@ if TYPE_CHECKING:
     from gpvo.twin.replicate import TwinSettings
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
-Model = Annotated[Path | None, typer.Option(help="Error model: adds the rows constant, scaled and learned.")]
-Truth = Annotated[Path | None, typer.Option(help="Ground truth (TUM lines, left camera) in place of the run's own.")]
-Segments = Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")]
-TruthSigma = Annotated[
-    str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default.")
-]
-Align = Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth: rotation or none.")]
-TimeOffset = Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")]
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """What runs are judged with."""
+
+    model: Annotated[Path | None, typer.Option(help="Error model: adds the rows constant, scaled and learned.")] = None
+    truth: Annotated[
+        Path | None, typer.Option(help="Ground truth (TUM lines, left camera) in place of the run's own.")
+    ] = None
+    segments: Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")] = None
+    truth_sigma: Annotated[
+        str | None,
+        typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),
+    ] = None
+    align: Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth: rotation or none.")] = "none"
+    time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")] = "0"
+
+    def options(self) -> EvaluateOptions:
+        """The flags, parsed."""
+        from gpvo.evaluation.evaluate import EvaluateOptions
+
+        lengths, sigma, offset_s = None, None, None
+        if self.segments is not None:
+            lengths = tuple(numbers("--segments", self.segments, "give lengths above 0 in metres", least=1e-9))
+        if self.truth_sigma is not None:
+            cure = "give metres, or metres,radians"
+            given = numbers("--truth-sigma", self.truth_sigma, cure, counts=(1, 2), least=0.0)
+            sigma = (given[0], given[1] if len(given) == 2 else 0.0)
+        if self.time_offset != "auto":
+            (offset_s,) = numbers("--time-offset", self.time_offset, "give seconds, or auto", counts=(1,))
+        return EvaluateOptions(lengths, sigma, self.align, offset_s)
 
 
 def evaluate(
     runs: Runs,
-    model: Model = None,
-    truth: Truth = None,
-    segments: Segments = None,
-    truth_sigma: TruthSigma = None,
-    align: Align = "none",
-    time_offset: TimeOffset = "0",
+    judge: JudgeOptions = JudgeOptions(),
     plots: Annotated[Path | None, typer.Option(help="Folder for plots, as PNG and PDF, one set per run.")] = None,
     tables: Annotated[
         Path | None, typer.Option(help="Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX).")
@@ -50,9 +70,7 @@ def evaluate(
         bool,
         typer.Option("--twins", help="Use twins as the truth: each run is simulated again from its own tracks."),
     ] = False,
-    replicates: Replicates = 8,
-    tolerance: ToleranceOption = "none",
-    gap: GapOption = None,
+    twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
     json_: Json = False,
 ) -> None:
@@ -63,13 +81,11 @@ def evaluate(
     from gpvo.evaluation.document import document
     from gpvo.evaluation.evaluate import distinct
 
-    options = options_of(segments, truth_sigma, align, time_offset)
     if twins:
-        documents, found = _with_twins(
-            *_loaded(runs, model, truth), options, settings_of(replicates, tolerance, seed, gap)
-        )
+        options = judge.options()
+        documents, found = _with_twins(*_loaded(runs, judge), options, twin_options.settings(seed))
     else:
-        found = _evaluate(runs, model, truth, options)
+        found = _evaluate(runs, judge)
         documents = document(found)["runs"]
     for evaluation, name in zip(found, distinct([e.run.name for e in found]), strict=True):
         _write_files(evaluation, name, stated=stated, tables=tables, plots=plots)
@@ -80,7 +96,7 @@ def evaluate(
             _print(about)
         if len(documents) > 1:
             _print_pooled(document(found)["pooled"], len(found))
-    _tell_misfits(model, found)
+    _tell_misfits(judge.model, found)
 
 
 def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path | None, plots: Path | None) -> None:
@@ -102,12 +118,7 @@ def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path 
 def report(
     runs: Runs,
     out: Annotated[Path, typer.Option("-o", "--out", help="HTML file to write.")] = Path("report.html"),
-    model: Model = None,
-    truth: Truth = None,
-    segments: Segments = None,
-    truth_sigma: TruthSigma = None,
-    align: Align = "none",
-    time_offset: TimeOffset = "0",
+    judge: JudgeOptions = JudgeOptions(),
     frames: Annotated[str | None, typer.Option(help="Also show the matches of these frames, e.g. 5,80.")] = None,
     sequence: Annotated[Path | None, typer.Option(help="The sequence of the run, for --frames.")] = None,
 ) -> None:
@@ -119,10 +130,11 @@ def report(
     """
     from gpvo.evaluation.report import write_report
 
-    found = _evaluate(runs, model, truth, options_of(segments, truth_sigma, align, time_offset), unjudged=True)
-    write_report(found, out, [] if frames is None else _pictures(runs, frames, sequence), model.name if model else "")
+    found = _evaluate(runs, judge, unjudged=True)
+    pictures = [] if frames is None else _pictures(runs, frames, sequence)
+    write_report(found, out, pictures, judge.model.name if judge.model else "")
     print(out)
-    _tell_misfits(model, found)
+    _tell_misfits(judge.model, found)
 
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
@@ -136,23 +148,7 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
     return match_pictures(open_source(sequence), config_of(runs[0]), wanted)
 
 
-def options_of(segments: str | None, truth_sigma: str | None, align: str, time_offset: str) -> EvaluateOptions:
-    """The flags, parsed."""
-    from gpvo.evaluation.evaluate import EvaluateOptions
-
-    lengths, sigma, offset_s = None, None, None
-    if segments is not None:
-        lengths = tuple(numbers("--segments", segments, "give lengths above 0 in metres", least=1e-9))
-    if truth_sigma is not None:
-        cure = "give metres, or metres,radians"
-        given = numbers("--truth-sigma", truth_sigma, cure, counts=(1, 2), least=0.0)
-        sigma = (given[0], given[1] if len(given) == 2 else 0.0)
-    if time_offset != "auto":
-        (offset_s,) = numbers("--time-offset", time_offset, "give seconds, or auto", counts=(1,))
-    return EvaluateOptions(lengths, sigma, align, offset_s)
-
-
-def _loaded(runs: list[Path], model: Path | None, truth: Path | None) -> tuple[list[Run], Predictor | None]:
+def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:
     from dataclasses import replace
 
     from gpvo.io.run import read_run
@@ -160,27 +156,27 @@ def _loaded(runs: list[Path], model: Path | None, truth: Path | None) -> tuple[l
     from gpvo.online.predictor import Predictor
     from gpvo.types import TruthLog
 
+    model = judge.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     loaded = [read_run(path) for path in runs]
-    if truth is not None:
-        trajectory = read_tum(truth)
+    if judge.truth is not None:
+        trajectory = read_tum(judge.truth)
         loaded = [replace(run, truth=TruthLog(trajectory.t_ns, trajectory.T_world_body)) for run in loaded]
     return loaded, predictor
 
 
-def _evaluate(
-    runs: list[Path], model: Path | None, truth: Path | None, options: EvaluateOptions, unjudged: bool = False
-) -> list[Evaluation]:
+def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> list[Evaluation]:
     """``unjudged``: runs without truth are shown and not refused."""
     from gpvo.evaluation.evaluate import evaluate_run, unjudged_run
 
-    loaded, predictor = _loaded(runs, model, truth)
-    if predictor is not None and model is not None:
+    options = judge.options()
+    loaded, predictor = _loaded(runs, judge)
+    if predictor is not None and judge.model is not None:
         from gpvo.learning.check import check
 
         for run in loaded:
             for problem in check(predictor, run).problems:
-                warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
+                warnings.warn(f"{judge.model.name} does not fit {run.name}: {problem}", stacklevel=2)
     return [
         unjudged_run(run, predictor) if unjudged and run.truth is None else evaluate_run(run, predictor, options)
         for run in loaded

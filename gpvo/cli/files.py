@@ -172,9 +172,7 @@ def import_(
         str, typer.Option(help="Whether the covariances in a CSV are of poses or motions.")
     ] = "pose",
     covariance_axes: Annotated[str, typer.Option(help="Axes of the covariances in a CSV: world or body.")] = "world",
-    vehicle: options.VehicleName = "any",
-    max_acceleration: options.MaxAcceleration = None,
-    max_turn: options.MaxTurn = None,
+    vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,
     json_: Json = False,
 ) -> None:
@@ -210,7 +208,7 @@ def import_(
         **chosen,
         time_offset_s=offset,
         truth_sigma=sigma,
-        vehicle=options.vehicle_of(vehicle, max_acceleration, max_turn),
+        vehicle=vehicle.bounds(),
         overwrite=overwrite,
     )
     if json_:

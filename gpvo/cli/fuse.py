@@ -11,15 +11,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli.output import Json, one_of, print_json, say
-from gpvo.cli.twin import (
-    GapOption,
-    Replicates,
-    Seed,
-    ToleranceOption,
-    in_place_of_runs_without_truth,
-    say_simulated,
-    settings_of,
-)
+from gpvo.cli.twin import Seed, TwinOptions, in_place_of_runs_without_truth, say_simulated
 
 
 def fuse(
@@ -39,9 +31,7 @@ def fuse(
         bool,
         typer.Option("--twins", help="Use twins of runs without ground truth: simulated again from their tracks."),
     ] = False,
-    replicates: Replicates = 8,
-    tolerance: ToleranceOption = "none",
-    gap: GapOption = None,
+    twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
     plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
@@ -73,7 +63,7 @@ def fuse(
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),
         ),
     )
-    judging = settings_of(replicates, tolerance, seed, gap) if twins else None
+    judging = twin_options.settings(seed) if twins else None
     teaching = replace(judging, seed=0) if judging else None
     with (
         in_place_of_runs_without_truth(runs, judging) as flown,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.output import Json, cell, new_table, note, print_json, say, show
-from gpvo.cli.twin import GapOption, Replicates, ToleranceOption, in_place_of_runs_without_truth, settings_of
+from gpvo.cli.twin import TwinOptions, in_place_of_runs_without_truth
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -54,9 +54,7 @@ def train(
             "--twins", help="Learn from twins of runs without ground truth (made with gpvo run --keep-tracks)."
         ),
     ] = False,
-    replicates: Replicates = 8,
-    tolerance: ToleranceOption = "none",
-    gap: GapOption = None,
+    twin_options: TwinOptions = TwinOptions(),
     statements: Annotated[
         Path | None,
         typer.Option(help="Folder for what each method states of the runs left out, for gpvo score."),
@@ -92,7 +90,7 @@ def train(
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
     if statements is not None:
         _check_statements(runs, settings, update)
-    drawn = settings_of(replicates, tolerance, seed, gap) if twins else None
+    drawn = twin_options.settings(seed) if twins else None
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         trained = _with_origin(_train(paths, settings, update), paths)
         if statements is not None:

@@ -56,9 +56,7 @@ def live(
     state: Annotated[
         Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
     ] = None,
-    vehicle: flags.VehicleName = "any",
-    max_acceleration: flags.MaxAcceleration = None,
-    max_turn: flags.MaxTurn = None,
+    vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     depth: Annotated[int, typer.Option(help="Length of the queue of a topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
@@ -70,7 +68,7 @@ def live(
     from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings, run_live
 
     one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
-    carrier = flags.vehicle_of(vehicle, max_acceleration, max_turn)
+    carrier = vehicle.bounds()
     one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
     result = run_live(
         LiveSettings(

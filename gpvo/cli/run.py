@@ -34,9 +34,7 @@ def run(
     min_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is lost; at least 4.")] = 8,
     weak_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is degraded.")] = 20,
     window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion for itself.")] = 2,
-    vehicle: flags.VehicleName = "any",
-    max_acceleration: flags.MaxAcceleration = None,
-    max_turn: flags.MaxTurn = None,
+    vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
@@ -84,9 +82,8 @@ def run(
     from gpvo.vo.config import make_config, read_settings
     from gpvo.vo.rig_findings import read_state
 
-    carrier = flags.vehicle_of(vehicle, max_acceleration, max_turn)
     shorthand = {
-        **asdict(carrier),
+        **asdict(vehicle.bounds()),
         "methods": methods,
         "sigma_px": sigma,
         "sigma_p_px": sigma_p,

@@ -33,12 +33,12 @@ def score(
 
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
-    from gpvo.cli.evaluate import options_of
+    from gpvo.cli.evaluate import JudgeOptions
     from gpvo.evaluation.score import board, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
 
     truth = truth or []
-    options = options_of(None, truth_sigma, "none", "0")
+    options = JudgeOptions(truth_sigma=truth_sigma).options()
     if len(stated) == 1 and stated[0].is_dir() and not truth:
         methods = score_folder(stated[0], options)
         if out is not None:

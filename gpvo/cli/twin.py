@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,23 +17,36 @@ from gpvo.errors import GpvoError
 if TYPE_CHECKING:
     from gpvo.twin.replicate import TwinSettings
 
-Replicates = Annotated[int, typer.Option(min=2, max=1000, help="Twins per run.")]
-ToleranceOption = Annotated[
-    str,
-    typer.Option(
-        "--tolerance",
-        help="Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
-        " with baseline and focal (fractions) and rotation_rad. Each twin draws its own.",
-    ),
-]
 
-GapOption = Annotated[
-    str | None,
-    typer.Option(
-        "--gap",
-        help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
-    ),
-]
+@dataclass(frozen=True)
+class TwinOptions:
+    """How twins are made."""
+
+    replicates: Annotated[int, typer.Option(min=2, max=1000, help="Twins per run.")] = 8
+    tolerance: Annotated[
+        str,
+        typer.Option(
+            "--tolerance",
+            help="Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
+            " with baseline and focal (fractions) and rotation_rad. Each twin draws its own.",
+        ),
+    ] = "none"
+    gap: Annotated[
+        str | None,
+        typer.Option(
+            "--gap",
+            help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
+        ),
+    ] = None
+
+    def settings(self, seed: int) -> TwinSettings:
+        """The flags, parsed. Raises GpvoError for an unknown tolerance or a file without a gap."""
+        from gpvo.twin.gap import read_gap
+        from gpvo.twin.replicate import TwinSettings, read_tolerance
+
+        name, sigma = read_tolerance(self.tolerance)
+        return TwinSettings(self.replicates, sigma, name, seed, None if self.gap is None else read_gap(self.gap))
+
 
 Seed = Annotated[
     int, typer.Option(min=0, help="Random seed of the twins. Not that of 'gpvo train': a model is judged by others.")
@@ -46,9 +60,7 @@ def twin(
         bool,
         typer.Option("--against", help="Compare with the runs' ground truth: real errors over what twins predict."),
     ] = False,
-    replicates: Replicates = 8,
-    tolerance: ToleranceOption = "none",
-    gap: GapOption = None,
+    options: TwinOptions = TwinOptions(),
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Twins to make in parallel; -1 for one per core.")] = 1,
     json_: Json = False,
@@ -59,13 +71,14 @@ def twin(
 
     Example: gpvo twin runs/mine -o twins --tolerance d455
     """
-    settings = settings_of(replicates, tolerance, seed, gap)
+    settings = options.settings(seed)
     if out is None and not against:
         raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")
     with nullcontext(out) if out is not None else TemporaryDirectory(prefix="gpvo-twins-") as folder:
         made = make_all(runs, Path(folder), settings, jobs)
         if against:
-            _print_ratios(runs, [made[i : i + replicates] for i in range(0, len(made), replicates)], json_)
+            n = settings.replicates
+            _print_ratios(runs, [made[i : i + n] for i in range(0, len(made), n)], json_)
             return
     if json_:
         print_json({"schema": 1, "twins": [str(p) for p in made]})
@@ -97,15 +110,6 @@ def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: 
         table.add_row("all, times or over", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
     show(table)
     print("real over predicted error, root mean square; the truth's own noise is counted in")
-
-
-def settings_of(replicates: int, tolerance: str, seed: int, gap: str | None = None) -> TwinSettings:
-    """The flags, parsed. Raises GpvoError for an unknown tolerance or a file without a gap."""
-    from gpvo.twin.gap import read_gap
-    from gpvo.twin.replicate import TwinSettings, read_tolerance
-
-    name, sigma = read_tolerance(tolerance)
-    return TwinSettings(replicates, sigma, name, seed, None if gap is None else read_gap(gap))
 
 
 def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int = 1) -> list[Path]:
