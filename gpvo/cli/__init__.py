@@ -25,6 +25,7 @@ from gpvo.cli import (
     live,
     model,
     output,
+    reproduce,
     run,
     score,
     selftest,
@@ -75,7 +76,7 @@ for command in (
     fuse.publish,
     live.live,
     live.doctor,
-    selftest.reproduce,
+    reproduce.reproduce,
     selftest.selftest,
 ):
     app.command(command.__name__.rstrip("_"))(common.with_common_options(command))
