@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.sim.render import raster, shade
-from gpvo.sim.render.groups import COLUMNS, SCRATCH, TAPS
-from gpvo.sim.render.lanes import LANES
 from gpvo.sim.render.scene import RayTable, Scene
 from gpvo.types import Array
 
@@ -24,12 +22,11 @@ class Drawer:
 
     def __init__(self, scene: Scene, table: RayTable, far_m: float, bands: int) -> None:
         self._scene, self._table, self._far = scene, table, float(far_m)
-        H, W, groups = table.height, table.width, table.rays.shape[1]
+        H, W = table.valid.shape
         edges = np.linspace(0, H, bands + 1).astype(int)
         self.bands = list(pairwise(edges.tolist()))
-        self._frame = np.zeros((H, groups, 5, LANES), np.float32)
-        self._radiance, self._depth = (np.zeros((H, groups * LANES), np.float32) for _ in range(2))
-        self.radiance, self.depth = self._radiance[:, :W], self._depth[:, :W]
+        self._inverse, self._owner = np.zeros_like(table.blank), np.zeros(table.blank.shape, np.int32)
+        self.radiance, self.depth = (np.zeros((H, W), np.float32) for _ in range(2))
         self._index = np.zeros(len(scene.sphere), np.int32)
         self._distance = np.zeros(len(scene.sphere), np.float32)
         self._light_map = _light_map(scene)
@@ -56,25 +53,31 @@ class Drawer:
         s, t, memory = self._scene, self._table, self._memory[band]
         y0, y1 = self.bands[band]
         memory.make_room(self._triangles + 1)
-        raster.clear(t.rays, t.valid, self._frame, y0, y1)
+        self._inverse[y0:y1], self._owner[y0:y1] = t.blank[y0:y1], 0
         kept = raster.visibility(
             self._order, self._near,
             (s.vertices, s.triangles, s.vertex_start, s.triangle_start, s.cluster_material),
-            self._R, self._P, t.plane, t.reach, np.float32(t.bend), t.width, self._frame, y0, y1, memory.camera,
-            memory.pixel, memory.rows, memory.corner,
+            self._R, self._P, t.plane, t.reach, np.float32(t.bend), t.width, t.rays, self._inverse, self._owner,
+            y0, y1, memory.camera, memory.pixel, memory.rows, memory.corner,
         )  # fmt: skip
-        # Marks the tables as not filled, and the blank triangle's as filled with nothing.
-        memory.table[:kept, TAPS] = 0
-        memory.table[0] = 0
-        memory.table[0, TAPS] = 1
+        memory.table[:kept, shade.TAPS] = 0  # not filled yet
         shade.shade(
-            self._frame, memory.rows, memory.corner, s.vertices, s.texels,
+            self._inverse, self._owner, memory.rows, memory.corner, s.vertices, s.texels,
             (s.texture_size, s.level_start), self._R, self._P, lights, t.rays, t.width, t.plane, t.reach, _MOST_TAPS,
-            memory.table, memory.table.view(np.int32), memory.scratch, self._radiance, self._depth, y0, y1,
+            memory.table, memory.table.view(np.int32), self.radiance, self.depth, y0, y1,
         )  # fmt: skip
         if self._light_map is not None:
             shade.cast_shadows(
-                self._frame, memory.corner, s.vertices, memory.table, self._light_map, self.radiance, y0, y1
+                t.rays,
+                self._inverse,
+                self._owner,
+                memory.corner,
+                s.vertices,
+                memory.table,
+                self._light_map,
+                self.radiance,
+                y0,
+                y1,
             )
 
 
@@ -83,7 +86,6 @@ class _Memory:
 
     def __init__(self, most_vertices: int) -> None:
         self.camera, self.pixel = np.zeros((3, most_vertices)), np.zeros((2, most_vertices), np.float32)
-        self.scratch = np.zeros(SCRATCH, np.float32)
         self.rows: NDArray[np.float32] = np.zeros((0, 10), np.float32)
 
     def make_room(self, triangles: int) -> None:
@@ -91,7 +93,7 @@ class _Memory:
             size = triangles * 5 // 4
             self.rows = np.zeros((size, 10), np.float32)
             self.corner = np.zeros((size, 4), np.int32)
-            self.table = np.zeros((size, COLUMNS), np.float32)
+            self.table = np.zeros((size, shade.COLUMNS), np.float32)
 
 
 def _light_map(scene: Scene) -> tuple[NDArray[np.uint8], int, np.float32, np.float32, np.float32] | None:

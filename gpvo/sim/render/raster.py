@@ -13,14 +13,12 @@ import math
 import numpy as np
 from numba import njit
 
-from gpvo.sim.render.groups import any_below, cover_group
-from gpvo.sim.render.lanes import LANES
+from gpvo.sim.render.scene import LANES
 
 # Contraction to fused multiply-adds, no NaNs: the same in every thread, unlike a change of the order of sums.
 FAST = {"contract", "nsz", "nnan", "arcp"}
 OPTIONS = {"nogil": True, "cache": True, "boundscheck": False, "error_model": "numpy", "fastmath": FAST}
 f4 = np.float32
-RX, RY, RZ, INVERSE, OWNER = range(5)  # rows of a group of pixels: ray, inverse distance, triangle
 
 
 @njit(**OPTIONS)
@@ -65,21 +63,6 @@ def cull(sphere, cone, R, P, reach, max_angle, far, index, distance):
 
 
 @njit(**OPTIONS)
-def clear(rays, valid, frame, y0, y1):
-    """Empty the pixels of rows y0 to y1; those without a ray can never be covered."""
-    width = valid.shape[1]
-    for y in range(y0, y1):
-        for g in range(rays.shape[1]):
-            for k in range(LANES):
-                x = g * LANES + k
-                frame[y, g, RX, k] = rays[y, g, 0, k]
-                frame[y, g, RY, k] = rays[y, g, 1, k]
-                frame[y, g, RZ, k] = rays[y, g, 2, k]
-                frame[y, g, INVERSE, k] = f4(0) if x < width and valid[y, min(x, width - 1)] else f4(np.inf)
-                frame[y, g, OWNER, k] = f4(0)
-
-
-@njit(**OPTIONS)
 def _to_pixels(vertices, start, count, R, P, plane, reach, camera, pixel):
     """Vertices of a cluster to the camera frame and, for bounds, to pixels."""
     size = plane.shape[0]
@@ -115,11 +98,11 @@ def _to_pixels(vertices, start, count, R, P, plane, reach, camera, pixel):
 
 
 @njit(**OPTIONS)
-def _hidden(pixels, groups, x0, x1, y0, y1, nearest):
+def _hidden(inverse, x0, x1, y0, y1, nearest):
     """Whether all pixels of a box are covered by something nearer than the inverse distance ``nearest``."""
     for y in range(y0, y1 + 1):
-        for g in range(x0 // LANES, x1 // LANES + 1):
-            if any_below(pixels, ((y * groups + g) * 5 + INVERSE) * LANES, nearest):
+        for x in range(x0 // LANES * LANES, (x1 // LANES + 1) * LANES):
+            if inverse[y, x] < nearest:
                 return False
     return True
 
@@ -149,22 +132,42 @@ def _solve(camera, i, j, k, rows, t):
 
 
 @njit(**OPTIONS)
-def _cover(pixels, groups, rows, t, x0, x1, y0, y1):
-    """Write triangle ``t`` into the pixels of its box that it covers first."""
-    row = (
+def _cover(rays, inverse, owner, rows, t, x0, x1, y0, y1):
+    """Let triangle ``t`` take those pixels of its box, widened to whole groups, that it covers first."""
+    ax, ay, az, bx, by, bz, cx, cy, cz, tolerance = (
         rows[t, 0], rows[t, 1], rows[t, 2], rows[t, 3], rows[t, 4],
         rows[t, 5], rows[t, 6], rows[t, 7], rows[t, 8], -rows[t, 9],
     )  # fmt: skip
-    owner = f4(t)
-    first, last = x0 // LANES, x1 // LANES + 1
+    this = np.int32(t)
+    first, end = x0 // LANES * LANES, (x1 // LANES + 1) * LANES
     for y in range(y0, y1 + 1):
-        for g in range(first, last):
-            cover_group(pixels, (y * groups + g) * 5 * LANES, row, owner)
+        # Slices let the compiler see that it may work on many pixels at once.
+        rx, ry, rz = rays[y, 0, first:end], rays[y, 1, first:end], rays[y, 2, first:end]
+        nearest, owners = inverse[y, first:end], owner[y, first:end]
+        for k in range(end - first):
+            near = ax * rx[k] + (ay * ry[k] + az * rz[k])
+            second = bx * rx[k] + (by * ry[k] + bz * rz[k])
+            third = cx * rx[k] + (cy * ry[k] + cz * rz[k])
+            edge, old = tolerance * near, nearest[k]
+            inside = (near > old) & (second >= edge) & (third >= edge) & (near - second - third >= edge)
+            nearest[k] = near if inside else old
+            owners[k] = this if inside else owners[k]
+
+
+@njit(**OPTIONS)
+def _box(left, right, top, bottom, spare, bend, width, y_first, y_last):
+    """Pixels x0, x1, y0, y1 (inclusive) of the image that bounds, and how far edges bulge out of them, may touch."""
+    grow = spare + bend * ((right - left) * (right - left) + (bottom - top) * (bottom - top))
+    return (
+        max(math.ceil(left - grow), 0), min(math.floor(right + grow), width - 1),
+        max(math.ceil(top - grow), y_first), min(math.floor(bottom + grow), y_last - 1),
+    )  # fmt: skip
 
 
 @njit(**OPTIONS)
 def visibility(
-    order, distance, scene, R, P, plane, reach, bend, width, frame, y_first, y_last, camera, pixel, rows, corner
+    order, distance, scene, R, P, plane, reach, bend, width, rays, inverse, owner, y_first, y_last, camera,
+    pixel, rows, corner,
 ):  # fmt: skip
     """Fill the visibility buffer of rows ``y_first`` to ``y_last`` (exclusive).
 
@@ -173,8 +176,6 @@ def visibility(
     ``corner`` (T, 4): indices of each kept triangle's three vertices and its material.
     """
     vertices, triangles, vertex_start, triangle_start, material = scene
-    groups = frame.shape[1]
-    pixels = frame.reshape(frame.size)
     kept = 1
     for q in range(len(order)):
         c = order[q]
@@ -186,15 +187,11 @@ def visibility(
         for k in range(1, count):
             left, right = min(left, pixel[0, k]), max(right, pixel[0, k])
             top, bottom = min(top, pixel[1, k]), max(bottom, pixel[1, k])
-        grow = f4(0.6) + bend * ((right - left) * (right - left) + (bottom - top) * (bottom - top))
-        x0 = max(math.ceil(left - grow), 0)
-        x1 = min(math.floor(right + grow), width - 1)
-        y0 = max(math.ceil(top - grow), y_first)
-        y1 = min(math.floor(bottom + grow), y_last - 1)
+        x0, x1, y0, y1 = _box(left, right, top, bottom, f4(0.6), bend, width, y_first, y_last)
         if x1 < x0 or y1 < y0:
             continue
         near = distance[q]
-        if near > 0 and _hidden(pixels, groups, x0, x1, y0, y1, f4(1.0 / near)):
+        if near > 0 and _hidden(inverse, x0, x1, y0, y1, f4(1.0 / near)):
             continue
         for t in range(triangle_start[c], triangle_start[c + 1]):
             i, j, k = np.int64(triangles[t, 0]), np.int64(triangles[t, 1]), np.int64(triangles[t, 2])
@@ -202,14 +199,10 @@ def visibility(
             right = max(max(pixel[0, i], pixel[0, j]), pixel[0, k])
             top = min(min(pixel[1, i], pixel[1, j]), pixel[1, k])
             bottom = max(max(pixel[1, i], pixel[1, j]), pixel[1, k])
-            grow = f4(0.03) + bend * ((right - left) * (right - left) + (bottom - top) * (bottom - top))
-            x0 = max(math.ceil(left - grow), 0)
-            x1 = min(math.floor(right + grow), width - 1)
-            y0 = max(math.ceil(top - grow), y_first)
-            y1 = min(math.floor(bottom + grow), y_last - 1)
+            x0, x1, y0, y1 = _box(left, right, top, bottom, f4(0.03), bend, width, y_first, y_last)
             if x1 < x0 or y1 < y0 or not _solve(camera, i, j, k, rows, kept):
                 continue
-            _cover(pixels, groups, rows, kept, x0, x1, y0, y1)
+            _cover(rays, inverse, owner, rows, kept, x0, x1, y0, y1)
             corner[kept, 0], corner[kept, 1], corner[kept, 2] = start + i, start + j, start + k
             corner[kept, 3] = material[c]
             kept += 1

@@ -14,7 +14,7 @@ from gpvo.sim.worlds.world import Lighting, LightMap, Mesh, World
 from gpvo.types import Array
 
 F32 = NDArray[np.float32]
-LANES = 8  # pixels of a row that are worked on at once
+LANES = 8  # rows of pixels are filled up to whole groups of so many
 _GRID = 192
 _MARGIN = 1.12
 _PINHOLE_LIMIT_RAD = 1.45  # a pinhole's tangent runs away near 90 degrees; no image reaches that far
@@ -154,14 +154,16 @@ def pyramids(textures: tuple[NDArray[np.uint8], ...]) -> tuple[NDArray[np.uint32
 class RayTable:
     """Tables of a lens, from its ``project`` and ``unproject``: rays of all pixels, and pixels of all directions.
 
-    ``rays`` (H, C, 3, 8) float32: unit rays of the pixels of a row in groups of eight, zero where there is none.
-    ``valid`` (H, W). ``plane`` (G, G, 2) float32: pixel (u, v) of directions given in the stereographic plane
+    ``rays`` (H, 3, C) float32: unit rays of the pixels of a row, filled up to whole groups, zero where there is none.
+    ``valid`` (H, W). ``blank`` (H, C) float32: inverse distances of an empty image, infinite where there is no ray, so
+    that nothing covers it. ``plane`` (G, G, 2) float32: pixel (u, v) of directions given in the stereographic plane
     ``p = (x, y) / (z + |xyz|)``, on an even grid over ``|p_x| <= reach[0], |p_y| <= reach[1]``; it only has to
     bound triangles. ``bend`` [1/px]: straight edges of length L bulge by at most ``bend L^2`` pixels.
     """
 
     rays: NDArray[np.float32]
     valid: NDArray[np.bool_]
+    blank: NDArray[np.float32]
     plane: NDArray[np.float32]
     reach: NDArray[np.float32]
     max_angle_rad: float
@@ -179,13 +181,13 @@ class RayTable:
         angle = float(np.arccos(np.clip(rays[valid, 2].min(), -1, 1)))
         p = np.abs(rays[valid, :2] / (1 + rays[valid, 2:])).max(axis=0)
         reach = (p * _MARGIN + 0.02).astype(np.float32)
-        groups = -(-W // LANES)
-        packed = np.zeros((H, groups * LANES, 3), np.float32)
-        packed[:, :W] = rays.reshape(H, W, 3)
+        packed = np.zeros((H, 3, -(-W // LANES) * LANES), np.float32)
+        packed[:, :, :W] = rays.reshape(H, W, 3).transpose(0, 2, 1)
         straight = isinstance(model, PinholeRadtan) and not any(model.distortion)
         return cls(
-            rays=np.ascontiguousarray(packed.reshape(H, groups, LANES, 3).transpose(0, 1, 3, 2)),
+            rays=packed,
             valid=valid.reshape(H, W),
+            blank=np.where(packed.any(axis=1), np.float32(0), np.float32(np.inf)),
             plane=_pixel_plane(model, reach),
             reach=reach,
             max_angle_rad=angle,

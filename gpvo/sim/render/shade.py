@@ -7,25 +7,12 @@ import math
 import numpy as np
 from numba import njit
 
-from gpvo.sim.render.groups import (
-    LIGHT,
-    SIZE,
-    START,
-    TAP_U,
-    TAP_V,
-    TAPS,
-    U0,
-    V0,
-    U,
-    V,
-    begin_group,
-    end_group,
-    tap_group,
-)
-from gpvo.sim.render.lanes import LANES
-from gpvo.sim.render.raster import INVERSE, OPTIONS, OWNER, RX, RY, RZ
+from gpvo.sim.render.raster import OPTIONS
 
 f4 = np.float32
+# Columns of a triangle's table: what is linear over it, against the ray; then constants.
+U, V, LIGHT, U0, V0, TAP_U, TAP_V, START, SIZE, TAPS = 0, 3, 6, 9, 10, 11, 12, 13, 14, 15
+COLUMNS = 16
 
 
 @njit(**OPTIONS)
@@ -94,9 +81,7 @@ def _footprint(t, rows, vertices, i, j, k, R, P, rays, width, plane, reach, size
     py = min(max(int(plane[gy, gx, 1]), 0), rays.shape[0] - 2)
     table[t, TAP_U], table[t, TAP_V] = f4(0), f4(0)
     s = rows[t, 0] * X + rows[t, 1] * Y + rows[t, 2] * Z
-    g, lane = px // LANES, px % LANES
-    g1, lane1 = (px + 1) // LANES, (px + 1) % LANES
-    norm = rays[py, g1, 2, lane1] * rays[py, g, 2, lane] * rays[py + 1, g, 2, lane]
+    norm = rays[py, 2, px + 1] * rays[py, 2, px] * rays[py + 1, 2, px]
     if s <= 0 or norm == 0:
         return f4(0), 1
     turn = f4(1) / s
@@ -104,13 +89,10 @@ def _footprint(t, rows, vertices, i, j, k, R, P, rays, width, plane, reach, size
     v = (table[t, V] * X + table[t, V + 1] * Y + table[t, V + 2] * Z) * turn
     qa = qb = qc = f4(0)
     for step in range(2):
-        if step == 0:
-            yn, gn, ln = py, g1, lane1
-        else:
-            yn, gn, ln = py + 1, g, lane
-        dx = rays[yn, gn, 0, ln] - rays[py, g, 0, lane]
-        dy = rays[yn, gn, 1, ln] - rays[py, g, 1, lane]
-        dz = rays[yn, gn, 2, ln] - rays[py, g, 2, lane]
+        yn, xn = (py, px + 1) if step == 0 else (py + 1, px)
+        dx = rays[yn, 0, xn] - rays[py, 0, px]
+        dy = rays[yn, 1, xn] - rays[py, 1, px]
+        dz = rays[yn, 2, xn] - rays[py, 2, px]
         ds = rows[t, 0] * dx + rows[t, 1] * dy + rows[t, 2] * dz
         du = (table[t, U] * dx + table[t, U + 1] * dy + table[t, U + 2] * dz - ds * u) * turn
         dv = (table[t, V] * dx + table[t, V + 1] * dy + table[t, V + 2] * dz - ds * v) * turn
@@ -133,6 +115,67 @@ def _footprint(t, rows, vertices, i, j, k, R, P, rays, width, plane, reach, size
 
 
 @njit(**OPTIONS)
+def _bilinear(texels, start, size, u, v):
+    """Texture value 0..255, repeated; each texel also holds its right and lower neighbours."""
+    x, y = u * size - f4(0.5), v * size - f4(0.5)
+    i, j = np.int32(x), np.int32(y)
+    across, down = x - f4(i), y - f4(j)
+    whole = np.int32(size)
+    four = texels[start + (j & (whole - 1)) * whole + (i & (whole - 1))]
+    a, b = f4(four & 255), f4((four >> 8) & 255)
+    c, d = f4((four >> 16) & 255), f4(four >> 24)
+    upper, lower = a + (b - a) * across, c + (d - c) * across
+    return upper + (lower - upper) * down
+
+
+@njit(**OPTIONS)
+def _texture(t, table, integers, texels, u, v):
+    """Texture value 0..255 of triangle ``t``: taps along the longer axis of the footprint, of one or two levels."""
+    taps = int(table[t, TAPS])
+    start, size = np.int64(integers[t, START]), table[t, SIZE]
+    step, blend = f4(1) / f4(taps), (table[t, TAPS] - f4(taps)) * f4(2)
+    total = f4(0)
+    for k in range(taps):
+        along = (f4(k) + f4(0.5)) * step - f4(0.5)
+        at_u, at_v = u + along * table[t, TAP_U], v + along * table[t, TAP_V]
+        total += _bilinear(texels, start, size, at_u, at_v) * (step * (blend * f4(-1) + f4(1)))
+        if blend > 0:
+            next_start = start + np.int64(size) * np.int64(size)
+            total += _bilinear(texels, next_start, size * f4(0.5), at_u, at_v) * (step * blend)
+    return total
+
+
+@njit(**OPTIONS)
+def shade(
+    inverse, owner, rows, corner, vertices, texels, texture, R, P, lights, rays, width, plane, reach, most_taps,
+    table, integers, radiance, depth, y_first, y_last,
+):  # fmt: skip
+    """Radiance and depth of the rows ``y_first`` to ``y_last`` (exclusive) from the visibility buffer.
+
+    ``lights``: ambient, head lamp. ``table`` (T, 16) float32, ``integers`` the same memory as
+    int32; a row whose TAPS are 0 is not filled yet.
+    """
+    for y in range(y_first, y_last):
+        for x in range(width):
+            t = np.int64(owner[y, x])
+            if t == 0:
+                radiance[y, x], depth[y, x] = f4(0), f4(np.nan)
+                continue
+            if table[t, TAPS] == 0:
+                _prepare(
+                    t, rows, corner, vertices, R, P, lights, rays, width, plane, reach, texture, most_taps, table,
+                    integers,
+                )  # fmt: skip
+            rx, ry, rz = rays[y, 0, x], rays[y, 1, x], rays[y, 2, x]
+            distance = f4(1) / max(inverse[y, x], f4(1e-9))
+            u = table[t, U0] + (table[t, U] * rx + (table[t, U + 1] * ry + table[t, U + 2] * rz)) * distance
+            v = table[t, V0] + (table[t, V] * rx + (table[t, V + 1] * ry + table[t, V + 2] * rz)) * distance
+            light = (table[t, LIGHT] * rx + (table[t, LIGHT + 1] * ry + table[t, LIGHT + 2] * rz)) * distance
+            albedo = _texture(t, table, integers, texels, u, v) * f4(1 / 255.0)
+            radiance[y, x], depth[y, x] = albedo * albedo * light, rz * distance
+
+
+@njit(**OPTIONS)
 def _shadow(image, u, v, origin_u, origin_v, per_texel):
     """Light map value 0..1, 1 outside."""
     x = (u - origin_u) * per_texel - f4(0.5)
@@ -149,57 +192,16 @@ def _shadow(image, u, v, origin_u, origin_v, per_texel):
 
 
 @njit(**OPTIONS)
-def shade(
-    frame, rows, corner, vertices, texels, texture, R, P, lights, rays, width, plane, reach, most_taps,
-    table, integers, scratch, radiance, depth, y_first, y_last,
-):  # fmt: skip
-    """Radiance and depth of the rows ``y_first`` to ``y_last`` (exclusive) from the visibility buffer.
-
-    ``lights``: ambient, head lamp. ``table`` (T, 16) float32, ``integers`` the same memory as
-    int32; a row whose TAPS are 0 is not filled yet.
-    """
-    pixels, out_radiance, out_depth = (
-        frame.reshape(frame.size),
-        radiance.reshape(radiance.size),
-        depth.reshape(depth.size),
-    )
-    tables = table.reshape(table.size)
-    groups = frame.shape[1]
-    for y in range(y_first, y_last):
-        for g in range(groups):
-            taps, blended, before = f4(0), False, np.int64(-1)
-            for k in range(LANES):
-                t = np.int64(frame[y, g, OWNER, k])
-                if t != before:
-                    before = t
-                    if table[t, TAPS] == 0:
-                        _prepare(
-                            t, rows, corner, vertices, R, P, lights, rays, width, plane, reach, texture, most_taps,
-                            table, integers,
-                        )  # fmt: skip
-                    taps = max(taps, table[t, TAPS])
-                    blended = blended or table[t, TAPS] != f4(int(table[t, TAPS]))
-            offset = (y * groups + g) * 5 * LANES
-            begin_group(pixels, offset, tables, scratch)
-            for k in range(int(taps)):
-                tap_group(scratch, texels, f4(k), 0)
-                if blended:
-                    tap_group(scratch, texels, f4(k), 1)
-            end_group(scratch, pixels, offset, out_radiance, out_depth, (y * groups + g) * LANES)
-
-
-@njit(**OPTIONS)
-def cast_shadows(frame, corner, vertices, table, light_map, radiance, y_first, y_last):
+def cast_shadows(rays, inverse, owner, corner, vertices, table, light_map, radiance, y_first, y_last):
     """Multiply the light map into the pixels of its material."""
     image, material, origin_u, origin_v, scale = light_map
     for y in range(y_first, y_last):
         for x in range(radiance.shape[1]):
-            g, k = x >> 3, x & 7
-            t = np.int64(frame[y, g, OWNER, k])
+            t = np.int64(owner[y, x])
             if t == 0 or corner[t, 3] != material:
                 continue
-            rx, ry, rz = frame[y, g, RX, k], frame[y, g, RY, k], frame[y, g, RZ, k]
-            distance = f4(1) / frame[y, g, INVERSE, k]
+            rx, ry, rz = rays[y, 0, x], rays[y, 1, x], rays[y, 2, x]
+            distance = f4(1) / inverse[y, x]
             i = corner[t, 0]
             u = vertices[i, 6] + (table[t, U] * rx + table[t, U + 1] * ry + table[t, U + 2] * rz) * distance
             v = vertices[i, 7] + (table[t, V] * rx + table[t, V + 1] * ry + table[t, V + 2] * rz) * distance
