@@ -13,8 +13,7 @@ from gpvo.cli.output import Json, print_json, progress
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
-    from gpvo.sim.campaign import Flight
-    from gpvo.sim.scenario import Scenario
+    from gpvo.sim.scenario import Flight, Scenario
 
 _SEED_LIMIT = 100_000
 
@@ -70,7 +69,7 @@ def simulate(
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
     if points and preview:
         raise GpvoError("--points draws no images to preview", cure="leave out one of --points, --preview")
-    from gpvo.sim.scenario import load_scenario, stated_seed
+    from gpvo.sim.scenario import fly_campaign, load_scenario, stated_seed
 
     given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,
              "trajectory": None if trajectory is None else str(trajectory)}  # fmt: skip
@@ -86,8 +85,6 @@ def simulate(
         if seeds is None:
             flights = [_one(chosen, stated_seed(scenario) if seed is None else seed, target, points, threads)]
         else:
-            from gpvo.sim.campaign import fly_campaign
-
             flights = fly_campaign(
                 chosen, _seeds(seeds), target, points=points, jobs=jobs, backend=backend, scheduler=scheduler
             )
@@ -105,7 +102,7 @@ def _like(run: Path | None, points: bool) -> dict[str, Any]:
 
 
 def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -> Flight:
-    from gpvo.sim.campaign import fly
+    from gpvo.sim.scenario import fly
 
     if points:
         return fly(scenario, seed, out if out.suffix == ".npz" else out.with_name(out.name + ".npz"), points)

@@ -5,7 +5,7 @@ All positions are in the axes of the first camera, whose pose is made equal to t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -125,11 +125,6 @@ class BoundMethod:
         """Of the odometry."""
         return "thesis" if self.kind in ("v_t", "position") else "fast"
 
-    @property
-    def learns(self) -> bool:
-        """Whether it needs training flights."""
-        return self.kind in ("position", "motion", "learned")
-
 
 def method_of(e: Experiment, way: Way) -> BoundMethod:
     """The method that a way of an experiment comes to."""
@@ -162,24 +157,25 @@ class BoundsJob:
 
     def make(self, path: Path, store: Store) -> None:
         """State the bounds of every flight and save them."""
-        runs = [read_run(p) for p in self.runs]
+        stated = self._statement(store)
+        write_arrays(path, as_arrays([bounds_of(run, *stated(run)) for run in map(read_run, self.runs)]))
+
+    def _statement(self, store: Store) -> Callable[[Run], tuple[Array, Array]]:
+        """What gives mean (N, 3) and covariance (N, 3, 3) of the position's error at every frame of a run."""
         kind, name = self.method.kind, self.method.name
         if kind == "v_t":
-            found = [bounds_of(r, np.zeros((len(r.log), 3)), summed_v_t(r.log, name)) for r in runs]
-        elif kind == "joint":
-            found = [_joint(r, name) for r in runs]
-        elif kind == "motion":
+            return lambda run: (np.zeros((len(run.log), 3)), summed_v_t(run.log, name))
+        if kind == "joint":
+            return lambda run: (np.zeros((len(run.log), 3)), _joint(run.log, name))
+        if kind == "motion":
             gps = fit_thesis(sets_of(self.training))
-            found = [_motion(r, gps) for r in runs]
-        else:
-            assert self.model is not None
-            model = self.model.path(store)
-            if kind == "position":
-                positions = ThesisModel.of_positions(model)
-                found = [_position(r, positions) for r in runs]
-            else:
-                found = [_learned(r, Predictor.load(model)) for r in runs]
-        write_arrays(path, as_arrays(found))
+            return lambda run: _motion(run, gps)
+        assert self.model is not None
+        model = self.model.path(store)
+        if kind == "position":
+            positions = ThesisModel.of_positions(model)
+            return lambda run: positions.predict(observe(run.log, positions.columns, "position")[1])
+        return lambda run: _learned(run, Predictor.load(model))
 
 
 def job_of(
@@ -187,7 +183,7 @@ def job_of(
 ) -> BoundsJob | None:
     """A way of an experiment over ``runs``, learnt from ``training`` runs; None where it needs some and has none."""
     method = method_of(e, way)
-    if not runs or (method.learns and not training):
+    if not runs or (method.kind in ("position", "motion", "learned") and not training):
         return None
     model = None
     if method.kind == "learned":
@@ -197,22 +193,15 @@ def job_of(
     return BoundsJob(name, method, runs, training if method.kind == "motion" else (), model)
 
 
-def _joint(run: Run, method: str) -> Bounds:
+def _joint(log: VoLog, method: str) -> Array:
     # Of all that the records state, this method alone is wanted.
-    log = VoLog(
-        [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in run.log]
-    )
-    errors = next(s.errors for s in statements(log) if s.method == method)
+    alone = [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in log]
+    errors = next(s.errors for s in statements(VoLog(alone)) if s.method == method)
     assert errors is not None
-    return bounds_of(run, np.zeros((len(run.log), 3)), compounded(run.log, errors))
+    return compounded(log, errors)
 
 
-def _position(run: Run, model: ThesisModel) -> Bounds:
-    _, X = observe(run.log, model.columns, "position")
-    return bounds_of(run, *model.predict(X))
-
-
-def _motion(run: Run, model: ThesisModel) -> Bounds:
+def _motion(run: Run, model: ThesisModel) -> tuple[Array, Array]:
     """A GP speaks of measured motions; a lost one is taken to be like the one before."""
     s = build_run(run, columns=THESIS)
     stated = model.predict(s.select(model.columns))
@@ -223,13 +212,13 @@ def _motion(run: Run, model: ThesisModel) -> Bounds:
         if row is not None:
             mean[k], last = stated[0][row], stated[1][row]
         errors.append(MotionError.independent(last))
-    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, errors))
+    return mean_shift(run.log, mean), compounded(run.log, errors)
 
 
-def _learned(run: Run, predictor: Predictor) -> Bounds:
+def _learned(run: Run, predictor: Predictor) -> tuple[Array, Array]:
     predictions = predictions_of(run, predictor)
     bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
     learned = next(s for s in statements(bare, predictions) if s.method == "learned")
     assert learned.errors is not None
     mean: Array = np.where([[r.status is Status.LOST] for r in run.log], 0.0, learned.mean)
-    return bounds_of(run, mean_shift(run.log, mean), compounded(run.log, learned.errors))
+    return mean_shift(run.log, mean), compounded(run.log, learned.errors)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.reproduce.bounds import BoundMethod, Bounds, BoundsJob, load_bounds
 from gpvo.reproduce.experiments import WAYS, Mode, Way
 from gpvo.reproduce.flights import Flights
 from gpvo.reproduce.models import OTHER, SAME, Studies
 from gpvo.reproduce.rows import Cell
-from gpvo.reproduce.scores import Interval, pooled, squared_ends
+from gpvo.reproduce.scores import Interval, over_seeds, pooled, squared_ends
 from gpvo.reproduce.stages import Store, Workers
 from gpvo.reproduce.tables import MODES, number, with_interval
 from gpvo.stats.bootstrap import sequence_bootstrap
@@ -22,24 +22,17 @@ from gpvo.types import Array
 _REST_S = 2.9
 _FLAT, _HARDLY, _OWN = 0.1, 1.25, 0.5
 HOLDS, FAILS, OPEN = "holds", "does not hold", "open"
+_DENIED = {HOLDS: FAILS, FAILS: HOLDS, OPEN: OPEN}
 
 Evidence = Callable[[str, Way], list[Bounds]]
 """The flights of a row by its key and a way."""
 
 
-@dataclass(frozen=True)
-class Claim:
-    """One claim: ``verdict`` is holds, does not hold, or open; ``evidence`` one line of numbers."""
-
-    claim: str
-    verdict: str
-    evidence: str
-
-
 def claims(
     cells: Sequence[Cell], flights: Flights, studies: Studies | None, store: Store, workers: Workers
 ) -> list[dict[str, Any]]:
-    """Every claim with its verdict, by the mode with more flights; one that cannot be judged is open, and says why."""
+    """Every claim with its verdict (holds, does not hold, or open) and one line of evidence, by the mode with more
+    flights; one that cannot be judged is open, and says why."""
     modes = {c.mode for c in cells}
     mode: Mode = "points" if "points" in modes or not modes else "images"
     flown = {(c.experiment.key, c.way): c for c in cells if c.mode == mode}
@@ -47,17 +40,20 @@ def claims(
     def found(key: str, way: Way) -> list[Bounds]:
         return flown[key, way].load(store)
 
-    out = []
-    for claim, keys, judge in _ROWS:
-        known = all((key, way) in flown for key in keys for way in WAYS)
-        out.append(Claim(claim, *(judge(found) if known else _UNKNOWN)))
-    out.insert(2, Claim("noisy pairs hardly matter on the moon", *_noisy_pairs(flights, mode, store, workers)))
-    out.append(Claim("more training data help", *_more_data(studies)))
-    out.append(Claim("training in the environment of the target helps", *_target_world(studies)))
+    judged = [
+        (claim, judge(found) if all((key, way) in flown for key in keys for way in WAYS) else _UNKNOWN)
+        for claim, keys, judge in _ROWS
+    ]
+    judged.insert(2, ("noisy pairs hardly matter on the moon", _noisy_pairs(flights, mode, store, workers)))
+    judged.append(("more training data help", _more_data(studies)))
+    judged.append(("training in the environment of the target helps", _target_world(studies)))
     for what, lacking in (("the IMU", "without IMU"), ("the geometric covariance", "without geometric covariance")):
-        judged = _UNKNOWN if studies is None else _gain("a model without", studies.ablation, "all inputs", lacking)
-        out.append(Claim(f"{what} as an input helps", *judged))
-    return [{**asdict(c), "mode": MODES[mode]} for c in out]
+        gain = _UNKNOWN if studies is None else _gain("a model without", studies.ablation, "all inputs", lacking)
+        judged.append((f"{what} as an input helps", gain))
+    return [
+        {"claim": claim, "verdict": verdict, "evidence": evidence, "mode": MODES[mode]}
+        for claim, (verdict, evidence) in judged
+    ]
 
 
 _UNKNOWN = OPEN, "no flights of this kind"
@@ -91,8 +87,7 @@ def _tighter(found: Evidence) -> tuple[str, str]:
     value, interval = pooled(squared_ends(pm)[1], squared_ends(tri)[1])
     inside = [float(np.mean([(np.abs(b.error_m) <= 3 * b.sigma_m + 1e-9).mean() for b in way])) for way in (pm, tri)]
     # Tighter: the quotient lies below one.
-    verdict = {HOLDS: FAILS, FAILS: HOLDS, OPEN: OPEN}[_above(interval, 1.0)]
-    return verdict, (
+    return _DENIED[_above(interval, 1.0)], (
         f"last bound over that of triangulation: {with_interval(value, interval)}; inside 3 sigma: "
         f"{100 * inside[0]:.0f} % against {100 * inside[1]:.0f} % (99.7 % is right): tighter is not better by itself"
     )
@@ -132,8 +127,7 @@ def _noisy_pairs(flights: Flights, mode: Mode, store: Store, workers: Workers) -
     noisy, clean = _paired(*(load_bounds(job.path(store)) for job in jobs))
     error, stated = (pooled(a, b) for a, b in zip(noisy, clean, strict=True))
     # Holds where the error surely grows by less than a quarter.
-    verdict = {HOLDS: FAILS, FAILS: HOLDS, OPEN: OPEN}[_above(error[1], _HARDLY)]
-    return verdict, (
+    return _DENIED[_above(error[1], _HARDLY)], (
         f"final error with noisy pairs over that without: {with_interval(*error)}; bound: {with_interval(*stated)}"
     )
 
@@ -177,12 +171,11 @@ def _paired(a: Sequence[Bounds], b: Sequence[Bounds]) -> tuple[tuple[Array, Arra
     return squared_ends(a[:n]), squared_ends(b[:n])
 
 
-def _double_ratio(noisy: tuple[Array, Array], clean: tuple[Array, Array], draws: int = 4000) -> Interval | None:
+def _double_ratio(noisy: tuple[Array, Array], clean: tuple[Array, Array]) -> Interval | None:
     """Interval over seeds of the growth of what is stated over the growth of the error."""
-    n = len(noisy[0])
-    if n < 3:
-        return None
-    pick = np.random.default_rng(0).integers(0, n, (draws, n))
-    (error, stated), (clean_error, clean_stated) = ([v[pick].mean(1) for v in pair] for pair in (noisy, clean))
-    low, high = np.quantile(np.sqrt(stated / clean_stated * clean_error / error), [0.025, 0.975])
-    return float(low), float(high)
+
+    def drawn(pick: NDArray[np.int64]) -> Array:
+        (error, stated), (clean_error, clean_stated) = ([v[pick].mean(1) for v in pair] for pair in (noisy, clean))
+        return np.sqrt(stated / clean_stated * clean_error / error)
+
+    return over_seeds(len(noisy[0]), drawn)

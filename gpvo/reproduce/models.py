@@ -84,24 +84,18 @@ class LikelihoodJob:
             return np.asarray(data["nll_per_dim"], dtype=np.float64)
 
 
-def without(s: TrainingSet, lacking: Lacking) -> TrainingSet:
-    """The same rows as of a vehicle without IMU, or of an odometry without geometric covariance."""
-    if not lacking:
-        return s
-    if lacking == "imu":
-        gone = set(resolve("imu"))
-        kept = s.covariances
-    else:
-        gone = {c for c in s.columns if c.startswith(("ln_var_", "ln_det_"))}
-        kept = {}
-    X = s.X.copy()
-    X[:, [c in gone for c in s.columns]] = np.nan
-    return replace(s, X=X, covariances=kept)
-
-
 def sets_of(runs: Sequence[Path], lacking: Lacking = "") -> list[TrainingSet]:
-    """Training sets of runs."""
-    return [without(build_run(read_run(p)), lacking) for p in runs]
+    """Training sets of runs, as of a vehicle without IMU, or of an odometry without geometric covariance."""
+    out = []
+    for s in (build_run(read_run(p)) for p in runs):
+        if lacking:
+            imu, X = resolve("imu"), s.X.copy()
+            geometry = lacking == "geometry"
+            gone = [c.startswith(("ln_var_", "ln_det_")) if geometry else c in imu for c in s.columns]
+            X[:, gone] = np.nan
+            s = replace(s, X=X, covariances={} if geometry else s.covariances)
+        out.append(s)
+    return out
 
 
 SAME, OTHER = "same world and path", "other worlds"

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from gpvo import __version__
-from gpvo.files import plain, write_json
-from gpvo.reproduce import figures, models, rows, scores, tables
+from gpvo.files import plain, write_json, write_text
+from gpvo.reproduce import models, rows, scores, tables
 from gpvo.reproduce.claims import claims
 from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS, Plan
 from gpvo.reproduce.flights import fly_all
-from gpvo.reproduce.stages import Store, Workers, only_user, write_text
+from gpvo.reproduce.stages import Store, Workers, only_user
 
 
 def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
         "errata": list(ERRATA),
         "out_of_scope": list(OUT_OF_SCOPE),
         "failed": [*flights.failed, *refused],
-        "figures": figures.draw([*simulated, *real], studied, store, out),
+        "figures": tables.draw([*simulated, *real], studied, store, out),
     }
 
 

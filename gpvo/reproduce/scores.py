@@ -5,11 +5,12 @@ What could not be computed is None.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.reproduce.bounds import Bounds, BoundsJob
 from gpvo.reproduce.experiments import Experiment
@@ -57,7 +58,8 @@ def score(flights: Sequence[Bounds]) -> Scores:
     squared_error = np.array([(b.error_m**2).sum(1).mean() for b in flights])
     final, predicted = squared_ends(flights)
     vector = np.array([((b.error_m - b.mean_m) ** 2).sum(1).mean() for b in flights])
-    magnitude = np.array([(magnitude_residual(b) ** 2).mean() for b in flights])
+    expected = [expected_length(b.mean_m, b.covariance_m2) for b in flights]
+    magnitude = np.array([((np.linalg.norm(b.error_m, axis=1) - m) ** 2).mean() for b, m in zip(flights, expected)])
     inside = [(np.abs(b.error_m - b.mean_m) <= 3 * b.sigma_m + 1e-9).mean() for b in flights]
     one = np.ones(len(flights))
     return Scores(
@@ -78,11 +80,6 @@ def squared_ends(flights: Sequence[Bounds]) -> tuple[Array, Array]:
     """(n,) squared error of the last position of every flight, and what is expected of it [m^2]."""
     final = np.array([(b.error_m[-1] ** 2).sum() for b in flights])
     return final, np.array([b.predicted_m[-1] ** 2 for b in flights])
-
-
-def magnitude_residual(b: Bounds) -> Array:
-    """(N,) length of the error minus the length that is expected of it [m]."""
-    return np.linalg.norm(b.error_m, axis=1) - expected_length(b.mean_m, b.covariance_m2)
 
 
 def expected_length(mean: Array, covariance: Array) -> Array:
@@ -111,12 +108,15 @@ def pooled(above: Array, below: Array) -> tuple[float, Interval | None]:
         return np.sqrt(np.asarray(above) / np.maximum(below, 1e-300))
 
     value = float(root_ratio(above.mean(), below.mean()))
-    n = len(above)
-    if n < 3:
-        return value, None
-    pick = np.random.default_rng(0).integers(0, n, (_DRAWS, n))
-    low, high = np.quantile(root_ratio(above[pick].mean(1), below[pick].mean(1)), [0.025, 0.975])
-    return value, (float(low), float(high))
+    return value, over_seeds(len(above), lambda pick: root_ratio(above[pick].mean(1), below[pick].mean(1)))
+
+
+def over_seeds(seeds: int, statistic: Callable[[NDArray[np.int64]], Array]) -> Interval | None:
+    """95 % of a statistic (draws,) of drawn seeds (draws, seeds), by a bootstrap; None with fewer than three."""
+    if seeds < 3:
+        return None
+    low, high = np.quantile(statistic(np.random.default_rng(0).integers(0, seeds, (_DRAWS, seeds))), [0.025, 0.975])
+    return float(low), float(high)
 
 
 def rows(cells: Sequence[Cell], store: Store) -> list[dict[str, Any]]:

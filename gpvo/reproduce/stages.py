@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from gpvo import files
 from gpvo.errors import GpvoError, SourceError
 from gpvo.files import FolderLock, plain
 from gpvo.parallel import map_jobs
@@ -102,9 +101,3 @@ def only_user(root: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_text(path, text)

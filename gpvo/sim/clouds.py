@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from gpvo.sim import paths, recorded
 from gpvo.sim.paths import Path3
 from gpvo.types import Array
 
-WORLDS = ("tunnel", "lunar", "room", "street")
 PATHS = ("along", "wander", "straight", "hover")
 _CAMERA_HEIGHT_M = 1.6  # over the road
 _STEP_M = 0.5  # between the points of a centre line
@@ -25,42 +25,30 @@ def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.ran
     ``path``: one of :data:`PATHS`, or a recorded one, a file or run folder, which is scaled to fit the world; a street
     is laid along it.
     """
-    if world not in WORLDS:
-        raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(WORLDS)}")
+    if world not in _KINDS:
+        raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(_KINDS)}")
     reach = duration_s * speed_mps + 25.0
     bend = 0.0 if path == "straight" else 1.0
     centre = _tunnel_line(reach, rng, bend, scale=12.0 if world == "street" else 1.0)
     if world == "street" and path not in PATHS:
         return _street_along(_recording(path, duration_s), duration_s, rng)
-    low, high = {
-        "tunnel": (np.array([4.0, -0.6, -0.4]), np.array([6.0, 0.6, 0.5])),
-        "lunar": (np.array([-40.0, -20.0, 2.0]), np.array([40.0, 20.0, 4.0])),
-        "room": (np.array([-4.0, -4.0, 0.8]), np.array([4.0, 4.0, 3.2])),
-        "street": (np.array([4.0, -1.0, 1.4]), np.array([40.0, 1.0, 1.8])),
-    }[world]
-    cloud = {"tunnel": _tunnel, "lunar": _lunar, "room": _room, "street": _street}[world](centre, rng)
-    return _path(world, path, centre, low, high, duration_s, speed_mps, rng), cloud
-
-
-def _path(
-    world: str, path: str, centre: Array, low: Array, high: Array, duration_s: float, speed_mps: float,
-    rng: np.random.Generator,
-) -> Path3:  # fmt: skip
+    landmarks, low, high = _KINDS[world]
+    cloud = landmarks(centre, rng)
     if path == "hover":
-        return paths.hover((low + high) / 2, 0.0, duration_s)
-    if path == "straight":
-        height = 1.1 if world == "lunar" else 0.0
-        ground = ground_height if world == "lunar" else None
-        return paths.straight(np.array([0.0, 0.0, height]), np.array([1.0, 0, 0]), duration_s, speed_mps, ground)
-    if path == "wander" or (path == "along" and world == "room"):
-        return paths.wandering(low, high, duration_s, speed_mps, rng)
-    if path == "along":
-        if world == "lunar":
-            centre = centre * [1, 1, 0] + [0, 0, 1.5]
-        if world == "street":
-            return paths.driving(centre + [0, 0, _CAMERA_HEIGHT_M], duration_s, speed_mps, rng)
-        return paths.along_curve(centre, duration_s, speed_mps, rng, sway_m=0.35)
-    return _recording(path, duration_s).fitted(low, high, duration_s, rng)
+        flown = paths.hover((low + high) / 2, 0.0, duration_s)
+    elif path == "straight":
+        height, ground = (1.1, ground_height) if world == "lunar" else (0.0, None)
+        flown = paths.straight(np.array([0.0, 0.0, height]), np.array([1.0, 0, 0]), duration_s, speed_mps, ground)
+    elif path == "wander" or (path == "along" and world == "room"):
+        flown = paths.wandering(low, high, duration_s, speed_mps, rng)
+    elif path == "along" and world == "street":
+        flown = paths.driving(centre + [0, 0, _CAMERA_HEIGHT_M], duration_s, speed_mps, rng)
+    elif path == "along":
+        line = centre * [1, 1, 0] + [0, 0, 1.5] if world == "lunar" else centre
+        flown = paths.along_curve(line, duration_s, speed_mps, rng, sway_m=0.35)
+    else:
+        flown = _recording(path, duration_s).fitted(low, high, duration_s, rng)
+    return flown, cloud
 
 
 def _recording(path: str, duration_s: float) -> recorded.Recording:
@@ -157,3 +145,12 @@ def _room(centre: Array, rng: np.random.Generator) -> Array:
     for f, (axis, value) in enumerate(((0, -6.0), (0, 6.0), (1, -6.0), (1, 6.0), (2, 0.0), (2, 5.0))):
         p[face == f, axis] = value
     return p
+
+
+# Of each world: its landmarks, and the box in which its paths stay [m].
+_KINDS: dict[str, tuple[Callable[[Array, np.random.Generator], Array], Array, Array]] = {
+    "tunnel": (_tunnel, np.array([4.0, -0.6, -0.4]), np.array([6.0, 0.6, 0.5])),
+    "lunar": (_lunar, np.array([-40.0, -20.0, 2.0]), np.array([40.0, 20.0, 4.0])),
+    "room": (_room, np.array([-4.0, -4.0, 0.8]), np.array([4.0, 4.0, 3.2])),
+    "street": (_street, np.array([4.0, -1.0, 1.4]), np.array([40.0, 1.0, 1.8])),
+}

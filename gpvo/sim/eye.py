@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.sim import sequence_plan
 from gpvo.sim.imu import Motion
 from gpvo.sim.scenario import Scenario
-from gpvo.sim.worlds import World
+from gpvo.sim.worlds.world import World, check_ranges
 from gpvo.types import Array
 
 Image = NDArray[np.float32]
@@ -105,6 +106,10 @@ def optical_flow(
 _SHOT_STREAM, _ADDED_STREAM, _FIXED_STREAM = 0, 1, 2
 
 
+def _within(low: float, high: float, default: float) -> Any:
+    return field(default=default, metadata={"limits": (low, high)})
+
+
 @dataclass(frozen=True)
 class SensorParams:
     """A small global-shutter camera.
@@ -116,32 +121,25 @@ class SensorParams:
     times gain per unit of radiance. ``gamma``: exponent of the tone curve.
     """
 
-    psf_sigma_px: float = 0.55
-    vignetting: float = 0.3
-    prnu: float = 0.006
-    full_well_e: float = 6000.0
-    read_noise_e: float = 6.0
-    auto_exposure: float = 0.08
+    psf_sigma_px: float = _within(0, 5, default=0.55)
+    vignetting: float = _within(0, 0.95, default=0.3)
+    prnu: float = _within(0, 0.2, default=0.006)
+    full_well_e: float = _within(0, 1e7, default=6000.0)
+    read_noise_e: float = _within(0, 1e5, default=6.0)
+    auto_exposure: float = _within(0, 1, default=0.08)
     gain: float | None = None
-    target: float = 0.30
-    max_gain: float = 60.0
-    gamma: float = 0.5
+    target: float = _within(0.01, 0.99, default=0.30)
+    max_gain: float = _within(1e-3, 1e6, default=60.0)
+    gamma: float = _within(0.2, 1, default=0.5)
 
     def __post_init__(self) -> None:
-        limits = (
-            ("psf_sigma_px", self.psf_sigma_px, 0, 5),
-            ("vignetting", self.vignetting, 0, 0.95),
-            ("prnu", self.prnu, 0, 0.2),
-            ("full_well_e", self.full_well_e, 0, 1e7),
-            ("read_noise_e", self.read_noise_e, 0, 1e5),
-            ("auto_exposure", self.auto_exposure, 0, 1),
-            ("target", self.target, 0.01, 0.99),
-            ("max_gain", self.max_gain, 1e-3, 1e6),
-            ("gamma", self.gamma, 0.2, 1),
+        check_ranges(
+            **{
+                f"the sensor's {f.name}": (getattr(self, f.name), *f.metadata["limits"])
+                for f in fields(self)
+                if f.metadata
+            }
         )
-        for name, value, low, high in limits:
-            if not low <= value <= high:
-                raise GpvoError(f"the sensor's {name} = {value} is not between {low} and {high}")
 
 
 class SensorModel:

@@ -55,9 +55,9 @@ class Motion:
 
     def thinned(self, every: int) -> Motion:
         """Every n-th sample."""
-        return Motion(*(getattr(self, name)[::every] for name in self.__dataclass_fields__))
+        return self.at(slice(None, None, every))
 
-    def at(self, index: NDArray[np.int64]) -> Motion:
+    def at(self, index: NDArray[np.int64] | slice) -> Motion:
         """The samples of these indices."""
         return Motion(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 

@@ -70,8 +70,7 @@ def along_curve(
     room = arc[-1] - 1.0
     s = room * np.tanh(s / room * 1.0) if s[-1] > 0.8 * room else s
     start = _smoothstep(pace / 4.0)
-    tangent = curve.derivative(1)(s)
-    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    heading = _heading(curve.derivative(1)(s))
     left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], 1)
     offset = sway_m * (np.sin(2 * w[1] * pace + ph[1]) - np.sin(ph[1])) * start
     rise = 0.5 * sway_m * (np.sin(2 * w[2] * pace + ph[2]) - np.sin(ph[2])) * start
@@ -92,8 +91,7 @@ def driving(centre: Array, duration_s: float, speed_mps: float, rng: np.random.G
     speed = np.maximum(PchipInterpolator(at, wanted)(np.maximum(t, at[0])), 0.0)
     speed = gaussian_filter1d(speed, 0.4 * _KNOTS_PER_S, mode="nearest")
     s = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
-    tangent = curve.derivative(1)(s)
-    return _flat(t, curve(s), np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), duration_s, lean=0.0)
+    return _flat(t, curve(s), _heading(curve.derivative(1)(s)), duration_s, lean=0.0)
 
 
 def wandering(
@@ -129,16 +127,20 @@ def straight(
     s = speed_mps * smooth_start(t, rest_s)
     unit = np.asarray(direction, float) / np.linalg.norm(direction)
     position = np.asarray(start, float) + s[:, None] * unit
+    yaw = np.full(len(t), np.arctan2(unit[1], unit[0]))
     if ground is None:
-        return _flat(t, position, np.full(len(t), np.arctan2(unit[1], unit[0])), duration_s, lean=0.0)
+        return _flat(t, position, yaw, duration_s, lean=0.0)
     position[:, 2] = start[2] + ground(position[:, :2])
-    side = 0.5 * np.array([-unit[1], unit[0], 0.0])
-    ahead = 0.6 * unit
+    side, ahead = 0.5 * np.array([-unit[1], unit[0], 0.0]), 0.6 * unit
     pitch = np.arctan2(ground((position - ahead)[:, :2]) - ground((position + ahead)[:, :2]), 1.2)
     roll = np.arctan2(ground((position + side)[:, :2]) - ground((position - side)[:, :2]), 1.0)
-    yaw = np.full(len(t), np.arctan2(unit[1], unit[0]))
     angles = make_interp_spline(t, np.stack([roll, pitch, yaw], 1), k=5)
-    return Path3(make_interp_spline(t, position, k=5), lambda u: _from_rpy(angles(u)), duration_s)
+
+    def attitude(u: Array) -> Array:
+        about_x, about_y, about_z = (se3.so3_exp(angles(u)[:, i, None] * np.eye(3)[i]) for i in range(3))
+        return about_z @ about_y @ about_x
+
+    return Path3(make_interp_spline(t, position, k=5), attitude, duration_s)
 
 
 def hover(at: Array, yaw_rad: float, duration_s: float) -> Path3:
@@ -163,8 +165,7 @@ def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float 
     t = knots(duration_s)
     u = at_arc(soft_end(speed_mps * smooth_start(t, rest_s), along[-1], 0.5 * speed_mps))
     # A step straight up has no heading of its own: it keeps a trace of the first one.
-    tangent = curve.derivative(1)(u) + 1e-3 * (corners[-1] - corners[0])
-    return _flat(t, curve(u), np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), duration_s)
+    return _flat(t, curve(u), _heading(curve.derivative(1)(u) + 1e-3 * (corners[-1] - corners[0])), duration_s)
 
 
 def soft_end(distance: Array, limit: float, width: float) -> Array:
@@ -186,6 +187,11 @@ def knots(duration_s: float) -> Array:
     return np.arange(-0.2, duration_s + 0.24, 1.0 / _KNOTS_PER_S)
 
 
+def _heading(tangent: Array) -> Array:
+    """Directions (N,) [rad] of vectors (N, 3), without jumps."""
+    return np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+
+
 def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float = 1.0) -> Path3:
     """Attitude of a multirotor: its thrust points along acceleration plus gravity (D. Mellinger, V. Kumar, "Minimum
     snap trajectory generation and control for quadrotors", 2011, section III). ``lean`` scales the tilt; 0 stays
@@ -203,8 +209,3 @@ def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float 
         return np.stack([np.cross(y, z), y, z], axis=2)
 
     return Path3(place, attitude, duration_s)
-
-
-def _from_rpy(rpy: Array) -> Array:
-    roll, pitch, yaw = (se3.so3_exp(rpy[:, i, None] * np.eye(3)[i]) for i in range(3))
-    return yaw @ pitch @ roll

@@ -18,8 +18,8 @@ from gpvo.errors import GpvoError
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
-from gpvo.sim import clouds, imu, movers
-from gpvo.sim.episodes import CAUSES, Episode, draw_episodes
+from gpvo.sim import clouds, events, imu
+from gpvo.sim.events import CAUSES, Episode, draw_episodes
 from gpvo.sim.paths import Path3
 from gpvo.types import Array, ImuLog, StereoCamera
 
@@ -184,7 +184,7 @@ def _fly(
     episodes = draw_episodes(scenario.duration_s, streams[2], causes=scenario.causes) if scenario.bursts else ()
     if scenario.texture < 1.0:
         cloud = cloud[streams[6].random(len(cloud)) < scenario.texture]
-    bodies = movers.draw_movers(
+    bodies = events.draw_movers(
         at_frames.t_s, T_world_cam, streams[6], cars=scenario.cars, smoke=scenario.smoke, dust=scenario.dust
     )
     frames = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams, bodies)
@@ -210,7 +210,7 @@ Seen = tuple[NDArray[np.int64], Array, Array]
 
 def observe(
     scenario: PointsScenario, t_s: Array, T_world_cam: Array, cloud: Array, episodes: tuple[Episode, ...],
-    streams: list[np.random.Generator], bodies: tuple[movers.Body, ...] = (),
+    streams: list[np.random.Generator], bodies: tuple[events.Body, ...] = (),
 ) -> list[Seen]:  # fmt: skip
     """Tracks of each frame: identities (n,), left and right pixels (n, 2); points of ``bodies`` follow the cloud's."""
     rig = TrueRig.of(scenario.camera, scenario.tolerance, streams[3].standard_normal(RIG_ERRORS), scenario.offset)
@@ -233,7 +233,7 @@ def observe(
         points = np.concatenate([cloud, *(b.at(k, streams[6]) for b in bodies)]) if bodies else cloud
         left, right, visible, depth = _visible(rig, T_world_cam[k], points, scenario.reach_m)
         if bodies:
-            visible &= ~movers.hidden(bodies, len(cloud), left, depth)
+            visible &= ~events.hidden(bodies, len(cloud), left, depth)
         wanted = int(scenario.tracks * (bad.count_factor if bad else 1.0))
         before = active.copy()
         _renew(active, generation, visible, wanted, min(1.0, scenario.drop * (3.0 if bad else 1.0)), life)

@@ -58,7 +58,6 @@ class Recording:
         self, low: Array, high: Array, duration_s: float, rng: np.random.Generator, rest_s: float = 3.0
     ) -> Path3:
         """The recording scaled down to fit a box [m], looking in a random direction at its start."""
-        low, high = np.asarray(low, float), np.asarray(high, float)
         scale = min(1.0, float(((high - low) / np.maximum(np.ptp(self.position_m, axis=0), 1e-6)).min()))
         return self.placed((high + low) / 2, 0.0, scale, rng.uniform(-np.pi, np.pi), duration_s, rest_s)
 
@@ -124,12 +123,9 @@ def _resample(clock: Array, T: Array, at: Array) -> Array:
 
 def _smoothed(position: Array, R: Array) -> tuple[Array, Array]:
     """Positions (N, 3) and quaternions (N, 4), x y z w, of poses every 0.02 s, without jitter."""
-    both = position, _continuous(se3.rotation_to_quaternion_xyzw(R))
-    smooth = (gaussian_filter1d(v, 0.1 / _STEP_S, axis=0, mode="nearest") for v in both)
+    q = se3.rotation_to_quaternion_xyzw(R)
+    # q and -q are equal: signs must not jump.
+    flips = np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0)
+    q = q * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
+    smooth = (gaussian_filter1d(v, 0.1 / _STEP_S, axis=0, mode="nearest") for v in (position, q))
     return next(smooth), next(smooth)
-
-
-def _continuous(q_xyzw: Array) -> Array:
-    """The same rotations with signs that do not jump: q and -q are equal."""
-    flips = np.where((q_xyzw[1:] * q_xyzw[:-1]).sum(1) < 0, -1.0, 1.0)
-    return q_xyzw * np.cumprod(np.concatenate([[1.0], flips]))[:, None]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,32 +15,27 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.run_read import is_run, read_run
-from gpvo.types import Array
+from gpvo.sim.points import T_BODY_CAM
 
-# The left camera looks forward from the nose, level. The IMU is the body's origin.
-T_BODY_LEFT = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
-# Where it sits on a vehicle, in body axes [m]: a rover carries it on a mast.
+# Where the left camera sits on a vehicle, in body axes [m]; the IMU is the body's origin. A rover carries it on a mast.
 PLACE_M = {"quadrotor": (0.12, 0.0, 0.02), "path": (0.12, 0.0, 0.02), "rover": (0.35, 0.0, 0.75)}
-
-
-def _pinhole() -> StereoRig:
-    lens = PinholeRadtan(380.0, 380.0, 319.5, 239.5, 640, 480)
-    return _pair(lens, lens, 0.12, np.eye(3))
-
-
-def _euroc() -> StereoRig:
-    left = PinholeRadtan(458.0, 457.0, 367.0, 248.0, 752, 480, (-0.28, 0.074, 2e-4, 1e-5))
-    right = PinholeRadtan(457.5, 456.0, 380.0, 255.0, 752, 480, (-0.28, 0.074, -1e-4, -3e-5))
-    return _pair(left, right, 0.11, se3.so3_exp(np.array([0.014, -0.004, 0.002])))
-
-
-def _t265() -> StereoRig:
-    left = KannalaBrandt(286.0, 286.0, 421.0, 399.0, 848, 800, (-0.005, 0.04, -0.038, 0.006))
-    right = KannalaBrandt(285.5, 285.5, 419.0, 403.0, 848, 800, (-0.004, 0.039, -0.037, 0.006))
-    return _pair(left, right, 0.064, se3.so3_exp(np.array([0.001, 0.0046, -0.002])))
-
-
-_PRESETS: dict[str, Callable[[], StereoRig]] = {"pinhole": _pinhole, "euroc": _euroc, "t265": _t265}
+_PINHOLE = PinholeRadtan(380.0, 380.0, 319.5, 239.5, 640, 480)
+# Left and right lens, baseline [m], rotation of the right camera [rad].
+_PRESETS: dict[str, tuple[CameraModel, CameraModel, float, tuple[float, float, float]]] = {
+    "pinhole": (_PINHOLE, _PINHOLE, 0.12, (0.0, 0.0, 0.0)),
+    "euroc": (
+        PinholeRadtan(458.0, 457.0, 367.0, 248.0, 752, 480, (-0.28, 0.074, 2e-4, 1e-5)),
+        PinholeRadtan(457.5, 456.0, 380.0, 255.0, 752, 480, (-0.28, 0.074, -1e-4, -3e-5)),
+        0.11,
+        (0.014, -0.004, 0.002),
+    ),
+    "t265": (
+        KannalaBrandt(286.0, 286.0, 421.0, 399.0, 848, 800, (-0.005, 0.04, -0.038, 0.006)),
+        KannalaBrandt(285.5, 285.5, 419.0, 403.0, 848, 800, (-0.004, 0.039, -0.037, 0.006)),
+        0.064,
+        (0.001, 0.0046, -0.002),
+    ),
+}
 CAMERAS = tuple(_PRESETS)
 
 
@@ -53,23 +47,18 @@ def camera_rig(name: str) -> StereoRig:
     Raises GpvoError for any other name, or a file that is no calibration.
     """
     if name in _PRESETS:
-        return _PRESETS[name]()
+        return _pair(*_PRESETS[name])
     if is_run(name):
-        return _of_run(Path(name))
+        if (c := read_run(Path(name)).log.camera) is None:
+            raise GpvoError("the run does not know its camera", where=name, cure="give a calibration file")
+        lens = PinholeRadtan(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height)
+        return _pair(lens, lens, c.baseline_m)
     if not Path(name).is_file():
         raise GpvoError(f"unknown camera '{name}'", cure=f"choose from {', '.join(CAMERAS)}, or a calibration file")
     path, size = Path(name), None
     if path.suffix.lower() == ".txt" and (P := read_projections(path).get("P0")) is not None:
         size = round(2 * P[0, 2]) + 1, round(2 * P[1, 2]) + 1
-    return replace(read_stereo_yaml(path, size=size), T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)
-
-
-def _of_run(path: Path) -> StereoRig:
-    c = read_run(path).log.camera
-    if c is None:
-        raise GpvoError("the run does not know its camera", where=path, cure="give a calibration file")
-    lens = PinholeRadtan(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height)
-    return _pair(lens, lens, c.baseline_m, np.eye(3))
+    return replace(read_stereo_yaml(path, size=size), T_imu_left=T_BODY_CAM, T_body_left=T_BODY_CAM)
 
 
 def mounted(rig: StereoRig, vehicle: str, pitch_deg: float) -> StereoRig:
@@ -93,13 +82,13 @@ class RigError:
     def draw(cls, tolerance: Tolerance, rng: np.random.Generator, offset: Tolerance | None = None) -> RigError:
         """Normal within the tolerance, about a fixed ``offset``, whose turn is about the vertical axis of the image."""
         e, fixed = rng.standard_normal(7), offset or Tolerance()
-        turn = tolerance.rotation_rad * e[1:4] + [0.0, fixed.rotation_rad, 0.0]
-        bend = fixed.distortion + tolerance.distortion * e[5:]
+        x, y, z = (tolerance.rotation_rad * e[1:4] + [0.0, fixed.rotation_rad, 0.0]).tolist()
+        left, right = (fixed.distortion + tolerance.distortion * e[5:]).tolist()
         return cls(
             baseline=float(fixed.baseline + tolerance.baseline * e[0]),
             focal=float(fixed.focal + tolerance.focal * e[4]),
-            rotation_rad=(float(turn[0]), float(turn[1]), float(turn[2])),
-            distortion=(float(bend[0]), float(bend[1])),
+            rotation_rad=(x, y, z),
+            distortion=(left, right),
         )
 
 
@@ -122,6 +111,9 @@ def _altered(lens: CameraModel, focal: float, k1: float) -> CameraModel:
     return replace(lens, fx_px=lens.fx_px * focal, fy_px=lens.fy_px * focal, distortion=(first + k1, *rest))
 
 
-def _pair(left: CameraModel, right: CameraModel, baseline_m: float, R_right_left: Array) -> StereoRig:
+def _pair(
+    left: CameraModel, right: CameraModel, baseline_m: float, turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> StereoRig:
+    R_right_left = se3.so3_exp(np.array(turn_rad))
     T_right_left = se3.from_rt(R_right_left, R_right_left @ np.array([-baseline_m, 0.0, 0.0]))
-    return StereoRig(left, right, T_right_left, T_imu_left=T_BODY_LEFT, T_body_left=T_BODY_LEFT)
+    return StereoRig(left, right, T_right_left, T_imu_left=T_BODY_CAM, T_body_left=T_BODY_CAM)

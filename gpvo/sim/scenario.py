@@ -1,11 +1,11 @@
-"""Scenarios: what is flown, where, with which sensors and faults. One validated set of values, kept as small TOML."""
+"""Scenarios: what is flown, where, with which sensors and faults. One validated set of values, kept as small TOML; and
+their flights, one or many, on the cores of this machine or on a dask cluster."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -14,12 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from gpvo.cameras.rig import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.files import read_toml
-from gpvo.sim.points import SCENARIOS, PointsScenario
+from gpvo.geometry.se3 import path_length_m
+from gpvo.parallel import map_jobs
+from gpvo.sim.points import SCENARIOS, PointsScenario, simulate_points
 from gpvo.sim.rig import CAMERAS, camera_rig
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
 Share = Field(0.0, ge=0.0, le=0.5)
+_FOLDER = Path(__file__).parent / "scenarios"
 
 
 class Scenario(BaseModel):
@@ -107,8 +110,7 @@ class Flight:
 
 def names() -> tuple[str, ...]:
     """Names of the scenarios that come with the package."""
-    folder = resources.files("gpvo.sim").joinpath("scenarios")
-    return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")))
+    return tuple(sorted(file.stem for file in _FOLDER.glob("*.toml")))
 
 
 def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scenario:
@@ -116,20 +118,17 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
 
     Raises GpvoError for an unknown name or value, with the nearest one that is known.
     """
-    if name.endswith(".toml"):
-        table, where = read_toml(Path(name)), name
-    elif name in names():
-        with resources.as_file(resources.files("gpvo.sim").joinpath("scenarios", f"{name}.toml")) as file:
-            table, where = read_toml(file), name
-    else:
+    if not name.endswith(".toml") and name not in names():
         raise GpvoError(f"unknown scenario '{name}'", cure=_nearest(name, names()))
+    file = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
+    table = read_toml(file)
     # A resolved scenario, as it lies beside a sequence, may be flown again.
     table.pop("seed", None)
     table.pop("drawn", None)
-    table.setdefault("name", Path(name).stem if name.endswith(".toml") else name)
+    table.setdefault("name", file.stem)
     for key, value in (overrides or {}).items():
         _put(table, key, value)
-    return _validated(table, where)
+    return _validated(table, name)
 
 
 def stated_seed(name: str) -> int:
@@ -144,18 +143,12 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
 
     base = SCENARIOS.get(scenario.name, PointsScenario())
     camera = base.camera if scenario.camera in ("pinhole", "t265") else Rectifier(camera_rig(scenario.camera)).camera
+    same = ("world", "duration_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "causes", "dark")
     values: dict[str, Any] = {
-        "world": scenario.world,
+        **{name: getattr(scenario, name) for name in same},
         "path": scenario.trajectory or scenario.path,
-        "duration_s": scenario.duration_s,
-        "rate_hz": scenario.rate_hz,
-        "speed_mps": scenario.speed_mps,
         "camera": camera,
-        "imu": scenario.imu,
-        "imu_rate_hz": scenario.imu_rate_hz,
         "bursts": scenario.episodes_share > 0,
-        "causes": scenario.causes,
-        "dark": scenario.dark,
         # A rectified pair has no distortion to be wrong.
         "tolerance": replace(scenario.tolerance, distortion=0.0),
         "offset": replace(scenario.offset, distortion=0.0),
@@ -171,32 +164,26 @@ def require_pictures(scenario: Scenario) -> None:
 
 
 def _put(table: dict[str, Any], key: str, value: Any) -> None:
-    head, _, rest = key.partition(".")
-    if not rest:
-        table[head] = value
-        return
-    inner = table.setdefault(head, {})
-    if not isinstance(inner, dict):
-        raise GpvoError(f"'{head}' is not a table", cure=f"set {head} itself")
-    _put(inner, rest, value)
+    *heads, last = key.split(".")
+    for head in heads:
+        table = table.setdefault(head, {})
+        if not isinstance(table, dict):
+            raise GpvoError(f"'{head}' is not a table", cure=f"set {head} itself")
+    table[last] = value
 
 
 def _validated(table: dict[str, Any], where: object) -> Scenario:
     if unknown := sorted(set(table) - set(Scenario.model_fields)):
-        raise GpvoError(
-            f"unknown parameter '{unknown[0]}'", where=where, cure=_nearest(unknown[0], Scenario.model_fields)
-        )
+        cure = _nearest(unknown[0], Scenario.model_fields)
+        raise GpvoError(f"unknown parameter '{unknown[0]}'", where=where, cure=cure)
     try:
         scenario = Scenario(**table)
     except ValidationError as error:
         first = error.errors()[0]
-        table_name = str(first["loc"][0])
         if first["loc"][-1] == "[key]":
-            raise GpvoError(
-                f"unknown parameter '{table_name}.{first['input']}'",
-                where=where,
-                cure=_nearest(str(first["input"]), get_args(CalibrationKey)),
-            ) from None
+            word = str(first["input"])
+            cure = _nearest(word, get_args(CalibrationKey))
+            raise GpvoError(f"unknown parameter '{first['loc'][0]}.{word}'", where=where, cure=cure) from None
         key = ".".join(str(part) for part in first["loc"])
         raise GpvoError(f"{key} = {first['input']!r}: {first['msg']}", where=where) from None
     known = {f.name for f in fields(PointsScenario)}
@@ -218,3 +205,53 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
 def _nearest(word: str, known: Any) -> str:
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
     return f"nearest: {close[0]}" if close else f"known: {', '.join(sorted(known))}"
+
+
+def fly_campaign(
+    scenario: Scenario,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    points: bool = False,
+    jobs: int = 1,
+    backend: str = "joblib",
+    scheduler: str | None = None,
+) -> list[Flight]:
+    """Simulate every seed into ``out/seed_N`` (``out/seed_N.npz`` for points); one failure does not stop the others.
+
+    Raises GpvoError for an unknown backend; MissingExtraError for ``dask`` without the extra.
+    """
+    if backend not in ("joblib", "dask"):
+        raise GpvoError(f"unknown backend '{backend}'", cure="choose joblib or dask")
+    suffix = ".npz" if points else ""
+    tasks = [(scenario, seed, out / f"seed_{seed}{suffix}", points) for seed in seeds]
+    out.mkdir(parents=True, exist_ok=True)
+    where = "local" if backend == "joblib" else backend
+    return map_jobs(fly_one, tasks, jobs=jobs, backend=where, scheduler=scheduler)
+
+
+def fly_one(scenario: Scenario, seed: int, out: Path, points: bool = False) -> Flight:
+    """One flight; what goes wrong with it comes back as its ``error``."""
+    try:
+        return fly(scenario, seed, out, points)
+    except GpvoError as error:
+        return Flight(seed, out, error=str(error))
+
+
+def fly(
+    scenario: Scenario, seed: int, out: Path, points: bool = False, threads: int = 1,
+    on_frame: Callable[[], None] | None = None,
+) -> Flight:  # fmt: skip
+    """One flight with images, a folder, or without, an ``.npz``. Raises GpvoError where it goes wrong."""
+    if points:
+        return fly_points(scenario, seed, out)
+    from gpvo.sim.sequence import simulate
+
+    return simulate(scenario, seed, out, threads=threads, on_frame=on_frame)
+
+
+def fly_points(scenario: Scenario, seed: int, out: Path) -> Flight:
+    """One flight without images, written as ``.npz``; an existing file of that name is written anew."""
+    flight = simulate_points(points_scenario(scenario), seed)
+    flight.save(out)
+    return Flight(seed, out, len(flight.t_s), float(path_length_m(flight.motion.position_m)[-1]))

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.files import FolderLock, to_toml, write_json
 from gpvo.geometry.se3 import path_length_m
-from gpvo.sim import imu, routes, sequence_files, sequence_plan, vehicles
-from gpvo.sim.episodes import Episode
+from gpvo.sim import imu, sequence_files, sequence_plan, vehicles
 from gpvo.sim.eye import Eye, optical_flow
 from gpvo.sim.imu import Motion
 from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
@@ -53,7 +52,9 @@ def simulate(
     resolved = to_toml({"seed": seed, **scenario.model_dump()})
     with _only_writer(target):
         if _is_finished(target, resolved):
-            poses = np.loadtxt(_truth_file(target), delimiter=",", usecols=(1, 2, 3), ndmin=2)
+            poses = np.loadtxt(
+                target / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",", usecols=(1, 2, 3), ndmin=2
+            )
             frames = sum(1 for _ in (target / "mav0" / "cam0" / "data.csv").open()) - 1
             return Flight(seed, target, frames, float(path_length_m(poses)[-1]), redone=False)
         part = target.with_name(target.name + ".part")
@@ -99,22 +100,12 @@ def _is_finished(target: Path, resolved: str) -> bool:
         text = file.read_text(encoding="utf-8")
         if text.startswith(resolved + "\n"):
             return True
-        raise GpvoError(
-            f"holds another sequence{_difference(text, resolved)}",
-            where=target,
-            cure="remove it, or give another --out",
-        )
+        pairs = zip(text.splitlines(), resolved.splitlines())
+        difference = next((f" ({there}, not {here})" for there, here in pairs if there != here), "")
+        raise GpvoError(f"holds another sequence{difference}", where=target, cure="remove it, or give another --out")
     if target.is_dir() and not any(target.iterdir()):
         return False
     raise GpvoError("exists and is not a simulated sequence", where=target, cure="give another --out")
-
-
-def _difference(text: str, resolved: str) -> str:
-    """The first line in which two scenarios differ, in brackets."""
-    for there, here in zip(text.splitlines(), resolved.splitlines()):
-        if there != here:
-            return f" ({there}, not {here})"
-    return ""
 
 
 def _write(
@@ -124,9 +115,9 @@ def _write(
     # One stream per purpose: more noise must not move the path.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 78]).spawn(5)]
     world_seed = seed if scenario.world_seed is None else scenario.world_seed
-    parameters = routes.world_parameters(scenario)
+    parameters = sequence_plan.world_parameters(scenario)
     world = build_world(scenario.world, world_seed, **parameters)
-    path = routes.plan_path(scenario, world, streams[0])
+    path = sequence_plan.plan_path(scenario, world, streams[0])
     motion = sequence_plan.move(scenario, path, world)
     sequence_plan.check_motion(scenario, world, motion)
     written = mounted(camera_rig(scenario.camera), scenario.vehicle, scenario.camera_pitch_deg)
@@ -135,14 +126,6 @@ def _write(
     frames = sequence_plan.plan_frames(scenario, episodes, streams[3])
     _write_states(scenario, folder, motion, frames, streams[1])
     error = RigError.draw(scenario.tolerance, streams[4], scenario.offset)
-    _write_episodes(folder, episodes, frames)
-    eye = Eye(scenario, seed, world, true_rig(written, error), motion, threads)
-    count = _write_images(scenario, folder, frames, eye, threads, on_frame)
-    drawn = {"world_seed": world_seed, "world_params": parameters, "rig_error": asdict(error)}
-    return count, float(path_length_m(motion.position_m[::50])[-1]), drawn
-
-
-def _write_episodes(folder: Path, episodes: tuple[Episode, ...], frames: list[FramePlan]) -> None:
     document = {
         "schema": 1,
         "t_start_ns": START_NS,
@@ -150,6 +133,10 @@ def _write_episodes(folder: Path, episodes: tuple[Episode, ...], frames: list[Fr
         "frames": {f"{k}": f.fate for k, f in enumerate(frames) if f.fate != "shown"},
     }
     write_json(folder / "episodes.json", document)
+    eye = Eye(scenario, seed, world, true_rig(written, error), motion, threads)
+    count = _write_images(scenario, folder, frames, eye, threads, on_frame)
+    drawn = {"world_seed": world_seed, "world_params": parameters, "rig_error": asdict(error)}
+    return count, float(path_length_m(motion.position_m[::50])[-1]), drawn
 
 
 def _write_states(
@@ -171,8 +158,9 @@ def _write_images(
     scenario: Scenario, folder: Path, frames: list[FramePlan], eye: Eye, threads: int,
     on_frame: Callable[[], None],
 ) -> int:  # fmt: skip
+    mav = folder / "mav0"
     for camera in ("cam0", "cam1"):
-        (folder / "mav0" / camera / "data").mkdir(parents=True, exist_ok=True)
+        (mav / camera / "data").mkdir(parents=True, exist_ok=True)
     stamps: list[int] = []
     shown = seen_before = None
     pending: list[Future[None]] = []
@@ -187,15 +175,15 @@ def _write_images(
             stamp = START_NS + plan.step * round(1e9 / vehicles.RATE_HZ) + round(late * 1e9)
             stamps.append(stamp)
             if scenario.depth and eye.depth_m is not None:
-                pending.append(pool.submit(_save_array, folder / "mav0" / "depth0" / f"{stamp}.npy", eye.depth_m))
+                pending.append(pool.submit(_save_array, mav / "depth0" / f"{stamp}.npy", eye.depth_m))
             if scenario.flow and eye.depth_m is not None and plan.fate != "frozen":
                 if seen_before is not None:
                     before, depth_m, T_world_cam = seen_before
                     flow_px = optical_flow(eye.model, depth_m, eye.depth_m, T_world_cam, eye.T_world_cam)
-                    pending.append(pool.submit(_save_array, folder / "mav0" / "flow0" / f"{before}.npy", flow_px))
+                    pending.append(pool.submit(_save_array, mav / "flow0" / f"{before}.npy", flow_px))
                 seen_before = (stamp, eye.depth_m, eye.T_world_cam)
             for camera, image in zip(("cam0", "cam1"), shown):
-                pending.append(pool.submit(_save, folder / "mav0" / camera / "data" / f"{stamp}.png", image))
+                pending.append(pool.submit(_save, mav / camera / "data" / f"{stamp}.png", image))
             while len(pending) > _AHEAD:
                 pending.pop(0).result()
         for job in pending:
@@ -212,7 +200,3 @@ def _save(path: Path, image: NDArray[np.uint8]) -> None:
 def _save_array(path: Path, values: NDArray[np.float32]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, values, allow_pickle=False)
-
-
-def _truth_file(folder: Path) -> Path:
-    return folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"

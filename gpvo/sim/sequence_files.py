@@ -14,8 +14,9 @@ from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.io.images import read_grey8
 from gpvo.sim.imu import Motion
-from gpvo.types import Array, ImuLog, ImuNoise
+from gpvo.types import Array, ImuLog
 
 _WIDTH_PX = 320  # of an image on the contact sheet
 _CAMERA_HEAD = "#timestamp [ns],filename"
@@ -37,13 +38,7 @@ def write_calibration(folder: Path, rig: StereoRig, rate_hz: float, offset_s: fl
     T_body_right = rig.T_body_left @ se3.inverse(rig.T_right_left)
     chain: dict[str, Any] = {}
     for i, (lens, T) in enumerate(((rig.left, rig.T_body_left), (rig.right, T_body_right))):
-        sensor = {
-            "sensor_type": "camera",
-            "T_BS": {"cols": 4, "rows": 4, "data": T.ravel().tolist()},
-            "rate_hz": rate_hz,
-            **_lens(lens, "distortion_coefficients"),
-        }
-        _yaml(folder / "mav0" / f"cam{i}" / "sensor.yaml", sensor)
+        _sensor(folder / "mav0" / f"cam{i}", "camera", T, rate_hz=rate_hz, **_lens(lens, "distortion_coefficients"))
         chain[f"cam{i}"] = {
             "T_cam_imu": se3.inverse(T).tolist(),
             **_lens(lens, "distortion_coeffs"),
@@ -58,29 +53,22 @@ def write_imu(folder: Path, log: ImuLog, rate_hz: float, gravity_mps2: float) ->
     """``imu0`` and ``dso/imu_config.yaml``."""
     noise = log.noise
     assert noise is not None
-    sensor = {
-        "sensor_type": "imu",
-        "T_BS": {"cols": 4, "rows": 4, "data": np.eye(4).ravel().tolist()},
-        "rate_hz": rate_hz,
-        **_densities(noise),
-        "gravity_mps2": gravity_mps2,
+    densities = {
+        "gyroscope_noise_density": noise.gyro_density_radps_sqrthz,
+        "gyroscope_random_walk": noise.gyro_walk_radps2_sqrthz,
+        "accelerometer_noise_density": noise.acc_density_mps2_sqrthz,
+        "accelerometer_random_walk": noise.acc_walk_mps3_sqrthz,
     }
-    _yaml(folder / "mav0" / "imu0" / "sensor.yaml", sensor)
-    _yaml(folder / "dso" / "imu_config.yaml", {**_densities(noise), "update_rate": rate_hz, "rostopic": "/imu0"})
+    _sensor(folder / "mav0" / "imu0", "imu", np.eye(4), rate_hz=rate_hz, **densities, gravity_mps2=gravity_mps2)
+    _yaml(folder / "dso" / "imu_config.yaml", {**densities, "update_rate": rate_hz, "rostopic": "/imu0"})
     rows = np.concatenate([log.gyro_radps, log.acc_mps2], axis=1)
     _csv(folder / "mav0" / "imu0" / "data.csv", _IMU_HEAD, log.t_ns, rows)
 
 
 def write_truth(folder: Path, t_ns: NDArray[np.int64], motion: Motion, bias_gyro: Array, bias_acc: Array) -> None:
     """``state_groundtruth_estimate0``: the body's exact states and the IMU's true biases."""
-    sensor = {
-        "sensor_type": "visual-inertial",
-        "T_BS": {"cols": 4, "rows": 4, "data": np.eye(4).ravel().tolist()},
-        "sigma_translation_m": 0.0,
-        "sigma_rotation_rad": 0.0,
-    }
     base = folder / "mav0" / "state_groundtruth_estimate0"
-    _yaml(base / "sensor.yaml", sensor)
+    _sensor(base, "visual-inertial", np.eye(4), sigma_translation_m=0.0, sigma_rotation_rad=0.0)
     q_wxyz = np.roll(se3.rotation_to_quaternion_xyzw(motion.R_world_body), 1, axis=1)
     rows = np.concatenate([motion.position_m, q_wxyz, motion.velocity_mps, bias_gyro, bias_acc], axis=1)
     _csv(base / "data.csv", _TRUTH_HEAD, t_ns, rows)
@@ -103,13 +91,9 @@ def _lens(lens: CameraModel, distortion_key: str) -> dict[str, Any]:
     }
 
 
-def _densities(noise: ImuNoise) -> dict[str, float]:
-    return {
-        "gyroscope_noise_density": noise.gyro_density_radps_sqrthz,
-        "gyroscope_random_walk": noise.gyro_walk_radps2_sqrthz,
-        "accelerometer_noise_density": noise.acc_density_mps2_sqrthz,
-        "accelerometer_random_walk": noise.acc_walk_mps3_sqrthz,
-    }
+def _sensor(folder: Path, kind: str, T_body_sensor: Array, **values: Any) -> None:
+    pose = {"cols": 4, "rows": 4, "data": T_body_sensor.ravel().tolist()}
+    _yaml(folder / "sensor.yaml", {"sensor_type": kind, "T_BS": pose, **values})
 
 
 def _yaml(path: Path, document: dict[str, Any]) -> None:
@@ -134,8 +118,11 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
         raise GpvoError("holds no images", where=sequence)
     tiles = []
     for k in np.linspace(0, len(files[0]) - 1, rows * columns).astype(int):
-        pair = [_read(side[k]) for side in files]
-        small = [cv2.resize(p, (_WIDTH_PX, round(p.shape[0] * _WIDTH_PX / p.shape[1]))) for p in pair]
+        small = []
+        for file in (side[k] for side in files):
+            if (image := read_grey8(file)) is None:
+                raise GpvoError("is not an image", where=file)
+            small.append(cv2.resize(image, (_WIDTH_PX, round(image.shape[0] * _WIDTH_PX / image.shape[1]))))
         tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
     sheet = np.vstack([np.hstack(tiles[r * columns : (r + 1) * columns]) for r in range(rows)])
     target = Path(out)
@@ -143,10 +130,3 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
     return target
-
-
-def _read(file: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise GpvoError("is not an image", where=file)
-    return np.asarray(image, np.uint8)

@@ -8,7 +8,7 @@ central differences of the 1 kHz states that MuJoCo computed: poses and IMU then
 
 from __future__ import annotations
 
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,7 @@ def _model(name: str, **values: object) -> tuple[Any, Any, Any]:
         import mujoco
     except ImportError as error:
         raise MissingExtraError("mujoco", "sim") from error
-    text = resources.files("gpvo.sim").joinpath("models", f"{name}.xml").read_text(encoding="utf-8")
+    text = (Path(__file__).parent / "models" / f"{name}.xml").read_text(encoding="utf-8")
     model = mujoco.MjModel.from_xml_string(text.format(**values))
     return mujoco, model, mujoco.MjData(model)
 

@@ -5,15 +5,14 @@ import json
 import pytest
 from gpvo.cli import simulate as command
 from gpvo.errors import GpvoError
-from gpvo.sim import campaign
-from gpvo.sim.scenario import load_scenario
+from gpvo.sim import scenario as sc
 from typer.testing import CliRunner
 
 
 def test_points_campaign_is_the_same_on_two_jobs(tmp_path):
-    scenario = load_scenario("tunnel-clean", {"duration_s": 5.0})
-    one = campaign.fly_campaign(scenario, [0, 2], tmp_path / "one", points=True)
-    two = campaign.fly_campaign(scenario, [0, 2], tmp_path / "two", points=True, jobs=2)
+    scenario = sc.load_scenario("tunnel-clean", {"duration_s": 5.0})
+    one = sc.fly_campaign(scenario, [0, 2], tmp_path / "one", points=True)
+    two = sc.fly_campaign(scenario, [0, 2], tmp_path / "two", points=True, jobs=2)
     assert [f.seed for f in one] == [0, 2]
     assert not any(f.error for f in one + two)
     for a, b in zip(one, two):
@@ -23,10 +22,10 @@ def test_points_campaign_is_the_same_on_two_jobs(tmp_path):
 @pytest.mark.slow
 def test_a_dask_cluster_of_two_workers_makes_the_same_bytes(tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra gpvo[dask]")
-    scenario = load_scenario("tunnel-clean", {"duration_s": 5.0})
-    here = campaign.fly_campaign(scenario, [0, 2], tmp_path / "here", points=True)
+    scenario = sc.load_scenario("tunnel-clean", {"duration_s": 5.0})
+    here = sc.fly_campaign(scenario, [0, 2], tmp_path / "here", points=True)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-        there = campaign.fly_campaign(
+        there = sc.fly_campaign(
             scenario, [0, 2], tmp_path / "there", points=True, backend="dask", scheduler=cluster.scheduler_address
         )
     assert [f.error for f in there] == ["", ""]
@@ -38,16 +37,16 @@ def test_one_failure_does_not_stop_the_others(tmp_path, monkeypatch):
     def flaky(scenario, seed, out):
         if seed == 1:
             raise GpvoError("the quadrotor crashes")
-        return campaign.Flight(seed, out, 10)
+        return sc.Flight(seed, out, 10)
 
-    monkeypatch.setattr(campaign, "fly_points", flaky)
-    flights = campaign.fly_campaign(load_scenario("tunnel"), [0, 1, 2], tmp_path, points=True)
+    monkeypatch.setattr(sc, "fly_points", flaky)
+    flights = sc.fly_campaign(sc.load_scenario("tunnel"), [0, 1, 2], tmp_path, points=True)
     assert [bool(f.error) for f in flights] == [False, True, False]
 
 
 def test_unknown_backend(tmp_path):
     with pytest.raises(GpvoError, match="joblib or dask"):
-        campaign.fly_campaign(load_scenario("tunnel"), [0], tmp_path, backend="slurm")
+        sc.fly_campaign(sc.load_scenario("tunnel"), [0], tmp_path, backend="slurm")
 
 
 @pytest.mark.parametrize("text, seeds", [("0..3", [0, 1, 2, 3]), ("1,4,7", [1, 4, 7]), ("5", [5]), ("1..2,2", [1, 2])])

@@ -60,8 +60,8 @@ class StereoRenderer:
         except ImportError as error:
             raise MissingExtraError("numba", "sim") from error
         scene = Scene.of(world)
-        lamp = scene.lighting.head_lamp if head_lamp is None else head_lamp
-        self._lights = np.array([scene.lighting.ambient, lamp])
+        lamp = world.lighting.head_lamp if head_lamp is None else head_lamp
+        self._lights = np.array([world.lighting.ambient, lamp])
         tables = [RayTable.of(model, max_angle_rad) for model in (left, right)]
         bands = max(1, (threads + 1) // 2)
         self._left, self._right = (Drawer(scene, table, far_m, bands) for table in tables)
@@ -98,10 +98,6 @@ class StereoRenderer:
         views = ((self._left, T_world_left), (self._right, T_world_left @ self._T_left_right))
         aims = [(drawer.aim, (pose,)) for drawer, pose in views]
         draws = [(drawer.draw, (band, self._lights)) for drawer, _ in views for band in range(len(drawer.bands))]
+        run = map if self._pool is None else self._pool.map
         for jobs in (aims, draws):
-            if self._pool is None:
-                for function, arguments in jobs:
-                    function(*arguments)
-            else:
-                for future in [self._pool.submit(function, *arguments) for function, arguments in jobs]:
-                    future.result()
+            list(run(lambda job: job[0](*job[1]), jobs))

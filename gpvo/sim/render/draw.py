@@ -25,11 +25,12 @@ class Drawer:
         H, W = table.valid.shape
         edges = np.linspace(0, H, bands + 1).astype(int)
         self.bands = list(pairwise(edges.tolist()))
-        self._inverse, self._owner = np.zeros_like(table.blank), np.zeros(table.blank.shape, np.int32)
+        # Inverse distances of an empty image: infinite where there is no ray, so that nothing covers it.
+        self._blank = np.where(table.rays.any(axis=1), np.float32(0), np.float32(np.inf))
+        self._inverse, self._owner = np.zeros_like(self._blank), np.zeros(self._blank.shape, np.int32)
         self.radiance, self.depth = (np.zeros((H, W), np.float32) for _ in range(2))
         self._index = np.zeros(len(scene.sphere), np.int32)
         self._distance = np.zeros(len(scene.sphere), np.float32)
-        self._light_map = _light_map(scene)
         most = int(np.diff(scene.vertex_start).max())
         self._memory = [_Memory(most) for _ in self.bands]
 
@@ -51,34 +52,27 @@ class Drawer:
         ``lights``: ambient, head lamp.
         """
         s, t, memory = self._scene, self._table, self._memory[band]
-        y0, y1 = self.bands[band]
+        (y0, y1), width = self.bands[band], t.valid.shape[1]
         memory.make_room(self._triangles + 1)
-        self._inverse[y0:y1], self._owner[y0:y1] = t.blank[y0:y1], 0
+        self._inverse[y0:y1], self._owner[y0:y1] = self._blank[y0:y1], 0
         kept = raster.visibility(
             self._order, self._near,
             (s.vertices, s.triangles, s.vertex_start, s.triangle_start, s.cluster_material),
-            self._R, self._P, t.plane, t.reach, np.float32(t.bend), t.width, t.rays, self._inverse, self._owner,
+            self._R, self._P, t.plane, t.reach, np.float32(t.bend), width, t.rays, self._inverse, self._owner,
             y0, y1, memory.camera, memory.pixel, memory.rows, memory.corner,
         )  # fmt: skip
         memory.table[:kept, shade.TAPS] = 0  # not filled yet
         shade.shade(
             self._inverse, self._owner, memory.rows, memory.corner, s.vertices, s.texels,
-            (s.texture_size, s.level_start), self._R, self._P, lights, t.rays, t.width, t.plane, t.reach, _MOST_TAPS,
+            (s.texture_size, s.level_start), self._R, self._P, lights, t.rays, width, t.plane, t.reach, _MOST_TAPS,
             memory.table, memory.table.view(np.int32), self.radiance, self.depth, y0, y1,
         )  # fmt: skip
-        if self._light_map is not None:
+        if (shadows := s.light_map) is not None:
+            u, v, scale = (np.float32(value) for value in (*shadows.origin, 1 / shadows.texel))
             shade.cast_shadows(
-                t.rays,
-                self._inverse,
-                self._owner,
-                memory.corner,
-                s.vertices,
-                memory.table,
-                self._light_map,
-                self.radiance,
-                y0,
-                y1,
-            )
+                t.rays, self._inverse, self._owner, memory.corner, s.vertices, memory.table,
+                (shadows.image, shadows.material, u, v, scale), self.radiance, y0, y1,
+            )  # fmt: skip
 
 
 class _Memory:
@@ -94,11 +88,3 @@ class _Memory:
             self.rows = np.zeros((size, 10), np.float32)
             self.corner = np.zeros((size, 4), np.int32)
             self.table = np.zeros((size, shade.COLUMNS), np.float32)
-
-
-def _light_map(scene: Scene) -> tuple[NDArray[np.uint8], int, np.float32, np.float32, np.float32] | None:
-    lm = scene.light_map
-    if lm is None:
-        return None
-    u, v = np.float32(lm.origin[0]), np.float32(lm.origin[1])
-    return np.ascontiguousarray(lm.image), lm.material, u, v, np.float32(1 / lm.texel)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds.world import Lighting, LightMap, Mesh, World
+from gpvo.sim.worlds.world import LightMap, Mesh, World
 from gpvo.types import Array
 
 F32 = NDArray[np.float32]
@@ -43,7 +43,6 @@ class Scene:
     level_start: NDArray[np.int32]
     texture_size: int
     light_map: LightMap | None
-    lighting: Lighting
 
     @classmethod
     def of(cls, world: World) -> Scene:
@@ -63,19 +62,19 @@ class Scene:
         local = local.reshape(-1, 3) - vertex_start[cluster][:, None]
         triangle_start = np.searchsorted(cluster, np.arange(count + 1)).astype(np.int32)
         texels, level_start = pyramids(world.textures)
+        columns = (mesh.vertices, mesh.normals, mesh.uv, mesh.light[:, None], mesh.albedo[:, None])
         return cls(
             sphere=_spheres(mesh, vertex, vertex_start),
             cone=_cones(mesh, faces, cluster, triangle_start),
             vertex_start=vertex_start,
             triangle_start=triangle_start,
             cluster_material=mesh.material[order][triangle_start[:-1]].astype(np.int32),
-            vertices=_records(mesh)[vertex],
+            vertices=np.concatenate(columns, axis=1).astype(np.float32)[vertex],
             triangles=np.ascontiguousarray(local.astype(np.uint8)),
             texels=texels,
             level_start=level_start,
             texture_size=world.textures[0].shape[0],
-            light_map=getattr(world, "light_map", None),
-            lighting=world.lighting,
+            light_map=world.light_map,
         )
 
 
@@ -93,11 +92,6 @@ def _clusters(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     place = np.arange(len(order)) - np.searchsorted(material, material)
     step = np.concatenate([[0], (np.diff(material) != 0) | (place[1:] % _TRIANGLES == 0)])
     return order, np.cumsum(step)
-
-
-def _records(mesh: Mesh) -> F32:
-    columns = (mesh.vertices, mesh.normals, mesh.uv, mesh.light[:, None], mesh.albedo[:, None])
-    return np.concatenate(columns, axis=1).astype(np.float32)
 
 
 def _spheres(mesh: Mesh, vertex: NDArray[np.int64], start: NDArray[np.int32]) -> F32:
@@ -155,15 +149,13 @@ class RayTable:
     """Tables of a lens, from its ``project`` and ``unproject``: rays of all pixels, and pixels of all directions.
 
     ``rays`` (H, 3, C) float32: unit rays of the pixels of a row, filled up to whole groups, zero where there is none.
-    ``valid`` (H, W). ``blank`` (H, C) float32: inverse distances of an empty image, infinite where there is no ray, so
-    that nothing covers it. ``plane`` (G, G, 2) float32: pixel (u, v) of directions given in the stereographic plane
+    ``valid`` (H, W). ``plane`` (G, G, 2) float32: pixel (u, v) of directions given in the stereographic plane
     ``p = (x, y) / (z + |xyz|)``, on an even grid over ``|p_x| <= reach[0], |p_y| <= reach[1]``; it only has to
     bound triangles. ``bend`` [1/px]: straight edges of length L bulge by at most ``bend L^2`` pixels.
     """
 
     rays: NDArray[np.float32]
     valid: NDArray[np.bool_]
-    blank: NDArray[np.float32]
     plane: NDArray[np.float32]
     reach: NDArray[np.float32]
     max_angle_rad: float
@@ -187,22 +179,11 @@ class RayTable:
         return cls(
             rays=packed,
             valid=valid.reshape(H, W),
-            blank=np.where(packed.any(axis=1), np.float32(0), np.float32(np.inf)),
             plane=_pixel_plane(model, reach),
             reach=reach,
             max_angle_rad=angle,
             bend=0.0 if straight else 1.0 / (8.0 * min(model.fx_px, model.fy_px)),
         )
-
-    @property
-    def height(self) -> int:
-        """Rows of the image."""
-        return self.valid.shape[0]
-
-    @property
-    def width(self) -> int:
-        """Columns of the image."""
-        return self.valid.shape[1]
 
 
 def _pixel_plane(model: CameraModel, reach: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -7,7 +7,6 @@ import inspect
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, fields
 from importlib import import_module
@@ -27,7 +26,8 @@ KINDS = ("tunnel", "lunar", "room")
 
 def world_parameters(kind: str) -> dict[str, object]:
     """Names and defaults of the parameters that ``build_world`` takes for a kind."""
-    _check_kind(kind)
+    if kind not in KINDS:
+        raise GpvoError(f"unknown world '{kind}'", cure=f"choose from {', '.join(KINDS)}")
     signature = inspect.signature(import_module(f"gpvo.sim.worlds.{kind}").build)
     return {name: p.default for name, p in signature.parameters.items() if name != "seed"}
 
@@ -48,36 +48,24 @@ def build_world(kind: str, seed: int, **params: object) -> World:
     if unknown := sorted(set(params) - set(known)):
         raise GpvoError(f"the world '{kind}' has no parameter '{unknown[0]}'", cure=f"it has {', '.join(known)}")
     full = {**known, **params}
-    build = import_module(f"gpvo.sim.worlds.{kind}").build
-    return cached(kind, seed, full, lambda: build(seed, **full))
-
-
-def _check_kind(kind: str) -> None:
-    if kind not in KINDS:
-        raise GpvoError(f"unknown world '{kind}'", cure=f"choose from {', '.join(KINDS)}")
+    text = json.dumps([kind, int(seed), full, code_digest(Path(__file__).parent)], sort_keys=True, default=str)
+    path = cache_folder() / f"{kind}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    with suppress(OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):  # absent or damaged: built anew
+        return load_world(path)
+    world: World = import_module(f"gpvo.sim.worlds.{kind}").build(seed, **full)
+    with suppress(OSError, SourceError):  # a full or read-only home costs time at the next run, nothing else
+        save_world(world, path)
+    return world
 
 
 _LARGEST_BYTES = 2_000_000_000
+_ARRAYS = ("centreline", "start_pose", "bounds")
 
 
 def cache_folder() -> Path:
     """Where worlds are kept: ``$XDG_CACHE_HOME/gpvo/worlds``, by default under ``~/.cache``."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "gpvo" / "worlds"
-
-
-def cached(kind: str, seed: int, params: Mapping[str, object], build: Callable[[], World]) -> World:
-    """The world from its file, or built and written; a file that cannot be read or written is no hindrance."""
-    text = json.dumps([kind, int(seed), dict(params), code_digest(Path(__file__).parent)], sort_keys=True, default=str)
-    path = cache_folder() / f"{kind}-{seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
-    try:
-        return load_world(path)
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-        pass
-    world = build()
-    with suppress(OSError, SourceError):  # a full or read-only home costs time at the next run, nothing else
-        save_world(world, path)
-    return world
 
 
 def save_world(world: World, path: Path) -> None:
@@ -88,28 +76,27 @@ def save_world(world: World, path: Path) -> None:
     OSError
         Where the folder cannot be written.
     """
-    arrays: dict[str, np.ndarray] = {f"mesh_{f.name}": getattr(world.mesh, f.name) for f in fields(Mesh)}
-    arrays |= {f"texture_{k}": texture for k, texture in enumerate(world.textures)}
-    arrays |= {"centreline": world.centreline, "start_pose": world.start_pose, "bounds": world.bounds}
-    header: dict[str, object] = {
+    ground, shadows = world.ground, world.light_map
+    header = {
         "kind": world.kind,
         "seed": world.seed,
         "params": dict(world.params),
         "lighting": asdict(world.lighting),
         "textures": len(world.textures),
-        "ground": None,
-        "light_map": None,
+        "ground": None if ground is None else (ground.x0, ground.y0, ground.cell),
+        "light_map": None if shadows is None else (shadows.origin, shadows.texel, shadows.material),
     }
-    if world.ground is not None:
-        arrays["ground"] = world.ground.z
-        header["ground"] = (world.ground.x0, world.ground.y0, world.ground.cell)
-    if world.light_map is not None:
-        arrays["light_map"] = world.light_map.image
-        header["light_map"] = (world.light_map.origin, world.light_map.texel, world.light_map.material)
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    arrays = {
+        **{f"mesh_{f.name}": getattr(world.mesh, f.name) for f in fields(Mesh)},
+        **{f"texture_{k}": texture for k, texture in enumerate(world.textures)},
+        **{name: getattr(world, name) for name in _ARRAYS},
+        **({} if ground is None else {"ground": ground.z}),
+        **({} if shadows is None else {"light_map": shadows.image}),
+        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        np.savez(file, **arrays)
 
 
 def load_world(path: Path) -> World:
@@ -136,9 +123,7 @@ def load_world(path: Path) -> World:
             mesh=Mesh(**{f.name: data[f"mesh_{f.name}"] for f in fields(Mesh)}),
             textures=tuple(data[f"texture_{k}"] for k in range(header["textures"])),
             lighting=Lighting(**header["lighting"]),
-            centreline=data["centreline"],
-            start_pose=data["start_pose"],
-            bounds=data["bounds"],
+            **{name: data[name] for name in _ARRAYS},
             ground=HeightGrid(data["ground"], *header["ground"]) if header["ground"] is not None else None,
             light_map=light_map,
         )

@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.shapes import Parts, add_stone, grid_faces, icosphere, vertex_normals
-from gpvo.sim.worlds.stone import regolith, rock
-from gpvo.sim.worlds.textures import fractal, lattice, spectral
+from gpvo.sim.worlds.shapes import Baker, Parts, add_stone, grid_faces, icosphere
+from gpvo.sim.worlds.textures import fractal, lattice, regolith, rock, spectral
 from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World, check_ranges
 from gpvo.types import Array
 
@@ -152,17 +150,15 @@ def _mesh(
     parts = Parts()
     parts.add(ground, ground[:, :2] / _TILE_M, grid_faces(len(y), len(x)), _GROUND)
     _boulders(parts, x, y, z, length, boulders, rng)
-    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces)
-    N = vertex_normals(V, F)
-    baker = Baker(V, N, F)
+    baker = Baker(parts)
+    V = baker.vertices
     light = _SUN * baker.sun(sun, 4, 0.006, rng)
     shadows, strip = _shadows(baker, x, y, z, length, sun)
     # Where the fine map holds the shadows, vertices only say how steeply the light falls.
     inside = (np.arange(len(V)) < len(ground)) & (np.abs(V[:, 1]) < _SHADOW_WIDTH_M) & strip(V[:, 0])
-    light = np.where(inside, _SUN * np.maximum(N @ sun, 0), light)
+    light = np.where(inside, _SUN * np.maximum(baker.normals @ sun, 0), light)
     albedo = np.clip(1 + 0.18 * fractal(V * 0.5, lattice(rng), 4), 0.5, 1.5)
-    mesh = Mesh.of(V, N, np.concatenate(parts.uv), light, albedo, F, np.concatenate(parts.material))
-    return mesh, shadows
+    return baker.mesh(light, albedo), shadows
 
 
 def _shadows(

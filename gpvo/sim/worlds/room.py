@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpvo.sim.worlds import textures
-from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.shapes import Parts, rectangle, vertex_normals
+from gpvo.sim.worlds.shapes import Baker, Parts, rectangle
+from gpvo.sim.worlds.textures import F32, Texture, encode, spectral
 from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
 
@@ -70,7 +69,7 @@ def build(
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     pose[:3, 3] = line[0]
     inner = np.array([width / 2 - 0.6, depth / 2 - 0.6])
-    images = [textures.plaster, textures.blocks, textures.planks, textures.cardboard, *[textures.poster] * _POSTERS]
+    images = [plaster, blocks, planks, cardboard, *[poster] * _POSTERS]
     return World(
         kind="room",
         seed=seed,
@@ -132,11 +131,77 @@ def _furnish(parts: Parts, size: Array, boxes: int, posters: int, rng: np.random
 
 
 def _lit(parts: Parts, size: Array, rng: np.random.Generator) -> Mesh:
-    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces)
-    N = vertex_normals(V, F)
-    baker = Baker(V, N, F)
+    baker = Baker(parts)
     grid = np.stack(np.meshgrid([-0.3, 0.0, 0.3], [-0.3, 0.0, 0.3], [0.0]), axis=-1).reshape(-1, 3)
     lamps = grid * size + [0, 0, size[2] - 0.45]
     light = baker.lamps(lamps, np.full(len(lamps), 1.2), reach_m=30.0, size_m=1.2)
-    openness = 0.3 + 0.7 * baker.openness(24, 1.0, rng)
-    return Mesh.of(V, N, np.concatenate(parts.uv), light, openness, F, np.concatenate(parts.material))
+    return baker.mesh(light, 0.3 + 0.7 * baker.openness(24, 1.0, rng))
+
+
+def plaster(n: int, rng: np.random.Generator) -> Texture:
+    """A painted wall: blank but for faint stains."""
+    return encode(0.78 + 0.008 * spectral(n, rng, 1.5, 1) + 0.004 * spectral(n, rng, 0.2, n / 32))
+
+
+def blocks(n: int, rng: np.random.Generator) -> Texture:
+    """Masonry of concrete blocks, 5 by 10 to a tile."""
+    v, u = np.mgrid[:n, :n] / n
+    row = np.floor(v * 10).astype(int)
+    x = (u * 5 + 0.5 * (row % 2)) % 5
+    column = np.floor(x).astype(int)
+    joint = np.minimum(np.minimum(x % 1, 1 - x % 1) * 2, np.minimum((v * 10) % 1, 1 - (v * 10) % 1)) < 0.05
+    shade = rng.normal(0, 0.045, (10, 5))[row, column]
+    pits = spectral(n, rng, 0.4, n / 40)
+    return encode(np.where(joint, 0.4, 0.58 + shade - 0.07 * (pits > 1.7)) + 0.02 * spectral(n, rng, 0.9, 3))
+
+
+def planks(n: int, rng: np.random.Generator) -> Texture:
+    """A worn wooden sports floor with scuffs."""
+    v, u = np.mgrid[:n, :n] / n
+    row = np.floor(v * 24).astype(int)
+    x = (u * 2 + rng.random(24)[row]) % 2
+    shade = rng.normal(0, 0.05, (24, 2))[row, np.floor(x).astype(int)]
+    gap = (np.minimum((v * 24) % 1, 1 - (v * 24) % 1) < 0.02) | (np.minimum(x % 1, 1 - x % 1) < 0.003)
+    grain = spectral(n, rng, 0.8, 4)[:, (np.arange(n) // 12) % n]
+    scuffs = np.clip(spectral(n, rng, 1.1, 6) - 1.6, 0, 1)
+    grey = 0.5 + shade + 0.03 * grain + 0.025 * spectral(n, rng, 0.5, 20) - 0.12 * scuffs
+    return encode(np.where(gap, 0.28, grey))
+
+
+def cardboard(n: int, rng: np.random.Generator) -> Texture:
+    """Boxes: cardboard with tape, labels and print."""
+    grey = 0.5 + 0.02 * spectral(n, rng, 0.8, 2)
+    grey[int(0.47 * n) : int(0.53 * n)] += 0.12
+    for _ in range(7):
+        _label(grey, rng, 0.08, 0.22)
+    return encode(grey)
+
+
+def poster(n: int, rng: np.random.Generator) -> Texture:
+    """Printed matter: pictures, lines of text, blocks of colour."""
+    grey = np.full((n, n), 0.85, np.float32)
+    picture = spectral(n, rng, 1.3, 2)
+    y0, y1 = int(0.08 * n), int(rng.uniform(0.4, 0.6) * n)
+    grey[y0:y1, int(0.06 * n) : int(0.94 * n)] = (0.45 + 0.18 * picture)[y0:y1, int(0.06 * n) : int(0.94 * n)]
+    for _ in range(5):
+        _label(grey, rng, 0.1, 0.35)
+    line = n // 40
+    for y in range(y1 + 2 * line, int(0.94 * n), 2 * line):
+        x = 0.08 * n
+        while x < 0.88 * n:
+            width = rng.uniform(0.3, 2.2) * line
+            grey[y : y + line, int(x) : int(x + width)] = rng.uniform(0.08, 0.35)
+            x += width + 0.5 * line
+    return encode(grey + 0.01 * spectral(n, rng, 0.3, n / 32))
+
+
+def _label(grey: F32, rng: np.random.Generator, low: float, high: float) -> None:
+    n = len(grey)
+    height, width = (int(s * n) for s in rng.uniform(low, high, 2))
+    row, column = (int(x * n) for x in rng.uniform(0.05, 0.95 - high, 2))
+    grey[row : row + height, column : column + width] = rng.uniform(0.1, 0.95)
+    cell = max(n // 90, 1)
+    bits = rng.random((max(height // cell - 2, 1), max(width // cell - 2, 1))) < 0.5
+    code = np.kron(bits, np.ones((cell, cell), bool))[: height // 2, :]
+    part = grey[row + cell : row + cell + code.shape[0], column + cell : column + cell + code.shape[1]]
+    part[code[: part.shape[0], : part.shape[1]]] = rng.uniform(0.05, 0.9)

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds.baking import Baker
-from gpvo.sim.worlds.shapes import Parts, vertex_normals
-from gpvo.sim.worlds.stone import gravel, rock
-from gpvo.sim.worlds.textures import duct, fractal, lattice, shotcrete
+from gpvo.sim.worlds.shapes import Baker, Parts
+from gpvo.sim.worlds.textures import duct, fractal, gravel, lattice, rock, shotcrete
 from gpvo.sim.worlds.tubes import Line, Tube, bolts, lamp_fixtures, pipe, rough_tube, rubble
 from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
@@ -145,13 +143,11 @@ def _mesh(tubes: list[Tube], bare: Array, lamps: float, values: np.ndarray, rng:
         parts.add(points, tube.uv(_TILE_M).reshape(-1, 2), f, material.astype(np.uint8))
     positions, powers = _lamps(tubes[0].line, lamps, rng)
     _furnish(parts, tubes[0], bare, positions, values, rng)
-    V, F = np.concatenate(parts.vertices), np.concatenate(parts.faces)
-    N = _seamless(vertex_normals(V, F), tubes)
-    baker = Baker(V, N, F)
-    light = baker.lamps(positions, powers, reach_m=16.0) + np.concatenate(parts.glow)
-    patches = fractal(V * 0.35, values, 4)
+    baker = Baker(parts, lambda normals: _seamless(normals, tubes))
+    light = baker.lamps(positions, powers, reach_m=16.0) + baker.glow
+    patches = fractal(baker.vertices * 0.35, values, 4)
     albedo = (0.35 + 0.65 * baker.openness(12, 1.2, rng)) * np.clip(1 + 0.3 * patches, 0.4, 1.8)
-    return Mesh.of(V, N, np.concatenate(parts.uv), light, albedo, F, np.concatenate(parts.material))
+    return baker.mesh(light, albedo)
 
 
 def _within(s: Array, intervals: Array) -> NDArray[np.bool_]:

@@ -45,29 +45,12 @@ class Mesh:
 
     @classmethod
     def of(
-        cls,
-        vertices: Array,
-        normals: Array,
-        uv: Array,
-        light: Array,
-        albedo: Array,
-        faces: NDArray[np.integer],
+        cls, vertices: Array, normals: Array, uv: Array, light: Array, albedo: Array, faces: NDArray[np.integer],
         material: NDArray[np.integer],
-    ) -> Mesh:
+    ) -> Mesh:  # fmt: skip
         """A mesh from arrays of any number type."""
-
-        def single(a: Array) -> F32:
-            return np.ascontiguousarray(a, dtype=np.float32)
-
-        return cls(
-            vertices=single(vertices),
-            normals=single(normals),
-            uv=single(uv),
-            light=single(light),
-            albedo=single(albedo),
-            faces=faces.astype(np.int32),
-            material=material.astype(np.uint8),
-        )
+        V, N, UV, L, A = (np.ascontiguousarray(a, dtype=np.float32) for a in (vertices, normals, uv, light, albedo))
+        return cls(V, N, UV, L, A, faces.astype(np.int32), material.astype(np.uint8))
 
 
 @dataclass(frozen=True)

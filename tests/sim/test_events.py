@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.sim import movers
+from gpvo.sim import events
 from gpvo.sim.points import simulate_points
 
 
@@ -33,7 +33,7 @@ def test_a_leader_stays_before_the_camera():
     T_world_cam[:, 0, 3] = 15.0 * t_s
     found = 0
     for seed in range(12):
-        (car,) = movers.draw_movers(t_s, T_world_cam, np.random.default_rng(seed), cars=1)
+        (car,) = events.draw_movers(t_s, T_world_cam, np.random.default_rng(seed), cars=1)
         there = np.flatnonzero(np.isfinite(car.T_world_body[:, 0, 3]))
         assert 50 <= len(there) <= 201
         relative = se3.inverse(T_world_cam[there]) @ car.T_world_body[there]
@@ -44,7 +44,7 @@ def test_a_leader_stays_before_the_camera():
 
 
 def test_a_lorry_hides_what_is_behind_it_alone():
-    body = movers.Body(np.array([[-1.0, -1, 0], [1, 1, 0]]), np.eye(4)[None], solid=True)
+    body = events.Body(np.array([[-1.0, -1, 0], [1, 1, 0]]), np.eye(4)[None], solid=True)
     uv = np.array([[50.0, 50.0], [50.0, 50.0], [500.0, 50.0], [40.0, 40.0], [60.0, 60.0]])
     depth_m = np.array([30.0, 2.0, 30.0, 10.0, 10.0])
-    assert movers.hidden((body,), 3, uv, depth_m).tolist() == [True, False, False, False, False]
+    assert events.hidden((body,), 3, uv, depth_m).tolist() == [True, False, False, False, False]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.sim import paths, recorded, routes
+from gpvo.sim import paths, recorded, sequence_plan
 from gpvo.sim.scenario import load_scenario
 
 RADIUS_M = 1.6
@@ -42,7 +42,7 @@ def recording(tmp_path, suffix=".txt"):
 @pytest.mark.parametrize("suffix", [".txt", ".csv"])
 def test_recording_fits_into_the_pipe(tmp_path, suffix):
     scenario = load_scenario("tunnel", {"trajectory": str(recording(tmp_path, suffix)), "duration_s": 20.0})
-    path = routes.plan_path(scenario, pipe(), np.random.default_rng(0))
+    path = sequence_plan.plan_path(scenario, pipe(), np.random.default_rng(0))
     motion = path.motion(100.0)
     assert pipe().clearance(motion.position_m).min() > 0.25
     extent = np.ptp(motion.position_m, axis=0)
@@ -55,7 +55,7 @@ def test_recording_fits_into_the_pipe(tmp_path, suffix):
 def test_recording_is_never_blown_up(tmp_path):
     scenario = load_scenario("tunnel", {"trajectory": str(recording(tmp_path)), "duration_s": 20.0})
     wide = pipe(400.0, 60.0)
-    path = routes.plan_path(scenario, wide, np.random.default_rng(0))
+    path = sequence_plan.plan_path(scenario, wide, np.random.default_rng(0))
     read = recorded.read_recording(recording(tmp_path), 20.0)
     extent = np.ptp(path.position(np.arange(3.0, 20.0, 0.02)), axis=0)
     assert extent[2] == pytest.approx(np.ptp(read.position_m[:, 2]), rel=0.05)
@@ -64,12 +64,12 @@ def test_recording_is_never_blown_up(tmp_path):
 def test_recording_that_cannot_fit(tmp_path):
     scenario = load_scenario("tunnel", {"trajectory": str(recording(tmp_path)), "duration_s": 20.0})
     with pytest.raises(GpvoError, match="does not fit"):
-        routes.plan_path(scenario, pipe(radius_m=0.45), np.random.default_rng(0))
+        sequence_plan.plan_path(scenario, pipe(radius_m=0.45), np.random.default_rng(0))
 
 
 def test_sway_gives_way_to_walls():
     scenario = load_scenario("tunnel", {"sway_m": 1.2, "duration_s": 30.0})
-    path = routes.plan_path(scenario, pipe(), np.random.default_rng(1))
+    path = sequence_plan.plan_path(scenario, pipe(), np.random.default_rng(1))
     assert pipe().clearance(path.position(np.arange(0, 30, 0.02))).min() > 0.25
 
 
@@ -85,15 +85,15 @@ def test_sway_gives_way_to_walls():
 )
 def test_refused_up_front(values, message):
     with pytest.raises(GpvoError, match=message):
-        routes.plan_path(load_scenario("tunnel", values), pipe(), np.random.default_rng(0))
+        sequence_plan.plan_path(load_scenario("tunnel", values), pipe(), np.random.default_rng(0))
 
 
 def test_worlds_grow_with_the_flight():
-    assert routes.world_parameters(load_scenario("tunnel")) == {}
-    long = routes.world_parameters(load_scenario("tunnel", {"duration_s": 300.0}))
+    assert sequence_plan.world_parameters(load_scenario("tunnel")) == {}
+    long = sequence_plan.world_parameters(load_scenario("tunnel", {"duration_s": 300.0}))
     assert long["length"] >= 300.0 * 1.2
     own = {"duration_s": 300.0, "world_params": {"length": 50.0}}
-    assert routes.world_parameters(load_scenario("tunnel", own)) == {"length": 50.0}
+    assert sequence_plan.world_parameters(load_scenario("tunnel", own)) == {"length": 50.0}
 
 
 def test_waypoints_are_passed_and_the_end_is_reached():
