@@ -155,6 +155,7 @@ def nees(e: Evaluation) -> list[Panel]:
     for s, error, C, t in _stated_errors(e):
         values = consistency.nees(error, C) / s.dof
         ones = np.ones(min(len(values), max(1, round(_NEES_WINDOW_S / max(float(np.median(e.errors.dt_s)), 1e-3)))))
+        # Divide by what lies under the window, or both ends would seem more honest than they are.
         smooth = np.convolve(values, ones, mode="same") / np.convolve(np.ones(len(values)), ones, mode="same")
         lines.append(_of_method(e, s, *_thin(t, np.maximum(smooth, 1e-3))))
     return [_panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)]
