@@ -144,13 +144,19 @@ def read_gap_or_tolerance(path: Path) -> None:
 
 def read_options(path: Path) -> None:
     """The options of a command, as ``--config`` takes them."""
-    from gpvo.cli import app
     from gpvo.cli.common import options_of_file
-    from typer.main import get_group
 
     for name, needed in NEEDED.items():
-        command = get_group(app).commands[name]
+        command = commands()[name]
         command.make_context(name, [*options_of_file(path, name, command), *needed])
+
+
+@cache
+def commands() -> dict[str, Any]:
+    from gpvo.cli import app
+    from typer.main import get_group
+
+    return dict(get_group(app).commands)
 
 
 NEEDED = {"run": ["x", "-o", "y"], "live": ["--model", "x"], "evaluate": ["x"]}
@@ -220,12 +226,17 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Rng], None] | N
 # -- cases --
 
 
+@cache
+def listed(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The seeds of a kind, and all their files."""
+    return sorted(folder.iterdir()), [p for p in sorted(folder.rglob("*")) if p.is_file()]
+
+
 def mutated(seeds: Path, number: int, work: Path) -> tuple[str, Path, Path]:
     """The kind of a case, what is to be read, and the file in it that was changed."""
     rng = np.random.default_rng(number)
-    kinds = [k for k in READERS if (seeds / k).is_dir()]
-    kind = kinds[number % len(kinds)]
-    chosen = sorted((seeds / kind).iterdir())
+    kind = list(READERS)[number % len(READERS)]
+    chosen, others = listed(seeds / kind)
     seed = chosen[int(rng.integers(len(chosen)))]
     target = work / seed.name
     if seed.is_dir():
@@ -239,7 +250,6 @@ def mutated(seeds: Path, number: int, work: Path) -> tuple[str, Path, Path]:
     if odd is not None and rng.random() < 0.5 and changed.suffix in (".npz", ".gpvo", ".parquet"):
         odd(changed, rng)
     else:
-        others = [p for p in sorted((seeds / kind).rglob("*")) if p.is_file()]
         mutate = ANY_BYTES[int(rng.integers(len(ANY_BYTES)))]
         other = others[int(rng.integers(len(others)))].read_bytes()
         changed.write_bytes(mutate(changed.read_bytes(), rng, other))
@@ -247,7 +257,7 @@ def mutated(seeds: Path, number: int, work: Path) -> tuple[str, Path, Path]:
 
 
 def problems(seeds: Path, first: int, count: int, work: Path) -> Iterator[dict[str, Any]]:
-    """What went wrong, case by case, and which took more memory than any should."""
+    """What went wrong, case by case, and which took more memory than any should. ``work`` is emptied for each."""
     from gpvo.errors import GpvoError
 
     def hang(*_: object) -> None:
