@@ -42,7 +42,7 @@ POSE = "  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.
 
 @pytest.fixture(scope="module")
 def seeds() -> Iterator[Path]:
-    """One of each kind, as gpvo writes and reads them; in memory where there is a disk of memory, as cases write much."""
+    """One of each kind, as gpvo writes and reads them; on a disk of memory if there is one, as cases write much."""
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         yield _all_kinds(Path(folder) / "seeds")
 
