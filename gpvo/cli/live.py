@@ -126,7 +126,7 @@ def doctor(
 
     Example: gpvo doctor flight.mcap --truth mocap.tum
     """
-    from gpvo.live.examination import examine_bag, examine_topic
+    from gpvo.live.doctor import examine_bag, examine_topic
     from gpvo.live.job import POSE_TYPE_NAMES
 
     wire = _one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1)

@@ -1,4 +1,4 @@
-"""A linter of anyone's covariance: what is wrong with the numbers, and what the filters that read them will do.
+"""``gpvo doctor``: what is wrong with anyone's odometry, of a bag or a live topic, and what filters make of it.
 
 robot_localization: src/ros_filter.cpp, src/ekf.cpp (variances below 1e-9 become 1e-9, negative ones positive, NaN is
 not looked for). PX4: src/modules/ekf2/EKF/aid_sources/external_vision and params_external_vision.yaml (floors).
@@ -8,12 +8,21 @@ chi-square gate, zeros fall back to 0.1 m and 0.02 rad, off-diagonal elements ar
 
 from __future__ import annotations
 
+import threading
+import time
+from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
+from gpvo.live.intake import Mailbox, arrivals
+from gpvo.live.job import WIRES, open_wire
+from gpvo.live.outputs import decode
 from gpvo.live.stated import ENOUGH, Finding, Stated
 from gpvo.types import Array
 
@@ -24,6 +33,45 @@ _ZERO_FALLBACK = "FusionCore takes 0.1 m and 0.02 rad in its place"
 _RL_FLOOR = "robot_localization takes 1e-9, a sigma of 0.03 mm, and lets go of everything else"
 _PX4_FLOOR = "PX4 takes EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) in its place"
 _AP_FLOOR = "ArduPilot takes VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
+_DEPTH = 10_000  # messages of a live topic that may wait
+
+
+def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]]:
+    """Findings of a topic, or of every topic that holds poses.
+
+    Raises
+    ------
+    SourceError
+        Where the path is no bag, or has no such topic.
+    """
+    if not path.exists() or not is_bag(path):
+        raise SourceError("is not a bag", where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
+    with open_bag(path) as reader:
+        found = list(topics_of(reader, POSE_TYPES))
+        if not found or (topic is not None and topic not in found):
+            raise SourceError(f"has no poses on '{topic or ''}' (poses on: {', '.join(found) or 'none'})", where=path)
+        wanted = found if topic is None else [topic]
+        return {t: examine(Stated.of((m for _, m in messages(reader, [t])), path)) for t in wanted}
+
+
+def examine_topic(
+    wire: str, topic: str, msgtype: str, seconds: float, address: str | None = None, domain: int = 0
+) -> list[Finding]:
+    """Findings of what a running system publishes in so many ``seconds``. GpvoError where nothing comes."""
+    link, mailbox, stop = open_wire(wire, address, domain), Mailbox(_DEPTH), threading.Event()
+    kept: list[Any] = []
+    try:
+        link.subscribe(topic, msgtype, lambda name, data: mailbox.put(name, data))
+        end_s = time.monotonic() + seconds
+        for arrival in arrivals(mailbox, lambda _, data: decode(link, data, msgtype), stop, Counter()):
+            kept += [] if arrival is None else [arrival.message]
+            if time.monotonic() > end_s:
+                break
+    finally:
+        link.close()
+    if not kept:
+        raise GpvoError(f"nothing came on '{topic}' in {seconds:g} s", cure="is it published, and of that type?")
+    return examine(Stated.of(kept))
 
 
 def examine(stated: Stated) -> list[Finding]:
@@ -92,9 +140,8 @@ def _symmetric(C: Array) -> np.ndarray:
 def _stamps(s: Stated) -> list[Finding]:
     out, steps = [], np.diff(s.t_ns)
     if (s.t_ns == 0).any():
-        out.append(
-            Finding("stamp-zero", "stamps are zero", "every consumer dates the measurement to the epoch and drops it")
-        )
+        text = "every consumer dates the measurement to the epoch and drops it"
+        out.append(Finding("stamp-zero", "stamps are zero", text))
     elif (steps < 0).any():
         text = "robot_localization drops or replays them; PX4 and ArduPilot take them as they come"
         out.append(Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean())))
@@ -104,9 +151,8 @@ def _stamps(s: Stated) -> list[Finding]:
     good = steps[steps > 0]
     if len(good) and good.max() > 10 * np.median(good):
         what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"
-        out.append(
-            Finding("stamp-gap", what, "what covers a gap is not a measurement: the first message after it must say so")
-        )
+        text = "what covers a gap is not a measurement: the first message after it must say so"
+        out.append(Finding("stamp-gap", what, text))
     return out
 
 
@@ -118,11 +164,8 @@ def _frames(s: Stated) -> list[Finding]:
     if not frame or not child:
         out.append(Finding("frame-empty", f"frame_id '{frame}', child_frame_id '{child}'", text))
     elif frame == child:
-        out.append(
-            Finding(
-                "frame-same", f"frame_id and child_frame_id are both '{frame}'", "pose and twist lose their meaning"
-            )
-        )
+        text = "pose and twist lose their meaning"
+        out.append(Finding("frame-same", f"frame_id and child_frame_id are both '{frame}'", text))
     elif "optical" in child:
         text = "twist and rotations are of axes z forward: robot_localization needs TF to base_link"
         out.append(Finding("frame-optical", f"child_frame_id is '{child}', an optical frame", text))
@@ -133,14 +176,8 @@ def _poses(s: Stated) -> list[Finding]:
     out = []
     bad = ~np.isfinite(s.T).all(axis=(1, 2))
     if bad.any():
-        out.append(
-            Finding(
-                "pose-not-finite",
-                "poses hold NaN, or numbers beyond measure",
-                "robot_localization drops them",
-                float(bad.mean()),
-            )
-        )
+        what = "poses hold NaN, or numbers beyond measure"
+        out.append(Finding("pose-not-finite", what, "robot_localization drops them", float(bad.mean())))
     off = np.abs(s.quaternion_norm - 1.0) > 1e-2
     if (off & ~bad).any():
         text = "robot_localization normalises with a warning, PX4 refuses the attitude"
@@ -155,13 +192,8 @@ def _poses(s: Stated) -> list[Finding]:
     if jumps.any():
         size = float(np.linalg.norm(steps[jumps][:, :3], axis=1).max())
         what = f"{int(jumps.sum())} jumps of the pose, up to {size:.2g} m"
-        out.append(
-            Finding(
-                "pose-jump",
-                what,
-                "an odometry must be continuous (REP 105): a differential pose fuses the jump as speed",
-            )
-        )
+        text = "an odometry must be continuous (REP 105): a differential pose fuses the jump as speed"
+        out.append(Finding("pose-jump", what, text))
     return out
 
 
@@ -204,13 +236,8 @@ def _twist_against_motion(s: Stated, steps: Array, dt: Array) -> list[Finding]:
     if len(said) != len(moved) or np.linalg.norm(moved[:, :3], axis=1).mean() < 0.05:
         return []
     if not said.any():
-        return [
-            Finding(
-                "twist-empty",
-                "the twist is zero while the pose moves",
-                "a filter that fuses the twist is told to stand still",
-            )
-        ]
+        text = "a filter that fuses the twist is told to stand still"
+        return [Finding("twist-empty", "the twist is zero while the pose moves", text)]
     R = s.T[1:, :3, :3][-len(steps) :]
     in_parent = np.einsum("nij,nj->ni", R, moved[:, :3])
     own, other = (float(np.linalg.norm(said[:, :3] - m, axis=1).mean()) for m in (moved[:, :3], in_parent))
@@ -230,9 +257,8 @@ def _blocks(name: str, C: Array) -> list[Finding]:
     D = np.median(np.diagonal(C, axis1=1, axis2=2), axis=0)
     first, second = D[:3].mean(), D[3:].mean()
     if second > 100 * first and 0.05 < second < _HUGE:
-        what = (
-            f"the {name}'s blocks look swapped: {first:.2g} m^2 before {second:.2g} rad^2 (order is translation first)"
-        )
+        seen = f"{first:.2g} m^2 before {second:.2g} rad^2"
+        what = f"the {name}'s blocks look swapped: {seen} (order is translation first)"
         return [Finding(f"{name}-swapped", what, _SWAPPED)]
     return []
 

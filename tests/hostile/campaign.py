@@ -106,7 +106,7 @@ def read_image(path: Path) -> None:
 
 def read_bag(path: Path) -> None:
     from gpvo.io.bag_reader import POSE_TYPES, open_bag, read_poses, topics_of
-    from gpvo.live.examination import examine_bag
+    from gpvo.live.doctor import examine_bag
 
     with open_bag(path) as reader:
         topics = list(topics_of(reader, POSE_TYPES))
