@@ -132,7 +132,7 @@ def _environment(wire: str, place: str) -> dict[str, str]:
 
 @contextmanager
 def _router(place: str) -> Iterator[None]:
-    from gpvo.live.zenoh_wire import ZenohWire
+    from gpvo.live.rosless_wire import ZenohWire
 
     router = ZenohWire(f"listen:{place}", node="router")
     try:

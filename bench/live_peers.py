@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 from gpvo.geometry import se3
+from gpvo.io.bag_reader import ODOMETRY_TYPE
 from gpvo.live.job import open_wire
-from gpvo.live.outputs import DIAGNOSTICS, ODOMETRY, Wire, decode, encode
+from gpvo.live.outputs import DIAGNOSTICS, Wire, decode, encode
 from gpvo.publish import ros
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Status
@@ -53,7 +54,7 @@ def _publish(seconds: float, send: Callable[[int, int], None]) -> None:
 
 
 def _poses(link: Wire) -> Callable[[int, int], None]:
-    emit, types = link.advertise(POSES, ODOMETRY), _types(link)
+    emit, types = link.advertise(POSES, ODOMETRY_TYPE), _types(link)
     eye = 1e-4 * np.eye(6)
 
     def send(k: int, t_ns: int) -> None:
@@ -115,14 +116,14 @@ def _listen(link: Wire, want: int, seconds: float) -> None:
 
     def odometry(_topic: str, data: bytes) -> None:
         now_ns = time.time_ns()
-        stamp = decode(link, data, ODOMETRY).header.stamp
+        stamp = decode(link, data, ODOMETRY_TYPE).header.stamp
         came.append((stamp.sec * 10**9 + stamp.nanosec, now_ns))
 
     def diagnostics(_topic: str, data: bytes) -> None:
         status = decode(link, data, DIAGNOSTICS).status[0]
         health[0] = {v.key: v.value for v in status.values}
 
-    link.subscribe(ros.TOPIC, ODOMETRY, odometry)
+    link.subscribe(ros.TOPIC, ODOMETRY_TYPE, odometry)
     link.subscribe("/diagnostics", DIAGNOSTICS, diagnostics)
     print("ready", flush=True)
     for _ in _until(seconds, lambda: len(came) >= want):

@@ -24,10 +24,11 @@ IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU_TYPE = "sensor_msgs/msg/Imu"
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSE_TYPES = (
     ODOMETRY_TYPE,
     "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    POSE_TYPE,
     "geometry_msgs/msg/TransformStamped",
 )
 

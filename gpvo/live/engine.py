@@ -1,4 +1,7 @@
-"""One engine for files, tests and every transport: messages in, odometry with its covariance and its health out."""
+"""One engine for files, tests and every transport: messages in, odometry with its covariance and its health out.
+
+What it keeps in a file lets a restart continue from it.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
-from gpvo.geometry.se3 import rotate_covariance
+from gpvo.geometry.covariance import are_positive_definite, symmetrise
+from gpvo.geometry.se3 import is_rigid, rotate_covariance
+from gpvo.io.trajectory import FARTHEST_M
 from gpvo.learning.check import rate_problems
 from gpvo.live.intake import Arrival
-from gpvo.live.kept_state import State, load_state, save_state
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
@@ -272,10 +277,44 @@ class Engine:
     def _save(self) -> None:
         if self.settings.state is None or self.last is None:
             return
-        save_state(self.settings.state, State(self.last.T_odom_body, self.last.pose_covariance, self._scale))
+        _save_state(self.settings.state, KeptState(self.last.T_odom_body, self.last.pose_covariance, self._scale))
 
 
 def _unknown(away_s: float, twist: Array) -> Array:
     """(6, 6) covariance of what may have happened while nothing was heard, or the source began elsewhere."""
     start = np.diag([_POSITION_SIGMA_M**2] * 3 + [_ATTITUDE_SIGMA_RAD**2] * 3)
     return lost_covariance(min(away_s, 1e3), twist) + start
+
+
+@dataclass(frozen=True)
+class KeptState:
+    """Pose (4, 4) and its covariance (6, 6) in ``odom``, and the scale (6,) of sigma that late truth taught."""
+
+    T_odom_body: Array
+    pose_covariance: Array
+    scale: Array
+
+
+def _save_state(path: Path, state: KeptState) -> None:
+    """Write it, whole or not at all."""
+    write_json(path, {"schema": 1, **vars(state)})
+
+
+def load_state(path: Path | None) -> KeptState | None:
+    """Of a state file; None where there is none yet. Raises GpvoError, one line, for a pose, covariance or scale that
+    cannot be."""
+    if path is None or not path.exists():
+        return None
+    try:
+        document = read_json(path)
+        T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
+        scale = np.array(document.get("scale", np.ones(6)), dtype=np.float64)
+        if T.shape != (4, 4) or not is_rigid(T, FARTHEST_M):
+            raise ValueError("it holds no pose")
+        if C.shape != (6, 6) or not are_positive_definite(C[None], semi=True).all():
+            raise ValueError("its covariance is not positive semidefinite")
+        if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
+            raise ValueError("it holds an impossible scale")
+    except (GpvoError, ValueError, KeyError, TypeError) as error:
+        raise GpvoError(f"is not a state file of gpvo live: {error}", where=path, cure="remove it") from None
+    return KeptState(T, symmetrise(C), scale)

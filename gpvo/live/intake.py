@@ -1,17 +1,22 @@
-"""What comes in: messages with their time of arrival, a mailbox that drops the oldest, and a watch over stamps."""
+"""Messages as they come in, from a transport or a recording: how a stamp continues those before, what waits, and when
+each arrived.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from math import inf
+from pathlib import Path
 from statistics import median
 from typing import Any
 
+from gpvo.errors import SourceError
+from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, topics_of
 from gpvo.io.stated import GAP_STEPS
 from gpvo.stats.series import Doubt
 
@@ -21,6 +26,7 @@ AHEAD_S = 10.0
 """The same of a stamp ahead of the last: after so long a silence nothing of before holds."""
 _CONFIRM = 3
 _WINDOW = 51
+_LONGEST_WAIT_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -150,3 +156,40 @@ def arrivals(
             counts["undecodable"] += 1
             continue
         yield Arrival(topic, message, received_ns)
+
+
+def replay(path: Path, topics: Iterable[str], stop: threading.Event, *, fast: bool = False) -> Iterator[Arrival]:
+    """Messages of the named topics until ``stop``; they arrive when they were recorded.
+
+    Raises
+    ------
+    SourceError
+        Where the bag cannot be read or lacks a topic.
+    """
+    wanted = set(topics)
+    start, first = time.monotonic_ns(), None
+    with open_bag(path) as reader:
+        absent = sorted(wanted - set(reader.topics))
+        if absent:
+            found = ", ".join(sorted(reader.topics))
+            raise SourceError(f"has no topic {', '.join(absent)} (there are: {found})", where=path)
+        connections = [c for c in reader.connections if c.topic in wanted]
+        for connection, recorded_ns, raw in reader.messages(connections=connections):
+            first = recorded_ns if first is None else first
+            due_ns = recorded_ns if fast else start + recorded_ns - first
+            while not fast and not stop.is_set() and (ahead_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
+                time.sleep(min(ahead_s, _LONGEST_WAIT_S))
+            if stop.is_set():
+                return
+            yield Arrival(connection.topic, reader.deserialize(raw, connection.msgtype), due_ns)
+
+
+def odometry_topic(path: Path) -> str:
+    """The only odometry of a bag. SourceError where there is none, or a choice."""
+    with open_bag(path) as reader:
+        found = list(topics_of(reader, (ODOMETRY_TYPE,))) or list(topics_of(reader, (POSE_TYPE,)))
+        poses = list(topics_of(reader, POSE_TYPES))
+    if len(found) != 1:
+        listed = ", ".join(found or poses) or "none"
+        raise SourceError(f"which odometry? (topics with poses: {listed})", where=path, cure="name it with --odometry")
+    return found[0]

@@ -13,15 +13,13 @@ from typing import Any
 
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import GpvoError
-from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, open_bag
+from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, ODOMETRY_TYPE, POSE_TYPE, open_bag
 from gpvo.io.bags import info_topic
-from gpvo.live.base_frame import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage
 from gpvo.live.engine import Engine, EngineSettings, Output
-from gpvo.live.intake import Arrival, Mailbox, arrivals
+from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
-from gpvo.live.outputs import ODOMETRY, POSE, FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
-from gpvo.live.replay import odometry_topic, replay
-from gpvo.live.stages import PoseStage, Stage
+from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
+from gpvo.live.stages import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage, PoseStage, Stage
 from gpvo.live.stereo_stage import StereoStage
 from gpvo.online.predictor import Predictor
 
@@ -41,9 +39,9 @@ class LiveSettings:
     stereo: tuple[str, str] | None = None
     imu: str | None = None
     odometry: str | None = None
-    pose_type: str = ODOMETRY
+    pose_type: str = ODOMETRY_TYPE
     truth: str | None = None
-    truth_type: str = POSE
+    truth_type: str = POSE_TYPE
     calibration: Path | None = None
     base_frame: str | None = None
     replay: Path | None = None
@@ -179,7 +177,7 @@ def make_stage(settings: LiveSettings) -> Stage:
     stage = _source_stage(settings)
     if settings.base_frame is None:
         return stage
-    if isinstance(stage, PoseStage) and settings.pose_type != ODOMETRY:
+    if isinstance(stage, PoseStage) and settings.pose_type != ODOMETRY_TYPE:
         raise GpvoError(
             "--base-frame needs to know whose poses come, and their messages do not name a frame",
             cure="use a topic of nav_msgs/Odometry",
@@ -215,14 +213,10 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
 
 def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
     """One of :data:`WIRES`. MissingExtraError, one line, where its package is not installed."""
-    if name == "zenoh":
-        from gpvo.live.zenoh_wire import ZenohWire
+    if name in ("zenoh", "dds"):
+        from gpvo.live.rosless_wire import DdsWire, ZenohWire
 
-        return ZenohWire(address, domain)
-    if name == "dds":
-        from gpvo.live.dds_wire import DdsWire
-
-        return DdsWire(domain)
+        return ZenohWire(address, domain) if name == "zenoh" else DdsWire(domain)
     if name in ("ros1", "ros2"):
         from gpvo.live.ros_wire import Ros1Wire, Ros2Wire
 
@@ -253,4 +247,4 @@ def _tell(text: str) -> None:
     print(f"gpvo live: {text}", file=sys.stderr, flush=True)
 
 
-POSE_TYPE_NAMES = {"odometry": ODOMETRY, "pose": POSE, "pose_stamped": "geometry_msgs/msg/PoseStamped"}
+POSE_TYPE_NAMES = {"odometry": ODOMETRY_TYPE, "pose": POSE_TYPE, "pose_stamped": "geometry_msgs/msg/PoseStamped"}

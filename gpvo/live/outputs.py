@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gpvo.errors import GpvoError
+from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE
 from gpvo.live.engine import Health
 from gpvo.publish import ros
 from gpvo.publish.mavlink import Link
 from gpvo.publish.odometry import Odometry
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 Send = Callable[[bytes], None]
 
@@ -59,8 +58,8 @@ class WireOutput:
 
     def __init__(self, wire: Wire, topic: str = ros.TOPIC, pose_topic: str | None = None) -> None:
         self._wire, self._types, self._seq = wire, wire.store.types, 0
-        self._send = wire.advertise(topic, ODOMETRY)
-        self._send_pose = None if pose_topic is None else wire.advertise(pose_topic, POSE)
+        self._send = wire.advertise(topic, ODOMETRY_TYPE)
+        self._send_pose = None if pose_topic is None else wire.advertise(pose_topic, POSE_TYPE)
         self._send_health = wire.advertise("/diagnostics", DIAGNOSTICS)
 
     def odometry(self, odometry: Odometry) -> None:
@@ -71,7 +70,7 @@ class WireOutput:
         self._seq += 1
         self._send(encode(self._wire, message))
         if self._send_pose is not None:
-            self._send_pose(encode(self._wire, self._types[POSE](header=message.header, pose=message.pose)))
+            self._send_pose(encode(self._wire, self._types[POSE_TYPE](header=message.header, pose=message.pose)))
 
     def health(self, health: Health) -> None:
         """Send one DiagnosticArray."""

@@ -6,10 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gpvo.live.engine import EngineSettings
+from gpvo.live.engine import EngineSettings, load_state
 from gpvo.live.intake import Mailbox
 from gpvo.live.job import Live, LiveSettings, open_wire
-from gpvo.live.kept_state import load_state
 from shim_bags import TOPIC, flight, flown, save_model
 from test_base_frame import TRANSFORMS, tf_message
 from test_wires import needs_dds

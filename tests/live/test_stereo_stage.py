@@ -12,8 +12,7 @@ from gpvo import runner
 from gpvo.cameras.projections import read_kitti_calib
 from gpvo.io import open_source
 from gpvo.io.images import read_grey8
-from gpvo.live.intake import Arrival
-from gpvo.live.replay import replay
+from gpvo.live.intake import Arrival, replay
 from gpvo.live.stereo_stage import StereoStage
 from gpvo.types import StereoFrame, VoRecord
 from gpvo.vo.config import VoConfig

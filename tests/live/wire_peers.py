@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gpvo.live.outputs import ODOMETRY
+from gpvo.io.bag_reader import ODOMETRY_TYPE
 from ros1_tools import SYSTEM_PYTHON, environment, ros_master, with_gpvo
 from rosbags.typesys import Stores, get_typestore
 
@@ -31,7 +31,9 @@ def free_port() -> int:
 
 def write_definitions(folder: Path) -> Path:
     """The .msg files of Odometry and what it holds, for a client that would fetch them from GitHub."""
-    text = "MSG: nav_msgs/Odometry\n" + get_typestore(Stores.ROS2_JAZZY).generate_msgdef(ODOMETRY, ros_version=2)[0]
+    text = (
+        "MSG: nav_msgs/Odometry\n" + get_typestore(Stores.ROS2_JAZZY).generate_msgdef(ODOMETRY_TYPE, ros_version=2)[0]
+    )
     for part in re.split(r"=+\n", text):
         head, _, body = part.partition("\n")
         package, name = head.removeprefix("MSG: ").split("/")[::2] if head.count("/") == 2 else head[5:].split("/")
@@ -63,7 +65,7 @@ def place(wire: str) -> Iterator[Place]:
         with ros_master() as uri:
             yield Place(wire, uri, ["--ros1"], [SYSTEM_PYTHON], with_gpvo(ROS_MASTER_URI=uri))
     else:
-        from gpvo.live.zenoh_wire import ZenohWire
+        from gpvo.live.rosless_wire import ZenohWire
 
         address = f"tcp/127.0.0.1:{port}"
         router = ZenohWire(f"listen:{address}", node="router")

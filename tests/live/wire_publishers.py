@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gpvo.live.base_frame import TF_STATIC, TF_TYPE
-from gpvo.live.outputs import ODOMETRY, Wire
+from gpvo.io.bag_reader import ODOMETRY_TYPE
+from gpvo.live.outputs import Wire
 from gpvo.live.ros_wire import ros1_types
+from gpvo.live.stages import TF_STATIC, TF_TYPE
 from ros1_tools import SYSTEM_PYTHON, environment
 from rosbags.typesys import Stores, get_typestore
 from wire_peers import Place, running
@@ -37,9 +38,9 @@ def publish(at: Place, topic: str, arrivals: list[Any], folder: Path) -> None:
 
         store = get_typestore(Stores.ROS1_NOETIC)
         with Writer(folder / "vio.bag") as writer:
-            connection = writer.add_connection(topic, ODOMETRY, typestore=store)
+            connection = writer.add_connection(topic, ODOMETRY_TYPE, typestore=store)
             for k, a in enumerate(arrivals):
-                data = store.serialize_ros1(same(store.types, a.message, k), ODOMETRY)
+                data = store.serialize_ros1(same(store.types, a.message, k), ODOMETRY_TYPE)
                 writer.write(connection, a.received_ns, data)
         command = [SYSTEM_PYTHON, "-c", BAG_PUBLISHER, str(folder / "vio.bag"), topic]
         subprocess.run(command, env=environment(ROS_MASTER_URI=at.address), check=True, timeout=60)
@@ -57,7 +58,7 @@ def publish(at: Place, topic: str, arrivals: list[Any], folder: Path) -> None:
         wire.close()
 
 
-def publish_on(wire: Wire, topic: str, msgtype: str = ODOMETRY) -> Callable[[Any], None]:
+def publish_on(wire: Wire, topic: str, msgtype: str = ODOMETRY_TYPE) -> Callable[[Any], None]:
     """A function that sends messages of any typestore, once somebody has had time to find the topic."""
     send = wire.advertise(topic, msgtype)
     time.sleep(0.5)
@@ -101,7 +102,7 @@ def _dds(domain: int, data: bytes) -> Iterator[None]:
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
     from cyclonedds.util import duration
-    from gpvo.live.dds_wire import raw_type
+    from gpvo.live.rosless_wire import raw_type
 
     kind = raw_type(TF_TYPE)
     lasting = (Policy.Reliability.Reliable(duration(seconds=1)), Policy.Durability.TransientLocal)
