@@ -8,7 +8,7 @@ from itertools import cycle
 
 import numpy as np
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import Gate
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
 from gpvo.publish.odometry import OdometryBuilder

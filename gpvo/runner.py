@@ -18,9 +18,8 @@ from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
 from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo.config import VoConfig, make_config
-from gpvo.vo.frontend import Followed
+from gpvo.vo.frontend import Followed, TrackRecorder
 from gpvo.vo.odometry import StereoOdometry
-from gpvo.vo.recorder import TrackRecorder
 from gpvo.vo.rig_error import RigState
 from gpvo.vo.rig_findings import STATE_FILE, document, findings
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
-from gpvo.vo.imu_moments import ImuMoments
+from gpvo.vo.state import ImuMoments
 
 STILL_S = 1.0
 """So long a vehicle must stand at least for a wait."""

@@ -15,7 +15,7 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
 from gpvo.evaluation.flights import constants_in, constants_of, flight_of, start_sigmas
 from gpvo.files import write_text
-from gpvo.filters.gate import chi2_quantile
+from gpvo.filters.measurement import chi2_quantile
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import CONSTANT_BEST, CONSTANT_HINDSIGHT, LEARNED, POLICIES, STATED
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, begin

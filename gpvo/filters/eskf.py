@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from gpvo.accumulation import first_jitter, from_end, independent_part, persistence
 from gpvo.filters import kernels
 from gpvo.filters import measurement as me
-from gpvo.filters.gate import Gate
-from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu, Innovation
+from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu, Gate, Innovation
 from gpvo.filters.propagation import (
     BA,
     BG,
@@ -153,8 +152,8 @@ class ErrorStateFilter:
     ) -> Innovation:
         """Use VO's motion from the cloned pose to the present one, ``T_est`` (4, 4) in the camera frame.
 
-        ``recover`` (B,): members that have waited too long (:class:`gpvo.filters.gate.Wait`). Where the measurement
-        fails again, the state is doubted instead: its covariance grows until the measurement can move it.
+        ``recover`` (B,): members that have waited too long (:class:`gpvo.filters.measurement.Wait`). Where the
+        measurement fails again, the state is doubted instead: its covariance grows until the measurement can move it.
         """
         gate = gate or Gate()
         if not (self.jitter_known or noise.lost):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import Gate
 from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, ConstantVelocityNoise, Nominal, constant_velocity_noise

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.gate import Gate, Wait
-from gpvo.filters.measurement import Innovation
+from gpvo.filters.measurement import Gate, Innovation, Wait
 from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import BG, CORE, TH, V

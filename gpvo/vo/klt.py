@@ -18,9 +18,8 @@ from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
-from gpvo.vo.image import Light, image_stats, in_light_of
 from gpvo.vo.motion import predict_uvd
-from gpvo.vo.opencv import Image, Points
+from gpvo.vo.opencv import Image, Light, Points, image_stats, in_light_of
 from gpvo.vo.rig_error import RigError
 from gpvo.vo.rivals import cells
 

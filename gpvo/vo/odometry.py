@@ -12,17 +12,23 @@ from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFr
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
-from gpvo.vo.frontend import EMPTY, Followed, Frontend, Matches
-from gpvo.vo.imu_moments import ImuMoments
+from gpvo.vo.frontend import EMPTY, Followed, Frontend, Matches, make_frontend
 from gpvo.vo.motion import Motion, refine, whitened
-from gpvo.vo.pairwatch import PairWatch
-from gpvo.vo.parts import Stopwatch, check_frame, make_frontend, motion_fields, stats_fields
 from gpvo.vo.points import triangulate
-from gpvo.vo.quality import Verdict, agrees, judge, lost_covariance, median_parallax_px
+from gpvo.vo.quality import (
+    PairWatch,
+    Verdict,
+    agrees,
+    judge,
+    lost_covariance,
+    median_parallax_px,
+    motion_fields,
+    stats_fields,
+)
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained
 from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
-from gpvo.vo.state import State
+from gpvo.vo.state import ImuMoments, State, Stopwatch, check_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame

@@ -1,17 +1,39 @@
-"""When can a motion be believed? No motion is ever invented silently."""
+"""When can a motion be believed, and do the two images of a pair belong together?
+
+No motion is ever invented silently.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.types import Array, Status, StereoCamera
 from gpvo.vo.config import VoConfig
-from gpvo.vo.frontend import Matches
+from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.motion import Motion, predict_uvd
+from gpvo.vo.opencv import ImageStats
+from gpvo.vo.sigmas import ResidualMoments
+
+_ENOUGH_FOR_SIGMAS = 8  # points
+_MEMORY = 0.8  # of the running sums: about five frames
+_NAMED_FROM = 0.05  # share of the frames
+_DARKER = 1.25
+
+_CURES = {
+    "frozen": "the right image repeats itself while the left one changes; look at the right camera's driver",
+    "late": "left and right are a frame apart; pair them by time stamp, or trigger both cameras together",
+    "swapped": "most points lie behind the cameras; exchange left and right",
+    "rows": "most points are in another row on the right; calibrate the pair again",
+    "few": "most points are not found in the right image; look at its exposure, focus and lens",
+    "light": "the right image has other light than the left one; give both cameras the same exposure and gain",
+    "size": "the calibration is of images twice as large; scale it, or use images of full size",
+}
 
 
 @dataclass(frozen=True)
@@ -79,7 +101,7 @@ def worst_translation_sigma_m(motion: Motion) -> float:
     return motion.scale_px / np.sqrt(smallest) if smallest > 0 else np.inf
 
 
-def log10_condition(information: Array, depth_m: float) -> float:
+def _log10_condition(information: Array, depth_m: float) -> float:
     """log10 of the condition number of a (6, 6) information matrix, lengths in units of the median depth."""
     scale = np.array([depth_m] * 3 + [1.0] * 3)
     values = np.linalg.eigvalsh(information * scale[:, None] * scale)
@@ -100,3 +122,94 @@ def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
     """Median image motion of the inliers [px]."""
     off = matches.uvd_cur[inliers, :2] - matches.uvd_prev[inliers, :2]
     return float(np.median(np.hypot(off[:, 0], off[:, 1])))
+
+
+class PairWatch:
+    """Watches the pairs of a run: :meth:`step` says what is doubtful in one, :meth:`findings` what is in the run."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        # A principal point in the lower right corner is the centre of an image of twice the size.
+        doubled = 2 * np.array([camera.cx_px, camera.cy_px]) / [camera.width, camera.height]
+        self._half_size = bool((np.abs(doubled - 2.0) < 0.4).all())
+        self._rows = np.zeros(4)
+        self._frames = 0
+        self._seen: Counter[str] = Counter()
+
+    def step(self, seen: Observation, right: RightSearch | None) -> list[str]:
+        """What is doubtful about this pair, in words; empty for a good one."""
+        self._frames += 1
+        self._seen["frozen"] += seen.right_repeated
+        self._seen["light"] += not 1 / _DARKER < seen.right_light < _DARKER
+        doubts = []
+        if self._half_size:
+            self._seen["size"] += 1
+            doubts.append("the principal point lies in the corner of the image")
+        if right is None:
+            return doubts
+        if abs(late := self._lateness(right)) > 0.25:
+            self._seen["late"] += 1
+            doubts.append(f"the {'right' if late > 0 else 'left'} image is {abs(late):.1f} frames late")
+        if right.sought > 0 and right.found < 0.6 * right.sought:
+            lost = right.sought - right.found
+            cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
+            self._seen[cause] += 1
+            doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
+        return doubts
+
+    def findings(self) -> list[str]:
+        """What was wrong in more than a twentieth of the pairs, with the remedy."""
+        often = [(n, cause) for cause, n in self._seen.items() if n > max(2, _NAMED_FROM * self._frames)]
+        return [f"{_CURES[cause]} ({n} of {self._frames} pairs)" for n, cause in sorted(often, reverse=True)]
+
+    def _lateness(self, right: RightSearch) -> float:
+        """By how many frames the right image is older than the left one; 0 where nothing speaks for it.
+
+        Then a point's right row is where the left one was: the error of rows is the motion of rows, with a minus.
+        """
+        error, motion = _centred(right.row_error_px), _centred(right.row_motion_px)
+        now = np.array([len(error), error @ error, error @ motion, motion @ motion])
+        self._rows = _MEMORY * self._rows + now
+        n, ee, em, mm = self._rows
+        # Rows must move by more than a pixel, and their motion explain a quarter of the error's variance.
+        if n < 20 or mm < n or em**2 < 0.25 * ee * mm:
+            return 0.0
+        late = -em / mm
+        return float(late) if abs(late) < 2.0 else 0.0
+
+
+def _centred(x: Array) -> Array:
+    """Without its median: a vertical offset of the cameras is no delay."""
+    return np.asarray(x, np.float64) - np.median(x) if len(x) else np.zeros(0)
+
+
+def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moments: ResidualMoments) -> dict[str, Any]:
+    """Fields of a :class:`gpvo.types.VoRecord` that describe the match and the solution."""
+    uvd = matches.uvd_cur[motion.inliers]
+    p10, p50, p90 = (float(p) for p in np.percentile(uvd[:, 2], [10, 50, 90]))
+    depth_m = camera.fx_px * camera.baseline_m / max(float(p50), 1e-3)
+    sigma_p, sigma_m = moments.sigmas if len(uvd) >= _ENOUGH_FOR_SIGMAS else (np.nan, np.nan)
+    return {
+        "n_tracked": matches.n_tracked,
+        "n_inliers": len(uvd),
+        "reproj_rms_px": float(np.sqrt((motion.residuals[:, :2] ** 2).sum(1).mean())),
+        "residual_sigma_p_px": sigma_p,
+        "residual_sigma_m_px": sigma_m,
+        "disparity_p10_px": float(p10),
+        "disparity_p50_px": float(p50),
+        "disparity_p90_px": float(p90),
+        "spread_u": float(np.std(uvd[:, 0]) / camera.fx_px),
+        "spread_v": float(np.std(uvd[:, 1]) / camera.fy_px),
+        "log10_condition": _log10_condition(motion.information, depth_m),
+    }
+
+
+def stats_fields(stats: ImageStats | None) -> dict[str, Any]:
+    """Fields of a record that describe the image; empty for tracks."""
+    if stats is None:
+        return {}
+    return {
+        "brightness": stats.brightness,
+        "contrast": stats.contrast,
+        "sharpness": stats.sharpness,
+        "noise_level": stats.noise_level,
+    }

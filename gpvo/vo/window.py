@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.frontend import Matches
+from gpvo.vo.frontend import Matches, keys
 from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, Motion, transfer
 from gpvo.vo.points import PointNoise
-from gpvo.vo.recorder import keys
 from gpvo.vo.rig_error import RigError
 
 _CHOOSING = 3  # iterations in which weights may change

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.gate import THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
-from gpvo.filters.measurement import BIAS, JOINT
+from gpvo.filters.measurement import BIAS, JOINT, THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter

@@ -11,7 +11,7 @@ import pytest
 from gpvo.accumulation import PoseError, adjoints_to_end, along, carry, frame_jitter, persistence, persistent_sum
 from gpvo.evaluation.forecast import _Flight, _sum_up
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import Gate
 from gpvo.filters.propagation import CORE, Nominal
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import change_body

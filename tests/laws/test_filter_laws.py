@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gpvo.filters import measurement as me
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.gate import Gate
+from gpvo.filters.measurement import Gate
 from gpvo.filters.policies import ConstantPolicy
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V, imu_step
 from gpvo.filters.run import Flight, FuseOptions, fuse_flight

@@ -12,11 +12,10 @@ from gpvo.io.source import open_source
 from gpvo.types import Status, StereoFrame
 from gpvo.vo.config import make_config
 from gpvo.vo.frontend import Matches, Observation, RightSearch
-from gpvo.vo.image import Light, in_light_of
 from gpvo.vo.motion import refine, transfer
 from gpvo.vo.odometry import StereoOdometry
-from gpvo.vo.opencv import halve
-from gpvo.vo.pairwatch import PairWatch
+from gpvo.vo.opencv import Light, halve, in_light_of
+from gpvo.vo.quality import PairWatch
 from gpvo.vo.rivals import areas, unexplained
 from stereo_points import CAMERA, scene
 
