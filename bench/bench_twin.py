@@ -14,8 +14,8 @@ from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.runner import run as run_odometry
 from gpvo.sim.points import simulate_points
+from gpvo.twin.bundle import Observations
 from gpvo.twin.noise import adjust
-from gpvo.twin.observations import Observations
 from gpvo.twin.replicate import TwinSettings, make_twins
 from gpvo.types import StereoCamera
 from gpvo.vo.points import triangulate

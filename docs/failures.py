@@ -16,9 +16,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from gpvo.cameras.rig import Tolerance
+from gpvo.dataset.doubtful import odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import interpolate_truth, motion_errors
-from gpvo.dataset.odd import odd_stretches
-from gpvo.dataset.rest import without_wandering_truth
 from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
 from gpvo.geometry import se3
 from gpvo.io import open_source

@@ -9,11 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.dataset.doubtful import in_waits, odd_stretches, odd_times, wandering_waits
 from gpvo.dataset.errors import check_target, motion_targets, position_targets
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
-from gpvo.dataset.odd import odd_stretches
-from gpvo.dataset.odd import times as odd_times
-from gpvo.dataset.rest import in_waits, wandering_waits
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
@@ -106,9 +104,10 @@ def build(
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
     ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
-    waits in which the truth moves (:func:`gpvo.dataset.rest.wandering_waits`); "keep" learns from them. ``odd``: the
-    same of stretches in which odometry and truth differ as nowhere else (:mod:`gpvo.dataset.odd`). Raises GpvoError
-    where nothing is left to learn from, which names ``where``, by default ``name``.
+    waits in which the truth moves (:func:`gpvo.dataset.doubtful.wandering_waits`); "keep" learns from them. ``odd``:
+    the same of stretches in which odometry and truth differ as nowhere else
+    (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
+    ``where``, by default ``name``.
     """
     check_target(target)
     for what, way in (("waits", waits), ("odd stretches", odd)):

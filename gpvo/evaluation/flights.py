@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from gpvo.dataset.build import predictions_of
+from gpvo.dataset.doubtful import without_wandering_truth
 from gpvo.dataset.errors import interpolate_truth, motion_errors
-from gpvo.dataset.rest import without_wandering_truth
 from gpvo.errors import GpvoError
 from gpvo.filters.policies import constant_from_errors
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE

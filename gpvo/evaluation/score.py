@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.rest import in_waits, wandering_waits
+from gpvo.dataset.doubtful import in_waits, wandering_waits
 from gpvo.dataset.splits import leave_one_out
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run

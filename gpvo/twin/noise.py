@@ -6,7 +6,7 @@ signs from one smooth field. Multiplying residuals by dependent random numbers, 
 X. Shao, "The dependent wild bootstrap" (2010).
 
 The residuals are those of a robust bundle adjustment: the path and the landmarks that explain a run's stereo tracks
-best. Levenberg-Marquardt on the normal equations (:mod:`gpvo.twin.normal`). B. Triggs et al., "Bundle adjustment, a
+best. Levenberg-Marquardt on the normal equations (:mod:`gpvo.twin.bundle`). B. Triggs et al., "Bundle adjustment, a
 modern synthesis" (2000), sections 6 and 7. A landmark moves in the (u, v, d) of one of its own views, where also far
 points are well conditioned.
 """
@@ -22,8 +22,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from gpvo.geometry import se3
-from gpvo.twin.normal import NormalEquations, Pieces
-from gpvo.twin.observations import WHITEN, Chart, Estimate, Observations
+from gpvo.twin.bundle import WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces
 from gpvo.types import Array
 
 _CHI2_3_MEDIAN, _CHI2_3_999 = 2.366, 16.266

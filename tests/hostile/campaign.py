@@ -117,7 +117,7 @@ def read_bag(path: Path) -> None:
 
 def read_seen(path: Path) -> None:
     """A run with what odometry saw, as ``gpvo twin`` takes it."""
-    from gpvo.twin.estimate import estimate
+    from gpvo.twin.replicate import estimate
 
     structure = estimate(path).structure
     assert np.isfinite(structure.T_world_cam).all(), "a pose that is none"

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
+from gpvo.twin.bundle import REACH, WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces, damped
 from gpvo.twin.noise import adjust, without_loose_frames
-from gpvo.twin.normal import REACH, NormalEquations, Pieces, damped
-from gpvo.twin.observations import WHITEN, Chart, Estimate, Observations
 from gpvo.types import StereoCamera
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.twin.bundle import Observations
 from gpvo.twin.noise import Neighbours, Structure, draw_signs
-from gpvo.twin.observations import Observations
 from gpvo.types import StereoCamera
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)

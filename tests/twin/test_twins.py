@@ -13,9 +13,8 @@ from gpvo.io import open_source
 from gpvo.io.run import read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
-from gpvo.twin.estimate import estimate
 from gpvo.twin.gap import Gap, pooled, read_gap
-from gpvo.twin.replicate import TwinSettings, make_twins, read_tolerance, rig_errors, twin_source
+from gpvo.twin.replicate import TwinSettings, estimate, make_twins, read_tolerance, rig_errors, twin_source
 from gpvo.types import StereoCamera
 from gpvo.vo.config import VoConfig
 from gpvo.vo.rig_error import N_TERMS, RigState

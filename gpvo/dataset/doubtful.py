@@ -1,0 +1,216 @@
+"""Stretches of a run from which nothing should be learnt about odometry, because the truth is in doubt there.
+
+Waits: where a vehicle stands and its truth does not, what the truth says of odometry's error is the truth's own.
+Satellite positions wander by decimetres while a car waits at a light, and odometry, which sees that nothing moves,
+would be charged with it. Whether the vehicle stands is said by image and IMU together: odometry that is blind to a
+motion does not deceive a gyroscope.
+
+Odd stretches: where odometry and truth differ as nowhere else in the sequence, one of the two is wrong, and a model
+that learnt from them would be timid everywhere. Two differences are looked for, each against its own median and spread
+in the sequence (by the median absolute deviation): the share of the true motion that odometry shows, where what it says
+of its own noise does not explain it; and the direction of travel, as of a truth that climbs while the vehicle does not.
+Which of the two is wrong is for the user to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
+from gpvo.stats.series import moving_sums
+from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.vo.state import ImuMoments
+
+STILL_S = 1.0
+"""So long a vehicle must stand at least for a wait."""
+STILL_PX, TRUTH_PX = 1.0, 2.0
+"""Image motion up to which an image is at rest, and that a truth must claim to contradict it."""
+GYRO_STD_RADPS, ACC_STD_MPS2 = 0.005, 0.5
+"""Spread up to which an IMU is at rest. Small gyroscopes have 0.0015 to 0.0035 rad/s of noise at 200 Hz; on the road,
+cars are seldom below 0.007 rad/s for a second (KITTI). The limit on accelerations lets an engine idle."""
+_SHORT, _LONG = 5, 50
+"""Motions over which the share, and the direction, are taken."""
+_LEAST_MOTIONS = 4  # in a row whose share is the same
+
+_SIGMAS = 5.0
+_LEAST_SHARE, _LEAST_TURN = 0.1, 0.02
+"""Smaller differences, of the share and in radians, are nobody's gross mistake."""
+_MOST = 1 / 3
+"""Of the sequence: what makes up more is how the sequence is."""
+
+
+def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
+    """(W, 2) times [ns] of the first and the last frame of waits during which the truth moves.
+
+    Over a wait, odometry moves by less than ``STILL_PX`` of the image and the IMU is still; the truth moves where
+    its motion would be more than ``TRUTH_PX``. Without a camera, or an IMU in the log, nothing is called a wait.
+    """
+    if log.camera is None:
+        return np.zeros((0, 2), dtype=np.int64)
+    found, (T_true, known) = [], interpolate_truth(truth, log.t_ns)
+    for first, last in _waits(log, log.trajectory(), log.camera):
+        span = slice(first, last + 1)
+        if known[span].all() and _image_motion_px(_extent(T_true[span]), log.records[last], log.camera) > TRUTH_PX:
+            found.append(log.t_ns[[first, last]])
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def in_waits(records: Sequence[VoRecord], waits: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) which motions, or windows of motions, share time with one of the waits (W, 2)."""
+    start = np.array([r.t_prev_ns for r in records], dtype=np.int64)[:, None]
+    end = np.array([r.t_ns for r in records], dtype=np.int64)[:, None]
+    return np.asarray(((start < waits[:, 1]) & (end > waits[:, 0])).any(axis=1), dtype=np.bool_)
+
+
+def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
+    """The log with what falls into such waits called lost, so that neither an error nor a sum of errors reaches over
+    it; for statistics alone."""
+    waits = wandering_waits(log, truth)
+    if not len(waits):
+        return log
+    inside = in_waits(log.records, waits)
+    marked = [r.with_status(Status.LOST, "truth moves at rest") if i else r for r, i in zip(log.records, inside)]
+    return replace(log, records=marked)
+
+
+def _waits(log: VoLog, T_est: Array, camera: StereoCamera) -> list[tuple[int, int]]:
+    """First and last frame of the longest stretches at rest, one after the other."""
+    sensed, found, first = [ImuMoments.of_record(r) for r in log.records], [], 0
+    while first < len(log) - 1:
+        last = _rests_until(first, log, T_est, sensed, camera)
+        if (log.records[last].t_ns - log.records[first].t_ns) * 1e-9 >= STILL_S:
+            found.append((first, last))
+            first = last
+        first += 1
+    return found
+
+
+def _rests_until(first: int, log: VoLog, T_est: Array, sensed: Sequence[ImuMoments], camera: StereoCamera) -> int:
+    """The last frame up to which the vehicle stands from the frame ``first`` on."""
+    low, high, moments = np.zeros(3), np.zeros(3), ImuMoments.of(None)
+    for k in range(first + 1, len(log)):
+        here = (T_est[k, :3, 3] - T_est[first, :3, 3]) @ T_est[first, :3, :3]
+        low, high, moments = np.minimum(low, here), np.maximum(high, here), moments.with_later(sensed[k])
+        moved_px = _image_motion_px(high - low, log.records[k], camera)
+        gyro, acc = np.sqrt(moments.variance).reshape(2, 3).max(axis=1)
+        # Written so that what is unknown, NaN, is not at rest; an accelerometer may be missing.
+        still = moved_px <= STILL_PX and gyro <= GYRO_STD_RADPS
+        if not (log.records[k].usable and still) or acc > ACC_STD_MPS2:
+            return k - 1
+    return len(log) - 1
+
+
+def _extent(T_world_cam: Array) -> Array:
+    """(3,) how far positions (n, 4, 4) spread along the axes of the first."""
+    return np.ptp((T_world_cam[:, :3, 3] - T_world_cam[0, :3, 3]) @ T_world_cam[0, :3, :3], axis=0)
+
+
+def _image_motion_px(extent_m: Array, seen: VoRecord, camera: StereoCamera) -> float:
+    """Image motion [px] that translations (3,) along the camera's axes make of the near points seen:
+    ``f / Z (t_xy - (x, y) t_z)``, in the mean square over image coordinates (x, y) of the spread seen."""
+    x, y, z = extent_m
+    forward = (seen.spread_u**2 + seen.spread_v**2) * z**2
+    return float(np.sqrt(x**2 + y**2 + forward) * seen.disparity_p90_px / camera.baseline_m)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """``first``, ``last``: indices of its motions in the log, which begin and end at ``t_ns`` (2,)."""
+
+    first: int
+    last: int
+    t_ns: tuple[int, int]
+    what: str
+
+    def __str__(self) -> str:
+        return f"motions {self.first} to {self.last}: {self.what}"
+
+
+def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
+    """Those of a log against its truth, in order of time."""
+    errors = motion_errors(log, truth)
+    if len(errors.index) < 2 * _LONG:
+        return []
+    true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
+    length = np.linalg.norm(true, axis=1)
+    share = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
+    found = [*_of_share(share, length, _stated_m(log, errors)), *_of_direction(seen - share[:, None] * true, length)]
+    spans = [(errors.index[a], errors.index[b], what) for a, b, what in found]
+    return sorted(
+        (Stretch(int(i), int(k), (log.records[i].t_prev_ns, log.records[k].t_ns), what) for i, k, what in spans),
+        key=lambda s: s.t_ns,
+    )
+
+
+def _of_share(own: Array, length: Array, sigma_m: Array) -> list[tuple[int, int, str]]:
+    """By each motion's share ``own`` (M,) of its true ``length`` (M,) [m]."""
+    moving = length > 0.5 * np.median(length)
+    usual = float(np.median(own[moving]))
+    z = moving_sums(np.where(moving, (own - usual) * length / sigma_m, 0.0), _SHORT)
+    far = np.abs(z) > _SIGMAS * 1.4826 * np.median(np.abs(z[_moving(length, _SHORT)]))
+    found = []
+    for first, of_window in _runs(far):
+        last = of_window + _SHORT - 1
+        farthest = first + int(np.argmax(np.abs(z[first : of_window + 1])))
+        level = float(np.median(own[farthest : farthest + _SHORT]))
+        # The windows at either end hold motions like all others; a level is steady, what noise makes is not.
+        alike = np.abs(own - level) < 0.5 * abs(level - usual)
+        steady = [(a + first, b + first) for a, b in _runs(alike[first : last + 1])]
+        k, m = max(steady, key=lambda run: run[1] - run[0], default=(0, -1))
+        if m - k + 1 >= _LEAST_MOTIONS and abs(level - usual) > _LEAST_SHARE:
+            level = float(np.mean(own[k : m + 1]))
+            found.append((k, m, f"odometry shows {level:.2f} of the true motion, else {usual:.2f}"))
+    return found
+
+
+def _of_direction(aside: Array, length: Array) -> list[tuple[int, int, str]]:
+    """By what odometry shows ``aside`` (M, 3) of true motions of a ``length`` (M,) [m]."""
+    turn = moving_sums(aside, _LONG) / np.maximum(moving_sums(length, _LONG), 1e-12)[:, None]
+    off, usual = _beyond(turn, _moving(length, _LONG), _LEAST_TURN)
+    found = []
+    for first, last in ((a, b + _LONG - 1) for a, b in _runs(off)):
+        here = aside[first : last + 1].sum(0) / length[first : last + 1].sum() - usual
+        degrees = float(np.rad2deg(np.arctan(np.linalg.norm(here))))
+        axis = ("sideways", "vertically", "along")[int(np.argmax(np.abs(here)))]
+        found.append((first, last, f"truth leaves odometry's direction by {degrees:.1f} deg, {axis}"))
+    return found
+
+
+def _moving(length: Array, count: int) -> NDArray[np.bool_]:
+    """Which windows are no slower than half the usual."""
+    path = moving_sums(length, count)
+    return np.asarray(path > max(0.5 * float(np.median(path)), 1e-9))
+
+
+def _beyond(values: Array, moving: NDArray[np.bool_], least: float) -> tuple[NDArray[np.bool_], Array]:
+    """Which moving windows (W, D) are far off the median of all of them, and the median (D,)."""
+    usual = np.median(values[moving], axis=0)
+    sigma = 1.4826 * np.median(np.abs(values[moving] - usual), axis=0)
+    off = moving & (np.abs(values - usual) > np.maximum(_SIGMAS * sigma, least)).any(axis=1)
+    return (off if off.mean() <= _MOST else np.zeros_like(off)), usual
+
+
+def _runs(off: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last of each run."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(int)))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+
+
+def _stated_m(log: VoLog, errors: MotionErrors) -> Array:
+    """(M,) what odometry says of its own noise, by the first covariance that all motions have and their residuals."""
+    records = [log.records[k] for k in errors.index]
+    known = [m for m in log.methods if all(m in r.covariances for r in records)]
+    if not known:
+        return np.ones(len(records))
+    stated = np.sqrt([np.trace(r.covariances[known[0]][:3, :3]) for r in records])
+    noise_px = np.array([r.reproj_rms_px for r in records])
+    return np.asarray(stated * np.where(np.isfinite(noise_px), np.maximum(noise_px, 1e-3), 1.0))
+
+
+def odd_times(stretches: Sequence[Stretch]) -> NDArray[np.int64]:
+    """(S, 2) first and last time [ns] of each."""
+    return np.array([s.t_ns for s in stretches], dtype=np.int64).reshape(-1, 2)
