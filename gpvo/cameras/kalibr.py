@@ -1,23 +1,100 @@
-"""Kalibr's ``camchain.yaml`` (also ``camchain-imucam.yaml`` and OpenVINS' variant) and ``imu.yaml``; and EuRoC's
-``sensor.yaml``, one file per sensor, with ``T_BS`` from sensor to body."""
+"""Calibrations in YAML, OpenCV's dialect included, no code ever run: Kalibr's ``camchain.yaml`` (also
+``camchain-imucam.yaml`` and OpenVINS' variant) and ``imu.yaml``; and EuRoC's ``sensor.yaml``, one file per sensor, with
+``T_BS`` from sensor to body.
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.cameras.rig import StereoRig, check_pose
-from gpvo.cameras.yamlfile import get_numbers, read_yaml
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuNoise
 
+_MAX_BYTES = 100_000  # a calibration has a few thousand
 # Chained and direct transforms of one calibration agree to the digits printed; a mistaken meaning does not.
 _CHAIN_TOLERANCE_M = 5e-3
 _CHAIN_TOLERANCE_RAD = np.deg2rad(0.5)
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe loader that knows OpenCV's matrices, and no aliases: nested, a few of them stand for a billion nodes."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(
+                None, None, f"the alias *{event.anchor}; write its value out", event.start_mark
+            )
+        return super().compose_node(parent, index)
+
+
+def _opencv_matrix(loader: _Loader, node: yaml.Node) -> Array:
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.constructor.ConstructorError(None, None, "opencv-matrix must be a mapping", node.start_mark)
+    fields = loader.construct_mapping(node, deep=True)
+    data = np.asarray(fields["data"], dtype=np.float64)
+    return data.reshape(int(fields["rows"]), int(fields["cols"]))
+
+
+for _tag in ("tag:yaml.org,2002:opencv-matrix", "!opencv-matrix"):
+    _Loader.add_constructor(_tag, _opencv_matrix)
+
+
+def calibration_text(path: Path) -> str:
+    """The text of a file. Raises CalibrationError where it cannot be read, or is too large for a calibration."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise CalibrationError("too large for a calibration", where=path)
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise CalibrationError(f"cannot be read: {error.strerror}", where=path) from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file; ``!!opencv-matrix`` becomes an array (rows, cols).
+
+    OpenCV's first line ``%YAML:1.0`` is no YAML and is dropped; tags that would build Python objects are refused.
+    Raises CalibrationError where the file is missing, too large, not YAML or not a mapping.
+    """
+    text = calibration_text(path)
+    # A leading directive without the document marker, a byte order mark, and tabs are what these files suffer from.
+    text = re.sub(r"\A\ufeff?\s*%YAML[: ][^\n]*\n(---[^\n]*\n)?", "", text).expandtabs(4)
+    try:
+        document = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" at line {mark.line + 1}" if mark is not None else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise CalibrationError(f"not readable as YAML{line}: {problem}", where=path) from None
+    if not isinstance(document, dict):
+        raise CalibrationError("holds no keys", where=path, cure="is this the calibration file?")
+    return document
+
+
+def get_numbers(block: dict[str, Any], key: str, count: int | tuple[int, ...], where: object) -> list[float]:
+    """``block[key]`` as a list of finite numbers of one of the given lengths.
+
+    Raises CalibrationError where the key is absent or holds something else.
+    """
+    allowed = (count,) if isinstance(count, int) else count
+    if key not in block:
+        raise CalibrationError(f"lacks the key '{key}'", where=where)
+    try:
+        values = np.asarray(block[key], dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise CalibrationError(f"'{key}' is not a list of numbers", where=where) from None
+    if len(values) not in allowed or not np.isfinite(values).all():
+        wanted = " or ".join(str(n) for n in allowed)
+        raise CalibrationError(f"'{key}' holds {len(values)} numbers, expected {wanted} finite ones", where=where)
+    return [float(v) for v in values]
 
 
 def read_camchain(path: Path, *, left: str = "cam0", right: str = "cam1") -> StereoRig:
@@ -196,7 +273,7 @@ def read_sensor_pose(path: Path) -> Array:
     return check_pose(block, "T_BS", path)
 
 
-def read_sensor_lens(path: Path) -> CameraModel:
+def _read_sensor_lens(path: Path) -> CameraModel:
     """The lens of one camera."""
     return _lens(read_yaml(path), str(path))
 
@@ -209,8 +286,8 @@ def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_i
     T_body_left, T_body_right = read_sensor_pose(left), read_sensor_pose(right)
     T_body_imu = read_sensor_pose(imu) if imu is not None else np.eye(4)
     return StereoRig(
-        left=read_sensor_lens(left),
-        right=read_sensor_lens(right),
+        left=_read_sensor_lens(left),
+        right=_read_sensor_lens(right),
         T_right_left=se3.inverse(T_body_right) @ T_body_left,
         T_imu_left=se3.inverse(T_body_imu) @ T_body_left,
         T_body_left=T_body_left if body_is_flu else None,

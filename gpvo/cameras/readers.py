@@ -1,19 +1,21 @@
-"""One call for a calibration file of any known kind; and OpenCV YAML with ``K1 D1 K2 D2 R T``, as community files of
-the T265 come."""
+"""One call for a calibration file of any kind, and the kinds beside Kalibr's: OpenCV YAML with ``K1 D1 K2 D2 R T``,
+as community files of the T265 come, ROS ``sensor_msgs/CameraInfo`` of a stereo pair, for raw or rectified images, and
+KITTI odometry's ``calib.txt``.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.kalibr import make_lens, read_camchain
-from gpvo.cameras.models import CameraModel
-from gpvo.cameras.projections import read_camera_infos, read_kitti_calib
+from gpvo.cameras.kalibr import calibration_text, get_numbers, make_lens, read_camchain, read_yaml
+from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.cameras.rig import StereoRig, check_pose
-from gpvo.cameras.yamlfile import get_numbers, read_yaml
 from gpvo.errors import CalibrationError
+from gpvo.types import Array
 
 _T265_SIZE = (848, 800)
 # Names under which a calibration lies beside images or a bag, the most telling first.
@@ -48,7 +50,7 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
     if "K1" in document:
         return read_opencv_stereo(path, size=size)
     if "camera_matrix" in document:
-        return read_camera_infos(path)
+        return _read_camera_infos(path)
     raise CalibrationError(
         "is neither a Kalibr camera chain (cam0, cam1), nor an OpenCV stereo file (K1, D1, K2, D2, R, T), nor ROS"
         " camera_info (camera_matrix, projection_matrix)",
@@ -108,3 +110,172 @@ def _lens(document: dict[str, Any], index: str, size: tuple[int, int], path: Pat
         fisheye = len(D) == 4 and size == _T265_SIZE
     model = "equidistant" if fisheye else "radtan"
     return make_lens("pinhole", model, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], D, size, path)
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The fields of the message: ``K`` (3, 3), ``D`` (n,), ``R`` (3, 3), ``P`` (3, 4), size [px]."""
+
+    width: int
+    height: int
+    distortion_model: str
+    D: Array
+    K: Array
+    R: Array
+    P: Array
+
+
+_SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("fisheye1", "fisheye2"))
+
+
+def _read_camera_infos(path: Path) -> StereoRig:
+    """The rig of ROS camera_info YAML (``camera_calibration_parsers``), a file per camera, for raw images.
+
+    ``path``: of either camera, ``left.yaml`` or ``right.yaml``; the other lies beside it. Raises CalibrationError where
+    the other file is missing, or one of them lacks a matrix.
+    """
+    for left, right in _SIDES:
+        name = path.name.replace(right, left)
+        if left in name:
+            pair = [path.with_name(name), path.with_name(name.replace(left, right))]
+            break
+    else:
+        cure = "name the files left.yaml and right.yaml"
+        raise CalibrationError("is of one camera, and its name does not say which", where=path, cure=cure)
+    for file in pair:
+        if not file.is_file():
+            raise CalibrationError(f"the other camera's file {file.name} is not beside it", where=path)
+    return rig_from_camera_info(*(_read_camera_info(file) for file in pair), rectified=False, where=path)
+
+
+def _read_camera_info(path: Path) -> CameraInfo:
+    document = read_yaml(path)
+
+    def matrix(name: str, rows: int, columns: int) -> Array:
+        holder = document.get(name)
+        if not isinstance(holder, dict):
+            raise CalibrationError(f"lacks '{name}'", where=path, cure="give a camera_info YAML of ROS")
+        return np.reshape(get_numbers(holder, "data", rows * columns, path), (rows, columns))
+
+    holder = document.get("distortion_coefficients")
+    count = len(holder.get("data", ())) if isinstance(holder, dict) else 0
+    return CameraInfo(
+        width=int(get_numbers(document, "image_width", 1, path)[0]),
+        height=int(get_numbers(document, "image_height", 1, path)[0]),
+        distortion_model=str(document.get("distortion_model", "plumb_bob")),
+        D=matrix("distortion_coefficients", 1, count)[0],
+        K=matrix("camera_matrix", 3, 3),
+        R=matrix("rectification_matrix", 3, 3),
+        P=matrix("projection_matrix", 3, 4),
+    )
+
+
+def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool, where: object = None) -> StereoRig:
+    """The rig of two CameraInfo messages; ``rectified`` says that the images already are.
+
+    The right camera's ``P[0, 3]`` is ``-fx' B``. For raw images the rectifying rotations ``R`` of both give their
+    relative orientation: ``R_right_left = R_right^T R_left``. Raises CalibrationError where the cameras are
+    uncalibrated (``K[0] == 0``), the baseline is absent or the rig impossible.
+    """
+    for name, info in (("left", left), ("right", right)):
+        if info.K[0, 0] == 0 or info.P[0, 0] == 0:
+            raise CalibrationError(
+                f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)",
+                where=where,
+                cure="put a Kalibr camchain.yaml beside the bag",
+            )
+    baseline = left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0]
+    T_rect = np.eye(4)
+    T_rect[0, 3] = -baseline
+    text = None if where is None else str(where)
+    if rectified:
+        lenses = [PinholeRadtan(c.P[0, 0], c.P[1, 1], c.P[0, 2], c.P[1, 2], c.width, c.height) for c in (left, right)]
+        return StereoRig(left=lenses[0], right=lenses[1], T_right_left=T_rect, where=text)
+    raw = [
+        make_lens(
+            "pinhole",
+            c.distortion_model,
+            [c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]],
+            [float(d) for d in c.D],
+            (c.width, c.height),
+            where,
+        )
+        for c in (left, right)
+    ]
+    T_right_left = np.eye(4)
+    T_right_left[:3, :3] = right.R.T @ left.R
+    T_right_left[:3, 3] = right.R.T @ T_rect[:3, 3]
+    return StereoRig(left=raw[0], right=raw[1], T_right_left=T_right_left, where=text)
+
+
+def read_projections(path: Path) -> dict[str, Array]:
+    """``P0`` ... ``P3`` (3, 4) of the file; raw KITTI's ``P_rect_00`` spelling is understood too."""
+    found: dict[str, Array] = {}
+    for number, line in enumerate(calibration_text(path).splitlines(), 1):
+        key, _, rest = line.partition(":")
+        key = key.strip().replace("P_rect_0", "P")
+        if key not in ("P0", "P1", "P2", "P3"):
+            continue
+        try:
+            values = np.array([float(v) for v in rest.split()])
+        except ValueError:
+            raise CalibrationError(f"line {number} holds something that is not a number", where=path) from None
+        if values.shape != (12,) or not np.isfinite(values).all():
+            raise CalibrationError(f"line {number} holds {len(values)} numbers, expected 12 finite ones", where=path)
+        found[key] = values.reshape(3, 4)
+    return found
+
+
+def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]) -> StereoRig:
+    """The rectified pair of cameras ``left`` and ``right`` (0 and 1 grey, 2 and 3 colour) with images of ``size``.
+
+    Raises CalibrationError where a matrix is missing, the two do not share their intrinsics, or the baseline is
+    impossible.
+    """
+    P = read_projections(path)
+    for camera in (left, right):
+        if f"P{camera}" not in P:
+            raise CalibrationError(
+                f"lacks the line 'P{camera}:'", where=path, cure="12 numbers, the 3x4 matrix row by row"
+            )
+    P_left, P_right = P[f"P{left}"], P[f"P{right}"]
+    if not np.allclose(P_left[:, :3], P_right[:, :3], rtol=1e-6, atol=1e-3):
+        raise CalibrationError(f"P{left} and P{right} differ in their intrinsics: not a rectified pair", where=path)
+    fx, fy, cx, cy = P_left[0, 0], P_left[1, 1], P_left[0, 2], P_left[1, 2]
+    if fx <= 1:
+        raise CalibrationError(f"P{left} has focal length {fx:g} px", where=path)
+    _check_centre(float(cx), float(cy), size, path)
+    # Both matrices place their camera relative to camera 0; K^-1 p is the translation from it.
+    K = P_left[:, :3]
+    try:
+        t_right_left = np.linalg.solve(K, P_right[:, 3] - P_left[:, 3])
+    except np.linalg.LinAlgError:
+        raise CalibrationError(f"P{left} is not a projection matrix", where=path) from None
+    # Colour cameras carry millimetres in y and z as well; rectified rows absorb y, and z stays a small scale error.
+    T_right_left = np.eye(4)
+    T_right_left[0, 3] = t_right_left[0]
+    if np.abs(t_right_left[1:]).max() > 0.05 * max(abs(t_right_left[0]), 1e-9):
+        raise CalibrationError(f"P{left} and P{right} do not sit side by side", where=path)
+    lens = PinholeRadtan(float(fx), float(fy), float(cx), float(cy), *size)
+    return StereoRig(left=lens, right=lens, T_right_left=T_right_left, where=str(path))
+
+
+def _check_centre(cx: float, cy: float, size: tuple[int, int], path: Path) -> None:
+    """The file does not say its resolution; a principal point far from the middle tells that it is another."""
+    width, height = size
+    if not (0.3 < cx / width < 0.7 and 0.3 < cy / height < 0.7):
+        raise CalibrationError(
+            f"its principal point ({cx:.1f}, {cy:.1f}) is far from the middle of the {width}x{height} images",
+            where=path,
+            cure="is it the calibration of another resolution? Scale its first two rows as the images",
+        )
+
+
+def left_camera_offset(path: Path, left: int) -> Array:
+    """(4, 4) camera 0, of which the poses are, from camera ``left``."""
+    P = read_projections(path)
+    T = np.eye(4)
+    if left != 0 and "P0" in P:
+        K = P[f"P{left}"][:, :3]
+        T[:3, 3] = -np.linalg.solve(K, P[f"P{left}"][:, 3])
+    return T

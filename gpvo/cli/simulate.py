@@ -113,7 +113,7 @@ def _one(scenario: Scenario, seed: int, out: Path, points: bool, threads: int) -
 def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path | None) -> None:
     good = [f for f in flights if not f.error]
     if preview is not None and good:
-        from gpvo.sim.sequence_files import contact_sheet
+        from gpvo.sim.sequence import contact_sheet
 
         contact_sheet(good[0].path, preview)
     if json_:

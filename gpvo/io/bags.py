@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.kalibr import camchain_topics
-from gpvo.cameras.projections import CameraInfo, rig_from_camera_info
-from gpvo.cameras.readers import find_calibration, read_stereo_yaml
+from gpvo.cameras.kalibr import camchain_topics, read_yaml
+from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
-from gpvo.cameras.yamlfile import read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.bag_images import decode_message, pair_streams
 from gpvo.io.bag_reader import (

@@ -87,8 +87,8 @@ class Source(Protocol):
 BUILT_IN: dict[str, str] = {
     "tracks": "gpvo.io.tracks:TracksSource",
     "rosbag": "gpvo.io.bags:BagSource",
-    "euroc": "gpvo.io.euroc:EurocSource",
-    "kitti": "gpvo.io.kitti:KittiSource",
+    "euroc": "gpvo.io.datasets:EurocSource",
+    "kitti": "gpvo.io.datasets:KittiSource",
     "folder": "gpvo.io.folder:FolderSource",
 }
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.projections import CameraInfo, rig_from_camera_info
+from gpvo.cameras.readers import CameraInfo, rig_from_camera_info
 from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
 from gpvo.io.bag_images import PairQueue, decode_message

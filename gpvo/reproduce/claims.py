@@ -12,8 +12,7 @@ from gpvo.reproduce.bounds import BoundMethod, Bounds, BoundsJob, load_bounds
 from gpvo.reproduce.experiments import WAYS, Mode, Way
 from gpvo.reproduce.flights import Flights
 from gpvo.reproduce.models import OTHER, SAME, Studies
-from gpvo.reproduce.rows import Cell
-from gpvo.reproduce.scores import Interval, over_seeds, pooled, squared_ends
+from gpvo.reproduce.rows import Cell, Interval, over_seeds, pooled, squared_ends
 from gpvo.reproduce.stages import Store, Workers
 from gpvo.reproduce.tables import MODES, number, with_interval
 from gpvo.stats.bootstrap import sequence_bootstrap

@@ -8,7 +8,7 @@ from typing import Any
 
 from gpvo import __version__
 from gpvo.files import plain, write_json, write_text
-from gpvo.reproduce import models, rows, scores, tables
+from gpvo.reproduce import models, rows, tables
 from gpvo.reproduce.claims import claims
 from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS, Plan
 from gpvo.reproduce.flights import fly_all
@@ -44,7 +44,7 @@ def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
     rows.compute([*simulated, *real], store, workers)
     studied = models.run_studies(plan, flights, store, workers)
     claimed = [] if plan.only else claims(simulated, flights, studied, store, workers)
-    main = scores.rows([c for c in simulated if c.experiment.table != "sensitivity"], store)
+    main = rows.scored([c for c in simulated if c.experiment.table != "sensitivity"], store)
     if not (plan.recordings("test") and plan.recordings("training")):
         for row in main:
             row["title"] += ", NO RECORDED PATHS: random ones" if row["table"] in ("4.5", "4.6") else ""
@@ -55,9 +55,9 @@ def _computed(plan: Plan, out: Path, workers: Workers) -> dict[str, Any]:
         "ways": WAYS,
         "notes": _notes(plan),
         "rows": main,
-        "sensitivity": scores.rows([c for c in simulated if c.experiment.table == "sensitivity"], store),
-        "real": scores.rows(real, store),
-        "targets": scores.targets(main),
+        "sensitivity": rows.scored([c for c in simulated if c.experiment.table == "sensitivity"], store),
+        "real": rows.scored(real, store),
+        "targets": rows.targets(main),
         "claims": claimed,
         "studies": models.studies_document(studied),
         "errata": list(ERRATA),

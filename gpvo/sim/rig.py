@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
-from gpvo.cameras.projections import read_projections
-from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.cameras.readers import read_projections, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig, Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3

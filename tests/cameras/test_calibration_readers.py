@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 from gpvo.cameras.kalibr import camchain_topics, read_camchain, read_imu_noise, read_sensor_pair
 from gpvo.cameras.models import KannalaBrandt, PinholeRadtan
-from gpvo.cameras.projections import CameraInfo, left_camera_offset, read_kitti_calib, rig_from_camera_info
-from gpvo.cameras.readers import find_calibration, read_opencv_stereo, read_stereo_yaml
+from gpvo.cameras.readers import (
+    CameraInfo,
+    find_calibration,
+    left_camera_offset,
+    read_kitti_calib,
+    read_opencv_stereo,
+    read_stereo_yaml,
+    rig_from_camera_info,
+)
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError

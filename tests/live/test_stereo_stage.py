@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from bag_maker import BagMaker, stereo_bag
 from gpvo import runner
-from gpvo.cameras.projections import read_kitti_calib
+from gpvo.cameras.readers import read_kitti_calib
 from gpvo.io import open_source
 from gpvo.io.images import read_grey8
 from gpvo.live.intake import Arrival, replay

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gpvo.reproduce.bounds import Bounds
-from gpvo.reproduce.scores import expected_length, pooled, score
+from gpvo.reproduce.rows import expected_length, pooled, score
 
 
 def flights(seeds, said=1.0, mean=0.0, n=40):

@@ -1,4 +1,6 @@
-"""EuRoC MAV ("ASL") folders, and TUM-VI, which adds a Kalibr camera chain."""
+"""Sequences of public data sets: EuRoC MAV ("ASL") folders, and TUM-VI, which adds a Kalibr camera chain; and KITTI
+odometry, rectified pairs by index with ``calib.txt``, ``times.txt`` and poses of the left camera.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +9,31 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.kalibr import read_imu_noise, read_sensor_pair, read_sensor_pose
-from gpvo.cameras.readers import find_calibration, read_stereo_yaml
+from gpvo.cameras.kalibr import calibration_text, read_imu_noise, read_sensor_pair, read_sensor_pose, read_yaml
+from gpvo.cameras.readers import find_calibration, left_camera_offset, read_kitti_calib, read_stereo_yaml
 from gpvo.cameras.rig import StereoRig
-from gpvo.cameras.yamlfile import calibration_text, read_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
-from gpvo.io.images import FileSource, PairFiles
+from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, text_lines
+from gpvo.io.stamps import PAIR_TOLERANCE_S, growing, integer_ns, match_nearest, text_lines
 from gpvo.io.trajectory import (
     BATCH_ESTIMATE,
+    GPS_INS,
     MOTION_CAPTURE,
+    Trajectory,
     TruthNoise,
     carry,
     check_overlap,
     read_euroc_csv,
     read_imu_csv,
+    read_kitti_poses,
+    read_times,
 )
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.
-_TRUTH = (
+_EUROC_TRUTH = (
     ("state_groundtruth_estimate0", BATCH_ESTIMATE),
     ("mocap0", MOTION_CAPTURE),
     ("vicon0", MOTION_CAPTURE),
@@ -55,9 +60,9 @@ class EurocSource(FileSource):
         **options: Any,
     ) -> None:
         mav = _mav_folder(path)
-        rig = _read_rig(path, mav, None if calibration is None else Path(calibration))
+        rig = _euroc_rig(path, mav, None if calibration is None else Path(calibration))
         known = SourceReport()
-        super().__init__(path, path.resolve().name, rig, _list_pairs(mav, tolerance_s, known), known, **options)
+        super().__init__(path, path.resolve().name, rig, _euroc_pairs(mav, tolerance_s, known), known, **options)
         self.imu = self._read_imu(mav)
         self.truth = self._read_truth(mav, truth_noise)
         if self.truth is None and (mav / "leica0").is_dir():
@@ -78,7 +83,7 @@ class EurocSource(FileSource):
     def _read_truth(self, mav: Path, noise: TruthNoise | None) -> TruthLog | None:
         if self.mounting.T_imu_cam is None:
             return None
-        for folder, usual in _TRUTH:
+        for folder, usual in _EUROC_TRUTH:
             file = mav / folder / "data.csv"
             if not file.is_file():
                 continue
@@ -100,7 +105,7 @@ def _mav_folder(path: Path) -> Path:
     return mav
 
 
-def _read_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
+def _euroc_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
     sensors = [mav / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     if given is None and all(s.is_file() for s in sensors):
         imu = mav / "imu0" / "sensor.yaml"
@@ -120,7 +125,7 @@ def _body_is_flu(mav: Path) -> bool:
     return body.is_file() and str(read_yaml(body).get("axes", "")).upper() == "FLU"
 
 
-def _list_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
+def _euroc_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
     left, right = (_read_image_list(mav / camera / "data.csv", known) for camera in ("cam0", "cam1"))
     folders = [mav / camera / "data" for camera in ("cam0", "cam1")]
     pairs = match_nearest(left, right, round(tolerance_s * 1e9), known, mav)
@@ -182,3 +187,97 @@ def _stated_noise(sensor: Path) -> TruthNoise | None:
     if not all(isinstance(v, (int, float)) and 0 <= v < 10 for v in values):
         return None
     return TruthNoise(float(values[0]), float(values[1]))  # type: ignore[arg-type]
+
+
+class KittiSource(FileSource):
+    """A sequence folder with ``image_0 image_1`` (or ``image_2 image_3``), ``calib.txt`` and ``times.txt``.
+
+    Poses are read from ``poses.txt`` in the folder or ``../../poses/NN.txt``. ``colour`` chooses the colour pair;
+    by default the grey one where it is there. ``truth_noise`` replaces the default of GPS/INS.
+    """
+
+    format = "kitti"
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        colour: bool | None = None,
+        calibration: str | Path | None = None,
+        truth_noise: TruthNoise = GPS_INS,
+        **options: Any,
+    ) -> None:
+        calib = Path(calibration) if calibration is not None else path / "calib.txt"
+        if not calib.is_file():
+            raise CalibrationError("no calibration", where=calib, cure="copy the sequence's calib.txt there")
+        left, right = self._cameras(path, colour)
+        known = SourceReport()
+        pairs = self._list_pairs(path, left, right, known)
+        first = first_size(pairs, "left")  # the calibration does not say it
+        if first is None:
+            raise SourceError("not one readable left image", where=path)
+        rig = read_kitti_calib(calib, left=left, right=right, size=first[1])
+        super().__init__(path, path.name, rig, pairs, known, **options)
+        self.truth = self._read_truth(path, calib, left, truth_noise)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """A folder with KITTI's image folders."""
+        return (
+            path.is_dir()
+            and any((path / f"image_{a}").is_dir() for a in (0, 2))
+            and ((path / "times.txt").is_file() or (path / "calib.txt").is_file())
+        )
+
+    @staticmethod
+    def _cameras(path: Path, colour: bool | None) -> tuple[int, int]:
+        for left, right in ((0, 1), (2, 3)):
+            if colour is not None and colour != (left == 2):
+                continue
+            if (path / f"image_{left}").is_dir() and (path / f"image_{right}").is_dir():
+                return left, right
+        raise SourceError(
+            "has no pair of image folders", where=path, cure="image_0 and image_1 (grey) or image_2 and image_3"
+        )
+
+    @staticmethod
+    def _list_pairs(path: Path, left: int, right: int, known: SourceReport) -> list[PairFiles]:
+        """One pair per line of ``times.txt``, named by index; a file without a line is counted, not guessed."""
+        times = path / "times.txt"
+        if not times.is_file():
+            raise SourceError("no time stamps", where=times, cure="one line of seconds per frame")
+        stamps = read_times(times)
+        folders = (path / f"image_{left}", path / f"image_{right}")
+        names: list[dict[int, Path]] = []
+        for folder in folders:
+            files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdigit())
+            names.append({int(f.stem): f for f in files})
+        if not names[0] or not names[1]:
+            empty = folders[0] if not names[0] else folders[1]
+            raise SourceError("holds no images", where=empty, cure="expected names like 000000.png")
+        surplus = {i for found in names for i in found if i >= len(stamps)}
+        if surplus:
+            known.missing += len(surplus)
+            known.note(f"{len(surplus)} frames have no line in times.txt")
+        suffix = next(iter(names[0].values())).suffix
+        return [
+            PairFiles(int(t), *(found.get(i, folder / f"{i:06d}{suffix}") for found, folder in zip(names, folders)))
+            for i, t in enumerate(stamps)
+        ]
+
+    @staticmethod
+    def _read_truth(path: Path, calib: Path, left: int, noise: TruthNoise) -> TruthLog | None:
+        candidates = (path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt")
+        file = next((c for c in candidates if c.is_file()), None)
+        if file is None:
+            return None
+        T_world_cam0 = read_kitti_poses(file)
+        stamps = read_times(path / "times.txt")
+        if len(T_world_cam0) != len(stamps):
+            raise SourceError(
+                f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt",
+                where=file,
+                cure="KITTI poses have no stamps: both files must have one line per frame",
+            )
+        grows = growing(stamps)
+        return carry(Trajectory(stamps[grows], T_world_cam0[grows]), left_camera_offset(calib, left), noise)
