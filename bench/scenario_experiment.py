@@ -29,7 +29,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
 from gpvo.sim.scenario import load_scenario, points_scenario
-from gpvo.stats.bootstrap import Interval, sequence_bootstrap
+from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.twin.replicate import TwinSettings, make_twins
 
 from bench.experiment_flights import Campaign, check_numbers, experiment_parser, flights, training_runs

@@ -25,7 +25,7 @@ from gpvo.io import open_source
 from gpvo.io.run import Run, read_run
 from gpvo.sim.scenario import load_scenario
 from gpvo.sim.sequence import simulate
-from gpvo.stats.bootstrap import sequence_bootstrap
+from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import Array
 from gpvo.vo.config import make_config
 

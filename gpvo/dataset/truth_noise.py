@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.errors import MotionErrors
 from gpvo.geometry import se3
-from gpvo.stats.bootstrap import block_bootstrap
-from gpvo.stats.series import moving_sums
+from gpvo.stats.series import block_bootstrap, moving_sums
 from gpvo.types import Array, TruthLog, VoLog
 
 ORDER = 3

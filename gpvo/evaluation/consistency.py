@@ -14,8 +14,8 @@ from gpvo.dataset.truth_noise import drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
 from gpvo.learning.methods import score
-from gpvo.stats.bootstrap import Interval, block_bootstrap
 from gpvo.stats.consistency import BLOCKS, by_difficulty, correlation_gain, energy_score, nees, nees_by_block
+from gpvo.stats.series import Interval, block_bootstrap
 from gpvo.types import Array, MotionError, VoLog
 
 HORIZONS_M = (1.0, 10.0, 100.0)

@@ -18,8 +18,8 @@ from gpvo.files import write_csv, write_text
 from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import METHODS
 from gpvo.online.features import AXES
-from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.stats.consistency import BLOCKS
+from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import Array, Status
 
 _UNITS = ("translation_m", "rotation_rad")

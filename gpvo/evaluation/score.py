@@ -27,7 +27,7 @@ from gpvo.io.trajectory import read_tum, write_tum
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import TrainedModel, fold_model
 from gpvo.online.predictor import Predictor
-from gpvo.stats.bootstrap import sequence_bootstrap
+from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog
 
 POOLED = ("energy_translation_m", "energy_rotation_rad", "nll_per_dim", "nees_dof", "correlation_gain_nats")

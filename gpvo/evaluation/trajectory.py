@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gpvo.evaluation.consistency import Consistency
 from gpvo.filters.metrics import ate_rmse, umeyama
 from gpvo.geometry import se3
-from gpvo.stats.bootstrap import Interval, block_bootstrap
 from gpvo.stats.consistency import nees
+from gpvo.stats.series import Interval, block_bootstrap
 from gpvo.types import IMPORTED_POSE, Array, VoLog
 
 SHORT_M, LONG_M = (10.0, 20.0, 50.0, 100.0), tuple(100.0 * k for k in range(1, 9))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.geometry import se3
-from gpvo.stats.bootstrap import Interval, block_bootstrap
 from gpvo.stats.consistency import nees
+from gpvo.stats.series import Interval, block_bootstrap
 from gpvo.types import Array
 
 # A run counts as diverged where the position error passes this share of the path and this many metres.

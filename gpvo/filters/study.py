@@ -25,7 +25,7 @@ from gpvo.filters.policies import (
     Policy,
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
-from gpvo.stats.bootstrap import Interval, sequence_bootstrap
+from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, MotionError, Prediction, VoRecord
 
 Progress = Callable[[str], None]

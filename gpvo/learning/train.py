@@ -38,8 +38,8 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import known_columns
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
-from gpvo.stats.bootstrap import Interval, sequence_bootstrap
 from gpvo.stats.consistency import nees
+from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, Prediction
 
 JUDGED_BLOCKS = 3

@@ -15,7 +15,7 @@ from gpvo.reproduce.models import OTHER, SAME, Studies
 from gpvo.reproduce.rows import Cell, Interval, over_seeds, pooled, squared_ends
 from gpvo.reproduce.stages import Store, Workers
 from gpvo.reproduce.tables import MODES, number, with_interval
-from gpvo.stats.bootstrap import sequence_bootstrap
+from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import Array
 
 _REST_S = 2.9

@@ -22,8 +22,8 @@ from gpvo.online.predictor import Predictor
 from gpvo.reproduce.experiments import Mode, Plan
 from gpvo.reproduce.flights import Flights
 from gpvo.reproduce.stages import Store, Workers, digest_of
-from gpvo.stats.bootstrap import sequence_bootstrap
 from gpvo.stats.consistency import nll_per_dim
+from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import Array
 
 Lacking = Literal["", "imu", "geometry"]

@@ -19,7 +19,7 @@ from gpvo.geometry import se3
 from gpvo.sim import sequence_plan
 from gpvo.sim.imu import Motion
 from gpvo.sim.scenario import Scenario
-from gpvo.sim.worlds.world import World, check_ranges
+from gpvo.sim.worlds import World, check_ranges
 from gpvo.types import Array
 
 Image = NDArray[np.float32]

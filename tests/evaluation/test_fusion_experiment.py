@@ -17,7 +17,7 @@ from gpvo.filters.metrics import Scores
 from gpvo.filters.study import Study
 from gpvo.geometry import se3
 from gpvo.io.run import Run, read_run, write_run
-from gpvo.stats.bootstrap import Interval
+from gpvo.stats.series import Interval
 from gpvo.types import Status, TruthLog, VoLog, VoRecord
 
 

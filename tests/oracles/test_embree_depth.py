@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
-from gpvo.sim.worlds import tunnel
-from gpvo.sim.worlds.world import World
+from gpvo.sim.worlds import World, tunnel
 
 pytest.importorskip("numba")
 rtcore = pytest.importorskip("embreex.rtcore_scene")

@@ -17,7 +17,8 @@ from gpvo.online.base import COASTED, BaseVariance, Velocities, base_columns
 from gpvo.online.division import PARTS, Division
 from gpvo.online.estimate import ErrorModel
 from gpvo.online.projected import ProjectedGP
-from gpvo.publish.export import export_model, to_c, to_onnx
+from gpvo.publish.export import export_model, to_c
+from gpvo.publish.onnx import to_onnx
 from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner

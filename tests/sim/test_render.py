@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.errors import GpvoError
+from gpvo.sim.worlds import Lighting, Mesh, World
 from gpvo.sim.worlds.shapes import rectangle, vertex_normals
-from gpvo.sim.worlds.world import Lighting, Mesh, World
 
 pytest.importorskip("numba")
 from gpvo.sim.render import StereoRenderer

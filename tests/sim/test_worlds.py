@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds import build_world, cache_folder, load_world, tunnel
+from gpvo.sim.worlds import TriangleDistance, World, build_world, cache_folder, load_world, tunnel
 from gpvo.sim.worlds.shapes import grid_faces, icosphere, rectangle, vertex_normals
-from gpvo.sim.worlds.world import TriangleDistance, World
 
 SMALL = {
     "tunnel": {"length": 30.0, "step": 0.25, "curve": "curved", "smooth_stretches": 1},

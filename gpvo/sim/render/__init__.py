@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gpvo.cameras.models import CameraModel
 from gpvo.errors import MissingExtraError
 from gpvo.sim.render.scene import RayTable, Scene
-from gpvo.sim.worlds.world import World
+from gpvo.sim.worlds import World
 from gpvo.types import Array
 
 Image = NDArray[np.float32]

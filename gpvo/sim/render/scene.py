@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.errors import GpvoError
-from gpvo.sim.worlds.world import LightMap, Mesh, World
+from gpvo.sim.worlds import LightMap, Mesh, World
 from gpvo.types import Array
 
 F32 = NDArray[np.float32]

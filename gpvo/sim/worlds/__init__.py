@@ -1,4 +1,7 @@
-"""Procedural worlds: a mine tunnel, the moon, a motion-capture hall. Built from a seed, kept in a cache."""
+"""Procedural worlds: a mine tunnel, the moon, a motion-capture hall. Built from a seed, kept in a cache.
+
+A world is one textured, baked mesh and what paths and vehicles need to know about it.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +10,218 @@ import inspect
 import json
 import os
 import zipfile
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.files import replacing
 from gpvo.io.snapshot import code_digest
-from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World
+from gpvo.types import Array
 
-__all__ = ["KINDS", "HeightGrid", "LightMap", "Lighting", "Mesh", "World", "build_world", "world_parameters"]
-
+F32 = NDArray[np.float32]
 KINDS = ("tunnel", "lunar", "room")
+_NEIGHBOURS = 16
+_CHUNK = 4096
+_LARGEST_BYTES = 2_000_000_000
+_ARRAYS = ("centreline", "start_pose", "bounds")
+
+
+def check_ranges(**given: tuple[float, float, float]) -> None:
+    """Refuse parameters, given as (value, least, most), that are out of range. Raises GpvoError."""
+    for name, (value, low, high) in given.items():
+        if not low <= value <= high:
+            raise GpvoError(f"{name} = {value} is not between {low} and {high}")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles seen from the side on which they run counter-clockwise.
+
+    ``vertices`` (V, 3) [m], ``normals`` (V, 3), ``uv`` (V, 2) in texture tiles, ``light`` (V,) irradiance of the
+    world's fixed lamps or sun, ``albedo`` (V,) factor on the texture that also holds ambient occlusion (all float32);
+    ``faces`` (F, 3) int32; ``material`` (F,) uint8, index of a face's texture.
+    """
+
+    vertices: F32
+    normals: F32
+    uv: F32
+    light: F32
+    albedo: F32
+    faces: NDArray[np.int32]
+    material: NDArray[np.uint8]
+
+    @classmethod
+    def of(
+        cls, vertices: Array, normals: Array, uv: Array, light: Array, albedo: Array, faces: NDArray[np.integer],
+        material: NDArray[np.integer],
+    ) -> Mesh:  # fmt: skip
+        """A mesh from arrays of any number type."""
+        V, N, UV, L, A = (np.ascontiguousarray(a, dtype=np.float32) for a in (vertices, normals, uv, light, albedo))
+        return cls(V, N, UV, L, A, faces.astype(np.int32), material.astype(np.uint8))
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light that is not baked. ``ambient``: irradiance from everywhere. ``head_lamp``: radiant intensity of a lamp at
+    the camera, 0 for none."""
+
+    ambient: float = 0.01
+    head_lamp: float = 0.0
+
+
+@dataclass(frozen=True)
+class LightMap:
+    """Fine shadows on one material: ``image`` (H, W) uint8, 255 in full light, over a rectangle of its texture plane.
+
+    Texel centres lie at ``uv = origin + (column + 0.5, row + 0.5) * texel``; outside, full light.
+    """
+
+    image: NDArray[np.uint8]
+    origin: tuple[float, float]
+    texel: float
+    material: int
+
+
+@dataclass(frozen=True)
+class World:
+    """A built world. z is up, lengths in metres.
+
+    ``textures``: one (n, n) uint8 image per material, tileable, n a power of two; grey 255 is albedo 1 after squaring.
+    ``centreline`` (N, 3): a line one can fly or drive along. ``start_pose`` (4, 4): body (FLU) at its beginning.
+    ``bounds`` (2, 3): corners of the box in which paths may run. ``ground``: heights of the terrain without boulders,
+    None where there is none.
+    """
+
+    kind: str
+    seed: int
+    params: Mapping[str, Any]
+    mesh: Mesh
+    textures: tuple[NDArray[np.uint8], ...]
+    lighting: Lighting
+    centreline: Array
+    start_pose: Array
+    bounds: Array
+    ground: HeightGrid | None = None
+    light_map: LightMap | None = None
+
+    @cached_property
+    def _distance(self) -> TriangleDistance:
+        return TriangleDistance(self.mesh.vertices, self.mesh.faces)
+
+    def clearance(self, points: Array) -> Array:
+        """Distance (N,) [m] of points (N, 3) to the nearest surface, negative inside rock, ground or a wall."""
+        return self._distance.signed(np.asarray(points, dtype=np.float64).reshape(-1, 3))
+
+
+@dataclass(frozen=True)
+class HeightGrid:
+    """Heights (rows along y, columns along x) [m] on a square grid: ``x = x0 + column * cell``, ``y`` likewise."""
+
+    z: F32
+    x0: float
+    y0: float
+    cell: float
+
+    def __call__(self, x: Array, y: Array) -> Array:
+        """Height on the two triangles of each cell, split from (0, 1) to (1, 0) as the mesh is.
+
+        Raises
+        ------
+        GpvoError
+            Outside the grid.
+        """
+        rows, columns = self.z.shape
+        u, v = (np.asarray(x) - self.x0) / self.cell, (np.asarray(y) - self.y0) / self.cell
+        if not ((u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)).all():
+            raise GpvoError("a height was asked for outside the terrain", cure="keep the path within World.bounds")
+        j = np.clip(u.astype(int), 0, columns - 2)
+        i = np.clip(v.astype(int), 0, rows - 2)
+        u, v = u - j, v - i
+        z = self.z.astype(np.float64)
+        z00, z10, z01, z11 = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
+        lower = z00 + u * (z10 - z00) + v * (z01 - z00)
+        upper = z11 + (1 - u) * (z01 - z11) + (1 - v) * (z10 - z11)
+        return np.where(u + v <= 1, lower, upper)
+
+
+class TriangleDistance:
+    """Distance to the nearest of a mesh's triangles, found among those whose centres are near.
+
+    Triangles of each class of size are searched apart, lest many small ones hide a large one.
+    ``vertices`` (V, 3), ``faces`` (F, 3), visible from the side of positive distance.
+    """
+
+    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+        self._corners = vertices[faces].astype(np.float64)
+        centre = self._corners.mean(axis=1)
+        size = np.linalg.norm(self._corners - centre[:, None], axis=2).max(axis=1)
+        size_class = np.floor(np.log2(np.maximum(size, 1e-6)) / 1.5)
+        self._members = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
+        self._trees = [cKDTree(centre[members]) for members in self._members]
+
+    def signed(self, points: Array) -> Array:
+        """(N, 3) to (N,) [m], positive on the visible side."""
+        parts = [self._signed(points[k : k + _CHUNK]) for k in range(0, len(points), _CHUNK)]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def _signed(self, points: Array) -> Array:
+        found = []
+        for tree, members in zip(self._trees, self._members):
+            count = min(_NEIGHBOURS, len(members))
+            found.append(members[tree.query(points, k=count)[1].reshape(len(points), count)])
+        index = np.concatenate(found, axis=1)
+        a, b, c = np.moveaxis(self._corners[index], 2, 0)
+        nearest = _closest_on_triangles(points[:, None], a, b, c)
+        offset = points[:, None] - nearest
+        distance = np.linalg.norm(offset, axis=-1)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+        # Several triangles share an edge or a corner: the one seen most squarely says which side it is.
+        side = (offset * normal).sum(axis=-1)
+        best = distance.min(axis=1, keepdims=True)
+        side = np.where(distance <= best + 1e-9 + 1e-6 * best, side, 0.0)
+        winner = np.abs(side).argmax(axis=1)
+        sign = np.where(side[np.arange(len(points)), winner] < 0, -1.0, 1.0)
+        return sign * best[:, 0]
+
+
+def _closest_on_triangles(p: Array, a: Array, b: Array, c: Array) -> Array:
+    """Nearest point of triangles ``a b c`` to ``p``, all (..., 3).
+
+    Christer Ericson, Real-Time Collision Detection (2005), section 5.1.5.
+    """
+    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
+    d1, d2 = (ab * ap).sum(-1), (ac * ap).sum(-1)
+    d3, d4 = (ab * bp).sum(-1), (ac * bp).sum(-1)
+    d5, d6 = (ab * cp).sum(-1), (ac * cp).sum(-1)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+
+    def ratio(x: Array, y: Array) -> Array:
+        return x / np.where(np.abs(y) > 1e-300, y, 1e-300)
+
+    total = ratio(np.ones_like(va), va + vb + vc)
+    v, w = vb * total, vc * total
+    rules = (
+        ((va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0), 1 - ratio(d4 - d3, d4 - d3 + d5 - d6), None),
+        ((vb <= 0) & (d2 >= 0) & (d6 <= 0), 0.0, ratio(d2, d2 - d6)),
+        ((d6 >= 0) & (d5 <= d6), 0.0, 1.0),
+        ((vc <= 0) & (d1 >= 0) & (d3 <= 0), ratio(d1, d1 - d3), 0.0),
+        ((d3 >= 0) & (d4 <= d3), 1.0, 0.0),
+        ((d1 <= 0) & (d2 <= 0), 0.0, 0.0),
+    )
+    for where, new_v, new_w in rules:
+        v = np.where(where, new_v, v)
+        w = np.where(where, 1 - v if new_w is None else new_w, w)
+    return a + v[..., None] * ab + w[..., None] * ac
 
 
 def world_parameters(kind: str) -> dict[str, object]:
@@ -54,12 +254,8 @@ def build_world(kind: str, seed: int, **params: object) -> World:
         return load_world(path)
     world: World = import_module(f"gpvo.sim.worlds.{kind}").build(seed, **full)
     with suppress(OSError, SourceError):  # a full or read-only home costs time at the next run, nothing else
-        save_world(world, path)
+        _save_world(world, path)
     return world
-
-
-_LARGEST_BYTES = 2_000_000_000
-_ARRAYS = ("centreline", "start_pose", "bounds")
 
 
 def cache_folder() -> Path:
@@ -68,7 +264,7 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "gpvo" / "worlds"
 
 
-def save_world(world: World, path: Path) -> None:
+def _save_world(world: World, path: Path) -> None:
     """Write a world atomically.
 
     Raises

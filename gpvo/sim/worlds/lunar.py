@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from gpvo.sim.worlds import HeightGrid, Lighting, LightMap, Mesh, World, check_ranges
 from gpvo.sim.worlds.shapes import Baker, Parts, add_stone, grid_faces, icosphere
 from gpvo.sim.worlds.textures import fractal, lattice, regolith, rock, spectral
-from gpvo.sim.worlds.world import HeightGrid, Lighting, LightMap, Mesh, World, check_ranges
 from gpvo.types import Array
 
 _TILE_M = 2.5

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpvo.sim.worlds import Lighting, Mesh, World, check_ranges
 from gpvo.sim.worlds.shapes import Baker, Parts, rectangle
 from gpvo.sim.worlds.textures import F32, Texture, encode, spectral
-from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
 
 _TEXTURE_PX = 1024

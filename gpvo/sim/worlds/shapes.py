@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import MissingExtraError
-from gpvo.sim.worlds.world import F32, Mesh
+from gpvo.sim.worlds import F32, Mesh
 from gpvo.types import Array
 
 Faces = NDArray[np.int32]

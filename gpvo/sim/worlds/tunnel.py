@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
+from gpvo.sim.worlds import Lighting, Mesh, World, check_ranges
 from gpvo.sim.worlds.shapes import Baker, Parts
 from gpvo.sim.worlds.textures import duct, fractal, gravel, lattice, rock, shotcrete
 from gpvo.sim.worlds.tubes import Line, Tube, bolts, lamp_fixtures, pipe, rough_tube, rubble
-from gpvo.sim.worlds.world import Lighting, Mesh, World, check_ranges
 from gpvo.types import Array
 
 _RADIUS_M = 2.6

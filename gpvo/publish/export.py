@@ -1,4 +1,6 @@
-"""The predictor as one C header: arrays as constants, then plain C99 that needs ``math.h`` alone."""
+"""A trained model for machines without Python: an ONNX graph, by :mod:`gpvo.publish.onnx`, or one C header: arrays as
+constants, then plain C99 that needs ``math.h`` alone.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,12 @@ from gpvo.errors import GpvoError
 from gpvo.files import write_text
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
+from gpvo.online.predictor import Predictor
 from gpvo.online.stored import LARGEST
+from gpvo.publish.onnx import to_onnx
 
+SUFFIXES = {"onnx": ".onnx", "c": ".h"}
+FORMATS = tuple(SUFFIXES)
 PREFIX = "gpvo"
 """Of every symbol, unless another is asked for."""
 _PER_LINE = 8
@@ -30,6 +36,45 @@ _KEYWORDS = (
 )
 # What a comment may hold of a model file's text: nothing that could end it.
 _NOT_IN_COMMENTS = re.compile(r"[^A-Za-z0-9_./^,;:=() -]")
+
+
+def format_of(to: str | None, path: str | os.PathLike[str] | None) -> str:
+    """The format ``to``, else that which the name ``path`` tells; GpvoError where there is none or they contradict."""
+    told = next((f for f in FORMATS if path is not None and Path(path).suffix.lower() == SUFFIXES[f]), None)
+    chosen = to or told
+    if chosen is None:
+        raise GpvoError("the format is not given", cure=f"--to with one of: {', '.join(FORMATS)}")
+    if chosen not in FORMATS:
+        raise GpvoError(f"cannot export to '{chosen}'", cure=f"one of: {', '.join(FORMATS)}")
+    if told not in (None, chosen):
+        raise GpvoError(f"is not a file name for --to {chosen}", where=path, cure=f"use --to {told}, or another -o")
+    return chosen
+
+
+def export_model(
+    model: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    to: str,
+    *,
+    prefix: str = PREFIX,
+) -> None:
+    """Write the model file ``model`` as ``to`` ("onnx" or "c").
+
+    ``prefix``: of every symbol in C, so that one program can hold several models. GpvoError for other formats or names,
+    a prefix that is no C identifier, or a bad file.
+    """
+    to = format_of(to, path)
+    if prefix != PREFIX and to != "c":
+        raise GpvoError(f"{to} has no symbols that a prefix '{prefix}' could go before", cure="give it with c alone")
+    predictor = Predictor.load(model)
+    units = tuple(str(u) for u in predictor.header.get("units") or ())
+    if to == "c":
+        note = f"Model file SHA-256: {predictor.digest}"
+        to_c(predictor.model, path, name=prefix, units=units, note=note)
+    else:
+        metadata = {"digest": predictor.digest, "units": ",".join(units)}
+        metadata["nu"] = f"{float(predictor.model.nu[0]):g}"
+        to_onnx(predictor.model, path, metadata=metadata)
 
 
 def to_c(
@@ -48,7 +93,7 @@ def to_c(
     """
     if not _NAME.fullmatch(name) or f" {name} " in _KEYWORDS:
         raise GpvoError(f"the prefix {name!r} is no C identifier", cure="a letter first, then letters, digits, _")
-    template = files("gpvo.publish.export").joinpath("predictor.c").read_text(encoding="utf-8")
+    template = files("gpvo.publish").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
     code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
     write_text(Path(path), code)
