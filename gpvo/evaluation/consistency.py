@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import PoseError
-from gpvo.dataset.errors import MotionErrors
-from gpvo.dataset.truth_noise import drift_variance
+from gpvo.dataset.errors import MotionErrors, drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
 from gpvo.learning.methods import score
@@ -93,7 +92,7 @@ def consistency(
     """Scores of one method, None where it says nothing about any motion with truth.
 
     ``T_true`` (N, 4, 4) and ``known`` (N,): truth at the log's stamps. ``noise_sigma`` (6,): of its poses [m, rad].
-    ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.truth_noise.velocity_path`).
+    ``by_velocity`` (N, 3): where the truth's own velocities lead (:func:`gpvo.dataset.errors.velocity_path`).
     """
     C = statement.covariance[errors.index]
     stated = np.isfinite(C).all(axis=(1, 2))

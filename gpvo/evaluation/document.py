@@ -42,8 +42,9 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
       as counted in: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
-      (:mod:`gpvo.dataset.truth_noise`), whichever is more. ``truth_sigma_axes``: by axis, x y z [m], then [rad].
-      ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion; None: nowhere.
+      (:func:`gpvo.dataset.errors.estimate_truth_noise`), whichever is more. ``truth_sigma_axes``: by axis, x y z [m],
+      then [rad]. ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion;
+      None: nowhere.
     * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None where it
       does not matter; ``error_change``: relative change of the errors over a second without it.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each

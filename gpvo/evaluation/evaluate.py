@@ -11,9 +11,15 @@ from numpy.typing import NDArray
 from gpvo.dataset.build import align_rotation, predictions_of
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
-from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
+from gpvo.dataset.errors import (
+    MotionErrors,
+    estimate_truth_noise,
+    interpolate_truth,
+    motion_errors,
+    telling_distance_m,
+    velocity_path,
+)
 from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
-from gpvo.dataset.truth_noise import estimate_truth_noise, telling_distance_m, velocity_path
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
