@@ -106,7 +106,7 @@ class Frontend(Protocol):
         """
 
 
-class _TrackFrontend:
+class TrackFrontend:
     """For stereo tracks: points are matched by their identity."""
 
     def __init__(self, rig_error: RigError, config: VoConfig) -> None:
@@ -158,7 +158,7 @@ class _Features:
     bits: NDArray[np.uint8]
 
 
-class _DescriptorFrontend:
+class DescriptorFrontend:
     """Every frame is detected, described and matched afresh (D. Ross, thesis, chapter 2)."""
 
     def __init__(
@@ -214,26 +214,6 @@ class _DescriptorFrontend:
         config = self._config
         uv = opencv.corners(image, config.max_features, config.corner_quality, config.min_distance_px, self._mask)
         return opencv.describe(image, uv)
-
-
-def make_frontend(
-    frame: StereoFrame | TrackFrame,
-    camera: StereoCamera,
-    rig_error: RigError,
-    config: VoConfig,
-    mask: NDArray[np.bool_] | None,
-) -> Frontend:
-    """The front end for this kind of frame and preset."""
-    if isinstance(frame, TrackFrame):
-        return _TrackFrontend(rig_error, config)
-    if config.preset == "thesis":
-        from gpvo.vo.frontend import _DescriptorFrontend
-
-        return _DescriptorFrontend(camera, rig_error, config, mask)
-    # Imported here, as it is itself made of what this module defines.
-    from gpvo.vo.klt import KltFrontend
-
-    return KltFrontend(camera, rig_error, config, mask)
 
 
 class TrackRecorder:

@@ -12,7 +12,8 @@ from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFr
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
-from gpvo.vo.frontend import EMPTY, Followed, Frontend, Matches, make_frontend
+from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
+from gpvo.vo.klt import KltFrontend
 from gpvo.vo.motion import Motion, refine, whitened
 from gpvo.vo.points import triangulate
 from gpvo.vo.quality import (
@@ -86,9 +87,7 @@ class StereoOdometry:
         """
         clock = Stopwatch()
         check_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
-        frontend = self._frontend = self._frontend or make_frontend(
-            frame, self.camera, self.rig_error, self.config, self._mask
-        )
+        frontend = self._frontend = self._frontend or self._new_frontend(frame)
         seen = frontend.observe(frame)
         clock.lap("observe")
         if self._state is None:
@@ -128,6 +127,13 @@ class StereoOdometry:
             **stats_fields(seen.stats),
             **sensed.fields(),
         )
+
+    def _new_frontend(self, frame: StereoFrame | TrackFrame) -> Frontend:
+        """The front end for this kind of frame and preset."""
+        if isinstance(frame, TrackFrame):
+            return TrackFrontend(self.rig_error, self.config)
+        kind = DescriptorFrontend if self.config.preset == "thesis" else KltFrontend
+        return kind(self.camera, self.rig_error, self.config, self._mask)
 
     def _solve(self, guess: Array, clock: Stopwatch) -> tuple[Matches, Motion | None]:
         """Match near the guess; if too little agrees, match without it and keep the better."""
