@@ -40,7 +40,7 @@ def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]
 def examine_topic(
     wire: str, topic: str, msgtype: str, seconds: float, address: str | None = None, domain: int = 0
 ) -> list[Finding]:
-    """Findings of what a running system publishes in so many ``seconds``. GpvoError where nothing comes."""
+    """Findings about what a running system publishes within ``seconds``. GpvoError if nothing is received."""
     link, mailbox, stop = open_wire(wire, address, domain), Mailbox(_DEPTH), threading.Event()
     kept: list[Any] = []
     try:
@@ -53,5 +53,5 @@ def examine_topic(
     finally:
         link.close()
     if not kept:
-        raise GpvoError(f"nothing came on '{topic}' in {seconds:g} s", cure="is it published, and of that type?")
+        raise GpvoError(f"nothing received on '{topic}' in {seconds:g} s", cure="is it published, and of that type?")
     return examine(Stated.of(kept))
