@@ -100,7 +100,7 @@ def evaluate(
 
 
 def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path | None, plots: Path | None) -> None:
-    """Whatever folder is given."""
+    """Write to whichever folders are given."""
     if stated is not None:
         from gpvo.evaluation.score import write_statements
 
@@ -166,7 +166,7 @@ def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor
 
 
 def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> list[Evaluation]:
-    """``unjudged``: runs without truth are shown and not refused."""
+    """``unjudged``: runs without truth are shown instead of refused."""
     from gpvo.evaluation.evaluate import evaluate_run, unjudged_run
 
     options = judge.options()
@@ -196,7 +196,7 @@ def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
 def _with_twins(
     runs: list[Run], predictor: Predictor | None, options: EvaluateOptions, settings: TwinSettings
 ) -> tuple[list[dict[str, Any]], list[Evaluation]]:
-    """Documents of the runs, and the evaluations behind them: of a run with truth its own, else those of its twins."""
+    """Documents of the runs, and the evaluations behind them: a run's own if it has truth, else those of its twins."""
     from tempfile import TemporaryDirectory
 
     from gpvo.cli.twin import make_all

@@ -203,7 +203,7 @@ def _frames(paths: list[Path]) -> int:
 
 
 def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
-    """Runs that do not fit into memory together: their rows go through a file, one run at a time."""
+    """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
     import tempfile
 
     from gpvo.dataset.table import write_sets

@@ -156,7 +156,7 @@ def forecast(
 
 
 def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
-    """The result as scripts read it: SI units, positions in the axes of the plan's world, 1 sigma."""
+    """The result for scripts: SI units, positions in the axes of the plan's world, 1 sigma."""
     return {
         "schema": 1,
         "model": str(model),
@@ -188,7 +188,7 @@ def _columns(f: Forecast) -> dict[str, Any]:
 
 
 def _rows(f: Forecast) -> list[dict[str, float]]:
-    """A few poses for a short table, evenly in time, the last among them."""
+    """A few poses for a short table, evenly spaced in time and including the last."""
     from numpy import linspace
 
     columns, n = _columns(f), len(f.plan.t_s)

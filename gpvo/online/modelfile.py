@@ -16,8 +16,8 @@ Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers 
   :class:`gpvo.online.estimate.ErrorModel`;
 * ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
-* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.learning.thesis.ThesisModel`; all that a model of positions
-  holds;
+* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.learning.thesis.ThesisModel`; all that a model of
+  positions holds;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.learning.sample.TrainingSample`.
 """
 
