@@ -4,9 +4,9 @@ Both describe one rigid body, so their motions A (log) and B (truth) over the sa
 unknown ``X = T_log_truth`` (Y. Shiu, S. Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
 transform equations of the form AX = XB", 1989).
 
-A truth may err by a constant itself: where its positions and its attitudes come from different instruments, as in
-motion capture, each may have a world of its own, turned against the other. No X mends that: the turns ask for one, the
-directions of travel for another. The rotation between the two worlds is then fitted as well.
+A ground truth may itself have a constant error: if its positions and its attitudes come from different instruments, as
+in motion capture, each may have a world of its own, rotated relative to the other. No X corrects that: the turns
+require one, the directions of travel another. The rotation between the two worlds is then fitted as well.
 """
 
 from __future__ import annotations

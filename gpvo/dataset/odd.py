@@ -1,11 +1,11 @@
 """Stretches in which odometry and truth differ as nowhere else in the sequence: one of the two is wrong.
 
-A model that learnt from them would be timid everywhere.
+A model that learned from them would be too cautious everywhere.
 
 Two differences are looked for, each against its own median and spread in the sequence (by the median absolute
-deviation): the share of the true motion that odometry shows, where what it says of its own noise does not explain it;
-and the direction of travel, as of a truth that climbs while the vehicle does not. Which of the two is wrong is for the
-user to say.
+deviation): the share of the true motion that odometry shows, if its own stated noise does not explain it; and the
+direction of travel, as when the truth climbs while the vehicle does not. Which of the two is wrong is for the user to
+decide.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Where a vehicle stands and its truth does not: what the truth then says of odometry's error is the truth's own.
+"""Waits during which the vehicle stands still but its truth does not: the apparent error of odometry is the truth's.
 
 Satellite positions wander by decimetres while a car waits at a light, and odometry, which sees that nothing moves,
-would be charged with it. Whether the vehicle stands is said by image and IMU together: odometry that is blind to a
-motion does not deceive a gyroscope.
+would be blamed for it. Image and IMU together decide whether the vehicle stands still: a motion to which odometry is
+blind does not escape a gyroscope.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """The white noise of a truth's poses, estimated beside an odometry that does not share it.
 
-Jitter of stamps, GPS/INS and motion capture put noise n_k on each pose, so that a true motion m_k is told as
-``u_k = m_k + n_k - n_(k-1)``. An odometry says ``m_k`` and errs in its own way. High-passed until little is left of
-m_k, what the truth has and the odometry lacks is the truth's noise: ``Cov(u, u - odometry)`` holds its variance,
-whatever noise, jitter included, the odometry has of its own (two instruments of one quantity: F. E. Grubbs, "On
+Jitter of stamps, GPS/INS and motion capture put noise n_k on each pose, so that a true motion m_k is reported as
+``u_k = m_k + n_k - n_(k-1)``. Odometry reports ``m_k`` with errors of its own. High-passed until little is left of
+m_k, what the truth has and the odometry lacks is the truth's noise: ``Cov(u, u - odometry)`` gives its variance,
+whatever noise, jitter included, the odometry itself has (two instruments for one quantity: F. E. Grubbs, "On
 estimating precision of measuring instruments and product variability", 1948).
 
-Positions of GPS/INS also drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show it;
-a third instrument can: a truth that measures velocities too tells each displacement twice, and where the two differ it
-is wrong in one of them. ``Cov(positions - velocities, positions - odometry)`` is the variance of the positions.
+GPS/INS positions also drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show this,
+but a third instrument can: a truth that also measures velocities gives each displacement twice, and where the two
+differ, one is wrong. ``Cov(positions - velocities, positions - odometry)`` is the variance of the positions.
 """
 
 from __future__ import annotations

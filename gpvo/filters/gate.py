@@ -1,4 +1,4 @@
-"""The chi-square gate: when a measurement disagrees with the filter by more than both admit."""
+"""The chi-square gate: when a measurement disagrees with the filter by more than both allow."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """MAVLink 2 for flight controllers: ODOMETRY, VISION_SPEED_ESTIMATE and HEARTBEAT, to a file, UDP or serial.
 
-FRD and NED live in this module and :mod:`gpvo.publish.ros` alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w,
-x, y, z, upper triangles row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
+FRD and NED occur only in this module and in :mod:`gpvo.publish.ros`. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion
+w, x, y, z, upper triangles row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
 """
 
 from __future__ import annotations

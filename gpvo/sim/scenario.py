@@ -1,5 +1,5 @@
-"""Scenarios: what is flown, where, with which sensors and faults. One validated set of values, kept as small TOML; and
-their flights, one or many, on the cores of this machine or on a dask cluster."""
+"""Scenarios: what is flown, where, with which sensors and faults, as one validated set of values in a small TOML file;
+and their flights, one or many, on the cores of this machine or on a dask cluster."""
 
 from __future__ import annotations
 

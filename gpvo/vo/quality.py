@@ -1,4 +1,4 @@
-"""When can a motion be believed? No motion is ever invented silently."""
+"""When can a motion be trusted? No motion is ever made up silently."""
 
 from __future__ import annotations
 
