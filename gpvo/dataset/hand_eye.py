@@ -174,11 +174,11 @@ def _start(A: Array, B: Array) -> Array:
             limit = np.minimum(1.0, 3 * size / np.maximum(np.linalg.norm(a, axis=1), 1e-12))
             pairs.append((a * limit[:, None] / size, b / size))
     if not pairs:
-        raise GpvoError("the motions do not show how the frames are turned", cure="use a log that moves")
+        raise GpvoError("the motions do not show how the frames are rotated", cure="use a log that moves")
     M = sum((a.T @ b for a, b in pairs), np.zeros((3, 3)))
     U, S, Vt = np.linalg.svd(M)
     if S[1] < 1e-4 * S[0]:
-        raise GpvoError("the motions do not show how the frames are turned", cure="use a log that turns as well")
+        raise GpvoError("the motions do not show how the frames are rotated", cure="use a log that turns as well")
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return se3.from_rt(R, np.zeros(3))
 

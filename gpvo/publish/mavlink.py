@@ -188,7 +188,7 @@ class Link:
         if kind not in ("udp", "serial") or not place or not number.isdecimal():
             raise GpvoError(f"'{self.address}' is not an address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
         if kind == "udp" and not 1 <= int(number) <= 65535:
-            raise GpvoError(f"'{self.address}' has no port of UDP", cure="give one of 1 to 65535")
+            raise GpvoError(f"'{self.address}' has no valid UDP port", cure="give one of 1 to 65535")
         self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))
 
     def send(self, odometry: Odometry) -> None:

@@ -196,7 +196,7 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
             cure=f"choose from {', '.join(CAMERAS)}, or give a file of Kalibr, OpenCV, ROS or KITTI, or a run",
         )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
-        raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")
+        raise GpvoError("path = waypoints needs at least two places", where=where, cure="waypoints = [[x, y, z], ...]")
     if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:
         raise GpvoError("late_s is longer than the time between frames", where=where)
     return scenario

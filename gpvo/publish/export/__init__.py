@@ -43,7 +43,7 @@ def export_model(
     """
     to = format_of(to, path)
     if prefix != PREFIX and to != "c":
-        raise GpvoError(f"{to} has no symbols that a prefix '{prefix}' could go before", cure="give it with c alone")
+        raise GpvoError(f"{to} has no symbols for a prefix '{prefix}' to go before", cure="give it only with c")
     predictor = Predictor.load(model)
     units = tuple(str(u) for u in predictor.header.get("units") or ())
     if to == "c":

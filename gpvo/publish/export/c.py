@@ -47,7 +47,7 @@ def to_c(
     is no C identifier.
     """
     if not _NAME.fullmatch(name) or f" {name} " in _KEYWORDS:
-        raise GpvoError(f"the prefix {name!r} is no C identifier", cure="a letter first, then letters, digits, _")
+        raise GpvoError(f"the prefix {name!r} is not a C identifier", cure="a letter first, then letters, digits, _")
     template = files("gpvo.publish.export").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
     code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
