@@ -1,6 +1,6 @@
-"""The whole job on simulated flights: fly, run VO, learn its error, predict on a flight never seen, fuse, report.
+"""The whole workflow on simulated flights: fly, run VO, learn its error, predict on an unseen flight, fuse, report.
 
-``make demo`` runs this; it takes about three minutes on two cores. Everything it writes lies in ``out/demo``.
+``make demo`` runs this; it takes about three minutes on two cores. Everything it writes goes to ``out/demo``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def gpvo(*arguments: object) -> None:
 
 
 def main() -> None:
-    """Five flights down a tunnel in which seeing goes wrong now and then; the last one is the test."""
+    """Five flights down a tunnel in which vision fails now and then; the last one is the test."""
     began = time.monotonic()
     print("simulating five flights of 40 s (stereo tracks and IMU, no images)", flush=True)
     for seed in (*TRAINING, UNSEEN):
@@ -37,7 +37,7 @@ def main() -> None:
     gpvo("fuse", unseen, "--model", model, "--plot", OUT / "fuse.png")
     gpvo("report", unseen, "--model", model, "-o", OUT / "report.html")
     gpvo("evaluate", unseen, "--model", model, "--plots", OUT / "pictures")
-    print(f"\n{time.monotonic() - began:.0f} s; the page to open: {OUT / 'report.html'}")
+    print(f"\n{time.monotonic() - began:.0f} s; now open {OUT / 'report.html'}")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """gpvo tells your filter how wrong stereo visual odometry is, right now.
 
-The names below are what gpvo promises to keep; they are loaded when first asked for.
+The names below are those that gpvo promises to keep; they are loaded on first use.
 
 * :func:`open_source`: frames of a recording, whatever its format. :class:`StereoCamera`, :class:`StereoFrame`.
 * :class:`StereoOdometry`: visual odometry; each frame gives a :class:`VoRecord`.
 * :class:`Predictor`: a trained model; each record gives a :class:`Prediction`, which is a :class:`MotionError`.
-* :func:`read_run`, :func:`train`, :func:`evaluate`: a stored run, a model of several, and how right a model is of one.
-* :class:`GpvoError`: what is raised for bad input, in one line.
+* :func:`read_run`, :func:`train`, :func:`evaluate`: a stored run, a model of several runs, and how right it is on one.
+* :class:`GpvoError`: raised for bad input, with a one-line message.
 """
 
 from importlib import import_module

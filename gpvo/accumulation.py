@@ -4,11 +4,11 @@ The error of a pose is ``e_k = Ad(T_k)^-1 e_(k-1) + xi_k``, right perturbation, 
 of a motion ``xi_k = n_k - Ad(T_k)^-1 n_(k-1) + w_k + L_k u_k``. Two-frame VO shares the pixel noise n of each frame
 between two motions, with opposite sign, as if that frame's pose were off by n; w is white; what persists (errors of
 calibration, bias of depth) is ``L u`` with u first-order Gauss-Markov of unit variance (A. Gelb, "Applied Optimal
-Estimation" (1974), section 3.8). So jitter never adds up: a pose holds the last frame's and, from
-afar, the first one's.
+Estimation" (1974), section 3.8). So jitter never adds up: a pose contains that of the last frame
+and, transported along the path, that of the first.
 
-A ``lost`` motion was not made of any frame's pixels: it adds its covariance and shares nothing, and the next motion
-brings the noise of the frame where it starts.
+A ``lost`` motion was not computed from any frame's pixels: it adds its covariance and shares nothing, and the next
+motion brings in the noise of the frame where it starts.
 """
 
 from __future__ import annotations

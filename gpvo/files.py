@@ -148,13 +148,13 @@ def parse_json(text: str) -> Any:
 def _number(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text} is no number of JSON")
+        raise ValueError(f"{text} is not a JSON number")
     return value
 
 
 def _whole(text: str) -> int:
     if len(text) > 20:  # of 64 bits: a longer one overflows where it becomes a float
-        raise ValueError(f"{text[:20]}... is no number of JSON")
+        raise ValueError(f"{text[:20]}... is not a JSON number")
     return int(text)
 
 
@@ -162,7 +162,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Settings of a file. Raises GpvoError where it cannot be read."""
     try:
         if path.stat().st_size > _MAX_TOML_BYTES:
-            raise GpvoError("is larger than 200 kB: no settings", where=path)
+            raise GpvoError("is larger than 200 kB, too large for settings", where=path)
         return parse_toml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as problem:
         raise GpvoError(f"cannot be read as TOML: {problem}", where=path) from None

@@ -107,7 +107,7 @@ def run(
         if writer.kept is not None:
             odometry, recorder = writer.kept.state
             if (odometry.config, odometry.camera) != (config, source.camera):
-                raise ValueError("its state is of other settings")
+                raise ValueError("its state is from other settings")
         for k, step in enumerate(steps(source, config, odometry, done)):
             record = as_stored(step.record if amend is None else amend(step.record))
             prediction = None if predictor is None else predictor.step(record)
@@ -139,7 +139,7 @@ def _gone_on_with(writer: RunWriter) -> Iterator[None]:
             raise
         reason = f"{type(error).__name__}: {error}"
         cure = "remove the folder to start afresh"
-        raise SourceError(f"cannot be gone on with: {reason}", where=writer.path, cure=cure) from error
+        raise SourceError(f"cannot be resumed: {reason}", where=writer.path, cure=cure) from error
 
 
 @dataclass(frozen=True)

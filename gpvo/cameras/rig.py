@@ -105,7 +105,7 @@ def check_pose(T: object, name: str, where: object = None) -> Array:
         raise CalibrationError(f"{name} holds a number that is not finite, or beyond a million", where=where)
     R = M[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(M[3], [0, 0, 0, 1]):
-        raise CalibrationError(f"{name} is not a rigid transform: its rotation block is no rotation", where=where)
+        raise CalibrationError(f"{name} is not a rigid transform: its rotation block is not a rotation", where=where)
     return M if np.abs(R @ R.T - np.eye(3)).max() < 1e-15 else se3.orthonormalise(M)
 
 

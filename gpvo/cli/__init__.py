@@ -1,7 +1,7 @@
-"""The ``gpvo`` command: one file per group of commands, each thin over the library.
+"""The ``gpvo`` command: one file per group of commands, each a thin layer over the library.
 
-Exit code 0; 1 where the answer of ``gpvo check`` is no; 2 with one line that says what is wrong with which file and
-what would mend it.
+Exit codes: 0; 1 if the answer of ``gpvo check`` is no; 2 with one line that says what is wrong with which file and
+how to fix it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _version(show: bool) -> None:
 def _root(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
-    """Options that stand before the command."""
+    """Options that come before the command."""
 
 
 for command in (
@@ -113,14 +113,14 @@ def main() -> None:
 
 
 def _refuse_control_characters(arguments: list[str]) -> None:
-    """The names of files are repeated on the terminal, which would obey what is in them."""
+    """File names are echoed to the terminal, which would obey any control characters in them."""
     for argument in arguments:
         if any(unicodedata.category(c) in ("Cc", "Cs") for c in argument):
             raise GpvoError("a control character in an argument", where=argument, cure="rename the file")
 
 
 def _extra(package: str) -> str:
-    """The extra that brings all that the command at hand needs, not only the first package that it missed."""
+    """The extra that provides all that this command needs, not only the first missing package."""
     of_command = {"run": "vo", "train": "train", "simulate": "sim", "reproduce": "all"}.get(
         sys.argv[1] if sys.argv[1:] else ""
     )

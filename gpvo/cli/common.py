@@ -1,4 +1,4 @@
-"""What commands have in common: ``--config``, ``-q``, ``-v``, the flags that open a sequence, ``--help`` in groups."""
+"""What all commands share: ``--config``, ``-q``, ``-v``, the flags that open a sequence, ``--help`` in groups."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ GROUPS = {
 
 
 class Groups(TyperGroup):
-    """The commands by what one wants to do; options of a file stand before those of the command line."""
+    """The commands grouped by purpose; options from a file come before those of the command line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the options of ``--config FILE`` behind the name of the command, where later ones replace them."""
+        """Put the options of ``--config FILE`` right after the command's name, where later ones override them."""
         name = next((a for a in args if not a.startswith("-")), None)
         command = self.get_command(ctx, name) if name else None
         paths = [w for w, before in zip(args[1:], args) if before == "--config"]
@@ -59,7 +59,7 @@ _OPTIONS = {"config": (Config, None), "quiet": (Quiet, False), "verbose": (Verbo
 
 
 def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that also takes ``--config``, ``-q`` and ``-v``; of a dataclass each field is an option."""
+    """A command that also takes ``--config``, ``-q`` and ``-v``; each field of a dataclass becomes an option."""
 
     @wraps(function)
     def command(**given: Any) -> Any:
@@ -93,9 +93,9 @@ _PLAIN = (str, int, float, bool, list, Path)
 
 
 def options_of_file(path: Path, name: str, command: Any) -> list[str]:
-    """Options of a command and its ``name`` from its table in a TOML file, as words of a command line.
+    """Options of a command called ``name`` from its table in a TOML file, as words of a command line.
 
-    Raises GpvoError: one line for what is no table of a command, no option of it, or no value for it.
+    Raises GpvoError, in one line, for a table that belongs to no command, an unknown option or a bad value.
     """
     from gpvo.files import read_toml
 
@@ -103,7 +103,9 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
     words: list[str] = []
     for key, value in found.items():
         if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
-            raise GpvoError(f"'{key}' names no table of a command", where=path, cure=f"write options under [{name}]")
+            raise GpvoError(
+                f"'{key}' is not the table of any command", where=path, cure=f"write options under [{name}]"
+            )
     known = {word.lstrip("-").replace("-", "_"): p for p in command.params for word in p.opts if word.startswith("--")}
     del known["config"]
     context = command.context_class(command, info_name=name)
@@ -120,7 +122,7 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
             continue
         values = value if isinstance(value, list) else [value]
         if not all(isinstance(v, (str, int, float)) for v in values):
-            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give a text or a number")
+            raise GpvoError(f"[{name}] {key} is {value!r}", where=path, cure="give text or a number")
         texts = [str(v) for v in values]
         try:
             for text in texts:
@@ -132,13 +134,13 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
 
 
 Kind = Annotated[str | None, typer.Option("--source", help="Override the guessed format of the sequence.")]
-Calibration = Annotated[Path | None, typer.Option(help="Calibration file in place of the one found.")]
+Calibration = Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")]
 HfovDeg = Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")]
 Size = Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")]
 MaskLeft = Annotated[Path | None, typer.Option(help="Mask image: the pixels of the left lens that may be used.")]
 MaskRight = Annotated[Path | None, typer.Option(help="The same for the right lens.")]
 Bits = Annotated[int | None, typer.Option(help="Depth of the samples in 16-bit images, e.g. 12.")]
-RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folder whose names are numbers.")]
+RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")]
 PairTolerance = Annotated[
     float | None, typer.Option(help="Largest difference between the stamps of a stereo pair [s].")
 ]
@@ -158,14 +160,14 @@ class VehicleOptions:
         str, typer.Option("--vehicle", help="What carries the camera: car, rover, multirotor, handheld or any.")
     ] = "any"
     max_acceleration: Annotated[
-        float | None, typer.Option(help="Largest acceleration [m/s^2], in place of --vehicle's.")
+        float | None, typer.Option(help="Largest acceleration [m/s^2], overriding --vehicle.")
     ] = None
     max_turn: Annotated[float | None, typer.Option(help="Largest angular acceleration [rad/s^2], likewise.")] = None
 
     def bounds(self) -> Vehicle:
-        """Of the kind of vehicle, or those given in their place.
+        """Those of the kind of vehicle, or the ones given to override them.
 
-        Raises GpvoError where the kind is unknown or a bound is not above 0.
+        Raises GpvoError if the kind is unknown or a bound is not above 0.
         """
         known = VEHICLES[one_of("--vehicle", self.vehicle, tuple(VEHICLES))]
         for flag, value in (("--max-acceleration", self.max_acceleration), ("--max-turn", self.max_turn)):
@@ -177,7 +179,7 @@ class VehicleOptions:
 def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:
     """Options for :func:`gpvo.io.open_source` from the flags; those that were not given are left out.
 
-    Raises GpvoError where ``size`` is not WIDTHxHEIGHT.
+    Raises GpvoError if ``size`` is not WIDTHxHEIGHT.
     """
     options = {name: value for name, value in given.items() if value is not None}
     if size is not None:

@@ -12,10 +12,10 @@ from gpvo.geometry.se3 import path_length_m
 
 
 def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known of it.
+    """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known about it.
 
-    ``kind`` takes the path as a sequence of that format, ``options`` go to its source. Raises GpvoError where the path
-    is nothing gpvo knows, or damaged.
+    ``kind`` treats the path as a sequence of that format, ``options`` go to its source. Raises GpvoError if the path is
+    nothing that gpvo knows, or is damaged.
     """
     if not path.exists():
         raise SourceError("no such file or folder", where=path)

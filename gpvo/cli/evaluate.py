@@ -26,11 +26,11 @@ Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """What runs are judged with."""
+    """How runs are judged."""
 
     model: Annotated[Path | None, typer.Option(help="Error model: adds the rows constant, scaled and learned.")] = None
     truth: Annotated[
-        Path | None, typer.Option(help="Ground truth (TUM lines, left camera) in place of the run's own.")
+        Path | None, typer.Option(help="Ground truth (TUM lines, left camera) to use instead of the run's own.")
     ] = None
     segments: Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")] = None
     truth_sigma: Annotated[
@@ -100,7 +100,7 @@ def evaluate(
 
 
 def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path | None, plots: Path | None) -> None:
-    """Whatever folder is given."""
+    """Write to whichever folders are given."""
     if stated is not None:
         from gpvo.evaluation.score import write_statements
 
@@ -124,7 +124,7 @@ def report(
 ) -> None:
     """Write a report: one HTML page that opens with a verdict.
 
-    A run without ground truth is shown with what was stated of it, unjudged.
+    For a run without ground truth, it shows what was stated, without a judgement.
 
     Example: gpvo report runs/mh01 -o report.html
     """
@@ -166,7 +166,7 @@ def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor
 
 
 def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> list[Evaluation]:
-    """``unjudged``: runs without truth are shown and not refused."""
+    """``unjudged``: runs without truth are shown instead of refused."""
     from gpvo.evaluation.evaluate import evaluate_run, unjudged_run
 
     options = judge.options()
@@ -184,7 +184,7 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
 
 
 def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
-    """At the end as well, where it is read."""
+    """Say it again at the end, where it is read."""
     from gpvo.learning.check import ENOUGH_INSIDE
 
     outside = [e for e in found if e.in_domain is not None and e.in_domain < ENOUGH_INSIDE]
@@ -196,7 +196,7 @@ def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
 def _with_twins(
     runs: list[Run], predictor: Predictor | None, options: EvaluateOptions, settings: TwinSettings
 ) -> tuple[list[dict[str, Any]], list[Evaluation]]:
-    """Documents of the runs, and the evaluations behind them: of a run with truth its own, else those of its twins."""
+    """Documents of the runs, and the evaluations behind them: a run's own if it has truth, else those of its twins."""
     from tempfile import TemporaryDirectory
 
     from gpvo.cli.twin import make_all
@@ -266,12 +266,12 @@ def _print_methods(d: dict[str, Any]) -> None:
     if not table.row_count:
         return
     show(table)
-    say("NEES: per degree of freedom of one motion; 1 is right. _vt: of the translation alone.")
+    say("NEES: per degree of freedom, for one motion; 1 is right. _vt: for the translation alone.")
     say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
-    say("NLL: nats per axis of a Gaussian; stated: of the stated density, where it has heavier tails.")
+    say("NLL: nats per axis, as a Gaussian; stated: by the stated density, where it has heavier tails.")
     if noisy:
         noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose and axis"
-        say(f"+truth: with the truth's own noise ({noise}) counted in, as over 1 s.")
+        say(f"+truth: with the truth's own noise ({noise}) taken into account, as over 1 s.")
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:

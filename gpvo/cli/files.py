@@ -1,4 +1,4 @@
-"""``gpvo info`` and ``gpvo import``: what files are, and other people's logs as runs."""
+"""``gpvo info`` and ``gpvo import``: what files are, and turning other people's logs into runs."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from gpvo.types import Mounting, TruthLog, Vehicle, VoLog
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """What came of an import. ``rotation_deg``, ``lever_m``: the fitted fixed transform, and ``worlds_deg`` the angle
-    between the worlds of the truth's attitudes and positions; None where it was not fitted."""
+    """Result of an import. ``rotation_deg``, ``lever_m``: the fitted fixed transform, and ``worlds_deg`` the angle
+    between the worlds of the truth's attitudes and positions; None if not fitted."""
 
     frames: int
     methods: list[str]
@@ -42,7 +42,9 @@ class ImportSummary:
         parts += [f"stamps moved by {self.time_offset_s:+.4f} s"] if self.time_offset_s else []
         parts += [f"truth turned by {self.rotation_deg:.2f} deg"] if self.rotation_deg is not None else []
         parts += [f"moved by {1e3 * self.lever_m:.0f} mm"] if self.lever_m else []
-        parts += [f"its attitudes by {self.worlds_deg:.2f} deg against its positions"] if self.worlds_deg else []
+        parts += (
+            [f"its attitudes turned by {self.worlds_deg:.2f} deg relative to its positions"] if self.worlds_deg else []
+        )
         return "\n  ".join([", ".join(parts), *self.notes])
 
 
@@ -58,12 +60,12 @@ def import_log(
     vehicle: Vehicle | None = None,
     overwrite: bool = True,
 ) -> ImportSummary:
-    """Make a run folder of another odometry's log, with a truth of the same frame.
+    """Make a run folder from another odometry's log, with ground truth of the same frame.
 
     ``frame``: whose poses these are, ``cam`` or ``body``. ``align``: the fixed transform to fit between log and truth,
     ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None to estimate it.
-    ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: what slips are told by, any by
-    default. ``overwrite``: also in place of a finished run. Raises SourceError: one line that names the file, the place
+    ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: the bounds by which slips are recognised, any
+    by default. ``overwrite``: also replace a finished run. Raises SourceError: one line that names the file, the place
     and the cure.
     """
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)

@@ -24,7 +24,7 @@ def fuse(
     policies: Annotated[str, typer.Option(help="Policies to compare, comma-separated; all by default.")] = "",
     init: Annotated[str, typer.Option(help="Start from truth, or from rest (static).")] = "truth",
     gate: Annotated[
-        str, typer.Option(help="What happens to a measurement beyond 3 sigma: discard or inflate.")
+        str, typer.Option(help="What to do with a measurement beyond 3 sigma: discard or inflate.")
     ] = "discard",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
     twins: Annotated[
@@ -92,7 +92,7 @@ def fuse(
         for compared in known:
             say(str(compared))
         if any(compared.difference_m.high == float("inf") for compared in known):
-            say("Fewer than three runs give no interval.")
+            say("With fewer than three runs there is no interval.")
 
 
 def publish(
@@ -120,7 +120,7 @@ def publish(
     ] = False,
     json_: Json = False,
 ) -> None:
-    """Write what robot_localization, PX4 and ArduPilot consume.
+    """Write messages for robot_localization, PX4, ArduPilot and FusionCore.
 
     Example: gpvo publish runs/flight7 --to mavlink -o flight7.tlog --consumer px4 --check
     """
@@ -146,7 +146,7 @@ def publish(
 
 
 def _teller() -> Callable[[str], None] | None:
-    """One line that says what is going on, on a terminal; silence in a pipe."""
+    """One line of progress on a terminal; silence in a pipe."""
     if not sys.stderr.isatty():
         return None
     return lambda what: print(f"\r\033[K{what}", end="\r", file=sys.stderr, flush=True)

@@ -34,12 +34,10 @@ def train(
     ] = "none",
     waits: Annotated[
         str,
-        typer.Option(
-            "--stationary", "--waits", help="Motions in which the vehicle stands while its truth wanders: drop or keep."
-        ),
+        typer.Option("--stationary", "--waits", help="Motions at rest during which the truth wanders: drop or keep."),
     ] = "drop",
     odd: Annotated[
-        str, typer.Option(help="Stretches in which odometry and truth differ as nowhere else: keep or drop.")
+        str, typer.Option(help="Stretches where odometry and truth differ as nowhere else: keep or drop.")
     ] = "keep",
     update: Annotated[
         Path | None,
@@ -57,7 +55,7 @@ def train(
     twin_options: TwinOptions = TwinOptions(),
     statements: Annotated[
         Path | None,
-        typer.Option(help="Folder for what each method states of the runs left out, for gpvo score."),
+        typer.Option(help="Folder for the covariances that each method states for the runs left out, for gpvo score."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
@@ -103,16 +101,16 @@ def train(
         _print_table(document)
         kept = sum(len(s) for s in trained.sets)
         given = trained.header.get("rows", {}).get("given", kept)
-        streamed = f", of {given} that streamed" if given > kept else ""
+        streamed = f", sampled from {given}" if given > kept else ""
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
 
 
 def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path | None) -> None:
-    """Raise GpvoError, before any work, where a training leaves out no run that ``gpvo score`` could judge."""
+    """Raise GpvoError, before any work, if training would leave out no run that ``gpvo score`` could judge."""
     whole = len(runs) > 1 and all(p.is_dir() for p in runs) and update is None
     if not whole or settings["target"] != "frame" or settings["backend"] != "local":
         raise GpvoError(
-            "--statements needs two run folders or more, --target frame and --backend local, without --update",
+            "--statements needs two or more run folders, --target frame and --backend local, without --update",
             cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER",
         )
 
@@ -123,7 +121,7 @@ def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[s
     from gpvo.learning.config import TrainConfig
 
     write_left_out(trained, [read_run(p) for p in paths], TrainConfig(**settings), folder)
-    note(f"gpvo: {folder} holds the covariances stated of the runs left out; score them by: gpvo score {folder}")
+    note(f"gpvo: {folder} holds the covariances stated for the runs left out; to score them: gpvo score {folder}")
 
 
 def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:
@@ -147,7 +145,7 @@ def _settings_of(model: Path) -> dict[str, Any]:
 
 
 def _is_given(ctx: typer.Context, option: str) -> bool:
-    """Whether the user wrote an option, or it stands at its default."""
+    """Whether the user gave an option, rather than leaving its default."""
     source = ctx.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
 
@@ -181,11 +179,11 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
 
 
 def _refuse_twice(paths: list[Path]) -> None:
-    """A run that is left out must not be among those that are learnt from."""
+    """A run that is left out must not be among those learned from."""
     seen: set[Path] = set()
     for path in paths:
         if path.resolve() in seen:
-            raise GpvoError("is given twice, and would be judged by itself", where=path, cure="give each run once")
+            raise GpvoError("is given twice, so it would be judged on itself", where=path, cure="give each run once")
         seen.add(path.resolve())
 
 
@@ -205,7 +203,7 @@ def _frames(paths: list[Path]) -> int:
 
 
 def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
-    """Runs that do not fit into memory together: their rows go through a file, one run at a time."""
+    """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
     import tempfile
 
     from gpvo.dataset.table import write_sets
@@ -234,13 +232,13 @@ def _print_table(document: dict[str, Any]) -> None:
         if any(v is not None for v in (*per_fold, *rest)):
             table.add_row(method, *(cell(v) for v in (*per_fold, *rest)))
     what = (
-        "run" if document.get("folds_are") != "time blocks" else "part of the one run (this says nothing of other runs)"
+        "run" if document.get("folds_are") != "time blocks" else "part of one run (this says nothing about other runs)"
     )
     say(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
     say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     show(table)
-    say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis of a Gaussian, lower is better;")
-    say("stated: of the stated density, where it has heavier tails. _vt: of the translation alone.")
+    say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
+    say("stated: by the stated density, where it has heavier tails. _vt: for the translation alone.")
     resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
     if resting:
         told = ", ".join(f"{n} of {name}" for name, n in resting.items())
@@ -249,7 +247,7 @@ def _print_table(document: dict[str, Any]) -> None:
     if differing:
         told = ", ".join(f"{n} of {name}" for name, n in differing.items())
         say(f"motions in which odometry and truth differ as nowhere else: {told}")
-        say("('gpvo evaluate' names them; 'gpvo train --odd drop' learns and judges without them)")
+        say("('gpvo evaluate' lists them; 'gpvo train --odd drop' trains and scores without them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):
         total = {k: sum(s[k] for s in slips) for k in ("caught", "missed", "falsely_flagged")}
@@ -259,7 +257,7 @@ def _print_table(document: dict[str, Any]) -> None:
         )
         say(
             f"slips: {total['caught']} caught, {total['missed']} missed, {total['falsely_flagged']} falsely flagged;"
-            f" NEES with the flagged ones counted in: {', '.join(counted_in)}"
+            f" NEES including the flagged ones: {', '.join(counted_in)}"
         )
     c = document["comparison"]
     if c is not None:

@@ -1,4 +1,4 @@
-"""``gpvo live``: images or anyone's odometry in, covariance out; ``gpvo doctor``: a linter of it."""
+"""``gpvo live``: images or anyone's odometry in, covariance out; ``gpvo doctor``: a linter for covariances."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ def live(
     ),
     base_frame: Annotated[
         str | None,
-        typer.Option(help="Publish the odometry of this frame of the robot, placed by /tf_static and /tf."),
+        typer.Option(help="Publish the odometry of this robot frame, located through /tf_static and /tf."),
     ] = None,
-    pose_covariance: Annotated[str, typer.Option(help="accumulated since the start, or the last increment.")] = (
-        "accumulated"
-    ),
+    pose_covariance: Annotated[
+        str, typer.Option(help="accumulated (since the start) or increment (the last motion).")
+    ] = ("accumulated"),
     state: Annotated[
         Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
     ] = None,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
-    depth: Annotated[int, typer.Option(help="Length of the queue of a topic; older messages are dropped.", min=2)] = 10,
+    depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
     """Publish odometry with an honest covariance, live.
@@ -98,14 +98,14 @@ def live(
     if json_:
         print_json({"schema": 1, **result})
     else:
-        print(", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing came")
+        print(", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received")
 
 
 def doctor(
     source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
     topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: NEES of what a bag states.")
+        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: adds the NEES of a bag.")
     ] = None,
     truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
     align: Annotated[
@@ -132,7 +132,9 @@ def doctor(
     wire = _one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1)
     one_of("--align", align, ("none", "rotation", "transform"))
     if truth is not None and wire is not None:
-        raise GpvoError("--truth judges a bag, not a running topic", cure="record it, or gpvo live --truth TOPIC")
+        raise GpvoError(
+            "--truth judges a bag, not a running topic", cure="record it first, or use gpvo live --truth TOPIC"
+        )
     judged = {}
     if wire is None:
         found = examine_bag(Path(source), topic)
@@ -160,17 +162,17 @@ def doctor(
 def _one_wire(**given: bool) -> str | None:
     chosen = [name for name, on in given.items() if on]
     if len(chosen) > 1:
-        raise GpvoError(f"--{' and --'.join(chosen)} exclude each other", cure="choose one")
+        raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
     return chosen[0] if chosen else None
 
 
 def _nees_of_bag(
     bag: Path, topic: str, truth: Path, truth_topic: str | None = None, align: str = "none"
 ) -> dict[str, Any]:
-    """NEES per degree of freedom of the ``poses`` and of the ``motions`` that a topic states covariances of.
+    """NEES per degree of freedom of the ``poses`` and of the ``motions`` whose covariances a topic states.
 
     Each is None, or by block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; ``problem`` is
-    the reason where nothing could be judged. ``truth``: anything that ``gpvo import --truth`` reads, of the same body.
+    the reason why nothing could be judged. ``truth``: anything that ``gpvo import --truth`` reads, of the same body.
     """
     from tempfile import TemporaryDirectory
 
@@ -189,14 +191,14 @@ def _nees_of_bag(
     except GpvoError as error:
         return {"poses": None, "motions": None, "problem": str(error)}
     motions = nees_document(evaluation.consistency.get(IMPORTED))
-    problem = None if motions or evaluation.poses else "no covariance is stated that could be judged"
+    problem = None if motions or evaluation.poses else "no stated covariance can be judged"
     return {"poses": nees_document(evaluation.poses), "motions": motions, "problem": problem}
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
     """The same in words, one line for each."""
     if found["problem"]:
-        return [f"NEES: not known: {found['problem']}"]
+        return [f"NEES unknown: {found['problem']}"]
     out = []
     for what in ("poses", "motions"):
         if about := found[what]:
@@ -213,5 +215,5 @@ def _lines(found: dict[str, Any]) -> list[str]:
 
 def _meaning(low: float, high: float) -> str:
     if low > 1.0:
-        return "too sure"
-    return "too timid" if high < 1.0 else "right, as far as this truth tells"
+        return "overconfident"
+    return "too cautious" if high < 1.0 else "right, as far as this truth can tell"

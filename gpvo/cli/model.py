@@ -112,7 +112,7 @@ def export(
 
     chosen = format_of(to, out)
     if for_filter:
-        print("gpvo: --for-filter changes nothing any more: a model states no mean of the error", file=sys.stderr)
+        print("gpvo: --for-filter no longer has any effect: models state no mean error", file=sys.stderr)
     target = out or model.with_name(model.stem + SUFFIXES[chosen])
     export_model(model, target, chosen, prefix=prefix)
     print(f"{target}: {target.stat().st_size} bytes")
@@ -129,7 +129,7 @@ def forecast(
         typer.Option(min=1, max=1000, help="Simulated flights along the plan, each in different conditions."),
     ] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over the distance.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over distance.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Every pose, as .parquet or .csv.")] = None,
     json_: Json = False,
 ) -> None:
@@ -156,7 +156,7 @@ def forecast(
 
 
 def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
-    """The result as scripts read it: SI units, positions in the axes of the plan's world, 1 sigma."""
+    """The result for scripts: SI units, positions in the axes of the plan's world, 1 sigma."""
     return {
         "schema": 1,
         "model": str(model),
@@ -188,7 +188,7 @@ def _columns(f: Forecast) -> dict[str, Any]:
 
 
 def _rows(f: Forecast) -> list[dict[str, float]]:
-    """A few poses for a short table, evenly in time, the last among them."""
+    """A few poses for a short table, evenly spaced in time and including the last."""
     from numpy import linspace
 
     columns, n = _columns(f), len(f.plan.t_s)

@@ -26,7 +26,7 @@ _loud = {"quiet": False, "verbose": False}
 
 @contextmanager
 def loudness(*, quiet: bool, verbose: bool) -> Iterator[None]:
-    """How much the commands say in the block, and of ``verbose`` ones what it took."""
+    """How much the commands print in the block; with ``verbose`` also time and memory."""
     _loud.update(quiet=quiet, verbose=verbose)
     start = time.perf_counter()
     yield
@@ -34,18 +34,18 @@ def loudness(*, quiet: bool, verbose: bool) -> Iterator[None]:
 
 
 def is_verbose() -> bool:
-    """Whether the command at hand was called with ``-v``."""
+    """Whether the current command was called with ``-v``."""
     return _loud["verbose"]
 
 
 def note(text: str) -> None:
-    """A remark beside the result, on standard error; not with ``-q``."""
+    """A remark alongside the result, on standard error; not with ``-q``."""
     if not _loud["quiet"]:
         print(text, file=sys.stderr)
 
 
 def detail(text: str) -> None:
-    """The same, with ``-v`` alone."""
+    """The same, only with ``-v``."""
     if _loud["verbose"]:
         print(f"gpvo: {text}", file=sys.stderr)
 
@@ -84,14 +84,14 @@ def new_table(*columns: str) -> Table:
 
 
 def print_json(document: dict[str, Any]) -> None:
-    """Print a document in the form scripts read."""
+    """Print a document as JSON, for scripts."""
     from gpvo.files import plain
 
     print(json.dumps(plain(document), indent=2))
 
 
 def one_of(option: str, value: str, choices: Iterable[str]) -> str:
-    """The value of an option. Raises GpvoError where it is none of the choices."""
+    """The value of an option. Raises GpvoError if it is not one of the choices."""
     known = list(choices)
     if value not in known:
         cure = f"choose {known[0]} or {known[1]}" if len(known) == 2 else f"choose one of: {', '.join(known)}"
@@ -102,7 +102,7 @@ def one_of(option: str, value: str, choices: Iterable[str]) -> str:
 def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), least: float = -math.inf) -> list[float]:
     """The numbers of an option, separated by commas: finite, at least ``least``, of one of the ``counts`` if given.
 
-    Raises GpvoError with the ``cure``, where the text is something else.
+    Raises GpvoError with the ``cure`` if the text is anything else.
     """
     try:
         found = [float(part) for part in text.split(",")]
@@ -114,7 +114,7 @@ def numbers(option: str, text: str, cure: str, *, counts: Sequence[int] = (), le
 
 
 def cell(value: float | str | None, digits: int = 3) -> str:
-    """A number as tables show it, a dash for what is not known; text as it is."""
+    """A number as tables show it, a dash for an unknown one; text as it is."""
     if isinstance(value, str):
         return value
     if value is None or not math.isfinite(value):

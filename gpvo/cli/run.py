@@ -31,9 +31,9 @@ def run(
     sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1",
     sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
-    min_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is lost; at least 4.")] = 8,
-    weak_inliers: Annotated[int, typer.Option(help="With fewer agreeing points a motion is degraded.")] = 20,
-    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion for itself.")] = 2,
+    min_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is lost; at least 4.")] = 8,
+    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is degraded.")] = 20,
+    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion alone.")] = 2,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     settings: Annotated[
         list[str] | None,
@@ -66,7 +66,7 @@ def run(
     keep_tracks: Annotated[
         bool, typer.Option("--keep-tracks", help="Keep the tracks of the points; 'gpvo twin' needs them.")
     ] = False,
-    view: Annotated[bool, typer.Option("--view", help="Watch it live in rerun (extra gpvo[viz]).")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Watch the run live in rerun (extra gpvo[viz]).")] = False,
     record_view: Annotated[Path | None, typer.Option(help="Write what --view would show to this .rrd file.")] = None,
     overwrite: flags.Overwrite = False,
     json_: Json = False,
@@ -125,12 +125,12 @@ def run(
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)
         told = f"{model.name} does not fit: only {share:.0f} % of the frames lie inside the training domain"
-        print(f"gpvo: {told} (gpvo check says more)", file=sys.stderr)
+        print(f"gpvo: {told} (see gpvo check)", file=sys.stderr)
     _tell(out, summary, sequence.report.notes, json_)
 
 
 def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> None:
-    """The summary, and a few of the notes that the source made."""
+    """Print the summary and a few of the source's notes."""
     more = [f"{len(notes) - _MOST_NOTES} more in run.json"] if len(notes) > _MOST_NOTES else []
     for line in (*notes[:_MOST_NOTES], *more):
         note(f"source: {line}")

@@ -25,11 +25,11 @@ def score(
     ] = None,
     json_: Json = False,
 ) -> None:
-    """Score anybody's stated covariances from files alone.
+    """Score anyone's stated covariances from files alone.
 
     `gpvo evaluate RUN --stated FOLDER` writes such files for every method of a
-    run. Such a folder, METHOD/SEQUENCE.txt beside truth/SEQUENCE.txt, is scored
-    as a whole.
+    run. Such a folder, with METHOD/SEQUENCE.txt and truth/SEQUENCE.txt, is
+    scored as a whole.
 
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
@@ -57,7 +57,7 @@ def score(
         _print(found)
 
 
-_LEGEND = "E: energy score, lower is better. NEES: of a motion, then over 1 s, 10 m and 100 m; 1 is right."
+_LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10 m and 100 m; 1 is right."
 
 
 def _print_board(columns: dict[str, list[Any]]) -> None:
@@ -80,7 +80,7 @@ def _print(found: dict[str, Any]) -> None:
     say(_LEGEND)
     pooled = found["pooled"]
     if pooled["nees_dof"]["low"] is None:
-        say("Fewer than three sequences give no mean with an interval.")
+        say("With fewer than three sequences there is no mean with an interval.")
         return
     for name, unit, factor in (
         ("energy_translation_m", " mm", 1e3),

@@ -16,7 +16,7 @@ _SECONDS, _RATE_HZ = 15.0, 10.0
 
 @dataclass
 class _Bench:
-    """Where the parts leave what the next ones need."""
+    """Where each part leaves what the next ones need."""
 
     folder: Path
     runs: list[Path] = field(default_factory=list)
@@ -27,7 +27,7 @@ class _Bench:
 
 
 class _Wrong(Exception):
-    """A part ran, and its result is not what it must be."""
+    """A part ran, but its result is not what it should be."""
 
 
 def selftest() -> None:

@@ -78,7 +78,7 @@ def simulate(
     )
     chosen = load_scenario(scenario, overrides)
     if seeds is not None and seed is not None:
-        raise GpvoError("--seed and --seeds exclude one another", cure="leave out one of them")
+        raise GpvoError("--seed and --seeds are mutually exclusive", cure="leave out one of them")
     # A contact sheet alone keeps no sequence.
     with nullcontext() if out is not None else TemporaryDirectory() as temporary:
         target = out or Path(temporary or "") / chosen.name
@@ -95,7 +95,7 @@ def _like(run: Path | None, points: bool) -> dict[str, Any]:
     if run is None:
         return {}
     if not points:
-        raise GpvoError("--like knows no images", cure="add --points: landmark tracks instead of images")
+        raise GpvoError("--like makes no images", cure="add --points: landmark tracks instead of images")
     from gpvo.sim.like import like
 
     return like(run)
@@ -140,7 +140,7 @@ def _show_list(json_: bool) -> None:
 
 
 def _assignment(text: str) -> tuple[str, Any]:
-    """``key=value`` with a TOML value; what is no TOML is text."""
+    """``key=value`` with a TOML value; anything that is not TOML is text."""
     from gpvo.files import parse_toml
 
     key, equals, value = text.partition("=")

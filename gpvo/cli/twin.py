@@ -35,7 +35,7 @@ class TwinOptions:
         str | None,
         typer.Option(
             "--gap",
-            help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
+            help="How far real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
         ),
     ] = None
 
@@ -49,7 +49,10 @@ class TwinOptions:
 
 
 Seed = Annotated[
-    int, typer.Option(min=0, help="Random seed of the twins. Not that of 'gpvo train': a model is judged by others.")
+    int,
+    typer.Option(
+        min=0, help="Random seed of the twins. Not that of 'gpvo train', so a model is judged on other twins."
+    ),
 ]
 
 
@@ -58,7 +61,7 @@ def twin(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for the twins.")] = None,
     against: Annotated[
         bool,
-        typer.Option("--against", help="Compare with the runs' ground truth: real errors over what twins predict."),
+        typer.Option("--against", help="Compare with the runs' ground truth: real errors over predicted ones."),
     ] = False,
     options: TwinOptions = TwinOptions(),
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
@@ -107,13 +110,13 @@ def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: 
         for span, row in zip(SPANS, of_run):
             table.add_row(name, span, *(f"{v:.2f}" for v in row))
     for span, m, d in zip(SPANS, mean, spread):
-        table.add_row("all, times or over", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
+        table.add_row("all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
     show(table)
-    print("real over predicted error, root mean square; the truth's own noise is counted in")
+    print("real over predicted error, root mean square; the truth's own noise is taken into account")
 
 
 def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int = 1) -> list[Path]:
-    """Twins of all runs, with a progress bar; names of runs that are alike are told apart."""
+    """Twins of all runs, with a progress bar; runs with the same name get distinct names."""
     from gpvo.evaluation.evaluate import distinct
     from gpvo.twin.replicate import make_twins
 
@@ -126,7 +129,7 @@ def make_all(runs: Sequence[Path], out: Path, settings: TwinSettings, jobs: int 
 
 
 def say_simulated(about: Mapping[str, Any]) -> None:
-    """The line above every table that twins are the truth of."""
+    """The line above every table whose truth comes from twins."""
     name, twins, tolerance = about["of"], about["twins"], about["tolerance_name"]
     say(f"{name} has no ground truth: means over {twins} twins, whose truth is simulated (tolerance {tolerance})")
 
@@ -135,7 +138,7 @@ def say_simulated(about: Mapping[str, Any]) -> None:
 def in_place_of_runs_without_truth(
     paths: list[Path], settings: TwinSettings | None, jobs: int = 1
 ) -> Iterator[list[Path]]:
-    """Runs with truth, and twins of the others, kept for as long as the context is open; no twins without settings."""
+    """Runs with truth, and twins of the others, for as long as the context is open; no twins without settings."""
     from gpvo.io.run import read_run
 
     if settings is None:

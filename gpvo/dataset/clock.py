@@ -1,8 +1,8 @@
 """The offset between the clocks of a log and its truth, from how much both turn and travel.
 
-Angle and distance over a window do not depend on how the two frames sit to one another, so nothing need be aligned
-first. (P. Furgale, J. Rehder, R. Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", 2013,
-estimate both at once from raw measurements; logs of poses do not need it.)
+Angle and distance over a window do not depend on how the two frames are placed relative to each other, so nothing has
+to be aligned first. (P. Furgale, J. Rehder, R. Siegwart, "Unified temporal and spatial calibration for multi-sensor
+systems", 2013, estimate both at once from raw measurements; logs of poses do not need that.)
 """
 
 from __future__ import annotations

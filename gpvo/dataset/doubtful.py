@@ -1,15 +1,15 @@
-"""Stretches of a run from which nothing should be learnt about odometry, because the truth is in doubt there.
+"""Stretches of a run from which nothing should be learned about odometry, because the truth is in doubt there.
 
-Waits: where a vehicle stands and its truth does not, what the truth says of odometry's error is the truth's own.
-Satellite positions wander by decimetres while a car waits at a light, and odometry, which sees that nothing moves,
-would be charged with it. Whether the vehicle stands is said by image and IMU together: odometry that is blind to a
-motion does not deceive a gyroscope.
+Waits: while the vehicle stands still but its truth does not, the apparent error of odometry is the truth's. Satellite
+positions wander by decimetres while a car waits at a light, and odometry, which sees that nothing moves, would be
+blamed for it. Image and IMU together decide whether the vehicle stands still: a motion to which odometry is blind does
+not escape a gyroscope.
 
 Odd stretches: where odometry and truth differ as nowhere else in the sequence, one of the two is wrong, and a model
-that learnt from them would be timid everywhere. Two differences are looked for, each against its own median and spread
-in the sequence (by the median absolute deviation): the share of the true motion that odometry shows, where what it says
-of its own noise does not explain it; and the direction of travel, as of a truth that climbs while the vehicle does not.
-Which of the two is wrong is for the user to say.
+that learned from them would be too cautious everywhere. Two differences are looked for, each against its own median
+and spread in the sequence (by the median absolute deviation): the share of the true motion that odometry shows, if its
+own stated noise does not explain it; and the direction of travel, as when the truth climbs while the vehicle does not.
+Which of the two is wrong is for the user to decide.
 """
 
 from __future__ import annotations

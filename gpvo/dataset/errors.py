@@ -124,10 +124,10 @@ def position_targets(
 def estimate_truth_noise(errors: MotionErrors, log: VoLog) -> Array:
     """(6,) standard deviation [m, rad] of the truth's white noise per pose, by axis of the camera; 0 where none shows.
 
-    Jitter of stamps, GPS/INS and motion capture put noise n_k on each pose, so that a true motion m_k is told as
-    ``u_k = m_k + n_k - n_(k-1)``. An odometry says ``m_k`` and errs in its own way. High-passed until little is left of
-    m_k, what the truth has and the odometry lacks is the truth's noise: ``Cov(u, u - odometry)`` holds its variance,
-    whatever noise, jitter included, the odometry has of its own (two instruments of one quantity: F. E. Grubbs, "On
+    Jitter of stamps, GPS/INS and motion capture put noise n_k on each pose, so that a true motion m_k is reported
+    as ``u_k = m_k + n_k - n_(k-1)``. Odometry reports ``m_k`` with errors of its own. High-passed until little is left
+    of m_k, what the truth has and the odometry lacks is the truth's noise: ``Cov(u, u - odometry)`` gives its variance,
+    whatever noise, jitter included, the odometry itself has (two instruments for one quantity: F. E. Grubbs, "On
     estimating precision of measuring instruments and product variability", 1948). An axis counts where the 95 %
     interval of its variance, by blocks of time, lies above zero.
     """
@@ -205,9 +205,9 @@ def velocity_path(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array | None:
 def drift_variance(contradiction: Array, error: Array) -> Array:
     """(3,) variance of the truth's displacements over windows (W, 3) [m^2]; 0 where the 99 % interval holds zero.
 
-    Positions of GPS/INS drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show it;
-    a third instrument can: a truth that measures velocities too tells each displacement twice, and where the two differ
-    it is wrong in one of them. ``Cov(positions - velocities, positions - odometry)`` is the variance of the positions.
+    GPS/INS positions drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show this,
+    but a third instrument can: a truth that also measures velocities gives each displacement twice, and where the two
+    differ, one is wrong. ``Cov(positions - velocities, positions - odometry)`` is the variance of the positions.
 
     ``contradiction``: displacements by the truth's positions less those by its velocities; ``error``: those by odometry
     less those by the positions; both in axes of the camera.

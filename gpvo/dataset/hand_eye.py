@@ -4,9 +4,9 @@ Both describe one rigid body, so their motions A (log) and B (truth) over the sa
 unknown ``X = T_log_truth`` (Y. Shiu, S. Ahmad, "Calibration of wrist-mounted robotic sensors by solving homogeneous
 transform equations of the form AX = XB", 1989).
 
-A truth may err by a constant itself: where its positions and its attitudes come from different instruments, as in
-motion capture, each may have a world of its own, turned against the other. No X mends that: the turns ask for one, the
-directions of travel for another. The rotation between the two worlds is then fitted as well.
+A ground truth may itself have a constant error: if its positions and its attitudes come from different instruments, as
+in motion capture, each may have a world of its own, rotated relative to the other. No X corrects that: the turns
+require one, the directions of travel another. The rotation between the two worlds is then fitted as well.
 """
 
 from __future__ import annotations
@@ -174,11 +174,11 @@ def _start(A: Array, B: Array) -> Array:
             limit = np.minimum(1.0, 3 * size / np.maximum(np.linalg.norm(a, axis=1), 1e-12))
             pairs.append((a * limit[:, None] / size, b / size))
     if not pairs:
-        raise GpvoError("the motions do not show how the frames are turned", cure="use a log that moves")
+        raise GpvoError("the motions do not show how the frames are rotated", cure="use a log that moves")
     M = sum((a.T @ b for a, b in pairs), np.zeros((3, 3)))
     U, S, Vt = np.linalg.svd(M)
     if S[1] < 1e-4 * S[0]:
-        raise GpvoError("the motions do not show how the frames are turned", cure="use a log that turns as well")
+        raise GpvoError("the motions do not show how the frames are rotated", cure="use a log that turns as well")
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return se3.from_rt(R, np.zeros(3))
 

@@ -1,6 +1,6 @@
-"""A run judged by its twins: what each stated covariance would score, and the twins' own as one more method, ``twin``:
-the covariance of each motion from the errors that the twins made there. And twins judged by a run with truth: by how
-much its errors exceed what a model of its twins predicts."""
+"""A run judged by its twins: what each stated covariance would score, with the twins' own as one more method, ``twin``:
+the covariance of each motion from the errors that the twins made there. And twins judged by a run with truth: how far
+its errors exceed what a model of its twins predicts."""
 
 from __future__ import annotations
 

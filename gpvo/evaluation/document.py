@@ -26,48 +26,48 @@ _UNITS = ("translation_m", "rotation_rad")
 
 
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """The result as scripts read it; what could not be computed is None. SI units; the names are part of the interface.
+    """The result for scripts; what could not be computed is None. SI units; the names are part of the interface.
 
-    ``pooled``: of each method ``nll_per_dim`` and ``nees_dof`` (with the truth's noise) {``mean``, ``low``, ``high``}
-    over the runs. Of each run, beside its name, counts, path length, ATE and segments:
+    ``pooled``: for each method, ``nll_per_dim`` and ``nees_dof`` (with the truth's noise) {``mean``, ``low``, ``high``}
+    over the runs. For each run, besides its name, counts, path length, ATE and segments:
 
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
-    * ``truth_moves_at_rest``: motions that are not scored, as the vehicle stands and the truth moves; they count in
-      ATE, final error and RPE alone.
+    * ``truth_moves_at_rest``: motions that are not scored, because the vehicle stands still while the truth moves; they
+      count only in ATE, final error and RPE.
     * ``odd_stretches``: motions, in words, in which odometry and truth differ as nowhere else; they are scored.
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
-    * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers come to, in words.
+    * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers amount to, in words.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
-      as counted in: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
-      (:func:`gpvo.dataset.errors.estimate_truth_noise`), whichever is more. ``truth_sigma_axes``: by axis, x y z [m],
+      as used: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
+      (:func:`gpvo.dataset.errors.estimate_truth_noise`), whichever is larger. ``truth_sigma_axes``: by axis, x y z [m],
       then [rad]. ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion;
       None: nowhere.
-    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None where it
+    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None if it
       does not matter; ``error_change``: relative change of the errors over a second without it.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
       {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
       frame or a second do not reach across a gap in the truth.
 
-    Of each method, beside NEES, coverage, NLL and CRPS:
+    For each method, besides NEES, coverage, NLL and CRPS:
 
     * ``nees_dof_interval``: by block, 95 % interval [low, high] of ``nees_dof`` by a bootstrap over blocks of time.
     * ``nees_dof_truth_noise``: by block, ``nees_dof`` with the truth's own noise added to what the method states.
-    * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS of vectors; it rewards sharp and honest
-      statements alike. ``correlation_gain_nats``: by how much the stated correlations make the errors likelier.
+    * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS for vectors; it rewards sharpness and
+      honesty together. ``correlation_gain_nats``: how much likelier the stated correlations make the errors.
       ``by_difficulty`` {``nees_dof``, ``coverage`` at one sigma}: in quartiles of rising stated uncertainty.
-    * ``nll_per_dim`` takes every statement as Gaussian; ``nll_stated_per_dim`` is of the stated density, a Student-t
-      for models that learnt their tails, and ``nees_dof_median_stated`` the median NEES/dof that it expects.
+    * ``nll_per_dim`` treats every method as Gaussian; ``nll_stated_per_dim`` is that of the stated density, a Student-t
+      for models that learned their tails, and ``nees_dof_median_stated`` the median NEES/dof that it implies.
     * ``one_second`` {``nees_dof``, ``nees_dof_truth_noise``, ``z2_truth_noise``, ``truth_drift_m``, ``count``}: of the
-      motion over windows of a second, joint and (6,) by axis, and the truth's drift (3,) that is counted in as its own
+      motion over windows of a second, joint and (6,) by axis, and the truth's drift (3,) taken into account because its
       velocities contradict its positions; ``horizons`` are the same over lengths of path.
     * ``predicted_final_error_m``: root of the trace of the accumulated position covariance, by the method's parts;
       ``predicted_final_error_independent_m``: the same if all motions were independent.
 
-    ``constant`` is said of the motion of one frame: a motion that bridges lost frames has as many times its covariance.
-    ``gp_thesis`` needs a model file that holds it, as all written by this version do.
+    ``constant`` is for a motion of one frame: a motion that bridges lost frames has its covariance as many times over.
+    ``gp_thesis`` needs a model file that holds it, as do all those written by this version.
     """
     runs = [_run_document(e) for e in evaluations]
     return {"schema": 1, "runs": runs, "pooled": _pooled([r["methods"] for r in runs])}

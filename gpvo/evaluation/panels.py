@@ -287,12 +287,12 @@ GROUPS: dict[tuple[str, str], tuple[Drawing, ...]] = {
         "Overconfident where the curve is below the diagonal, and where NEES (mean over 0.5 s) is above 1.",
     ): (
         Drawing(reliability, "reliability", "stated probability, and share inside", (5.5, 5)),
-        Drawing(nees, "nees", "1 is right, above is overconfident", (10, 3.5)),
+        Drawing(nees, "nees", "1 is right, above 1 is overconfident", (10, 3.5)),
     ),
     (
         "How errors are correlated in time",
         "A dip at the first lag shows shared pixel noise; a flat or rising Allan deviation shows a bias.",
-    ): (Drawing(memory, "memory", "how the error remembers", (10, 4), 2),),
+    ): (Drawing(memory, "memory", "how errors are correlated in time", (10, 4), 2),),
     ("What odometry saw", "Amber: degraded frames. Red: lost frames."): (
         Drawing(inputs, "inputs", "what odometry saw; amber is degraded, red is lost", (10, 5.5), 1, True),
     ),

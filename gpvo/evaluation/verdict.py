@@ -1,4 +1,4 @@
-"""What an evaluation comes to, in words: which stated covariance is honest, over which distances, and what to do."""
+"""What an evaluation amounts to, in words: which stated covariance is honest, over which distances, and what to do."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def verdict(e: Evaluation) -> Verdict:
     if not e.covered.any():
         told_of_none = (
             *_conditions(e),
-            "gpvo evaluate --twins judges a run by twins, if it was run with --keep-tracks.",
+            "gpvo evaluate --twins judges a run by its twins, if made with --keep-tracks.",
         )
         return Verdict("amber", "There is no ground truth, so no covariance can be judged.", told_of_none)
     if not judged:
-        cure = "gpvo train learns one from such runs; --model states it here."
+        cure = "gpvo train learns one from such runs; give the model with --model."
         return Verdict("red", "No covariance was stated, so nothing can be judged.", (*_conditions(e), cure))
     best = min(judged, key=lambda m: judged[m].nll_per_dim or 0.0)
     # What a vehicle would be told is judged first; others only where it is wrong.
@@ -57,9 +57,9 @@ def verdict(e: Evaluation) -> Verdict:
     if not wrong and not outside:
         return Verdict("green", f"The {told} covariance is honest here, per motion and over distance.", tuple(lines))
     if told != best and not _wrong(judged[best]):
-        lines.append(f"Use {best} here: it is honest, and its likelihood is the best of all.")
+        lines.append(f"Use {best} here: it is honest, and has the best likelihood of all.")
     if outside:
-        lines.append("Train on runs of this camera and these conditions, with truth or with twins.")
+        lines.append("Train on runs with this camera in these conditions, with ground truth or with twins.")
     per_motion = _word(_nees(judged[told]))
     headline = f"The {told} covariance is {per_motion} per motion"
     if wrong and per_motion == "honest":
@@ -119,16 +119,16 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
         yield (
-            f"The truth itself has noise of {_up_to(e.truth_sigma)} per pose, by estimate (its source states {stated})."
-            " It is counted in."
+            f"The truth itself has an estimated noise of {_up_to(e.truth_sigma)} per pose (its source states {stated})."
+            " This is taken into account."
         )
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
-        yield f"The truth's noise outweighs the odometry's errors {where}: there it cannot judge them."
+        yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
     if e.turned is not None:
         yield (
             f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg (mounting or calibration)."
-            f" Without it errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
+            f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
         )
 
 

@@ -2,7 +2,7 @@
 
 Joint error state (45): position, velocity (world), attitude (body), accelerometer and gyroscope bias; the cloned
 pose of VO's reference frame; that frame's jitter; the normalised VO bias; and, while an update runs, the jitter of the
-current frame, which then replaces the reference's. So two motions that share a frame are not taken as independent.
+current frame, which then replaces the reference's. So two motions that share a frame are not treated as independent.
 
 J. Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), sections 5 to 7; stochastic cloning:
 S. Roumeliotis, J. Burdick (2002). Arrays carry a leading axis of B members that see the same clock and statuses: 1 in

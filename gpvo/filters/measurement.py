@@ -1,5 +1,5 @@
 """A relative motion of the camera as a measurement of the IMU's state and of a cloned earlier pose; and the chi-square
-gate: when it disagrees with the filter by more than both admit.
+gate: when it disagrees with the filter by more than both allow.
 
 The measured motion is ``T_est = Exp(-n_ref) T_true Exp(n_cur + b + w)`` (see :mod:`gpvo.accumulation`): the noise of
 each frame enters the motion that ends there and, with opposite sign, the motion that starts there; ``b`` persists;

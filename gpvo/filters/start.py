@@ -1,4 +1,4 @@
-"""Where a filter starts, and how sure it says it is."""
+"""Where a filter starts, and how certain it claims to be."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The filter on a clock: samples and frames as they arrive, late, twice or out of order.
 
-IMU samples are buffered; the state is carried to a frame's stamp when its record arrives, so the usual latency of
-VO costs nothing. A record older than the newest is put in its place: the filter goes back to the state before the
-records that follow it, and uses them again.
+IMU samples are buffered; the state is propagated to a frame's stamp when its record arrives, so the usual latency of
+VO costs nothing. A record older than the newest is inserted in its place: the filter goes back to the state before
+the records that follow it, and applies them again.
 """
 
 from __future__ import annotations

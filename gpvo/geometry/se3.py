@@ -1,7 +1,7 @@
 """SE(3) as 4x4 matrices, with batches in the leading axes, and the fixed rotations between the field's frames (REP 103,
 REP 105; MAVLink's MAV_FRAME).
 
-House rules: a tangent vector is ``(translation xyz [m], rotation xyz [rad])`` and perturbs on the right,
+Conventions: a tangent vector is ``(translation xyz [m], rotation xyz [rad])`` and perturbs on the right,
 ``T Exp(xi)``. ``T_a_b`` maps coordinates in ``b`` to coordinates in ``a``.
 
 Formulas: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics" (2018),

@@ -80,7 +80,9 @@ def guess_format(path: Path) -> str:
     if len(words) in (8, 12):
         return "tum" if len(words) == 8 else "kitti"
     raise SourceError(
-        "is like no trajectory file", where=path, cure="TUM has 8 numbers a line, KITTI 12, CSV a header; see --format"
+        "does not look like a trajectory file",
+        where=path,
+        cure="TUM has 8 numbers a line, KITTI 12, CSV a header; see --format",
     )
 
 
@@ -205,7 +207,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
     elif rate_hz is not None:
         if not 1e-3 <= rate_hz <= 1e5:
             raise SourceError(
-                f"a rate of {rate_hz:g} Hz is none", where=path, cure="give --rate-hz from 0.001 to 100000"
+                f"a rate of {rate_hz:g} Hz is not possible", where=path, cure="give --rate-hz from 0.001 to 100000"
             )
         t = np.rint(np.arange(len(T)) * (1e9 / rate_hz)).astype(np.int64)
     else:

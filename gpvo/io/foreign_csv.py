@@ -106,7 +106,7 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                     yield comment[0], _split(comment[1], separator)
             yield number, _split(text, separator)
     except csv.Error as error:
-        raise SourceError(f"is no CSV: {error}", where=path) from None
+        raise SourceError(f"is not a CSV file: {error}", where=path) from None
 
 
 def _split(text: str, separator: str) -> list[str]:

@@ -1,9 +1,9 @@
 """The run folder: everything later stages need, so that nothing reopens the source.
 
 ``vo_log.parquet`` (columns in :mod:`gpvo.io.run_table`), ``trajectory.tum`` (raw VO, never corrected), ``rig.json``,
-``truth.parquet``, ``imu.parquet``, ``predictions.parquet``, ``tracks.parquet`` (what odometry saw) where there are
-such, ``config.toml``, ``run.json``. While a run is on, finished chunks of records lie in ``chunks/``; closing it joins
-them. A run that broke off is read from its chunks, and gone on with from the last of them.
+``truth.parquet``, ``imu.parquet``, ``predictions.parquet``, ``tracks.parquet`` (what odometry saw) if available,
+``config.toml``, ``run.json``. During a run, finished chunks of records lie in ``chunks/``; closing the run joins them.
+An interrupted run can be read from its chunks, and resumes from the last of them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Stereo tracks: pixel tracks of a rectified pair in place of images ("bring your own front end").
+"""Stereo tracks: pixel tracks of a rectified pair instead of images ("bring your own front end").
 
 An ``.npz`` with one row per observation: ``frame`` (M,), ``track`` (M,), ``uv_left``, ``uv_right`` (M, 2) [px]; per
-frame ``t_s`` (N,); ``fx fy cx cy`` [px] and ``baseline_m``. Where present: ``T_world_cam`` (N, 4, 4) truth of the left
+frame ``t_s`` (N,); ``fx fy cx cy`` [px] and ``baseline_m``. Optional: ``T_world_cam`` (N, 4, 4) truth of the left
 camera, NaN in frames without; ``gyro_body_radps`` and ``acc_body_mps2`` (N, 3) in body axes with ``R_cam_body``
 (3, 3) and ``p_body_cam_in_body_m`` (3,), ``vel_body_mps`` (N, 3) of the body as the truth measures it beside its
 positions (with the gyroscope), ``width``, ``height`` [px], ``sigma_translation_m``, ``sigma_rotation_rad``;

@@ -230,7 +230,7 @@ def _division_of(of: _Residuals) -> tuple[Division, Parts]:
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
-    """(n,) distance of each row, given the noise of its features, from the domain of the other groups."""
+    """(n,) distance of each row from the domain of the other groups, given the noise of its features."""
     out = np.zeros(len(X))
     labels = np.unique(group)
     for g in labels if len(labels) > 1 else ():

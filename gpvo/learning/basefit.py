@@ -19,8 +19,8 @@ _RARE = 0.0002
 
 
 def fit_coefficients(terms: Array, error: Array, weight: Array) -> Array:
-    """(6, 5) factors, not negative, on the ``terms`` (n, 6, 5) of a base variance (see :func:`gpvo.online.base.parts`)
-    by which errors (n, 6) are likeliest, taken as those of a Student-t; 0 where a term is never there.
+    """Non-negative factors (6, 5) on the ``terms`` (n, 6, 5) of a base variance (see :func:`gpvo.online.base.parts`)
+    that make errors (n, 6) likeliest, as those of a Student-t; 0 for a term that never occurs.
 
     ``weight`` (n,): how much a row counts. By Fisher scoring, projected onto the bounds (D. Bertsekas, "Projected
     Newton methods for optimization problems with simple constraints" (1982)), of all axes at a time.
@@ -50,7 +50,7 @@ def fit_coefficients(terms: Array, error: Array, weight: Array) -> Array:
 
 
 def _scoring_step(X: Array, square: Array, count: Array, theta: Array) -> Array:
-    """(6, 5) Fisher's step from ``theta`` within the bounds: a factor at one, which would leave it, is held there."""
+    """(6, 5) Fisher's step from ``theta`` within the bounds: a factor at a bound that would cross it is held there."""
     v = (X @ theta[..., None])[..., 0]
     R = X / v[..., None]
     score = ((count * log_scale_score(square * (NU / (NU - 2.0)) / v, NU))[:, None] @ R)[:, 0]
@@ -95,7 +95,7 @@ def _changes(s: TrainingSet, m: int, step_s: float) -> Array:
 def learn_domain(X: Array, *, margin: float = 0.02) -> Domain:
     """Where training rows (n, d) lie, not finite where a value is missing.
 
-    The narrower range leaves out one row in five thousand at either end; to both ``margin`` of its width is added.
+    The narrower range leaves out one row in five thousand at either end; both are extended by ``margin`` of its width.
     """
     X = np.where(np.isfinite(X), X, np.nan)
     centre = np.nanmedian(X, axis=0)

@@ -60,8 +60,8 @@ def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:
     """Power of the growth (see ``guard.growth``) with the ``distance`` (n,) from the domain of the other groups.
 
     ``square`` (n,): mean over the axes of the squared normalised residuals. The power is at least one, the expected
-    value: other surroundings differ in more ways than flights of one kind can show. The rows of a group outside count
-    as five at most, as they are correlated.
+    value: other surroundings differ in more ways than flights of one kind can show. A group's rows outside count as
+    five at most, because they are correlated.
     """
     outside = distance > _OUTSIDE
     d, q, g = distance[outside], square[outside], group[outside]
@@ -103,9 +103,9 @@ def residual_correlation(z: Array, nu: float = 5.0) -> Array:
 def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list[bool]]:
     """Half widths, in sigma, that cover a new group's frame at each of ``LEVELS``, and whether that is guaranteed.
 
-    Each group counts alike and a new one counts too, as an unknown: Y. Lee, R. Barber, R. Willett, "Distribution-free
+    All groups count equally, and a new one counts too, as an unknown: Y. Lee, R. Barber, R. Willett, "Distribution-free
     inference with hierarchical data" (2023), equation 5. Where G groups are too few for a level (level > G / (G + 1))
-    there is no finite guarantee: then the pooled quantile stands, marked so, and never below a lower level's.
+    there is no finite guarantee: the pooled quantile is used and marked as such, never below that of a lower level.
     """
     labels, inverse, counts = np.unique(group, return_inverse=True, return_counts=True)
     order = np.argsort(score, kind="stable")

@@ -17,7 +17,7 @@ _COLOURS = (
 )  # fmt: skip
 _SIZE, _LEFT, _TOP, _GAP = 260, 62, 14, 84
 _TRUE = math.sqrt(2.0)
-"""Sigma right within this factor counts as true, as in the verdict: NEES per degree of freedom from 0.5 to 2."""
+"""Sigma within this factor counts as right, as in the verdict: NEES per degree of freedom from 0.5 to 2."""
 
 
 def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -> str:
@@ -58,14 +58,14 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
 
 
 def _today() -> str:
-    """The date, or that of the environment's SOURCE_DATE_EPOCH, by which builds are made reproducible."""
+    """Today's date, or that of SOURCE_DATE_EPOCH in the environment, which makes builds reproducible."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(epoch), timezone.utc) if epoch.isdecimal() else datetime.now(timezone.utc)
     return now.date().isoformat()
 
 
 def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
-    """Where the model must not be used, by example."""
+    """Where the model must not be used, with examples."""
     camera, domain = h["camera"], h["training_domain"]
     lines = [f"* At a rate other than {h['rate_hz']:.3g} frames/s."]
     if camera is not None:
@@ -97,7 +97,7 @@ def _data(h: Mapping[str, Any]) -> str:
 
 
 def _simulated(h: Mapping[str, Any]) -> str:
-    """Says so where truth was simulated, as the twins' is."""
+    """Says so if the truth was simulated, as that of twins is."""
     told = []
     for s in h.get("simulated_truth") or ():
         rig = ", ".join(f"{k} {v:g}" for k, v in s["tolerance"].items())
@@ -124,7 +124,7 @@ def _camera(camera: Mapping[str, Any]) -> str:
 
 
 def _table(scores: Iterable[tuple[str, Mapping[str, Any]]]) -> list[str]:
-    """The lines of a table of scores by name, without those of which nothing is known."""
+    """The lines of a table of scores by name, without those that have no values."""
     rows = []
     for name, s in scores:
         numbers = [s["nees_dof"]["joint"], s["nees_dof_median"]["joint"], s["coverage"]["1"]]
@@ -245,7 +245,7 @@ def stated_against_actual(folds: Sequence[Mapping[str, Any]]) -> str | None:
 
 
 def _panel(left: float, name: str, curves: Sequence[Sequence[tuple[float, float]]]) -> list[str]:
-    """Logarithmic in both directions and equal in scale, with the band in which sigma counts as true."""
+    """Log-log with equal scales, and the band in which sigma counts as right."""
     values = [1e3 * v for curve in curves for pair in curve for v in pair if v > 0] or [0.1, 10.0]
     low, high = min(values) / 1.3, max(values) * 1.3
 

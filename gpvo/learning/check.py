@@ -14,8 +14,8 @@ from gpvo.online.predictor import Predictor
 
 _RATE = 0.2
 ENOUGH_INSIDE = 0.8
-"""A model fits a run where at least this share of its frames lies in the training domain; of a vehicle's next flight of
-the same kind a tenth may lie outside."""
+"""A model fits a run if at least this share of its frames lies in the training domain; in a vehicle's next flight of
+the same kind, a tenth may lie outside."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def check(predictor: Predictor, run: Run) -> Check:
 
 
 def rate_problems(predictor: Predictor, steps_s: Collection[float]) -> list[str]:
-    """Whether motions of durations ``steps_s`` [s] come at the rate that a model was trained at; a line if not."""
+    """Whether motions of durations ``steps_s`` [s] come at the rate that a model was trained at; one line if not."""
     if not steps_s or predictor.target != "frame":
         return []
     here, trained = 1.0 / float(np.median(list(steps_s))), 1.0 / predictor.model.dt_s

@@ -1,4 +1,4 @@
-"""Settings of a training, and the sets of inputs that it chooses among by itself."""
+"""Training settings, and the sets of inputs among which training chooses by itself."""
 
 from __future__ import annotations
 
@@ -24,24 +24,23 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "image": IMAGE,
     "all": (*AGILITY, *TRACKING, *IMAGE),
 }
-"""What ``features="auto"`` chooses among, the simplest first, beside no inputs at all: the base variance alone."""
+"""What ``features="auto"`` chooses among, simplest first, besides no inputs at all: the base variance alone."""
 
 GUARDED = (*TWIST_COLUMNS, *TRACKING, *ACCELERATION_COLUMNS, *IMAGE[:2])
-"""Columns by which a model tells whether it knows a place, also where no GP needs them: other surroundings show in
-them first."""
+"""Columns by which a model recognises familiar surroundings, even if no GP needs them: unfamiliar ones show here
+first."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """``features``: ``auto`` (chosen by cross-validation over the training sequences), ``thesis``, ``full`` or a list.
 
-    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: of
-    positions and of the thesis' model. ``align``:
-    ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``: ``drop`` leaves out waits in
-    which the truth moves; ``odd`` likewise stretches in which odometry and truth differ as nowhere else. ``inducing``:
-    points of its GP. ``max_rows``: held in memory, of larger files the rest streams. ``jobs``, ``backend`` (``local``
-    or ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for finished folds, which a training that was
-    broken off does not fit again; None keeps none.
+    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: for positions and for the
+    thesis' model. ``align``: ``rotation`` first fits a fixed rotation between each log and its truth. ``waits``:
+    ``drop`` leaves out waits in which the truth moves; ``odd`` does the same for stretches in which odometry and truth
+    differ as nowhere else. ``inducing``: points of its GP. ``max_rows``: held in memory; the rest of larger files is
+    streamed. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for
+    finished folds, which an interrupted training does not fit again; None keeps none.
     """
 
     features: str = "auto"
@@ -59,11 +58,11 @@ class TrainConfig:
     keep: str | None = None
 
     def settings(self) -> dict[str, Any]:
-        """Those that decide the model, not where its folds are fitted and kept."""
+        """Those that determine the model, not where its folds are fitted and kept."""
         return {k: v for k, v in asdict(self).items() if k not in ("jobs", "backend", "scheduler", "keep")}
 
     def rows_of(self, run: Run) -> TrainingSet:
-        """The training set of a run as these settings want it."""
+        """The training set of a run under these settings."""
         return build_run(run, target=self.target, align=self.align, waits=self.waits, odd=self.odd)
 
 
@@ -79,7 +78,7 @@ def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tup
 
 
 def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tuple[str, ...]]:
-    """Named sets of inputs to try, each without what the logs lack. Raises GpvoError where nothing is left."""
+    """Named sets of inputs to try, each without what the logs lack. Raises GpvoError if nothing is left."""
     names = FAMILIES if config.features == "auto" else {config.features: (config.features,)}
     out: dict[str, tuple[str, ...]] = {}
     for name, selection in names.items():
@@ -93,14 +92,14 @@ def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tu
 
 
 def guarded(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[str, ...]:
-    """Those of :data:`GUARDED` that the logs know; none beside those that were asked for by name."""
+    """Those of :data:`GUARDED` that the logs know; none besides those that were asked for by name."""
     return supported_columns(sets, GUARDED) if config.features == "auto" else ()
 
 
 def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:
-    """Bases to choose among, of the columns that every log knows in 95 of 100 rows: geometric covariances and imported
-    ones, at one pixel and at the noise of the residuals, and the motion alone. A covariance that is always the same
-    says nothing of a motion."""
+    """Bases to choose among, from columns that every log knows in 95 of 100 rows: geometric and imported covariances,
+    at one pixel and at the noise of the residuals, and the motion alone. A covariance that never changes says nothing
+    about a motion."""
     known = set.intersection(*(s.supported() for s in sets))
     columns = {m: {f"ln_var_{m}_{a}" for a in AXES} for m in (*GEOMETRIC_METHODS, IMPORTED)}
     tell = supported_columns(sets, sorted(set.union(*columns.values())))

@@ -35,7 +35,7 @@ MOST_FOLDS = 8
 
 @dataclass(frozen=True)
 class BaseChoice:
-    """What a base variance is made of: ``method`` of the geometric covariance, and whether it looks at residuals."""
+    """What a base variance is made of: ``method`` of the geometric covariance, and whether it uses the residuals."""
 
     method: str | None
     residual: bool
@@ -90,8 +90,8 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
 def choose_base(rows: Rows) -> tuple[BaseChoice, VarianceModel]:
     """The base variance, with geometry or without, that predicts left-out groups best.
 
-    One that trusts the residuals must beat the best that does not by a significant gain: where a moving object is all
-    there is to see, residuals are small and the motion wrong.
+    One that trusts the residuals must beat the best one that does not by a significant gain: if a moving object fills
+    the view, residuals are small and the motion is wrong.
     """
     tried = {c: fit_variance(rows, c, ()) for c in (BaseChoice(*c) for c in base_candidates(rows.sets))}
     losses = {c: _losses(rows, model) for c, model in tried.items()}
@@ -134,7 +134,7 @@ def fit_variance(rows: Rows, choice: BaseChoice, inputs: tuple[str, ...]) -> Var
 
 
 def _fit(rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_]) -> tuple[Array, ProjectedGP | None, Array]:
-    """Coefficients of the base, GP, and what it leaves of the errors, of the rows ``of``. The base is the GP's mean
+    """Coefficients of the base, GP, and what it leaves of the errors, for the rows ``of``. The base is the GP's mean
     function, and is fitted once more with it.
 
     Explicit basis functions: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006),

@@ -1,11 +1,11 @@
-"""The log-variance GP: how much noisier than its base variance a motion is, in the conditions that its inputs tell.
+"""The log-variance GP: how much noisier than its base variance a motion is, in the conditions that its inputs show.
 
 The squared error over the base is a Student-t's; the log of its scale is a GP, found by Fisher scoring on that density
 (P. Green, B. Silverman, "Nonparametric Regression and Generalized Linear Models" (1994), section 5.3).
 
-The kernel is a prior and is not learnt: the marginal likelihood of few sequences, whose rows go together, takes what
-differs between sequences for structure and ends at length scales of a tenth of the data's width. A level of its own
-for each sequence (a random effect) is taken out for the same reason: only what changes within sequences teaches.
+The kernel is a prior and is not learned: the marginal likelihood of few sequences, whose rows are alike, mistakes
+differences between sequences for structure and ends at length scales of a tenth of the data's width. A separate level
+for each sequence (a random effect) is removed for the same reason: the GP learns only from changes within sequences.
 """
 
 from __future__ import annotations
@@ -117,6 +117,6 @@ def _mode(prior: ProjectedGP, Z: Array, ratio: Array, weight: Array, group: NDAr
 
 
 def log_ratio(gp: ProjectedGP, inputs: Array) -> Array:
-    """(n, 6) log of the expected variance ratio: half the posterior's variance is the mean of a log-normal's share."""
+    """(n, 6) log of the expected variance ratio: the mean of a log-normal adds half the posterior's variance."""
     mean, variance = gp.evaluate(inputs)
     return mean + 0.5 * variance

@@ -97,7 +97,7 @@ def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) ->
     ``nll_per_dim`` is that of the Gaussian of these covariances, ``nll_stated_per_dim`` that of the stated Student-t;
     ``nees_dof_median_stated`` the median that the latter expects of NEES.
 
-    A covariance that speaks of the translation alone is (n, 3, 3): fields that need the rotation are then None.
+    A covariance of the translation alone is (n, 3, 3): fields that need the rotation are then None.
     Rows whose covariance is not finite are left out; with none left every field is None.
     """
     known = np.isfinite(covariance).all(axis=(1, 2))
@@ -139,7 +139,7 @@ def stated_and_actual(error: Array, mean: Array, covariance: Array) -> dict[str,
 
 
 def empty() -> dict[str, Any]:
-    """The same document where nothing could be computed."""
+    """The same document if nothing could be computed."""
 
     def blank(document: dict[str, Any]) -> dict[str, Any]:
         return {key: blank(v) if isinstance(v, dict) else None for key, v in document.items()}
@@ -148,7 +148,7 @@ def empty() -> dict[str, Any]:
 
 
 def average(values: Sequence[Any]) -> Any:
-    """Documents of one form averaged number by number; None where none has a number, text from the first."""
+    """Documents of one form averaged number by number; None where none has a number; text from the first."""
     values = [v for v in values if v is not None] or [None]
     first = values[0]
     if isinstance(first, dict):

@@ -30,7 +30,7 @@ _WORTH = 20.0
 """Gain in log-likelihood that a block must show for an unexpected shape; all spans count the same errors."""
 _MOST_WINDOWS = 1000
 _MOST_COUNT = 60.0
-"""A span's weight is its number of windows, up to this: short spans have many, but they tell the same thing."""
+"""A span's weight is its number of windows, up to this: short spans have many, but they say the same thing."""
 MOST_ROWS = 100_000
 _MIN_SHARE = 1e-6
 _REWEIGHTINGS, _REDIVISIONS = 6, 3
@@ -188,7 +188,7 @@ def _fit_shape(windows: _Windows, shape: _Shape, widen: Array | None = None) -> 
     """Shares for one shape, by the likelihood of squared sums, times ``widen`` (S, d) if given.
 
     The standard deviation of a squared sum is its own stated variance (times root two). So the fit is reweighted by
-    what it states itself: weights by the observed squares would favour statements that are too small.
+    its own stated variances: weights from the observed squares would favour variances that are too small.
     """
     d, sizes = len(windows.square), [w for w, _ in windows.spans]
     widen = np.ones((len(sizes), d)) if widen is None else widen

@@ -3,7 +3,7 @@
 A wrong baseline, focal length or rectification makes errors that are linear in the motion, ``e = K v``, with another K
 in each flight. So ``vec K`` is a random effect of a linear model (N. Laird, J. Ware, "Random-effects models for
 longitudinal data" (1982)): its covariance over the flights and the noise are found by expectation-maximisation, and the
-few principal axes of that covariance are patterns, each scaled by how wrong calibrations usually are in its way.
+few principal axes of that covariance are patterns, each scaled by how wrong calibrations usually are in that way.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _sums(error: Sequence[Array], variance: Sequence[Array], twist: Sequence[Arr
 
 def _clear(flights: Sequence[_Sums], step_s: float) -> NDArray[np.bool_]:
     """(6,) which velocities add up to ten times as much as VO's own errors in them: an error that seems to follow any
-    other velocity may just follow that error."""
+    other velocity may merely follow VO's error in it."""
     moved, wrong = (_rms(np.concatenate(x)) for x in ([f.twist for f in flights], [f.error for f in flights]))
     return np.asarray(moved * step_s > _CLEAR * wrong)
 

@@ -1,8 +1,8 @@
 """How much of the motions' errors adds up, by the poses that they add up to.
 
-White and bias are fitted to sums of single axes, in the camera's own frame. A pose shows more: errors are turned and
-levered along the path, and what belongs to a place, such as a turn and the shift that undoes it, takes back part of
-what the axes seem to add.
+White and bias are fitted to sums of single axes, in the camera frame. A pose shows more: errors are rotated and act
+over lever arms along the path, and errors that belong to a place, such as a turn and the shift that undoes it, cancel
+part of what the axes seem to add up to.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Training rows of several sequences below one another, with the groups that cross-validation leaves out, and the one
-rule by which training leaves a simpler model for another: held-out gain above its standard error."""
+"""Stacked training rows of several sequences, with the groups that cross-validation leaves out, and the single rule
+by which training replaces a simpler model by another: held-out gain above its standard error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gpvo.types import Array
 
 @dataclass(frozen=True)
 class Rows:
-    """All training rows of several sequences below one another, with the groups that cross-validation leaves out."""
+    """All training rows of several sequences, stacked, with the groups that cross-validation leaves out."""
 
     sets: Sequence[TrainingSet]
     error: Array
@@ -48,7 +48,7 @@ class Rows:
         return np.concatenate([s.select(names) for s in self.sets])
 
     def motions(self) -> Array:
-        """(n, 4, 4) VO's motions ``T_prev_cur``; that of an unknown velocity is none."""
+        """(n, 4, 4) VO's motions ``T_prev_cur``; the identity where the velocity is unknown."""
         twist = self.select(TWIST_COLUMNS) * self.dt_s[:, None]
         return se3.exp(np.where(np.isfinite(twist), twist, 0.0))
 

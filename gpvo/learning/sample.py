@@ -17,7 +17,7 @@ from gpvo.types import Array
 
 @dataclass(frozen=True)
 class TrainingSample:
-    """Rows of the training set, from every sequence alike: motions whose end is the reference of the next.
+    """Rows of the training set, equally from every sequence: motions whose end is the reference of the next.
 
     ``X`` (n, d): the model's features, NaN where unknown. ``sequence`` (n,): which sequence each row is from.
     ``dt_s`` (n,): duration of each motion, more than a frame's where odometry kept its reference.
@@ -39,7 +39,7 @@ class TrainingSample:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], n_features: int) -> TrainingSample:
-        """The sample of a model file. Raises ModelError where it has none, as older files."""
+        """The sample of a model file. Raises ModelError if it has none, as in older files."""
         if any(f"sample.{name}" not in arrays for name in ("X", "sequence", "dt_s")):
             raise ModelError("the model holds no sample of its training rows", cure="train it again")
         X, sequence, dt_s = arrays["sample.X"].astype(np.float64), arrays["sample.sequence"], arrays["sample.dt_s"]

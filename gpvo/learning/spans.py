@@ -40,7 +40,7 @@ class SpanVariances:
 
 
 def at_most(values: Chains, limit: int) -> Chains:
-    """Up to so many rows, equally many from the beginning of each sequence, so that every place and scenario is
+    """At most that many rows, equally many from the beginning of each sequence, so that every place and scenario is
     represented."""
     out = []
     for chains in values:

@@ -1,5 +1,5 @@
-"""A trained model on disk: the file, its card and its training rows, side by side; and training from rows that were
-kept: those of a model with one's own flights added, and sets larger than memory."""
+"""A trained model on disk: the file, its card and its training rows, side by side; and training from stored rows:
+those of a model with new flights added, and sets larger than memory."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def folds_path(model: Path) -> Path:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ModelError, before any work, where no model can be written to ``path``."""
+    """Raise ModelError, before any work, if no model can be written to ``path``."""
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise ModelError("cannot be written: not a file in a folder that is there and may be written", where=path)
 
@@ -62,7 +62,7 @@ def save_model(trained: TrainedModel, path: str | Path) -> None:
 
 
 def training_rows(path: str | Path) -> list[TrainingSet]:
-    """The rows a model was trained on. Raises ModelError where they are gone or are another model's."""
+    """The rows a model was trained on. Raises ModelError if they are gone or belong to another model."""
     path = Path(path)
     header = modelfile.load(path)[1]
     if not rows_path(path).is_file():
@@ -89,8 +89,8 @@ def update(
     judge: bool = True,
     tell: Callable[[str], None] = lambda _: None,
 ) -> TrainedModel:
-    """The model at ``path``, trained anew with more sequences. A run with a known name replaces that sequence, and
-    ``tell`` is told so."""
+    """The model at ``path``, retrained with more sequences. A run with a known name replaces that sequence, and
+    ``tell`` reports it."""
     old = training_rows(path)
     if old[0].target != config.target:
         raise ModelError(f"learns the target '{old[0].target}', not '{config.target}'", where=path)
@@ -104,9 +104,9 @@ def update(
 def train_stored(
     path: str | Path, config: TrainConfig, *, judge: bool = True, chunk_rows: int = CHUNK_ROWS
 ) -> TrainedModel:
-    """Train from a file of training sets; in memory are never more than ``config.max_rows`` rows and a chunk.
+    """Train from a file of training sets; memory never holds more than ``config.max_rows`` rows and a chunk.
 
-    Of more rows, blocks of consecutive ones are kept, equally many of each sequence.
+    From larger files, blocks of consecutive rows are kept, equally many of each sequence.
     """
     stored = StoredSets(path)
     sets = stored.thinned(config.max_rows, chunk_rows)

@@ -1,9 +1,9 @@
 """The thesis' model: Gaussian processes on velocity and inlier count, with constant noise.
 
-Of the error of a motion, an axis each, kept in every model file for comparison with ``learned``; or of the residual of
-the position at a point of the trajectory, which is no error of a motion and hence not for filters. Formula: D. Ross,
-"Uncertainty Estimation for Stereo Visual Odometry", eqs. 3.19 and 3.20, the latter with the inverse of the kernel
-matrix that it lacks in print.
+They predict the error of a motion, one axis each, kept in every model file for comparison with ``learned``; or the
+residual of the position at a point of the trajectory, which is not the error of a motion and hence not for filters.
+Formula: D. Ross, "Uncertainty Estimation for Stereo Visual Odometry", eqs. 3.19 and 3.20, the latter with the inverse
+of the kernel matrix that is missing in print.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class ThesisModel(Stored):
     @classmethod
     def of_positions(cls, path: str | PathLike[str]) -> ThesisModel:
         """From a file of ``--target position``: residuals [m] in the axes of the first camera. Raises ModelError, one
-        line, where the file cannot be used."""
+        line, if the file cannot be used."""
         arrays, header = modelfile.load(path)
         if header.get("target") != "position":
             raise ModelError("this model predicts the error of a motion", where=path, cure="use Predictor")

@@ -1,4 +1,4 @@
-"""Training: the model from all sequences, and the table of what it would have said on each one left out."""
+"""Training: the model from all sequences, and the table of what it would have predicted for each one left out."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ from gpvo.types import Array, Prediction
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
-"""A translation error longer than so many medians of its sequence counts as a slip in the report; if nobody called it
-one, only where it is so many sigma longer than was stated: an error that is expected is noise."""
+"""A translation error longer than so many medians of its sequence counts as a slip in the report; if it was not called
+one, only if it is also so many sigma longer than stated: an expected error is noise."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class TrainedModel:
     sets: Sequence[TrainingSet] = ()
 
     def predictor(self) -> Predictor:
-        """The predictor of this model, without a detour over a file."""
+        """The predictor of this model, without a detour through a file."""
         return Predictor(self.arrays, self.header)
 
 
 def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedModel:
     """Learn from runs with ground truth, and judge by leaving each run out.
 
-    Raises GpvoError where a run has no truth, or runs do not belong together.
+    Raises GpvoError if a run has no truth, or the runs do not belong together.
     """
     config = config or TrainConfig()
     return train_sets([config.rows_of(r) for r in runs], config)
@@ -119,7 +119,7 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
 def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
     """``folds`` (a sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
 
-    Of a single sequence, blocks of time are left out: they say less, and have no intervals. ``folds_are`` tells.
+    For a single sequence, blocks of time are left out: they say less, and have no intervals; see ``folds_are``.
     """
     parts = sets if len(sets) > 1 else time_blocks(sets[0])
     jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(parts) if train_on]
@@ -140,7 +140,7 @@ def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, A
 
 
 def time_blocks(s: TrainingSet) -> list[TrainingSet]:
-    """A sequence in ``JUDGED_BLOCKS`` parts, one after the other; one part where it is short."""
+    """A sequence in ``JUDGED_BLOCKS`` consecutive parts; a single part if it is short."""
     if len(s) < JUDGED_BLOCKS * 2 * MIN_ROWS:
         return [s]
     counts = {**s.counts, "lost": 0, "slips": 0, "truth_moves_at_rest": 0, "odd": 0}
@@ -150,7 +150,7 @@ def time_blocks(s: TrainingSet) -> list[TrainingSet]:
 
 
 def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
-    """A fold, from ``config.keep`` where a training that was broken off has left it."""
+    """A fold, from ``config.keep`` if an interrupted training has left it there."""
     if config.keep is None:
         return _fold(held_out, train_on, config)
     model = fold_model(held_out, train_on, config, config.keep)
@@ -162,7 +162,7 @@ def _kept_fold(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: T
 
 
 def fold_model(held_out: TrainingSet, train_on: Sequence[TrainingSet], config: TrainConfig, keep: str) -> Path:
-    """Where a training under way keeps the model that has not learned from one sequence; the scores lie beside it."""
+    """Where a training in progress keeps the model that has not learned from one sequence; its scores lie beside it."""
     sha = hashlib.sha256(repr((code_digest(), versions(), config.settings())).encode())
     for s in (held_out, *train_on):
         sha.update(repr((s.digest(), s.counts, s.camera)).encode() + s.lost_xi.tobytes() + s.lost_jump.tobytes())
@@ -206,8 +206,8 @@ def estimate_set(model: ErrorModel, s: TrainingSet) -> Prediction:
 
 
 def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Array) -> dict[str, Any]:
-    """Gross errors caught, and those missed although unexpected; good motions flagged; and NEES/dof with the caught
-    ones counted in."""
+    """Gross errors caught, and those missed although unexpected; good motions flagged; and NEES/dof including the
+    caught ones."""
     length, lost_length = (np.linalg.norm(xi[:, :3], axis=1) for xi in (s.Y, s.lost_xi))
     stated = np.sqrt(np.trace(estimate.covariance[:, :3, :3], axis1=1, axis2=2))
     gross = (length > SLIP_MEDIANS * np.median(length)) & (length > SLIP_SIGMAS * stated)
@@ -249,7 +249,7 @@ def paired_nll(folds: Sequence[dict[str, Any]], method: str, rival: str) -> Inte
 
 
 def versions() -> dict[str, str]:
-    """Of gpvo, and of the packages on which the numbers depend."""
+    """Versions of gpvo and of the packages on which the numbers depend."""
     return {"gpvo": __version__, **{name: version(name) for name in ("numpy", "scipy", "torch")}}
 
 

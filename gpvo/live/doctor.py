@@ -1,7 +1,7 @@
 """``gpvo doctor``: what is wrong with anyone's odometry, of a bag or a live topic, and what filters make of it.
 
 robot_localization: src/ros_filter.cpp, src/ekf.cpp (variances below 1e-9 become 1e-9, negative ones positive, NaN is
-not looked for). PX4: src/modules/ekf2/EKF/aid_sources/external_vision and params_external_vision.yaml (floors).
+not checked for). PX4: src/modules/ekf2/EKF/aid_sources/external_vision and params_external_vision.yaml (floors).
 ArduPilot: libraries/GCS_MAVLink/GCS_Common.cpp, AP_VisualOdom_MAV.cpp (clamps). FusionCore: what is stated drives its
 chi-square gate, zeros fall back to 0.1 m and 0.02 rad, off-diagonal elements are not read.
 """
@@ -27,12 +27,12 @@ from gpvo.live.stated import ENOUGH, Finding, Stated
 from gpvo.types import Array
 
 _LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds up over as many frames as it lasts
-_SWAPPED = "every consumer reads metres where radians stand, and the other way round"
+_SWAPPED = "every consumer reads metres where there are radians, and vice versa"
 _HUGE, _TINY = 1e3, 1e-8
-_ZERO_FALLBACK = "FusionCore takes 0.1 m and 0.02 rad in its place"
-_RL_FLOOR = "robot_localization takes 1e-9, a sigma of 0.03 mm, and lets go of everything else"
-_PX4_FLOOR = "PX4 takes EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) in its place"
-_AP_FLOOR = "ArduPilot takes VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
+_ZERO_FALLBACK = "FusionCore uses 0.1 m and 0.02 rad instead"
+_RL_FLOOR = "robot_localization uses 1e-9, a sigma of 0.03 mm, and ignores everything else"
+_PX4_FLOOR = "PX4 uses EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) instead"
+_AP_FLOOR = "ArduPilot uses VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
 _DEPTH = 10_000  # messages of a live topic that may wait
 
 
@@ -57,7 +57,7 @@ def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]
 def examine_topic(
     wire: str, topic: str, msgtype: str, seconds: float, address: str | None = None, domain: int = 0
 ) -> list[Finding]:
-    """Findings of what a running system publishes in so many ``seconds``. GpvoError where nothing comes."""
+    """Findings about what a running system publishes within ``seconds``. GpvoError if nothing is received."""
     link, mailbox, stop = open_wire(wire, address, domain), Mailbox(_DEPTH), threading.Event()
     kept: list[Any] = []
     try:
@@ -70,12 +70,12 @@ def examine_topic(
     finally:
         link.close()
     if not kept:
-        raise GpvoError(f"nothing came on '{topic}' in {seconds:g} s", cure="is it published, and of that type?")
+        raise GpvoError(f"nothing received on '{topic}' in {seconds:g} s", cure="is it published, and of that type?")
     return examine(Stated.of(kept))
 
 
 def examine(stated: Stated) -> list[Finding]:
-    """Everything that is wrong with a recording, the gravest first; empty for a good one."""
+    """Everything that is wrong with a recording, worst first; empty for a good one."""
     found = [*_stamps(stated), *_frames(stated), *_poses(stated)]
     if stated.pose is None and stated.twist is None:
         found.append(Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR))
@@ -87,16 +87,18 @@ def examine(stated: Stated) -> list[Finding]:
 
 
 def _matrices(name: str, C: Array) -> list[Finding]:
-    """Of each matrix by itself."""
+    """Findings about each matrix on its own."""
     if not np.isfinite(C).all():
         share = float(1 - np.isfinite(C).all(axis=(1, 2)).mean())
-        text = "robot_localization does not look and its state becomes NaN; ArduPilot reads NaN in element 0 alone"
+        text = "robot_localization does not check, so its state becomes NaN; ArduPilot checks only element 0 for NaN"
         return [Finding(f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text, share)]
     D = np.diagonal(C, axis1=1, axis2=2)
     zero = (C == 0).all(axis=(1, 2))
     if zero.all():
         text = f"{_RL_FLOOR}; {_PX4_FLOOR}; {_AP_FLOOR}; {_ZERO_FALLBACK}"
-        return [Finding(f"{name}-zero", f"the {name}'s covariance is zero throughout: unknown, said as certain", text)]
+        return [
+            Finding(f"{name}-zero", f"the {name}'s covariance is zero throughout: 'unknown' stated as certain", text)
+        ]
     found = []
     if zero.any() or (D == 0).any():
         share = float((D == 0).any(axis=1).mean())
@@ -105,11 +107,11 @@ def _matrices(name: str, C: Array) -> list[Finding]:
     checks: list[tuple[str, str, Any, str]] = [
         ("negative", "variances of the {} are negative", (D < 0).any(axis=1),
          "robot_localization takes the absolute value; PX4 and ArduPilot take their floors; Cholesky fails elsewhere"),
-        ("tiny", "variances of the {} are below 1e-8: a placeholder, no measurement",
+        ("tiny", "variances of the {} are below 1e-8: a placeholder, not a measurement",
          ((D > 0) & (D < _TINY)).any(axis=1), f"{_RL_FLOOR}; {_PX4_FLOOR}; FusionCore's gate rejects good data"),
         ("huge", "variances of the {} are above 1e3 (9999, 1e6: 'unknown' or 'lost')", (D > _HUGE).any(axis=1),
-         "no filter knows the flag: robot_localization fuses it at almost no weight and its correlations blow up; "
-         "ArduPilot clamps at 100 m and 1.5 rad and goes on fusing"),
+         "no filter knows the flag: robot_localization fuses it with almost no weight and its correlations blow up; "
+         "ArduPilot clamps it at 100 m and 1.5 rad and goes on fusing"),
         ("asymmetric", "the {}'s covariance is not symmetric", ~_symmetric(C),
          "filters read different halves: PX4 and ArduPilot the diagonal, robot_localization all of it"),
     ]  # fmt: skip
@@ -120,14 +122,14 @@ def _matrices(name: str, C: Array) -> list[Finding]:
     if not {"zero", "negative", "asymmetric"} & set(known):
         bad = np.array([not is_positive_definite(c) for c in C])
         if bad.any():
-            text = "its correlations are impossible: robot_localization's gain goes wrong, a Cholesky factor fails"
+            text = "its correlations are impossible: robot_localization's gain goes wrong, Cholesky factorisation fails"
             what = f"the {name}'s covariance is not positive definite"
             found.append(Finding(f"{name}-not-positive", what, text, float(bad.mean())))
     if np.ptp(C, axis=0).max() == 0.0:
-        text = "every frame weighs the same, in the dark and in good light: a gate passes bad frames and drops good"
+        text = "every frame has the same weight, in bad light and in good: a gate passes bad frames and drops good ones"
         found.append(Finding(f"{name}-constant", f"the {name}'s covariance never changes", text))
     elif len(np.unique(D.round(12), axis=0)) <= 4 < len(D) // 4:
-        text = "steps of a few levels (as of a tracker's confidence): most of what the source knows is lost"
+        text = "a few levels only (such as a tracker's confidence): most of what the source knows is lost"
         found.append(Finding(f"{name}-levels", f"the {name}'s covariance takes four values or fewer", text))
     return found
 
@@ -143,10 +145,10 @@ def _stamps(s: Stated) -> list[Finding]:
         text = "every consumer dates the measurement to the epoch and drops it"
         out.append(Finding("stamp-zero", "stamps are zero", text))
     elif (steps < 0).any():
-        text = "robot_localization drops or replays them; PX4 and ArduPilot take them as they come"
+        text = "robot_localization drops or replays them; PX4 and ArduPilot use them as they are"
         out.append(Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean())))
     if (steps == 0).any() and not (s.t_ns == 0).any():
-        text = "the same measurement is fused twice: the filter grows too sure of it"
+        text = "the same measurement is fused twice: the filter becomes overconfident"
         out.append(Finding("stamp-repeated", "stamps repeat", text, float((steps == 0).mean())))
     good = steps[steps > 0]
     if len(good) and good.max() > 10 * np.median(good):
@@ -176,7 +178,7 @@ def _poses(s: Stated) -> list[Finding]:
     out = []
     bad = ~np.isfinite(s.T).all(axis=(1, 2))
     if bad.any():
-        what = "poses hold NaN, or numbers beyond measure"
+        what = "poses hold NaN, or absurdly large numbers"
         out.append(Finding("pose-not-finite", what, "robot_localization drops them", float(bad.mean())))
     off = np.abs(s.quaternion_norm - 1.0) > 1e-2
     if (off & ~bad).any():
@@ -207,7 +209,7 @@ def _motions(s: Stated) -> tuple[Array, Array] | None:
 
 
 def _pose_against_twist(s: Stated) -> list[Finding]:
-    """What shows only when one part of the message is held against another."""
+    """What shows only when one part of the message is compared with another."""
     out: list[Finding] = []
     motion = _motions(s)
     if motion is None:
@@ -243,7 +245,9 @@ def _twist_against_motion(s: Stated, steps: Array, dt: Array) -> list[Finding]:
     own, other = (float(np.linalg.norm(said[:, :3] - m, axis=1).mean()) for m in (moved[:, :3], in_parent))
     size = float(np.linalg.norm(moved[:, :3], axis=1).mean())
     if other < 0.5 * own and own > 0.2 * size:
-        text = "robot_localization rotates it once more by the heading; MAVLink's receivers take it as of the body"
+        text = (
+            "robot_localization rotates it once more by the heading; MAVLink receivers take it to be in the body frame"
+        )
         return [Finding("twist-in-parent", "the twist is in frame_id's axes, not in child_frame_id's", text)]
     ratio = float(np.linalg.norm(said[:, :3], axis=1).mean()) / size
     if not 0.5 < ratio < 2.0:
@@ -253,7 +257,7 @@ def _twist_against_motion(s: Stated, steps: Array, dt: Array) -> list[Finding]:
 
 
 def _blocks(name: str, C: Array) -> list[Finding]:
-    """Rotation before translation: radians squared stand where metres squared belong."""
+    """Rotation before translation: radians squared where metres squared belong."""
     D = np.median(np.diagonal(C, axis1=1, axis2=2), axis=0)
     first, second = D[:3].mean(), D[3:].mean()
     if second > 100 * first and 0.05 < second < _HUGE:
@@ -264,10 +268,10 @@ def _blocks(name: str, C: Array) -> list[Finding]:
 
 
 def _heading(s: Stated) -> list[Finding]:
-    """A wrong heading carries the position away with it: its variance grows at least with the way that was gone.
+    """A wrong heading carries the position off with it: the position's variance grows with the distance travelled.
 
-    Of a heading whose error walks, the position's error across the way has a third of the heading's variance times the
-    way squared; a hundredth of the sum over the axes is out of the question.
+    If the heading's error is a random walk, the position's variance across the path is a third of the heading's
+    variance times the distance squared; a hundredth of the sum over the axes is out of the question.
     """
     if s.pose is None or not _usable(s.pose) or not np.isfinite(s.T[[0, -1]]).all():
         return []
@@ -281,7 +285,7 @@ def _heading(s: Stated) -> list[Finding]:
 
 
 def _turned(name: str, C: Array, R: Array) -> list[Finding]:
-    """Variances turned like the components of a vector, ``R d`` in place of ``R diag(d) R^T``."""
+    """Variances rotated like the components of a vector, ``R d`` instead of ``R diag(d) R^T``."""
     off = C[:, ~np.eye(6, dtype=bool)]
     d = np.diagonal(C, axis1=1, axis2=2)[:, :3]
     good = np.isfinite(R).all(axis=(1, 2))
@@ -290,13 +294,13 @@ def _turned(name: str, C: Array, R: Array) -> list[Finding]:
     for turn in (R, np.swapaxes(R, 1, 2)):
         back = np.einsum("nij,nj->ni", turn[good], d[good])
         if np.ptp(back, axis=0).max() < 1e-6 * np.abs(back).max():
-            text = "a body that turns makes them negative or wrong for every consumer; turn them by R C R^T"
+            text = "a body that turns makes them negative or wrong for every consumer; rotate them by R C R^T"
             return [Finding(f"{name}-turned", f"the {name}'s variances are rotated as if they were a vector", text)]
     return []
 
 
 def _growth(s: Stated) -> list[Finding]:
-    """Over the recording a pose's covariance grows by about what the twist's says."""
+    """Over the recording, a pose's covariance should grow by about what the twist's says."""
     assert s.pose is not None
     assert s.twist is not None
     if np.array_equal(s.pose, s.twist) and s.pose.any():
@@ -308,7 +312,7 @@ def _growth(s: Stated) -> list[Finding]:
     dt = np.diff(s.t_ns) * 1e-9
     gained, walked = float((pose[-1] - pose[0])[3:].sum()), float((twist[1:, 3:] * dt[:, None] ** 2).sum())
     if gained > 0 and not _LEAST < gained / walked < _MOST:
-        text = "fuse one of them only: the other is off by far (a covariance per frame is not per second)"
-        what = f"the rotation's variance in the pose grows {gained / walked:.1g} times what the twist's says"
+        text = "fuse only one of them: the other is far off (a covariance per frame is not per second)"
+        what = f"the rotation's variance in the pose grows {gained / walked:.1g} times as much as the twist's says"
         return [Finding("pose-against-twist", what, text)]
     return []

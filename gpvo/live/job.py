@@ -165,7 +165,7 @@ def _outputs(settings: LiveSettings, wire: Wire | None) -> list[Output]:
     outputs: list[Output] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
     if settings.px4:
         if wire is None or wire.ros1:
-            raise GpvoError("--px4 speaks DDS", cure="add --dds or --ros2")
+            raise GpvoError("--px4 needs DDS", cure="add --dds or --ros2")
         outputs.append(Px4Output(wire))
     outputs += [MavlinkOutput(settings.mavlink)] if settings.mavlink else []
     outputs += [FileOutput(settings.out)] if settings.out else []
@@ -179,7 +179,7 @@ def make_stage(settings: LiveSettings) -> Stage:
         return stage
     if isinstance(stage, PoseStage) and settings.pose_type != ODOMETRY_TYPE:
         raise GpvoError(
-            "--base-frame needs to know whose poses come, and their messages do not name a frame",
+            "--base-frame needs to know which frame the poses are of, and these messages do not name one",
             cure="use a topic of nav_msgs/Odometry",
         )
     return BaseFrameStage(stage, settings.base_frame)
@@ -188,7 +188,7 @@ def make_stage(settings: LiveSettings) -> Stage:
 def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
     if settings.stereo is not None:
         if settings.odometry is not None:
-            raise GpvoError("--stereo and --odometry exclude each other", cure="choose one")
+            raise GpvoError("--stereo and --odometry are mutually exclusive", cure="choose one")
         rig = None if settings.calibration is None else read_stereo_yaml(settings.calibration)
         return StereoStage(*settings.stereo, settings.imu, rig)
     if settings.odometry is not None:

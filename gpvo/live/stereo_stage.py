@@ -90,7 +90,7 @@ class StereoStage:
         """Images that nobody says the calibration of."""
         if self.camera is not None or not self.counts["uncalibrated"]:
             return []
-        return ["images come, but no calibration: no CameraInfo beside them"]
+        return ["images arrive, but no calibration: there is no CameraInfo beside them"]
 
     def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:
         if self._rectifier is None or self.camera is None:

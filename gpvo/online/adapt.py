@@ -16,7 +16,7 @@ _Z = 1.6448536269514722
 
 
 class AdaptiveScale:
-    """Per axis a factor on the standard deviation that brings the long-run coverage of the 90 % interval to 90 %.
+    """A factor on each axis' standard deviation that brings the long-run coverage of the 90 % interval to 90 %.
 
     Steps are in the log of the scale, so the factor stays positive; it is kept within [1/100, 100].
     """
@@ -31,9 +31,9 @@ class AdaptiveScale:
         return np.exp(self._log_scale)
 
     def observe(self, error: Array, sigma: Array) -> None:
-        """``error`` (6,) about the mean, and the ``sigma`` (6,) stated for it with the factor of that time inside.
+        """``error`` (6,) about the mean, and the ``sigma`` (6,) stated for it, including the factor at that time.
 
-        Axes whose error is NaN are left alone.
+        Axes whose error is NaN are left unchanged.
         """
         missed = np.abs(error) > _Z * sigma
         move = np.where(np.isfinite(error), self._step * (missed - (1.0 - LEVEL)), 0.0)

@@ -3,11 +3,11 @@
 The variance is, per axis, a sum of physical parts:
 
 ``v_j = a_j g_j + b_j + c_j |t|^2 + d_j |phi|^2 + e_j r^2 g_j``: the geometric variance g (noise of one pixel carried
-through the geometry) or the one that another odometry states of its motions, a floor, parts that grow with the motion
+through the geometry) or the one that another odometry states for its motions, a floor, parts that grow with the motion
 (S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics" (2005), section 5.4), and the geometry at the noise r that the
-motion's own residuals show (the variance of unit weight of least squares: W. Foerstner, B. Wrobel, "Photogrammetric
+motion's own residuals show (the variance of unit weight in least squares: W. Foerstner, B. Wrobel, "Photogrammetric
 Computer Vision" (2016), equation 4.90).
-Coefficients are not negative, so it never shrinks when a part grows. The GP learns the log of the ratio to it.
+Coefficients are never negative, so the variance never shrinks when a part grows. The GP learns the log ratio to it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ ACCELERATION_COLUMNS = ("acceleration_mps2", "angular_acceleration_radps2")
 RESIDUAL_COLUMN = "ln_residual_px"
 N_PARTS = 5
 OF_MOTION = np.array([0.0, 1.0, 1.0, 1.0, 0.0])
-"""Which parts of the base variance look at the motion alone."""
+"""Which parts of the base variance depend on the motion alone."""
 COASTED = (1, 2, 5, 10, 20, 50)
-"""Over so many usual motions training tells how much a velocity changes."""
+"""Numbers of usual motions over which training shows how much a velocity changes."""
 
 
 def base_columns(method: str | None, residual: bool = False) -> tuple[str, ...]:
-    """Feature columns that the base variance needs; ``method`` None where there is no geometric covariance."""
+    """Feature columns that the base variance needs; ``method`` None if there is no geometric covariance."""
     geometry = () if method is None else tuple(f"ln_var_{method}_{a}" for a in AXES)
     return TWIST_COLUMNS + geometry + ((RESIDUAL_COLUMN,) if residual else ())
 
@@ -42,9 +42,9 @@ class BaseVariance(Stored):
     """``theta`` (6, 5): coefficients of geometry, floor, squared translation and rotation of the motion, and geometry
     at the residuals' noise.
 
-    ``theta_plain`` (6, 5): the same fitted to the motion alone, as what odometry says of itself means what it meant in
-    training only where the surroundings are alike. ``method``: name of that covariance, None without one (its
-    coefficients are then 0). ``residual``: whether it looks at the residuals.
+    ``theta_plain`` (6, 5): the same fitted to the motion alone, because what odometry says about itself means the same
+    as in training only in similar surroundings. ``method``: name of that covariance, None without one (its
+    coefficients are then 0). ``residual``: whether it uses the residuals.
     """
 
     theta: Array
@@ -80,7 +80,7 @@ def positions(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
 
 
 def motion_noise(names: Sequence[str]) -> tuple[Array, Array]:
-    """(6, d) each: for which features ``names`` the variance of the motion, over dt^2 and dt^4, is their own.
+    """(6, d) each: which features ``names`` have the variance of the motion, over dt^2 and dt^4, as their own.
 
     They are VO's velocities and accelerations; an acceleration is the difference of two velocities, taken to be equally
     uncertain.
@@ -96,7 +96,7 @@ def motion_noise(names: Sequence[str]) -> tuple[Array, Array]:
 
 
 def feature_noise(carry: tuple[Array, Array], variance: Array, dt_s: Array) -> Array:
-    """(n, d) variance of the features, by :func:`motion_noise`, of motions of a variance (n, 6) and duration (n,)."""
+    """(n, d) variance of the features, by :func:`motion_noise`, for motions of given variance (n, 6), duration (n,)."""
     by_velocity, by_acceleration = carry
     squared = dt_s[:, None] ** 2
     return np.asarray((variance @ by_velocity + variance @ by_acceleration / squared) / squared)
@@ -118,11 +118,11 @@ class Velocities(Stored):
     def lost_variance(
         self, step_s: float, dt_s: float, age_s: float, rate: Array, rate_var: Array, jump: Array
     ) -> Array:
-        """(6,) variance of a lost motion of duration ``dt_s``, of which nothing was measured.
+        """(6,) variance of a lost motion of duration ``dt_s``, about which nothing was measured.
 
-        The vehicle has gone on with the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, known to ``rate_var``
-        (6,), but for what velocities changed in training over such a time, and more if it is faster than was usual
-        there; at most, and after longer times than training shows, it is as wrong as the vehicle is fast. ``jump`` (6,)
+        The vehicle is assumed to keep the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, known to ``rate_var``
+        (6,), give or take how much velocities changed in training over such a time, or more if it is faster than usual
+        there; at most, and after longer times than in training, the error is as large as the velocity. ``jump`` (6,)
         [m, rad]: by how much the motion given differs from that velocity's. ``step_s``: the usual duration.
         """
         lags = step_s * np.array(COASTED)

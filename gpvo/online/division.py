@@ -20,12 +20,12 @@ _RIDGE = 1e-6 * np.eye(6)
 
 @dataclass(frozen=True, kw_only=True)
 class Division(Stored):
-    """What has to be known to tell the parts of an error from its variance; axes in the order of the tangent vector.
+    """What is needed to divide a variance into the parts of the error; axes in the order of the tangent vector.
 
     ``share`` (3, 6): how the variance divides among jitter, white and bias at the log variance ``level`` (6,) and the
     typical speed, whose log is ``ln_speed`` (1,) [m/s]; ``growth`` (2, 6): how that changes (see :func:`divide`).
     ``correlation`` (3, 6, 6) of the parts, the first two mixed with the geometry's by ``geometry_weight`` (1,).
-    ``bias_tau_s`` (6,): of the bias. ``calibration_patterns`` (6, 6, 6): the ways of a calibration to be wrong (see
+    ``bias_tau_s`` (6,): of the bias. ``calibration_patterns`` (6, 6, 6): the ways a calibration can be wrong (see
     :func:`of_calibration`), and ``calibration_tau_s`` (6,): how long each stays the same.
     """
 
@@ -101,12 +101,12 @@ def divide(share: Array, growth: Array, above: Array, faster: Array) -> Array:
 
 
 def of_calibration(variance: Array, patterns: Array, twist: Array) -> tuple[Array, Array]:
-    """What a wrong calibration has of variances (n, D): its root (n, D, P), and what is left of them (n, D).
+    """The share of a wrong calibration in variances (n, D): its root (n, D, P), and what is left of them (n, D).
 
-    A wrong baseline, focal length or rectification makes errors that are linear in the motion, and turn around with it:
-    a scale that is 1 % off adds on the way out what it takes back on the way home. Each of ``patterns`` (P, D, 6) is
-    such a way to be wrong, by its usual amount: the error of a motion at unit velocities. ``twist`` (n, 6), unknown
-    ones bring nothing [m/s, rad/s]. It takes no more than all of the variance, however fast the motion.
+    A wrong baseline, focal length or rectification makes errors that are linear in the motion and reverse with it: a
+    scale that is 1 % off adds on the way out what it takes back on the way home. Each of ``patterns`` (P, D, 6) is one
+    way to be wrong, by its usual amount: the error of a motion at unit velocities. ``twist`` (n, 6) [m/s, rad/s];
+    unknown ones contribute nothing. The share never exceeds the whole variance, however fast the motion.
     """
     P, D, _ = patterns.shape
     known = np.where(np.isfinite(twist), twist, 0.0)
@@ -118,8 +118,8 @@ def of_calibration(variance: Array, patterns: Array, twist: Array) -> tuple[Arra
 def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
     """(n, 1) log of the speed of (n, 3) over the typical one, from 0 to that of twenty times it; 0 where unknown.
 
-    Slower than typical counts as typical: by the metre alone errors would not add up at rest, but they do with time,
-    and a filter that is told otherwise learns its biases from that.
+    Slower than typical counts as typical: if errors grew only with distance, none would add up at rest, but they do
+    with time, and a filter that is told otherwise absorbs them into its biases.
     """
     speed = np.sqrt((v_mps**2).sum(axis=1, keepdims=True))
     ratio = np.log(np.maximum(speed, 1e-9)) - ln_typical

@@ -19,18 +19,18 @@ from gpvo.online.stored import LARGEST, Stored, check_arrays, check_related
 from gpvo.types import Array, Prediction
 
 LN_LARGEST = 60.0
-"""Log variances [m, rad] above this count as this: nobody means them, and their squares would overflow."""
+"""Log variances [m, rad] are capped here: larger ones are never meant, and their squares would overflow."""
 LEAST_VAR = 1e-24
-"""No motion is known better [m^2, rad^2]."""
+"""No motion is known better than this [m^2, rad^2]."""
 DURATIONS_S = (1e-6, 1e4)
-"""A motion whose stated duration lies outside has the usual one."""
+"""A motion whose stated duration lies outside is given the usual one."""
 
 
 @dataclass(frozen=True)
 class ErrorModel(Stored):
     """Everything the arithmetic needs; axes in the order of the tangent vector.
 
-    ``columns``: all features, in order; ``inputs``: positions of those that the ``gp`` sees, which gives the log of the
+    ``columns``: all features, in order; ``inputs``: positions of those seen by the ``gp``, which gives the log of the
     variance over ``base``. ``factor`` (6,): calibration of the variance; ``outside_power`` (1,): its growth away from
     the training domain. ``high`` (6,): log ratio to the base that few training rows exceeded. ``typical_ln_det`` (1,):
     median over the training rows. ``nu`` (1,): degrees of freedom of a single motion's error, 0 for a Gaussian.
@@ -78,8 +78,8 @@ class ErrorModel(Stored):
     def estimate(self, X: Array, geometry: Array | None = None, dt_s: Array | None = None) -> Prediction:
         """Rows X (n, d) of ``columns``; ``geometry`` (n, 6, 6) covariances of the base's method, NaN where unknown.
 
-        Whatever the numbers, the covariance is finite and positive definite: what is not finite, or beyond all measure,
-        counts as missing.
+        Whatever the numbers, the covariance is finite and positive definite: values that are not finite, or absurdly
+        large, count as missing.
         """
         X = np.where(np.abs(X) < LARGEST, X, np.nan)
         duration, columns = self._duration(X, dt_s), self._base_columns(X)
@@ -124,22 +124,22 @@ class ErrorModel(Stored):
         return np.where((dt_s >= shortest) & (dt_s <= longest), dt_s, self.dt_s)
 
     def _variances(self, place: DomainCheck, base: Array, plain: Array) -> tuple[Array, Array]:
-        """(n, 6) each, before calibration: aleatoric variance, and the total with ignorance of it."""
+        """(n, 6) each, before calibration: aleatoric variance, and the total including uncertainty about it."""
         log_ratio, spread = self.gp.evaluate(place.inside[:, self.inputs])
         outside = (1.0 - place.in_domain)[:, None]
-        # The mean of a log-normal has half the variance of the log in it: that half is owed to ignorance.
+        # The mean of a log-normal contains half the variance of the log: that half is epistemic.
         log_noise = np.maximum(np.minimum(log_ratio + 0.5 * spread, LN_LARGEST), -LN_LARGEST)
         known = log_noise - 0.5 * spread
         # Away from the data the GP falls back to its prior; a ratio that few training rows exceeded is safer.
         cautious = log_noise + outside * np.maximum(self.high - log_noise, 0.0)
         grown = growth(place.distance, self.outside_power)[:, None]
-        # What odometry says of itself means what it meant in training only where the surroundings are alike.
+        # What odometry says about itself means the same as in training only in similar surroundings.
         total = (base + outside * np.maximum(plain - base, 0.0)) * np.exp(cautious) * grown
         return base * np.exp(known), total
 
     def _base_columns(self, X: Array) -> Array:
-        """The base's columns, missing ones by :attr:`absent`, geometric log variances never below the training's
-        smallest."""
+        """The base's columns, missing ones replaced by :attr:`absent`; geometric log variances never below the smallest
+        in training."""
         at, smallest = self._base_place
         C = X[:, at]
         C = np.where(np.isfinite(C), C, self.absent)
@@ -155,8 +155,8 @@ class ErrorModel(Stored):
 
     @cached_property
     def absent(self) -> Array:
-        """What stands for the base's columns where they are missing: the worst of the training, the fastest motion and
-        the largest geometric variance; where training missed them too, their typical value."""
+        """Substitutes for missing base columns: the worst of the training, that is the fastest motion and the largest
+        geometric variance; if training missed them too, their typical value."""
         at, d = self._base_place[0], self.domain
         low, high = (side[at] for side in d.reach)
         worst = np.where(np.abs(low) > np.abs(high), low, high)
@@ -169,7 +169,7 @@ class ErrorModel(Stored):
 
 
 def within(variance: Array, limit: Array) -> Array:
-    """The variance where it is small against the limit, the limit where it is far above; it grows all the way."""
-    # So far above, the limit it is; the square of what is farther would overflow.
+    """The variance if small compared with the limit, the limit if far above it; increasing throughout."""
+    # This far above, the result is the limit; squares of larger values would overflow.
     ratio = np.minimum(variance / limit, 1e8)
     return limit * ratio / np.sqrt(1.0 + ratio**2)

@@ -1,7 +1,7 @@
-"""What the error model looks at: the one causal, streaming definition, used in flight and replayed for training.
+"""What the error model looks at: a single causal, streaming definition, used in flight and replayed for training.
 
-A feature at frame k depends on the records up to k and on nothing later. Rates are per second and image lengths per
-focal length, so that a model survives another frame rate and another camera. Values a producer does not know are NaN.
+A feature at frame k depends on the records up to k and on nothing later. Rates are per second and image lengths are in
+focal lengths, so that a model survives a change of frame rate or camera. Values that a producer does not know are NaN.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Feature:
 class FeatureGroup:
     """Columns computed together. ``start(camera)`` gives a step function with its own, empty memory.
 
-    The step function is called once per record, in time order, and returns one number per column. Several may share a
-    ``name``, by which they are selected: each is worked out only where one of its own columns is wanted.
+    The step function is called once per record, in time order, and returns one number per column. Several groups may
+    share a ``name``, by which they are selected: each is computed only if one of its own columns is wanted.
     """
 
     name: str
@@ -110,12 +110,12 @@ def _imu_axes(r: VoRecord, _: float) -> Sequence[float]:
 
 
 def _columns(listed: str) -> tuple[Feature, ...]:
-    """Of ``"name [unit], name [unit]"``."""
+    """Parse ``"name [unit], name [unit]"``."""
     return tuple(Feature(*pair.rstrip("]").split(" [")) for pair in listed.split(", "))
 
 
 def _of_axes(name: str, unit: str) -> str:
-    """The same column for x, y and z, which stand in place of ``*``."""
+    """The same column for x, y and z, which replace ``*``."""
     return ", ".join(f"{name.replace('*', axis)} [{unit}]" for axis in "xyz")
 
 
@@ -161,7 +161,7 @@ BUILT_IN = (
     *_stated(IMPORTED, IMPORTED),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
     FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (log_of(r.reproj_rms_px),))),
-    # Lengths of the vectors: they survive another mounting of the IMU, its axes (imu_axes) do not.
+    # Magnitudes of the vectors: they survive a change of the IMU's mounting; its axes (imu_axes) do not.
     FeatureGroup(
         "imu",
         _columns("imu_acc_mps2 [m/s^2], imu_gyro_radps [rad/s], imu_acc_std_mps2 [m/s^2], imu_gyro_std_radps [rad/s]"),
@@ -182,8 +182,8 @@ def groups() -> dict[str, tuple[FeatureGroup, ...]]:
     """All groups by name: the built-in ones, then those of installed packages.
 
     A package joins with ``[project.entry-points."gpvo.features"]`` and ``name = "package.module:GROUP"``, GROUP being a
-    :class:`FeatureGroup`. A model that uses its columns is refused where the package is not installed. A built-in name
-    cannot be taken over.
+    :class:`FeatureGroup`. A model that uses its columns is refused if the package is not installed. A built-in name
+    cannot be overridden.
     """
     found: dict[str, tuple[FeatureGroup, ...]] = {}
     for group in BUILT_IN:

@@ -14,7 +14,7 @@ from gpvo.types import Array, StereoCamera
 _CAMERA = 0.25
 _MISSING = 2.0  # Standard deviations outside, where training never missed the value.
 DEGRADED_BELOW = 0.5
-"""``in_domain`` under which a prediction is called ``degraded``."""
+"""``in_domain`` below which a prediction is called ``degraded``."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Domain(Stored):
     """Where the training data lay, per feature and jointly.
 
     ``centre``, ``scale`` (d,): robust, in the features' units. ``low``, ``high`` (d,): range of the standardised
-    features but for rare ones, where a model can have learnt something; ``least``, ``most`` (d,): of all of them, as no
-    training row is another place. ``whitening`` (d, d): ``|u W|`` is the Mahalanobis distance, with ``radius`` (1,) its
+    features without rare ones, where a model can have learned something; ``least``, ``most`` (d,): of all rows, because
+    no training row is outside. ``whitening`` (d, d): ``|u W|`` is the Mahalanobis distance, with ``radius`` (1,) its
     training maximum. ``may_miss`` (d,) bool: features that were absent from some training rows.
     """
 
@@ -50,8 +50,8 @@ class Domain(Stored):
     def locate(self, X: Array, noise: Array | float = 0.0) -> DomainCheck:
         """Rows (n, d) in the features' units. A missing value is typical, but far off if training never missed it.
 
-        ``noise`` (n, d): variance with which the features themselves are known. A value that this explains is no sign
-        of another place: how far it lies outside counts in training deviations and this one together.
+        ``noise`` (n, d): variance with which the features themselves are known. A value that this explains does not
+        count as outside: the distance is measured in training deviations combined with this one.
         """
         U = (X - self.centre) / self.scale
         missing = ~np.isfinite(U)
@@ -89,7 +89,7 @@ def growth(distance: Array, power: Array | float) -> Array:
 
 
 def camera_problems(trained: StereoCamera | None, here: StereoCamera | None) -> list[str]:
-    """Where a camera differs from the one that a model was trained with, a line each."""
+    """How a camera differs from the one that a model was trained with, one line each."""
     if trained is None or here is None:
         return []
     out = []

@@ -75,9 +75,9 @@ class Trend:
 
 
 class Agility:
-    """Logs of how fast the vehicle moves and turns, and of how its velocity jerks: now, and lately on average.
+    """Logs of how fast the vehicle moves and turns, and of the jerk of its velocity: now, and recently on average.
 
-    A vehicle moves smoothly from frame to frame, so that most of a jerk is VO's own noise.
+    A vehicle moves smoothly from frame to frame, so most of the jerk is VO's own noise.
     """
 
     def __init__(self) -> None:

@@ -16,8 +16,8 @@ Arrays of an error model (``model_schema`` 1), d features, n rows kept; readers 
   :class:`gpvo.online.estimate.ErrorModel`;
 * ``base.*`` (optional): those in which the model with its GP held at the mean function differs;
 * ``method.constant`` (6, 6), ``method.<stated>.scale`` (6,): the simple methods that ``evaluate`` compares with;
-* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.learning.thesis.ThesisModel`; all there is in a model of
-  positions;
+* ``thesis.*`` (optional): the thesis' model, see :class:`gpvo.learning.thesis.ThesisModel`; all that a model of
+  positions holds;
 * ``sample.*`` (optional): training rows for forecasts, see :class:`gpvo.learning.sample.TrainingSample`.
 """
 
@@ -100,7 +100,7 @@ def _check_document(document: Any, path: Path) -> None:
 
 
 def check_version(name: str, found: Any, newest: int, path: Path | None = None) -> None:
-    """Raise ModelError where a file is of a later version of something than can be read."""
+    """Raise ModelError if a file was written in a later version of a format than can be read."""
     if not isinstance(found, int) or found < 1:
         raise ModelError("has a damaged header", where=path)
     if found > newest:
@@ -140,7 +140,7 @@ _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
 
 
 def _check_header(header: Mapping[str, Any]) -> None:
-    """Raise ModelError, one line, for the first key of a header that is not what its readers take; null is unknown."""
+    """Raise ModelError, one line, for the first header key that its readers cannot accept; null means unknown."""
     for name, (words, holds) in _HEADER.items():
         value = header.get(name)
         if value is not None and not holds(value):
@@ -151,7 +151,7 @@ def _check_header(header: Mapping[str, Any]) -> None:
 
 
 def _printable(value: Any) -> Any:
-    """The same document, none of whose texts a terminal would obey."""
+    """The same document, without text that a terminal would obey."""
     if isinstance(value, dict):
         return {printable(k): _printable(v) for k, v in value.items()}
     if isinstance(value, list):

@@ -1,7 +1,7 @@
 """From records to features: the one path that flight and training share.
 
-What cannot be is ``lost``, by name, and leaves no trace in what is remembered. Motions over a window are
-joined to records: features and targets then need no second definition.
+Impossible motions are marked ``lost``, with the reason, and leave no trace in the memory. Motions over a window are
+joined into records, so that features and targets need no second definition.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gpvo.stats.series import Doubt
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, IMU_FIELDS, Array, Status, StereoCamera, Vehicle, VoRecord
 
 LONGEST_STEP_S = 60.0
-"""A record that comes later than this after the one before is believed when the next one confirms its clock."""
+"""A record that comes later than this after the previous one is believed only once the next one confirms its clock."""
 _LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 _FARTHEST_M = 1e5  # No motion between two frames is longer.
 _EYE = np.eye(4)
@@ -34,8 +34,8 @@ _PATTERN = re.compile(r"(window|length):([0-9]*\.?[0-9]+)(s|m)")
 class Observer:
     """Judges stamps, flags slips, joins motions over a window, computes features: record by record, causally.
 
-    ``names``: feature columns. ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``vehicle``: what
-    its motions are judged by.
+    ``names``: feature columns. ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``vehicle``: the
+    bounds by which its motions are judged.
     """
 
     def __init__(
@@ -62,8 +62,8 @@ class Intake:
     """Judges the stamps and the motion of one record after the other, in the order of their arrival.
 
     A record whose stamp repeats, goes back or jumps ahead is ``lost``, and the next one is judged by the record before
-    it; where that next one follows the odd one, the clock itself was set, and is believed. A motion that is not finite
-    and rigid is replaced by none.
+    it; if that next one follows the odd one, the clock itself was set, and is believed. A motion that is not finite
+    and rigid is dropped.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class Intake:
         self._doubt: Doubt[int] = Doubt()
 
     def step(self, record: VoRecord) -> VoRecord:
-        """The record, ``lost`` with the reason where it cannot be. Call once per record."""
+        """The record, ``lost`` with the reason if it is impossible. Call once per record."""
         problem = self._clock(record)
         if record.T_prev_cur.shape != (4, 4) or not se3.is_rigid(record.T_prev_cur, _FARTHEST_M):
             record = replace(record, T_prev_cur=_EYE)

@@ -1,4 +1,4 @@
-"""The predictor that flies: features in, the error's distribution out. NumPy and safetensors alone."""
+"""The predictor that flies: features in, the error's distribution out. Needs only NumPy and safetensors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Predictor:
     """
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any], digest: str = "") -> None:
-        # Arrays that mean what this version does not know are refused; those it does not know are left alone.
+        # Arrays whose meaning this version does not know are refused; arrays it does not know are ignored.
         modelfile.check_version("model schema", header.get("model_schema", MODEL_SCHEMA), MODEL_SCHEMA)
         if header.get("target") == "position":
             raise ModelError(
@@ -77,7 +77,7 @@ class Predictor:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Predictor:
-        """From a model file. Raises ModelError, one line, where the file cannot be used."""
+        """From a model file. Raises ModelError, in one line, if the file cannot be used."""
         if not Path(path).exists():
             raise ModelError("no such model file", where=path, cure="'gpvo train RUN... -o MODEL' makes one")
         arrays, header = modelfile.load(path)
@@ -93,15 +93,15 @@ class Predictor:
 
     @property
     def scale(self) -> Array:
-        """(6,) factor on each standard deviation that late truth has taught; ones before any."""
+        """(6,) factor on each standard deviation, learned from late truth; ones before any."""
         return self._adaptive.scale
 
     def reset(
         self, camera: StereoCamera | None = None, scale: Array | None = None, vehicle: Vehicle | None = None
     ) -> None:
-        """Forget the run so far. ``camera``: of the run, where it is not the one the model was trained with; warns
-        where the two are far apart. ``scale``: what late truth taught of this odometry before. ``vehicle``: of the run,
-        any by default."""
+        """Forget the run so far. ``camera``: of the run, if it is not the one the model was trained with; warns if the
+        two are far apart. ``scale``: what was learned earlier from late truth on this odometry. ``vehicle``: of the
+        run, any by default."""
         for problem in camera_problems(self.camera, camera):
             warnings.warn(f"this is another camera: {problem}", stacklevel=2)
         self._observer = Observer(self.features, self.target, camera or self.camera, vehicle)
@@ -111,7 +111,7 @@ class Predictor:
         self._rate_var = np.zeros(6)
 
     def require_motions(self, where: str | PathLike[str] | None = None) -> Predictor:
-        """Itself; ModelError, one line, where the model (file ``where``) predicts the error over windows of motions."""
+        """Itself; ModelError, one line, if the model (file ``where``) predicts the error over windows of motions."""
         if self.target != "frame":
             raise ModelError(
                 f"this model predicts the error over {self.target}, not that of each motion",
@@ -121,7 +121,7 @@ class Predictor:
         return self
 
     def replay(self, log: VoLog) -> dict[int, Prediction]:
-        """Predictions for a recorded run, by time stamp and in order; begins anew with its camera."""
+        """Predictions for a recorded run, by time stamp and in order; starts afresh with its camera."""
         self.reset(log.camera, vehicle=log.vehicle)
         return {p.t_ns: p for p in map(self.step, log) if p is not None}
 
@@ -151,7 +151,7 @@ class Predictor:
             return None
         record, x = self._last = seen
         if record.status is Status.START:
-            # The first frame has no motion and hence no error to speak of.
+            # The first frame has no motion and hence no error.
             return self._unmeasured(record, np.eye(6) * _NO_MOTION_VAR, 1.0, 1.0)
         method = self.model.base.method
         estimate = self.predict(x, record.covariances.get(method or ""), record.dt_s)
@@ -160,9 +160,9 @@ class Predictor:
     def interval(self, prediction: Prediction, level: float = 0.9) -> Array:
         """(6, 2) ends between which each axis' error lies in a share ``level`` of the motions of a new sequence.
 
-        Their width in sigma is that which covered the training sequences, each left out in turn, whatever the shape of
-        the errors' distribution: :func:`gpvo.learning.calibrate.conformal_quantiles`. The header's
-        ``interval_guaranteed`` says by axis and level whether the sequences were enough for a guarantee. Raises
+        Their width in sigma is the one that covered the training sequences, each left out in turn, whatever the shape
+        of the errors' distribution: :func:`gpvo.learning.calibrate.conformal_quantiles`. The header's
+        ``interval_guaranteed`` says by axis and level whether there were enough sequences for a guarantee. Raises
         ModelError for a level that the model does not hold.
         """
         calibration = self.header.get("calibration") or {}
@@ -177,7 +177,7 @@ class Predictor:
     def observe(self, xi_true: ArrayLike, t_ns: int | None = None) -> None:
         """Late truth: the error (6,) that the motion ending at ``t_ns`` (default: the last) turned out to have.
 
-        Adapts the scale of later predictions; axes that are NaN are left alone, and so are lost motions.
+        Adapts the scale of later predictions; NaN axes are left unchanged, and so are lost motions.
         """
         if not self._stated:
             return
@@ -232,9 +232,9 @@ class Predictor:
         )
 
     def _publish_lost(self, record: VoRecord, prediction: Prediction) -> Prediction:
-        """What was learnt of measured motions does not apply to one that was not."""
+        """What was learned from measured motions does not apply to one that was not measured."""
         variance = self._lost_variance(record)
-        # Truth of it says nothing of the scale of what was.
+        # Its truth says nothing about the scale of measured motions.
         self._remember(record.t_ns, None)
         p = self._unmeasured(record, np.diag(variance), 0.0, float(prediction.in_domain))
         return replace(p, epistemic=np.minimum(prediction.epistemic * self._adaptive.scale**2, variance))
@@ -246,9 +246,9 @@ class Predictor:
 
     def _lost_variance(self, record: VoRecord) -> Array:
         """(6,) variance of a lost motion: what VO gives is the motion expected of the vehicle, or a jump away from it,
-        and the vehicle has not kept its velocity."""
+        which means that the vehicle has not kept its velocity."""
         xi, slip = se3.log(record.T_prev_cur), self._observer.slip
-        # A record that is lost for its stamps has no duration to go by.
+        # A record that is lost because of its stamps has no usable duration.
         dt_s = record.dt_s if record.dt_s > 0 else self.model.dt_s
         lost_variance = partial(self.model.velocities.lost_variance, self.model.dt_s)
         if slip.expected is None:

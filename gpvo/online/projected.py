@@ -6,8 +6,8 @@ All outputs share the squared-exponential kernel and its points, ``k_i(x) = exp(
     mean_j = offset_j + sum_r A_jr z_r
     var_j  = s_j^2 - sum_r W_jr z_r^2
 
-P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs squares of z alone; one P
-serves all outputs, exactly, as the rows' noise weights are one common profile times a scale per output. Mean and
+P comes from the eigenvectors of the (weighted) kernel statistics, so that the variance needs only squares of z; one P
+serves all outputs exactly, because the rows' noise weights are one common profile times a scale per output. Mean and
 variance: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), equations 2.25 and 2.26;
 with inducing points M. Titsias (2009), equation 6.
 """
@@ -46,7 +46,7 @@ class ProjectedGP(Stored):
 
     @classmethod
     def constant(cls, offset: Array) -> ProjectedGP:
-        """One that says the same (D,) of every place, from one input."""
+        """One that predicts the same (D,) everywhere, from one input."""
         zeros, one = np.zeros((len(offset), 1)), np.zeros((1, 1))
         return cls(one[0], np.ones(1), one, one, zeros, zeros, zeros[:, 0], offset)
 

@@ -1,8 +1,8 @@
 """Is this motion possible at all? Slips are caught from what is known at the time, before any truth is seen.
 
-The implied acceleration is compared with what the vehicle can have. Odometry's own noise, which counts by the square of
-the frame rate, raises the bound to eight times the median of what was seen, and no further than to four times the
-vehicle's. Disagreement with a gyro is compared with its far quantile, extrapolated from the history's
+The implied acceleration is compared with what the vehicle can do. Odometry's own noise, which enters with the square of
+the frame rate, raises the bound to eight times the median of what was seen, but to no more than four times the
+vehicle's. Disagreement with a gyro is compared with a high quantile of it, extrapolated from the history's
 upper tail (B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after
 I. Weissman, 1978).
 """
@@ -19,7 +19,7 @@ from gpvo.online.lately import lengths, twist
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, Status, Vehicle, VoLog, VoRecord
 
 FALSE_FLAG_RATE = 1e-6
-"""Wanted share of good motions that are called impossible."""
+"""Desired share of good motions that are called impossible."""
 
 _NOISE_MEDIANS = 8.0
 _MOST_NOISE = 4.0  # times the vehicle's bound
@@ -33,7 +33,7 @@ REASON = "implausible motion"
 
 
 def _is_beyond(value: float, history: deque[float], vehicle: float) -> bool:
-    """Whether it is beyond what a vehicle can have, and what odometry's noise makes of it, which is unknown at first; a
+    """Whether it exceeds what a vehicle can do, and what odometry's noise explains, which is unknown at first; a
     history of failures raises the bound fourfold at most."""
     if value <= vehicle:
         return False
@@ -56,9 +56,9 @@ def tail_quantile(history: Array, rate: float = FALSE_FLAG_RATE) -> float:
 
 
 class SlipDetector:
-    """Calls motions ``lost`` that the vehicle cannot have made.
+    """Marks as ``lost`` the motions that the vehicle cannot have made.
 
-    Each motion is compared with the last believed one, however often another velocity repeats itself; where that one is
+    Each motion is compared with the last believed one, however often another velocity repeats itself; if that one is
     more than a second away, or the clock was set, it starts afresh.
     """
 
@@ -121,7 +121,7 @@ class SlipDetector:
 
 
 def _unflagged(record: VoRecord) -> VoRecord:
-    """A record that an earlier detector flagged, for judging it afresh: flagging twice must change nothing."""
+    """A record that an earlier detector flagged, without the flag: flagging twice must change nothing."""
     before, found, _ = record.reason.partition(REASON)
     if record.status is not Status.LOST or not found:
         return record

@@ -1,7 +1,7 @@
 """What a model file holds: classes whose arrays go in and out by their names, and one schema that all arrays must fit.
 
-The schema is checked once, where a model is loaded; what has passed may be believed by the arithmetic. A new array gets
-a line in ``_ARRAYS``; arrays that are in no line are left alone, as readers ignore what they do not know. A file holds
+The schema is checked once, when a model is loaded; the arithmetic may rely on what has passed. A new array gets a line
+in ``_ARRAYS``; arrays without a line are left alone, because readers ignore what they do not know. A file holds
 two models: the one that predicts and, where its arrays differ, its base with the GP held at its mean function.
 """
 
@@ -21,7 +21,7 @@ from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import field_names
 
 LARGEST = 1e12
-"""No number of a model is larger, nor is a feature: a value beyond counts as missing, as its powers would overflow."""
+"""Largest number of a model or feature: anything larger counts as missing, because its powers would overflow."""
 BASE = "base."
 """Prefix of the arrays in which the model with its GP held at the mean function, the base variance, differs."""
 _NARROWEST = 1e-12  # No standard deviation or length scale is smaller.
@@ -30,7 +30,7 @@ _Stored = TypeVar("_Stored", bound="Stored")
 
 
 class Stored:
-    """A dataclass whose arrays stand in a model file by the names of its fields, after a prefix."""
+    """A dataclass whose arrays are stored in a model file under a prefix and the names of its fields."""
 
     parts: ClassVar[Mapping[str, tuple[type[Stored], str]]] = {}
     """Fields that are stored in turn: of which class, and what stands before the names of their arrays."""
@@ -65,8 +65,8 @@ def _array(arrays: _Arrays, name: str) -> NDArray[Any]:
 
 
 def arrays_of_base(arrays: _Arrays) -> dict[str, NDArray[Any]]:
-    """The arrays of a model file with those of its base in their place: the base variance, and a calibration of its
-    own. The same as the model where the GP is not at work."""
+    """The arrays of a model file with those of its base substituted: the base variance, and a calibration of its own.
+    The same as the model if the GP is not in use."""
     kept = {name: a for name, a in arrays.items() if not name.startswith(BASE)}
     return kept | {name.removeprefix(BASE): a for name, a in arrays.items() if name.startswith(BASE)}
 
@@ -75,9 +75,9 @@ def arrays_of_base(arrays: _Arrays) -> dict[str, NDArray[Any]]:
 class ArraySpec:
     """What one array must be.
 
-    ``shape``: a length per axis, or a letter for one that all arrays of a group have in common; ``"features"`` that of
-    the features. ``low``, ``high``: range of its values. ``kind``: NumPy's kinds that it may have. ``semidefinite``:
-    its last two axes hold symmetric positive semidefinite matrices; ``unit_diagonal``: with ones on the diagonal.
+    ``shape``: a length per axis, or a letter for one that all arrays of a group have in common; ``"features"`` for that
+    of the features. ``low``, ``high``: range of its values. ``kind``: NumPy kinds allowed. ``semidefinite``: its last
+    two axes hold symmetric positive semidefinite matrices; ``unit_diagonal``: with ones on the diagonal.
     ``gaps``: NaN may stand for unknown values.
     """
 
@@ -90,7 +90,7 @@ class ArraySpec:
     gaps: bool = False
 
     def problem(self, array: NDArray[Any], sizes: dict[str, int]) -> str:
-        """What is wrong with the array, empty where nothing is; ``sizes``: of the letters, which it adds to."""
+        """What is wrong with the array, empty if nothing is; ``sizes``: of the letters, which it adds to."""
         if array.dtype.kind not in self.kind:
             return f"holds {array.dtype}"
         wanted = [w if isinstance(w, int) else sizes.setdefault(w, n) for w, n in zip(self.shape, array.shape)]
@@ -168,7 +168,7 @@ _ARRAYS: dict[str, ArraySpec] = {
 
 @cache
 def spec_of(name: str) -> ArraySpec | None:
-    """The specification of an array, None where nothing is known of it; the first line that fits its name counts."""
+    """The specification of an array, None if there is none; the first line that fits its name counts."""
     name = name.removeprefix(BASE)
     return _ARRAYS.get(name) or next((spec for key, spec in _ARRAYS.items() if fnmatchcase(name, key)), None)
 
@@ -176,7 +176,7 @@ def spec_of(name: str) -> ArraySpec | None:
 def check_arrays(arrays: _Arrays, n_features: int | None = None) -> None:
     """Raise ModelError, one line, for the first array that is not what the schema says.
 
-    ``n_features``: of the header, where it is known.
+    ``n_features``: from the header, if known.
     """
     groups: dict[str, dict[str, int]] = {}
     for name in sorted(arrays):
@@ -188,7 +188,7 @@ def check_arrays(arrays: _Arrays, n_features: int | None = None) -> None:
 
 
 def check_related(arrays: _Arrays, n_features: int) -> None:
-    """Raise ModelError where arrays of an error model, each right by itself, contradict one another."""
+    """Raise ModelError if arrays of an error model, each valid on its own, contradict one another."""
     for low, high in (("domain.low", "domain.high"), ("domain.least", "domain.most")):
         if (arrays[low] > arrays[high]).any():
             raise ModelError("the training domain ends before it begins")

@@ -123,7 +123,7 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
     for quantity, C, unit in (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad")):
         sigma = np.array([fusioncore_sigmas(c) for c in C])
         correlated = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
-        advice = "It reads the diagonal alone, and its chi-square gate is as good as these sigmas; send no zeros"
+        advice = "It reads only the diagonal, and its chi-square gate is only as good as these sigmas; send no zeros"
         hidden = 100.0 * float(correlated.mean())
         out.append(Verdict(quantity, "diagonal only", 0.0, hidden, _percentiles(sigma.min(axis=1)), unit, advice))
     return out
@@ -142,8 +142,8 @@ def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
     predicted = _percentiles(np.sqrt(twist[:, :3]).max(axis=1))
     advice = (
         "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request 32478), or "
-        f"set VISO_VEL_M_NSE to {predicted[1]:.2g}; VISO_QUAL_MIN lets quality decide frame by frame; below 0 it would "
-        "let lost frames in"
+        f"set VISO_VEL_M_NSE to {predicted[1]:.2g}; VISO_QUAL_MIN lets quality decide frame by frame; below 0 it "
+        "would accept lost frames"
     )
     return [*out, Verdict("velocity", "VISO_VEL_M_NSE", p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
 

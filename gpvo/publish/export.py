@@ -65,7 +65,7 @@ def export_model(
     """
     to = format_of(to, path)
     if prefix != PREFIX and to != "c":
-        raise GpvoError(f"{to} has no symbols that a prefix '{prefix}' could go before", cure="give it with c alone")
+        raise GpvoError(f"{to} has no symbols for a prefix '{prefix}' to go before", cure="give it only with c")
     predictor = Predictor.load(model)
     units = tuple(str(u) for u in predictor.header.get("units") or ())
     if to == "c":
@@ -92,7 +92,7 @@ def to_c(
     is no C identifier.
     """
     if not _NAME.fullmatch(name) or f" {name} " in _KEYWORDS:
-        raise GpvoError(f"the prefix {name!r} is no C identifier", cure="a letter first, then letters, digits, _")
+        raise GpvoError(f"the prefix {name!r} is not a C identifier", cure="a letter first, then letters, digits, _")
     template = files("gpvo.publish").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
     code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")

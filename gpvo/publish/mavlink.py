@@ -1,7 +1,7 @@
 """MAVLink 2 for flight controllers: ODOMETRY, VISION_SPEED_ESTIMATE and HEARTBEAT, to a file, UDP or serial.
 
-FRD and NED live in this module and :mod:`gpvo.publish.ros` alone. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion w,
-x, y, z, upper triangles row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
+FRD and NED occur only in this module and in :mod:`gpvo.publish.ros`. ODOMETRY (331): LOCAL_FRD / BODY_FRD, quaternion
+w, x, y, z, upper triangles row-major (21); message_definitions/v1.0/common.xml. pymavlink (LGPL) is optional.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class Link:
         if kind not in ("udp", "serial") or not place or not number.isdecimal():
             raise GpvoError(f"'{self.address}' is not an address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
         if kind == "udp" and not 1 <= int(number) <= 65535:
-            raise GpvoError(f"'{self.address}' has no port of UDP", cure="give one of 1 to 65535")
+            raise GpvoError(f"'{self.address}' has no valid UDP port", cure="give one of 1 to 65535")
         self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))
 
     def send(self, odometry: Odometry) -> None:

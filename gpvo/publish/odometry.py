@@ -1,4 +1,4 @@
-"""From a VO motion in the camera to body odometry: pose in ``odom``, twist in ``base_link``, both with full 6x6."""
+"""From camera motion to body odometry: pose in ``odom``, twist in ``base_link``, both with a full 6x6 covariance."""
 
 from __future__ import annotations
 

@@ -172,9 +172,9 @@ def register_px4(store: Any) -> None:
 def vehicle_odometry(odometry: Odometry, types: dict[str, Any]) -> Any:
     """``px4_msgs/VehicleOdometry`` for PX4 over uXRCE-DDS, on ``/fmu/in/vehicle_visual_odometry``.
 
-    Pose in FRD of arbitrary heading, velocity in the body's FRD, diagonals alone; what is unknown is NaN, and a lost
-    frame NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; the agent turns Unix time
-    into the flight controller's.
+    Pose in FRD of arbitrary heading, velocity in the body's FRD, diagonals only; unknown values are NaN, and a lost
+    frame is NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; the agent turns Unix
+    time into the flight controller's.
     """
     pose, twist = frd(odometry)
     nan = np.full(6, np.nan)

@@ -1,4 +1,4 @@
-"""World to images, by the renderer and the sensor of one flight's true rig; what a camera makes of light: optics,
+"""From world to images, by the renderer and the sensor of one flight's true rig; what a camera makes of light: optics,
 exposure, noise and 8 bits; and the flow between two images."""
 
 from __future__ import annotations

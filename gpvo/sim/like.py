@@ -82,7 +82,7 @@ def _tracking(log: VoLog, tracks: StereoTracks, camera: StereoCamera, where: Pat
         depths.append(camera.fx_px * camera.baseline_m / np.maximum(uvd_now[j][good][:, 2], 0.1))
     if len(motions) < _MIN_PAIRS:
         raise SourceError(
-            f"only {len(motions)} motions have {_MIN_POINTS} inliers: too few to tell its noise",
+            f"only {len(motions)} motions have {_MIN_POINTS} inliers: too few to estimate its noise",
             where=where,
             cure="a longer run, or one with more features",
         )

@@ -1,8 +1,8 @@
 """Flights without images: landmarks seen as stereo pixel tracks, with noise, outliers and bad episodes.
 
-A thousand times faster than drawing images, for Monte Carlo and for training by the hundred. The vehicle follows
-its path exactly (no flight dynamics); the IMU is that of the path. Each frame's pixel noise belongs to the frame, so
-the two motions that share a frame share its noise, as in reality.
+A thousand times faster than drawing images, for Monte Carlo and for training on hundreds of flights. The vehicle
+follows its path exactly (no flight dynamics); the IMU is that of the path. Each frame's pixel noise belongs to the
+frame, so the two motions that share a frame share its noise, as in reality.
 """
 
 from __future__ import annotations

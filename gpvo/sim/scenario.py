@@ -1,5 +1,5 @@
-"""Scenarios: what is flown, where, with which sensors and faults. One validated set of values, kept as small TOML; and
-their flights, one or many, on the cores of this machine or on a dask cluster."""
+"""Scenarios: what is flown, where, with which sensors and faults, as one validated set of values in a small TOML file;
+and their flights, one or many, on the cores of this machine or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
             cure=f"choose from {', '.join(CAMERAS)}, or give a file of Kalibr, OpenCV, ROS or KITTI, or a run",
         )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
-        raise GpvoError("path = waypoints needs two places at least", where=where, cure="waypoints = [[x, y, z], ...]")
+        raise GpvoError("path = waypoints needs at least two places", where=where, cure="waypoints = [[x, y, z], ...]")
     if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:
         raise GpvoError("late_s is longer than the time between frames", where=where)
     return scenario

@@ -1,4 +1,4 @@
-"""Series: sums over windows, how they remember (autocorrelation and Allan deviation), what in them is odd; and
+"""Series: sums over windows, correlation in time (autocorrelation and Allan deviation), what in them is odd; and
 intervals for means, of one series or over sequences.
 
 D. W. Allan, "Statistics of atomic frequency standards" (1966); overlapping estimator as in IEEE Std 952-1997, annex C.

@@ -3,8 +3,8 @@ eliminated, solved in time linear in the length.
 
 The reduced matrix of the poses couples two frames that see a common landmark. Tracks are short, so it is banded, and
 its Cholesky factor costs no more than its band. A landmark that is seen for longer would widen the band for all: it is
-cut into pieces, each a landmark of its own, which makes a band of :data:`REACH` frames. The factor of that
-preconditions conjugate gradients on the whole equations: one step where no track was cut, a few where some were.
+cut into pieces, each a landmark of its own, which makes a band of :data:`REACH` frames. The factor of this system
+preconditions conjugate gradients on the full equations: one step if no track was cut, a few if some were.
 S. Agarwal et al., "Bundle adjustment in the large" (2010), section 3.
 """
 

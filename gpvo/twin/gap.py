@@ -1,4 +1,4 @@
-"""Which runs are twins, and their gap to reality: by how much real errors exceed what twins predict, learnt where truth
+"""Which runs are twins, and their gap to reality: how far real errors exceed what twins predict, learned where truth
 exists."""
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """The noise of a twin: the residuals of each track as a whole, with a random sign.
 
-So noise keeps its size by depth, place and time, and how it goes on along a track. Patches of neighbouring points
-overlap, and points of one moving thing are displaced together, so neighbours may err alike; then neighbours have their
+So noise keeps its dependence on depth, place and time, and its evolution along a track. Patches of neighbouring points
+overlap, and points on one moving object are displaced together, so neighbours may err alike; then neighbours get their
 signs from one smooth field. Multiplying residuals by dependent random numbers, and how far the dependence must reach:
 X. Shao, "The dependent wild bootstrap" (2010).
 
 The residuals are those of a robust bundle adjustment: the path and the landmarks that explain a run's stereo tracks
 best. Levenberg-Marquardt on the normal equations (:mod:`gpvo.twin.bundle`). B. Triggs et al., "Bundle adjustment, a
-modern synthesis" (2000), sections 6 and 7. A landmark moves in the (u, v, d) of one of its own views, where also far
+modern synthesis" (2000), sections 6 and 7. A landmark moves in the (u, v, d) of one of its own views, where even far
 points are well conditioned.
 """
 

@@ -44,7 +44,7 @@ class StereoCamera:
             number = float(value) if isinstance(value, int | float | np.number) else np.nan
             least = {"cx_px": -1e9, "cy_px": -1e9, "width": 1.0, "height": 1.0}.get(name, 1e-9)
             if not least <= number < 1e9:
-                raise CalibrationError(f"the camera's {name} is {value!r}, which cannot be")
+                raise CalibrationError(f"the camera's {name} is {value!r}, which is impossible")
 
     @property
     def K(self) -> Array:

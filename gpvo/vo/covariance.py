@@ -2,7 +2,7 @@
 
 Full 6x6: ``(sum H_i^T W_i H_i)^-1`` with ``H_i = R [I, -[P_i]x]`` and ``W_i = (R U_i R^T + V_i)^-1``, U_i and V_i the
 covariances of the point in the current and in the reference frame (L. Matthies, S. Shafer 1987, eqs. 12-17; D. Ross,
-thesis, section 3.3), here in its equal form over (u, v, d). ``V_T = (sum W_i)^-1`` takes the rotation as known: its
+thesis, section 3.3), here in its equal form over (u, v, d). ``V_T = (sum W_i)^-1`` treats the rotation as known: its
 lateral variance is 2 to 10 times too small when the rotation is estimated too.
 """
 

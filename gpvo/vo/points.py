@@ -3,7 +3,7 @@
 A measurement is ``(u, v, d)``: left column, row (mean of both images) and disparity [px].
 
 Sources: L. Matthies, S. Shafer, "Error modeling in stereo navigation" (1987), eqs. 3-8; D. Ross, thesis, eq. 3.4 and
-section 3.2. Two errata of the thesis are followed as meant, not as printed: eq. 3.4's coordinates are in focal lengths
+section 3.2. Two errata of the thesis are corrected as intended: eq. 3.4's coordinates are in focal lengths
 with the origin midway between the cameras and a baseline of 2 b; the pointing/matching covariance holds squares of
 sigma_p and sigma_m.
 """

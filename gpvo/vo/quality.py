@@ -1,6 +1,6 @@
-"""When can a motion be believed, and do the two images of a pair belong together?
+"""When can a motion be trusted, and do the two images of a pair belong together?
 
-No motion is ever invented silently.
+No motion is ever made up silently.
 """
 
 from __future__ import annotations

@@ -13,11 +13,11 @@ polynomials are free, and a turn is a part of their prior covariance. A Kalman f
 dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
 motion. What cannot be told apart from motion: the depth's scale.
 
-Two things keep it honest. Errors of neighbouring frames are alike (a feature's place is off in the same way for as
-long as it is followed): blocks of frames are compared with their expected scatter, and all information is divided by
+Two things keep it honest. Errors of neighbouring frames are alike (a feature is off in the same way for as long as it
+is tracked): blocks of frames are compared with their expected scatter, and all information is divided by
 the ratio. And rigs are of several kinds, exact or not, with a mounting and with lenses from good to bad: the
 estimate is the mean over the kinds by their probability (J. Dickey, "The weighted likelihood ratio", 1971), so that an
-exact rig keeps its exact geometry, and a camera knocked out of its place the lens that it had.
+exact rig keeps its exact geometry, and a camera knocked out of place keeps its lens.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
     if np.linalg.eigvalsh(covariance)[0] <= 0:
         raise SourceError("its covariance is not positive definite", where=path)
     if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):
-        raise SourceError("is of another camera, size or calibration", where=path, cure="use it with its own rig")
+        raise SourceError("belongs to another camera, size or calibration", where=path, cure="use it with its own rig")
     return RigState(mean, covariance, probability)
 
 

@@ -1,12 +1,12 @@
 """Several frames adjusted together: a sliding-window bundle adjustment, the setting ``window``.
 
-It is :func:`gpvo.vo.motion.refine` over more than two frames. The points of a motion move in the (u, v, d) of its
-reference, and the frames before the reference in which they were seen too say more of where they are::
+This is :func:`gpvo.vo.motion.refine` over more than two frames. The points of a motion move in the (u, v, d) of its
+reference, and earlier frames in which they were seen say more about where they are::
 
     min  sum_i |x_i + p_i - m_i|^2_S + sum_ij w_ij |f(T_ref_j, x_i) + p_i - m_ij|^2_S + p_i^2 / q
 
-over the places x_i, the poses T_ref_j of the current frame and of those before, and the error of disparity p_i that a
-point keeps, of variance q. The points are eliminated (B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000,
+over the positions x_i, the poses T_ref_j of the current and earlier frames, and the disparity error p_i that a point
+keeps, with variance q. The points are eliminated (B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000,
 section 6.1); with two frames alone this is the estimate of ``refine``.
 """
 

@@ -45,8 +45,8 @@ def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
     "text,told",
     [
         ('[evaluate]\nsegmens = "5"', "[evaluate] has no option 'segmens' (did you mean segments?)"),
-        ("seed = 3", "'seed' names no table of a command"),
-        ("[fly]\nseed = 3", "'fly' names no table of a command"),
+        ("seed = 3", "'seed' is not the table of any command"),
+        ("[fly]\nseed = 3", "'fly' is not the table of any command"),
         ("[evaluate]\ntwins = 2", "[evaluate] twins is 2 (give true or false)"),
         ('[evaluate]\nseed = "x"', "'--seed'"),
         ("[evaluate]\nconfig = 'o.toml'", "has no option 'config'"),

@@ -90,7 +90,7 @@ def test_somebody_elses_file_of_29_columns(tmp_path: Path, capsys) -> None:
     assert found["pooled"]["motions"] == 2 * 59
     assert found["pooled"]["nees_dof"]["mean"] < 1e-3
     cli.app(["score", *words], standalone_mode=False)
-    assert "Fewer than three sequences give no mean" in capsys.readouterr().out
+    assert "With fewer than three sequences there is no mean" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_the_table_of_a_training_is_scored_again_from_files_alone(tmp_path: Path
 
 def test_statements_of_a_run_that_nothing_was_left_out_for_are_refused(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
-    with pytest.raises(GpvoError, match="two run folders or more"):
+    with pytest.raises(GpvoError, match="two or more run folders"):
         cli.app(
             ["train", str(tmp_path / "run"), "-o", str(tmp_path / "m.gpvo"), "--statements", str(tmp_path / "stated")],
             standalone_mode=False,

@@ -167,7 +167,7 @@ def test_a_run_without_truth_shows_what_it_can(tmp_path: Path) -> None:
 
 def test_one_run_has_no_interval(runs: list[Path]) -> None:
     out = _run("fuse", runs[0], "--policies", "pointing_matching,learned")
-    assert "Fewer than three runs give no interval." in out
+    assert "With fewer than three runs there is no interval." in out
     assert "inf" not in out
 
 

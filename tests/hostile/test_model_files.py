@@ -58,7 +58,7 @@ def test_no_text_of_a_model_is_obeyed_by_a_terminal(parts, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("prefix", ["int", "while", "class", "_x", "9a", "a-b", "a b", "é", "", 'x"', "a\n#define b"])
 def test_a_prefix_is_a_c_identifier_and_no_keyword(prefix: str, tmp_path: Path) -> None:
-    with pytest.raises(GpvoError, match="no C identifier"):
+    with pytest.raises(GpvoError, match="not a C identifier"):
         export_model(MODEL, tmp_path / "x.h", "c", prefix=prefix)
     assert not (tmp_path / "x.h").exists()
 

@@ -158,7 +158,7 @@ def test_covariance_follows_the_frame(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "like no trajectory"),
+        ("", "not look like a trajectory"),
         ("a,b,c\n1,2,3\n", r"no column for t_s, p_x.*--map COLUMN=t_s"),
         ("t,x,y,z,qx,qy,qz,qw\n", "no rows"),
         ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0\n", "line 2 holds 7 fields"),
@@ -168,7 +168,7 @@ def test_covariance_follows_the_frame(tmp_path):
         ("t_ns,x,y,z,qx,qy,qz,qw\n99999999999999999999,0,0,0,0,0,0,1\n", "line 2: .* is not a stamp in nanosec"),
         ("t_ns,x,y,z,qx,qy,qz,qw\ninf,0,0,0,0,0,0,1\n", "line 2: 'inf' is not a stamp in nanosec"),
         ("1,0,0,0,0,0,0,1\n", "no header line"),
-        ("1 2 3\n", "like no trajectory"),
+        ("1 2 3\n", "not look like a trajectory"),
     ],
 )
 def test_bad_logs_in_one_line(tmp_path, text, reason):

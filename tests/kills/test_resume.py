@@ -198,6 +198,6 @@ def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypat
     _, made_by = tree["state"]["tuple"]
     made_by["tuple"][0]["fields"]["_state"]["fields"]["t_last_ns"] = "x"
     np.savez(state, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), data=data)
-    with pytest.raises(SourceError, match=r"run: cannot be gone on with: [A-Z]") as refusal:
+    with pytest.raises(SourceError, match=r"run: cannot be resumed: [A-Z]") as refusal:
         runner.run(open_source(path), tmp_path / "run", resume="")
     assert "\n" not in str(refusal.value)

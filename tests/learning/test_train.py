@@ -443,7 +443,7 @@ def test_the_table_says_what_slips_would_cost(capsys):
     _print_table({"folds": folds, "mean": {}, "comparison": None})
     said = " ".join(capsys.readouterr().out.split())
     assert "slips: 4 caught, 2 missed, 1 falsely flagged" in said
-    assert "counted in: learned 1, constant 60" in said
+    assert "flagged ones: learned 1, constant 60" in said
 
 
 @pytest.mark.slow

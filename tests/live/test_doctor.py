@@ -158,7 +158,7 @@ def test_with_truth_it_says_how_sure_the_topic_is(tmp_path: Path) -> None:
     assert joint["sure"] == pytest.approx(25 * joint["honest"], rel=0.02)
     said = CliRunner().invoke(app, ["doctor", str(tmp_path / "sure"), "--truth", str(truth)]).stdout
     assert f"motions: {joint['sure']:.3g}" in said
-    assert "too sure" in said
+    assert "overconfident" in said
 
 
 def test_a_truth_of_another_time_is_told_beside_the_findings(good: list[Odometry], tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_a_truth_of_another_time_is_told_beside_the_findings(good: list[Odometry
         app, ["doctor", str(bag_of(good, tmp_path / "bag")), "--truth", str(tmp_path / "late.tum")]
     )
     assert result.exit_code == 0
-    assert "NEES: not known" in result.stdout
+    assert "NEES unknown" in result.stdout
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13, 14, 15])

@@ -251,7 +251,7 @@ def test_onnx_has_no_prefix(tmp_path: Path) -> None:
 
 
 def test_c_names_must_be_identifiers(tmp_path: Path) -> None:
-    with pytest.raises(GpvoError, match="no C identifier"):
+    with pytest.raises(GpvoError, match="not a C identifier"):
         to_c(CASES["of conditions"], tmp_path / "model.h", name="1+1")
 
 

@@ -30,7 +30,7 @@ class Hyperparameters:
 class FittedGP:
     """A fitted GP: its posterior in projected form, in the units of the data.
 
-    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.projected``). ``hyper``: what was learnt.
+    ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.projected``). ``hyper``: what was learned.
     ``log_evidence``: log marginal likelihood, or its lower bound, in nats and in the units of the data.
     ``regressor``: name. ``n_rows``: rows conditioned on.
     """
@@ -47,7 +47,7 @@ class FittedGP:
 
 
 class Regressor(Protocol):
-    """Fits D outputs that share one kernel. Options go to the constructor; the same data gives the same bits."""
+    """Fits D outputs that share one kernel. Options go to the constructor; the same data give the same bits."""
 
     @property
     def name(self) -> str:
@@ -99,7 +99,7 @@ class Scaling:
 
 
 def checked(X: Array, Y: Array) -> tuple[Array, Array]:
-    """X (n, d) and Y (n, D) as float64, or ValueError with the shapes got."""
+    """X (n, d) and Y (n, D) as float64, or ValueError with the shapes received."""
     X, Y = np.asarray(X, dtype=np.float64), np.asarray(Y, dtype=np.float64)
     Y = Y[:, None] if Y.ndim == 1 else Y
     if X.ndim != 2 or Y.ndim != 2 or len(X) != len(Y) or len(X) < 2:
@@ -127,7 +127,7 @@ def regressor_names() -> tuple[str, ...]:
 
     A package joins with ``[project.entry-points."gpvo.regressors"]`` and ``name = "package.module:Class"``; the class
     follows :class:`Regressor`, takes options as keywords, and is chosen by ``gpvo train --regressor name``. A built-in
-    name cannot be taken over.
+    name cannot be overridden.
     """
     outside = {entry.name for entry in entry_points(group="gpvo.regressors")}
     return (*_BUILT_IN, *sorted(outside - set(_BUILT_IN)))

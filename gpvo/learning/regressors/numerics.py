@@ -20,18 +20,18 @@ from gpvo.types import Array
 LOG_LENGTH_BOUNDS = (np.log(0.05), np.log(50.0))
 LOG_SIGNAL_BOUNDS = (np.log(1e-6), np.log(1e3))
 LOG_NOISE_BOUNDS = (np.log(1e-6), np.log(1e2))
-"""Bounds of the learnt quantities for inputs and outputs of unit variance: sums of many features rarely need more."""
+"""Bounds of the learned quantities for inputs and outputs of unit variance: sums of many features rarely need more."""
 
 
 CHUNK_ROWS = 8192
 
 _RANK_TOLERANCE = 1e-11
-"""Directions of the points' kernel matrix below this share of the largest are rounding, not information."""
+"""Directions of the points' kernel matrix below this share of the largest are rounding errors, not information."""
 
 
 @contextmanager
 def fixed_threads(n: int) -> Iterator[None]:
-    """Run linear algebra on exactly ``n`` threads: sums split otherwise round otherwise, and a fit must repeat."""
+    """Run linear algebra on exactly ``n`` threads: sums split differently round differently, and fits must repeat."""
     before = torch.get_num_threads()
     torch.set_num_threads(n)
     try:
@@ -42,7 +42,7 @@ def fixed_threads(n: int) -> Iterator[None]:
 
 
 def pick_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one."""
+    """``auto`` is CUDA if available."""
     return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
 
 
@@ -189,7 +189,7 @@ class Posterior:
         return 0.5 * (log_det + left + ratio * self.lost) / self.n, gradient / self.n
 
     def maximise(self, hyper: Hyperparameters) -> Hyperparameters:
-        """Signal and noise variances of each output learnt anew on all rows, length scales kept."""
+        """Signal and noise variances of each output, relearned on all rows; length scales are kept."""
         box = [LOG_SIGNAL_BOUNDS, LOG_NOISE_BOUNDS]
         found = []
         for j, logs in enumerate(np.log(np.stack([hyper.signal_var, hyper.noise_var], 1))):

@@ -1,4 +1,4 @@
-"""scikit-learn's GaussianProcessRegressor behind the protocol: the oracle, and for those who trust it most."""
+"""scikit-learn's GaussianProcessRegressor behind the protocol: as the oracle, and for those who trust it most."""
 
 from __future__ import annotations
 

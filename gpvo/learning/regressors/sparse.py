@@ -39,16 +39,16 @@ START_LENGTHS = (0.8, 0.2)
 
 FEW_POINTS = 128
 TIGHT, TIGHT_EXACT = 0.05, 0.005
-"""Slack of the bound, in nats per row and output, from which on more points are worth their time."""
+"""Slack of the bound, in nats per row and output, above which more points are worth their time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnPoints(ABC):
-    """What all regressors here share: they learn, each in its own way, from data of unit variance, and close with the
+    """What all regressors here share: each learns in its own way from data of unit variance, and finishes with the
     best posterior of all rows on inducing points.
 
     ``inducing``: points; None: every row. ``isotropic``: one length scale for all inputs. ``hyper``: fixed
-    hyperparameters, in the units of the data; nothing is learnt then.
+    hyperparameters, in the units of the data; nothing is learned then.
     """
 
     inducing: int | None = 256
@@ -57,7 +57,7 @@ class OnPoints(ABC):
     threads: int = 1
 
     relearns: ClassVar[bool] = True
-    """Whether signal and noise variances are learnt anew on all rows in the end."""
+    """Whether signal and noise variances are finally relearned on all rows."""
 
     @property
     @abstractmethod
@@ -81,14 +81,14 @@ class OnPoints(ABC):
 
     @abstractmethod
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array | None]:
-        """Standardised hyperparameters, and points over the length scales where they are learnt too."""
+        """Standardised hyperparameters, and points over the length scales if they are learned too."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SparseRegressor(OnPoints):
     """O(m^2) memory beside the rows and O(n m^2) time for m ``inducing`` points; None: every row, the exact GP.
 
-    Length scales are learnt on at most ``optimise_rows`` rows; signal and noise variances, and the posterior, on all.
+    Length scales are learned on at most ``optimise_rows`` rows; signal and noise variances, and the posterior, on all.
     """
 
     optimise_rows: int = 5000
@@ -192,7 +192,7 @@ class CollapsedBound:
     def slack(self, hyper: Hyperparameters) -> float:
         """What the points leave unexplained of the rows' prior variance, as the bound charges it.
 
-        Where this is large the bound's maximum calls structure noise, because the points cannot hold it.
+        If this is large, the bound's maximum takes structure for noise, because the points cannot represent it.
         """
         lost = Posterior.of(*self.rows, self.points.numpy() / hyper.lengthscale, hyper.lengthscale).lost
         return float(0.5 * lost * (hyper.signal_var / hyper.noise_var).sum() / (self.n * self.D))

@@ -1,8 +1,8 @@
 """Stochastic variational GP (gpytorch): hyperparameters and inducing points from minibatches, then one closing pass.
 
 J. Hensman, N. Fusi, N. Lawrence, "Gaussian Processes for Big Data" (2013). With Gaussian noise the best variational
-distribution is known in closed form (Titsias 2009, equation 10), so the one that the minibatches found is used for
-learning alone.
+distribution is known in closed form (Titsias 2009, equation 10), so the one found by the minibatches is used only for
+learning.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class SvgpRegressor(OnPoints):
     """For millions of rows: every row can influence the hyperparameters and the inducing points.
 
     ``steps`` minibatches of ``batch`` rows at learning rate ``rate``, falling to a tenth. ``device`` "auto" is CUDA
-    where there is one.
+    if available.
     """
 
     inducing: int = 256

@@ -33,9 +33,9 @@ PARAMETERS = {
     "imu": Parameter("", "Topic of the IMU, beside a stereo pair."),
     "calibration": Parameter("", "Calibration file of the pair; default: CameraInfo beside the images."),
     "base_frame": Parameter(
-        "", "Publish the odometry of this frame, placed by /tf_static and /tf; default: the source's own."
+        "", "Publish the odometry of this frame, located through /tf_static and /tf; default: the source's own."
     ),
-    "truth": Parameter("", "Topic of ground truth that comes late: adapts the covariance."),
+    "truth": Parameter("", "Topic of ground truth that arrives late: adapts the covariance."),
     "truth_type": Parameter("pose", "Type of that topic.", choices=tuple(POSE_TYPE_NAMES)),
     "topic": Parameter("/gpvo/odometry", "Topic on which the odometry is published."),
     "pose_topic": Parameter("", "Also publish PoseWithCovarianceStamped here."),
@@ -46,11 +46,11 @@ PARAMETERS = {
     ),
     "mavlink": Parameter("", "Also send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD."),
     "px4": Parameter(False, "Also publish px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS."),
-    "state": Parameter("", "File to save the state in, and to take it up from."),
+    "state": Parameter("", "File in which the state is saved, and from which it is restored."),
     "vehicle": Parameter("any", "What carries the camera.", choices=tuple(VEHICLES)),
     "max_acceleration": Parameter(0.0, "Largest acceleration [m/s^2]; 0: the vehicle's.", (0.0, 1e4)),
     "max_turn": Parameter(0.0, "Largest angular acceleration [rad/s^2]; 0: the vehicle's.", (0.0, 1e5)),
-    "depth": Parameter(10, "Length of the queue of a topic; older messages are dropped.", (2, 1000)),
+    "depth": Parameter(10, "Queue length per topic; older messages are dropped.", (2, 1000)),
 }
 
 
