@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, cell, new_table, note, print_json, say, show
+from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, in_place_of_runs_without_truth
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
     from gpvo.learning.config import TrainConfig
-    from gpvo.learning.train import TrainedModel
+    from gpvo.learning.train import OnFit, TrainedModel
 
 _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 
@@ -90,7 +90,8 @@ def train(
         _check_statements(runs, settings, update)
     drawn = twin_options.settings(seed) if twins else None
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
-        trained = _with_origin(_train(paths, settings, update), paths)
+        with progress("models") as on_fit:
+            trained = _with_origin(_train(paths, settings, update, on_fit), paths)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
     save_model(trained, out)
@@ -150,7 +151,7 @@ def _is_given(ctx: typer.Context, option: str) -> bool:
     return source is not None and source.name != "DEFAULT"
 
 
-def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> TrainedModel:
+def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:
     from gpvo.io.run import read_run
     from gpvo.learning.config import TrainConfig
 
@@ -161,9 +162,9 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     if update is not None and config.target == "position":
         raise GpvoError("a model of positions cannot be updated", where=update, cure="train again from all runs")
     if any(p.is_file() for p in paths):
-        return _train_file(paths, config, update)
+        return _train_file(paths, config, update, on_fit)
     if update is None and config.target != "position" and _frames(paths) > config.max_rows:
-        return _train_streaming(paths, config)
+        return _train_streaming(paths, config, on_fit)
     runs = [read_run(p) for p in paths]
     if config.target == "position":
         from gpvo.learning.position import train_position
@@ -172,10 +173,10 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None) -> 
     if update is not None:
         from gpvo.learning.store import update as update_model
 
-        return update_model(update, runs, config, tell=lambda what: note(f"gpvo: {what}"))
+        return update_model(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
     from gpvo.learning.train import train as train_model
 
-    return train_model(runs, config)
+    return train_model(runs, config, on_fit=on_fit)
 
 
 def _refuse_twice(paths: list[Path]) -> None:
@@ -187,12 +188,12 @@ def _refuse_twice(paths: list[Path]) -> None:
         seen.add(path.resolve())
 
 
-def _train_file(paths: list[Path], config: TrainConfig, update: Path | None) -> TrainedModel:
+def _train_file(paths: list[Path], config: TrainConfig, update: Path | None, on_fit: OnFit) -> TrainedModel:
     from gpvo.learning.store import train_stored
 
     if len(paths) > 1 or update is not None:
         raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
-    return train_stored(paths[0], config)
+    return train_stored(paths[0], config, on_fit=on_fit)
 
 
 def _frames(paths: list[Path]) -> int:
@@ -202,7 +203,7 @@ def _frames(paths: list[Path]) -> int:
     return sum(int(read_json(p / "run.json").get("frames") or 0) for p in paths if (p / "run.json").is_file())
 
 
-def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
+def _train_streaming(paths: list[Path], config: TrainConfig, on_fit: OnFit) -> TrainedModel:
     """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
     import tempfile
 
@@ -213,7 +214,7 @@ def _train_streaming(paths: list[Path], config: TrainConfig) -> TrainedModel:
     with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
         rows = Path(folder) / "rows.parquet"
         write_sets(rows, (config.rows_of(read_run(p)) for p in paths))
-        return train_stored(rows, config)
+        return train_stored(rows, config, on_fit=on_fit)
 
 
 def _print_table(document: dict[str, Any]) -> None:

@@ -123,16 +123,24 @@ def cell(value: float | str | None, digits: int = 3) -> str:
 
 
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar on a terminal, silence in a pipe. Yields the function to call once per item."""
+def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+    """A progress bar with the time left on a terminal, silence in a pipe.
+
+    Yields the function to call once per item, or with how many are done, of how many.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     if _loud["quiet"] or not console.is_terminal:
-        yield lambda: None
+        yield lambda done=None, total=None: None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    # Of all items so far: a fit may take minutes, and the last half minute holds none.
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=1e9) as bar:
         task = bar.add_task(what, total=total)
-        yield lambda: bar.advance(task)
+
+        def tell(done: int | None = None, total: int | None = total) -> None:
+            bar.update(task, advance=1 if done is None else None, completed=done, total=total)
+
+        yield tell

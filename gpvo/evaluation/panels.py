@@ -111,11 +111,11 @@ def errors(e: Evaluation) -> list[Panel]:
             bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
         if bands:
-            # The bound's usual edges are always in the plot; its peaks unless the error would be a flat line.
+            # Nine tenths of the bound are always in the plot; its peaks unless the error would be a flat line.
             edge = np.abs(np.concatenate([low, high]))
             edge = edge[np.isfinite(edge)]
             if len(edge):
-                reach = max(reach, 1.15 * float(np.median(edge)), min(1.05 * float(edge.max()), 4.0 * reach))
+                reach = max(reach, 1.15 * float(np.quantile(edge, 0.9)), min(1.05 * float(edge.max()), 4.0 * reach))
         lines = [_line(*_thin(t, error), "", _BLACK, 1.0)]
         unit = "mm" if k < 3 else "mrad"
         panels.append(_panel(axis, "time [s]", f"{axis} [{unit}]", lines, bands=bands, limit=[-reach, reach]))

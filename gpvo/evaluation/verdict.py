@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -63,7 +63,7 @@ def verdict(e: Evaluation) -> Verdict:
     per_motion = _word(_nees(judged[told]))
     headline = f"The {told} covariance is {per_motion} per motion"
     if wrong and per_motion == "honest":
-        headline += f", but not over {' and '.join(wrong)}"
+        headline += f", but not over {_listed(wrong)}"
     if outside:
         headline += "; the model does not know these conditions"
     return Verdict("red" if outside or per_motion == "overconfident" else "amber", headline + ".", tuple(lines))
@@ -104,9 +104,14 @@ def _line(method: str, c: Consistency) -> str:
     off = max(nees, 1.0 / nees) ** 0.5 if nees > 0 else float("inf")
     by = "" if _word(nees) == "honest" else f" by a factor of {off:.1f} in sigma"
     wrong = [w for w in _wrong(c) if w != "one motion"]
-    then = f", not honest over {', '.join(wrong)}" if wrong else ""
+    then = f", not honest over {_listed(wrong)}" if wrong else ""
     over = "".join(f", {h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
     return f"{method}: {_word(nees)}{by} per motion{then}; NEES/dof {nees:.2f}{over}."
+
+
+def _listed(names: Sequence[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def _conditions(e: Evaluation) -> Iterator[str]:

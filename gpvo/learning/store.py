@@ -15,7 +15,7 @@ from gpvo.files import write_text
 from gpvo.io.run_read import Run
 from gpvo.learning.card import model_card, stated_against_actual
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.train import TrainedModel, TrainingSet, train_sets, training_digest
+from gpvo.learning.train import OnFit, TrainedModel, TrainingSet, train_sets, training_digest
 from gpvo.online import modelfile
 
 
@@ -88,6 +88,7 @@ def update(
     *,
     judge: bool = True,
     tell: Callable[[str], None] = lambda _: None,
+    on_fit: OnFit = lambda done, total: None,
 ) -> TrainedModel:
     """The model at ``path``, retrained with more sequences. A run with a known name replaces that sequence, and
     ``tell`` reports it."""
@@ -98,11 +99,16 @@ def update(
     names = {s.name for s in new}
     for gone in (s.name for s in old if s.name in names):
         tell(f"sequence '{gone}' of {path} is replaced by the run of that name")
-    return train_sets([*(s for s in old if s.name not in names), *new], config, judge=judge)
+    return train_sets([*(s for s in old if s.name not in names), *new], config, judge=judge, on_fit=on_fit)
 
 
 def train_stored(
-    path: str | Path, config: TrainConfig, *, judge: bool = True, chunk_rows: int = CHUNK_ROWS
+    path: str | Path,
+    config: TrainConfig,
+    *,
+    judge: bool = True,
+    chunk_rows: int = CHUNK_ROWS,
+    on_fit: OnFit = lambda done, total: None,
 ) -> TrainedModel:
     """Train from a file of training sets; memory never holds more than ``config.max_rows`` rows and a chunk.
 
@@ -110,6 +116,6 @@ def train_stored(
     """
     stored = StoredSets(path)
     sets = stored.thinned(config.max_rows, chunk_rows)
-    trained = train_sets(sets, config, judge=judge)
+    trained = train_sets(sets, config, judge=judge, on_fit=on_fit)
     trained.header["rows"] = {"given": len(stored), "in_memory": sum(len(s) for s in sets)}
     return trained

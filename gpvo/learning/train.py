@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,8 @@ from gpvo.stats.consistency import nees
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, Prediction
 
+OnFit = Callable[[int, int], None]
+"""Told how many fits of a training are done, of how many."""
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
@@ -63,13 +66,16 @@ class TrainedModel:
         return Predictor(self.arrays, self.header)
 
 
-def train(runs: Sequence[Run], config: TrainConfig | None = None) -> TrainedModel:
+def train(
+    runs: Sequence[Run], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
+) -> TrainedModel:
     """Learn from runs with ground truth, and judge by leaving each run out.
 
-    Raises GpvoError if a run has no truth, or the runs do not belong together.
+    ``on_fit`` is called with how many fits are done, of how many, for progress bars. Raises GpvoError if a run has no
+    truth, or the runs do not belong together.
     """
     config = config or TrainConfig()
-    return train_sets([config.rows_of(r) for r in runs], config)
+    return train_sets([config.rows_of(r) for r in runs], config, on_fit=on_fit)
 
 
 # On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.
@@ -79,10 +85,11 @@ def train_sets(
     config: TrainConfig,
     *,
     judge: bool = True,
+    on_fit: OnFit = lambda done, total: None,
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out."""
     sets = _checked(sets, config.target)
-    table = train_table(sets, config) if judge else {}
+    table = train_table(sets, config, on_fit) if judge else {}
     learned, thesis = fit_model(sets, config), fit_thesis(sets, seed=config.seed)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays(), **thesis.to_arrays()}
@@ -116,14 +123,25 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
     return list(sets)
 
 
-def train_table(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
+def train_table(
+    sets: Sequence[TrainingSet], config: TrainConfig, on_fit: OnFit = lambda done, total: None
+) -> dict[str, Any]:
     """``folds`` (a sequence left out, all methods), ``mean`` over them, and ``comparison`` with the best scaled row.
 
     For a single sequence, blocks of time are left out: they say less, and have no intervals; see ``folds_are``.
     """
     parts = sets if len(sets) > 1 else time_blocks(sets[0])
     jobs = [(held_out, train_on, config) for held_out, train_on in leave_one_out(parts) if train_on]
-    folds = map_jobs(_kept_fold, jobs, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler)
+    done, total = count(1), len(jobs) + 1  # the model itself comes last
+    on_fit(0, total)
+    folds = map_jobs(
+        _kept_fold,
+        jobs,
+        jobs=config.jobs,
+        backend=config.backend,
+        scheduler=config.scheduler,
+        on_done=lambda: on_fit(next(done), total),
+    )
     if not folds:
         return {"folds": [], "folds_are": None, "mean": {m: empty() for m in METHODS}, "comparison": None}
     mean = {m: average([f["methods"][m] for f in folds]) for m in METHODS}

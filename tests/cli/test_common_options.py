@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -77,6 +80,42 @@ def test_verbose_says_what_it_took_and_shows_where_it_failed():
     failed = call("evaluate", "nowhere", "-v")
     assert failed.returncode == 2
     assert "Traceback" in failed.stderr
+
+
+def on_a_terminal(*words: str) -> str:
+    """All that a command writes to a terminal of 80 columns."""
+    pty = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
+    ours, theirs = pty.openpty()
+    env = {**os.environ, "COLUMNS": "80", "TERM": "xterm"}
+    with subprocess.Popen([sys.executable, "-m", "gpvo", *words], stdout=theirs, stderr=theirs, env=env) as call:
+        os.close(theirs)
+        parts = []
+        with suppress(OSError):  # the end of a terminal
+            while part := os.read(ours, 4096):
+                parts.append(part)
+    os.close(ours)
+    assert call.returncode == 0
+    return re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", b"".join(parts).decode())
+
+
+def test_training_shows_how_far_it_is_and_how_long_it_will_take(tmp_path: Path):
+    runs = [str(ROOT / "data" / f"tunnel-{k}") for k in (1, 2)]
+    words = ("train", *runs, "-o", str(tmp_path / "m.gpvo"), "--features", "velocity")
+    shown = on_a_terminal(*words)
+    steps = [shown.index(f"{done}/3") for done in (0, 1, 2)]
+    assert steps == sorted(steps)
+    assert re.search(r"2/3 0:00:\d\d", shown)
+    assert steps[-1] < shown.index("left out")
+    piped = call(*words[:-2], "--features", "velocity", "-q")
+    assert "/3" not in piped.stdout + piped.stderr
+
+
+def test_a_shell_completes_the_commands():
+    env = {**os.environ, "_GPVO_COMPLETE": "complete_bash", "COMP_WORDS": "gpvo ev", "COMP_CWORD": "1"}
+    gpvo = shutil.which("gpvo", path=str(Path(sys.executable).parent))
+    assert gpvo is not None
+    done = subprocess.run([gpvo], capture_output=True, text=True, timeout=60, env=env)
+    assert done.stdout.split() == ["evaluate"]
 
 
 def test_tables_fit_80_columns():

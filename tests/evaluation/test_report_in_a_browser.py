@@ -56,6 +56,10 @@ told.unzoomed = ticks() === whole;
 told.verdicts = [...document.querySelectorAll(".verdict strong")].map(s => s.textContent).join("|");
 told.letters = getComputedStyle(document.querySelector("figure text")).fontSize;
 told.paper = getComputedStyle(document.body).backgroundColor;
+told.across = window.innerWidth;
+const numbers = (svg, at) => [...svg.querySelectorAll(`text[text-anchor=${at}]`)].filter(t => !isNaN(t.textContent));
+told.bare = [...document.querySelectorAll("figure svg")].filter(
+  svg => ["end", "middle"].some(at => numbers(svg, at).length < 2)).length;
 told.rows = document.querySelectorAll("nav tr").length;
 told.dead = [...document.querySelectorAll("a[href^='#']")].filter(
   a => !document.getElementById(a.getAttribute("href").slice(1))).length;
@@ -82,11 +86,13 @@ def test_a_browser_shows_the_page_without_errors(
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium here to open the report with")
-    page = render(evaluations(case), model="tunnel.gpvo")
+    # An axis that ends just before a round number: it must find two numbers all the same.
+    page = re.sub(r'"limit": ?\[[^\]]*\]', '"limit": [-48, 48]', render(evaluations(case), model="tunnel.gpvo"))
     (tmp_path / "report.html").write_text(page.replace("</body>", PROBE), encoding="utf-8")
     command = [
         browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
         f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900",
+        f"--screen-info={{{width}x900}}", "--kiosk",  # a window of its own is never narrower than 500 pixels
         f"--blink-settings=preferredColorScheme={0 if scheme == 'dark' else 1}",
         "--dump-dom", (tmp_path / "report.html").as_uri(),
     ]  # fmt: skip
@@ -94,9 +100,12 @@ def test_a_browser_shows_the_page_without_errors(
     (body,) = re.findall("<body[^>]*>", shown.stdout)
     found = dict(re.findall(r'data-(\w+)="([^"]*)"', body))
     assert found["verdicts"].split("|") == CASES[case]
+    assert found["across"] == str(width)
     assert int(found["wide"]) <= 0
     assert int(found["drawn"]) >= (5 if case == "no truth" else 13)
     assert found["fetched"] == "0"
+    # Every axis has two numbers or more.
+    assert found["bare"] == "0"
     assert (found["letters"], found["paper"]) == ("12px", paper)
     # The contents lead somewhere; a table across runs where there are several.
     assert found["dead"] == "0"

@@ -33,7 +33,7 @@
     const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
     const step = power * [1, 2, 5, 10].find(m => m * power >= 0.8 * rough), out = [];
     for (let k = Math.ceil(low / step); k * step <= high + 1e-9 * step; k += 1) out.push(k * step);
-    return out;
+    return out.length < 2 && count < 50 ? ticks(low, high, log, 2 * count) : out; // one alone shows no scale
   };
   const label = v => v === 0 ? "0" : Math.abs(v) >= 1e4 || Math.abs(v) < 1e-3 ? v.toExponential(0).replace("e+", "e")
     : String(Number(v.toPrecision(4)));
