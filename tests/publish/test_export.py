@@ -246,7 +246,7 @@ def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> 
 
 
 def test_onnx_has_no_prefix(tmp_path: Path) -> None:
-    with pytest.raises(GpvoError, match="c alone"):
+    with pytest.raises(GpvoError, match="only with c"):
         export_model(tmp_path / "model", tmp_path / "out", "onnx", prefix="mine")
 
 
