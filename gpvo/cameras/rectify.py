@@ -170,6 +170,14 @@ def rectifying_rotations(T_right_left: Array) -> tuple[Array, Array]:
     return R_rect_mean @ half, R_rect_mean @ half.T
 
 
+def read_size(text: str) -> tuple[int, int]:
+    """Width and height [px] of a text such as 640x480. Raises CalibrationError if it is something else."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise CalibrationError(f"the size is '{text}'", cure="give WIDTHxHEIGHT, such as 640x480")
+    return int(width), int(height)
+
+
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """(H, W) bool, True where usable, from a black and white image.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -18,6 +18,11 @@ from gpvo.cli import output
 from gpvo.cli.output import one_of
 from gpvo.errors import GpvoError
 from gpvo.types import VEHICLES, Vehicle
+
+if TYPE_CHECKING:
+    from gpvo.types import StereoCamera
+    from gpvo.vo.config import VoConfig
+    from gpvo.vo.rig_error import RigState
 
 GROUPS = {
     "Record": ("run", "import", "simulate", "info", "calibration"),
@@ -176,6 +181,61 @@ class VehicleOptions:
         return Vehicle(self.max_acceleration or known.max_acceleration_mps2, self.max_turn or known.max_turn_radps2)
 
 
+@dataclass(frozen=True)
+class OdometryOptions:
+    """Settings of gpvo's own odometry. A model knows only the odometry that it was trained on."""
+
+    preset: Annotated[str, typer.Option(help="Settings of the odometry: fast or thesis.")] = "fast"
+    methods: Annotated[str, typer.Option(help="Covariances: triangulation, pointing_matching, spherical.")] = (
+        "triangulation,pointing_matching"
+    )
+    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1"
+    sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5"
+    sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0
+    min_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is lost; at least 4.")] = 8
+    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is degraded.")] = 20
+    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion alone.")] = 2
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
+    ] = None
+    self_calibration: Annotated[
+        bool | None,
+        typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
+    ] = None
+    calibration_state: Annotated[
+        Path | None,
+        typer.Option(
+            help="Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
+        ),
+    ] = None
+
+    def config(self, vehicle: Vehicle) -> VoConfig:
+        """The settings, parsed. Raises GpvoError for an unknown one, or a value out of its range."""
+        from gpvo.vo.config import make_config, read_settings
+
+        shorthand = {
+            **asdict(vehicle),
+            "methods": self.methods,
+            "sigma_px": self.sigma,
+            "sigma_p_px": self.sigma_p,
+            "sigma_m_px": self.sigma_m,
+            "min_inliers": self.min_inliers,
+            "weak_inliers": self.weak_inliers,
+            "window": self.window,
+        }
+        if self.self_calibration is not None:
+            shorthand["self_calibration"] = self.self_calibration
+        texts = [*(f"{k}={v}" for k, v in shorthand.items()), *(self.settings or ())]
+        return make_config(self.preset, **read_settings(texts))
+
+    def state(self, camera: StereoCamera) -> RigState | None:
+        """What an earlier run found out about the calibration, None if no run was named."""
+        from gpvo.vo.rig_findings import read_state
+
+        return None if self.calibration_state is None else read_state(self.calibration_state, camera)
+
+
 def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:
     """Options for :func:`gpvo.io.open_source` from the flags; those that were not given are left out.
 
@@ -183,8 +243,7 @@ def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:
     """
     options = {name: value for name, value in given.items() if value is not None}
     if size is not None:
-        width, _, height = size.lower().partition("x")
-        if not (width.isdigit() and height.isdigit()):
-            raise GpvoError(f"--size is '{size}'", cure="give WIDTHxHEIGHT, such as 640x480")
-        options["size"] = (int(width), int(height))
+        from gpvo.cameras.rectify import read_size
+
+        options["size"] = read_size(size)
     return options

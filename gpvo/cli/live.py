@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gpvo.cli import common as flags
 from gpvo.cli.output import one_of, print_json, say
 from gpvo.errors import GpvoError, printable
+
+if TYPE_CHECKING:
+    from gpvo.live.stereo_stage import StereoSettings
+    from gpvo.types import Vehicle
 
 
 def live(
@@ -57,6 +61,11 @@ def live(
         Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
     ] = None,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
+    vo: flags.OdometryOptions = flags.OdometryOptions(),
+    hfov_deg: flags.HfovDeg = None,
+    size: flags.Size = None,
+    mask_left: flags.MaskLeft = None,
+    mask_right: flags.MaskRight = None,
     depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
@@ -69,11 +78,13 @@ def live(
 
     one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
     carrier = vehicle.bounds()
+    view = flags.source_options(size, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right)
     one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
     result = run_live(
         LiveSettings(
             model=model,
             stereo=stereo,
+            vo=_stereo_settings(vo, carrier, stereo is not None, view),
             imu=imu,
             odometry=odometry,
             pose_type=POSE_TYPE_NAMES[odometry_type],
@@ -99,6 +110,17 @@ def live(
         print_json({"schema": 1, **result})
     else:
         print(", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received")
+
+
+def _stereo_settings(
+    vo: flags.OdometryOptions, vehicle: Vehicle, has_images: bool, view: dict[str, Any]
+) -> StereoSettings:
+    """As ``gpvo run`` would read them; without images the vehicle alone is no setting of the odometry."""
+    from gpvo.live.stereo_stage import StereoSettings
+
+    if not has_images and vo == flags.OdometryOptions():
+        return StereoSettings(**view)
+    return StereoSettings(vo.config(vehicle), vo.calibration_state, **view)
 
 
 def doctor(

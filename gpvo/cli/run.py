@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,31 +23,8 @@ def run(
     source: Annotated[Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
     model: Annotated[Path | None, typer.Option(help="Error model: store a prediction with each frame.")] = None,
-    preset: Annotated[str, typer.Option(help="Settings of the odometry: fast or thesis.")] = "fast",
-    methods: Annotated[
-        str, typer.Option(help="Covariances: triangulation, pointing_matching, spherical.")
-    ] = "triangulation,pointing_matching",
-    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1",
-    sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5",
-    sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0,
-    min_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is lost; at least 4.")] = 8,
-    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is degraded.")] = 20,
-    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion alone.")] = 2,
+    odometry: flags.OdometryOptions = flags.OdometryOptions(),
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
-    ] = None,
-    self_calibration: Annotated[
-        bool | None,
-        typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
-    ] = None,
-    calibration_state: Annotated[
-        Path | None,
-        typer.Option(
-            help="Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
-        ),
-    ] = None,
     kind: flags.Kind = None,
     calibration: flags.Calibration = None,
     hfov_deg: flags.HfovDeg = None,
@@ -79,29 +55,15 @@ def run(
     from gpvo.io import open_source
     from gpvo.learning.check import ENOUGH_INSIDE
     from gpvo.online.predictor import Predictor
-    from gpvo.vo.config import make_config, read_settings
-    from gpvo.vo.rig_findings import read_state
 
-    shorthand = {
-        **asdict(vehicle.bounds()),
-        "methods": methods,
-        "sigma_px": sigma,
-        "sigma_p_px": sigma_p,
-        "sigma_m_px": sigma_m,
-        "min_inliers": min_inliers,
-        "weak_inliers": weak_inliers,
-        "window": window,
-    }
-    if self_calibration is not None:
-        shorthand["self_calibration"] = self_calibration
-    config = make_config(preset, **read_settings([*(f"{k}={v}" for k, v in shorthand.items()), *(settings or ())]))
+    config = odometry.config(vehicle.bounds())
     options = flags.source_options(
         size, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right, bits=bits,
         rate_hz=rate_hz, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic,
         imu_topic=imu_topic, truth_topic=truth_topic, truth_frame=truth_frame,
     )  # fmt: skip
     sequence = open_source(source, kind=kind, **options)
-    state = None if calibration_state is None else read_state(calibration_state, sequence.camera)
+    state = odometry.state(sequence.camera)
     predictor = None if model is None else Predictor.load(model)
     show = None
     if view or record_view is not None:

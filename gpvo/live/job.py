@@ -20,7 +20,7 @@ from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOutput, decode
 from gpvo.live.stages import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage, PoseStage, Stage
-from gpvo.live.stereo_stage import StereoStage
+from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.online.predictor import Predictor
 
 WIRES = ("zenoh", "dds", "ros2", "ros1")
@@ -37,6 +37,7 @@ class LiveSettings:
 
     model: Path
     stereo: tuple[str, str] | None = None
+    vo: StereoSettings = field(default_factory=StereoSettings)
     imu: str | None = None
     odometry: str | None = None
     pose_type: str = ODOMETRY_TYPE
@@ -190,7 +191,9 @@ def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
         if settings.odometry is not None:
             raise GpvoError("--stereo and --odometry are mutually exclusive", cure="choose one")
         rig = None if settings.calibration is None else read_stereo_yaml(settings.calibration)
-        return StereoStage(*settings.stereo, settings.imu, rig)
+        return StereoStage(*settings.stereo, settings.imu, rig, settings.vo)
+    if settings.vo != StereoSettings():
+        raise GpvoError("the odometry was given settings, but no images to run on", cure="add --stereo LEFT RIGHT")
     if settings.odometry is not None:
         return PoseStage(settings.odometry)
     if settings.replay is None:

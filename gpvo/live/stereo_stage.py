@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gpvo.cameras.readers import CameraInfo, rig_from_camera_info
-from gpvo.cameras.rectify import Rectifier
+from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.io.bag_images import PairQueue, decode_message
 from gpvo.io.bag_reader import stamp_ns
@@ -21,10 +23,29 @@ from gpvo.io.stamps import PAIR_TOLERANCE_S
 from gpvo.live.intake import Arrival, Sequence, StampWatch
 from gpvo.live.stages import Taken
 from gpvo.types import Array, ImuLog, StereoCamera, StereoFrame
+from gpvo.vo.config import VoConfig
 from gpvo.vo.odometry import StereoOdometry
+from gpvo.vo.rig_error import RigState
+from gpvo.vo.rig_findings import read_state
 
 _IMU_KEPT = 4000
 _PAIRS_KEPT = 10  # while no CameraInfo has come
+
+
+@dataclass(frozen=True)
+class StereoSettings:
+    """How ``gpvo run`` would go about it: the model knows only the odometry that it was trained on.
+
+    ``calibration_state``: what an earlier run found out. ``hfov_deg``, ``size``: of the rectified images.
+    ``mask_left``, ``mask_right``: images of the usable pixels.
+    """
+
+    config: VoConfig = field(default_factory=VoConfig)
+    calibration_state: Path | None = None
+    hfov_deg: float | None = None
+    size: tuple[int, int] | None = None
+    mask_left: Path | None = None
+    mask_right: Path | None = None
 
 
 class StereoStage:
@@ -32,11 +53,24 @@ class StereoStage:
 
     ``rig``: the calibration; without it pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits
     for the first IMU sample after it, or for the next pair.
+
+    Raises GpvoError if a file of the ``settings`` cannot be used, or does not fit the ``rig``.
     """
 
-    method = "pointing_matching"
-
-    def __init__(self, left: str, right: str, imu: str | None = None, rig: StereoRig | None = None) -> None:
+    def __init__(
+        self,
+        left: str,
+        right: str,
+        imu: str | None = None,
+        rig: StereoRig | None = None,
+        settings: StereoSettings | None = None,
+    ) -> None:
+        self.settings = settings or StereoSettings()
+        masks = (self.settings.mask_left, self.settings.mask_right)
+        self._masks = None if masks == (None, None) else [None if m is None else read_mask(m) for m in masks]
+        self._state: RigState | None = None
+        stated = self.settings.config.stated
+        self.method = "pointing_matching" if "pointing_matching" in stated else stated[0]
         self.topic, self.left, self.right, self.imu = left, left, right, imu
         self.counts: Counter[str] = Counter()
         self._infos: dict[str, CameraInfo] = {}
@@ -108,7 +142,7 @@ class StereoStage:
             self._restart()
         begins = self._odometry is None
         if self._odometry is None:
-            self._odometry = StereoOdometry(self.camera, mask=self._rectifier.mask)
+            self._odometry = StereoOdometry(self.camera, self.settings.config, self._rectifier.mask, self._state)
         assert images[0] is not None
         assert images[1] is not None
         frame = StereoFrame(t_ns, *self._rectifier.apply(images[0], images[1]))
@@ -129,8 +163,12 @@ class StereoStage:
             self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
 
     def _calibrate(self, rig: StereoRig) -> None:
-        self._rectifier = Rectifier(rig)
-        self.camera = self._rectifier.camera
+        if self._masks is not None:
+            rig = rig.with_masks(*self._masks)
+        rectifier = Rectifier(rig, hfov_deg=self.settings.hfov_deg, size=self.settings.size)
+        if self.settings.calibration_state is not None:
+            self._state = read_state(self.settings.calibration_state, rectifier.camera)
+        self._rectifier, self.camera = rectifier, rectifier.camera
         self._shift_ns = round(rig.timeshift_cam_imu_s * 1e9)
         self.T_source_cam = self._rectifier.T_left_cam
         place = self._rectifier.mounting.T_body_cam

@@ -56,11 +56,16 @@ def test_the_nodes_parameters_are_the_commands_options(parameters: ModuleType) -
     assert (stereo.stereo, stereo.pose_type, stereo.engine.increment) == (("/l", "/r"), ODOMETRY_TYPE, True)
     assert stereo.base_frame == "base_link"
     assert stereo.calibration is None
+    seen = {"preset": "thesis", "settings": "window=5 sigma_m_px=auto", "size": "320x240", "vehicle": "car"}
+    of_pair = parameters.settings_of({**given, **seen}).vo
+    assert (of_pair.config.preset, of_pair.config.window, of_pair.config.sigma_m_px) == ("thesis", 5, None)
+    assert (of_pair.config.vehicle, of_pair.size, of_pair.hfov_deg) == (VEHICLES["car"], (320, 240), None)
     for wrong in (
         {},
         {"model": "m", "left": "/l"},
         {"model": "m", "odometry_type": "tf"},
         {"model": "m", "vehicle": "x"},
+        {"model": "m", "left": "/l", "right": "/r", "settings": "windw=5"},
     ):
         with pytest.raises(GpvoError):
             parameters.settings_of(wrong)

@@ -6,17 +6,25 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pytest
 from bag_maker import BagMaker, stereo_bag
 from gpvo import runner
 from gpvo.cameras.readers import read_kitti_calib
+from gpvo.errors import GpvoError
 from gpvo.io import open_source
+from gpvo.io.bag_reader import messages, open_bag
 from gpvo.io.images import read_grey8
 from gpvo.live.intake import Arrival, replay
-from gpvo.live.stereo_stage import StereoStage
+from gpvo.live.job import LiveSettings, run_live
+from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.types import StereoFrame, VoRecord
-from gpvo.vo.config import VoConfig
+from gpvo.vo.config import make_config
 from gpvo.vo.odometry import StereoOdometry
+from gpvo.vo.rig_findings import read_state
+
+LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
 
 
 def _equal(ours: list[VoRecord], theirs: list[VoRecord]) -> None:
@@ -27,11 +35,31 @@ def _equal(ours: list[VoRecord], theirs: list[VoRecord]) -> None:
             np.testing.assert_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
-def test_a_bag_with_imu_and_camera_info(tmp_path: Path) -> None:
+def _black_half(path: Path, shape: tuple[int, int]) -> Path:
+    mask = np.full(shape, 255, np.uint8)
+    mask[: shape[0] // 3] = 0
+    cv2.imwrite(str(path), mask)
+    return path
+
+
+@pytest.mark.parametrize("settings", ["of its own", "as they are"])
+def test_a_bag_with_imu_and_camera_info(settings: str, tmp_path: Path) -> None:
     bag = stereo_bag(ros1=True, n=8).write(tmp_path / "stereo.bag")
-    source = open_source(bag, prefetch=False)
-    theirs = [s.record for s in runner.steps(source, VoConfig())]
-    stage = StereoStage("/camera/left/image_raw", "/camera/right/image_raw", "/imu0")
+    chosen, seen = StereoSettings(), {}
+    if settings == "of its own":
+        with open_bag(bag) as reader:
+            (_, image), *_ = messages(reader, [LEFT])
+        mask = _black_half(tmp_path / "mask.png", (image.height, image.width))
+        seen = {"hfov_deg": 50.0, "size": (image.width // 2, image.height // 2), "mask_left": mask}
+        config = make_config("thesis", window=3, sigma_m_px=None)
+        runner.run(open_source(bag, prefetch=False, **seen), tmp_path / "before", make_config())
+        state = tmp_path / "before" / "calibration_state.json"
+        chosen = StereoSettings(replace(config, self_calibration=True), state, **seen)
+    source = open_source(bag, prefetch=False, **seen)
+    known = None if chosen.calibration_state is None else read_state(chosen.calibration_state, source.camera)
+    odometry = StereoOdometry(source.camera, chosen.config, source.mask, known)
+    theirs = [s.record for s in runner.steps(source, chosen.config, odometry)]
+    stage = StereoStage(LEFT, RIGHT, "/imu0", settings=chosen)
     topics = ["/imu0", *(f"/camera/{s}/{t}" for s in ("left", "right") for t in ("image_raw", "camera_info"))]
     taken = [t for a in replay(bag, topics, threading.Event(), fast=True) for t in stage.take(a)]
     taken += list(stage.flush())
@@ -65,3 +93,16 @@ def test_real_pictures_and_a_source_that_starts_again(real_data: Path) -> None:
         assert list(stage.take(replace(arrivals[-2]))) == []
         assert list(stage.take(replace(arrivals[-1], message=message))) == []
     assert stage.counts["unreadable"] == 2
+
+
+def test_settings_that_cannot_be_used_are_refused_at_the_start(tmp_path: Path, real_data: Path) -> None:
+    folder = real_data / "kitti_2011_09_26_0001"
+    rig = read_kitti_calib(folder / "calib.txt", left=0, right=1, size=(1242, 375))
+    small = _black_half(tmp_path / "mask.png", (20, 30))
+    with pytest.raises(GpvoError, match="mask is 30x20"):
+        StereoStage("/l", "/r", rig=rig, settings=StereoSettings(mask_left=small))
+    (tmp_path / "state.json").write_text("{}")
+    with pytest.raises(GpvoError, match="is not a calibration state"):
+        StereoStage("/l", "/r", rig=rig, settings=StereoSettings(calibration_state=tmp_path / "state.json"))
+    with pytest.raises(GpvoError, match="no images to run on"):
+        run_live(LiveSettings(tmp_path / "m.gpvo", odometry="/vio", replay=tmp_path, vo=StereoSettings(size=(9, 9))))

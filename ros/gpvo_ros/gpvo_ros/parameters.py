@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gpvo.cameras.rectify import read_size
 from gpvo.errors import GpvoError
 from gpvo.live.engine import EngineSettings
 from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings
+from gpvo.live.stereo_stage import StereoSettings
 from gpvo.types import VEHICLES, Vehicle
+from gpvo.vo.config import PRESETS, make_config, read_settings
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,13 @@ PARAMETERS = {
     "right": Parameter("", "The other topic of the pair."),
     "imu": Parameter("", "Topic of the IMU, beside a stereo pair."),
     "calibration": Parameter("", "Calibration file of the pair; default: CameraInfo beside the images."),
+    "preset": Parameter("fast", "Settings of the odometry of a stereo pair.", choices=tuple(PRESETS)),
+    "settings": Parameter("", "More of them, NAME=VALUE separated by spaces, such as window=5."),
+    "calibration_state": Parameter("", "Start from the calibration errors of an earlier run: its folder."),
+    "hfov_deg": Parameter(0.0, "Field of view of the rectified images [deg]; 0: the lens's own.", (0.0, 179.0)),
+    "size": Parameter("", "Size of the rectified images, WIDTHxHEIGHT; default: that of the raw ones."),
+    "mask_left": Parameter("", "Mask image: the pixels of the left lens that may be used."),
+    "mask_right": Parameter("", "The same for the right lens."),
     "base_frame": Parameter(
         "", "Publish the odometry of this frame, located through /tf_static and /tf; default: the source's own."
     ),
@@ -76,6 +86,7 @@ def settings_of(given: Mapping[str, Any]) -> LiveSettings:
     return LiveSettings(
         model=Path(p["model"]),
         stereo=None if p["left"] is None else (p["left"], p["right"]),
+        vo=StereoSettings() if p["left"] is None else _stereo_settings(p, vehicle),
         imu=p["imu"],
         odometry=p["odometry"],
         pose_type=POSE_TYPE_NAMES[p["odometry_type"]],
@@ -95,6 +106,13 @@ def settings_of(given: Mapping[str, Any]) -> LiveSettings:
             vehicle=vehicle,
         ),
     )
+
+
+def _stereo_settings(p: Mapping[str, Any], vehicle: Vehicle) -> StereoSettings:
+    bounds = {"max_acceleration_mps2": vehicle.max_acceleration_mps2, "max_turn_radps2": vehicle.max_turn_radps2}
+    config = make_config(p["preset"], **{**bounds, **read_settings((p["settings"] or "").split())})
+    state, left, right = (p[name] and Path(p[name]) for name in ("calibration_state", "mask_left", "mask_right"))
+    return StereoSettings(config, state, p["hfov_deg"] or None, p["size"] and read_size(p["size"]), left, right)
 
 
 def typed(name: str, text: str) -> str | int | float | bool:
