@@ -25,7 +25,7 @@ def printable(text: object) -> str:
 
 
 class GpvoError(Exception):
-    """Bad input, described for the person who can mend it.
+    """Bad input, described for the person who can fix it.
 
     The command line prints it as one line and exits with code 2; library callers catch it.
     """

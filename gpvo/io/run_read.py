@@ -68,9 +68,9 @@ def is_run(path: str | Path) -> bool:
 
 
 def read_run(path: str | Path) -> Run:
-    """Read a run folder; of a killed run what its complete chunks hold.
+    """Read a run folder; for a killed run, what its complete chunks hold.
 
-    Raises SourceError where it is not a run folder, is newer than this version, or a file in it is damaged.
+    Raises SourceError if it is not a run folder, is newer than this version, or a file in it is damaged.
     """
     p = Path(path)
     if not p.is_dir():

@@ -1,4 +1,4 @@
-"""What odometry and models say of motions: records, logs of them, and the error that is stated of a motion."""
+"""What odometry and models say about motions: records, logs of them, and the error that is stated for a motion."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class VoLog:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionError:
-    """What is stated of the error of a motion, or of many along leading axes: ``T_true = T_est Exp(-xi)``.
+    """What is stated about the error of a motion, or of many along leading axes: ``T_true = T_est Exp(-xi)``.
 
     The error ``xi`` has the mean ``mean`` (..., 6) [m, rad], in ``cam``, per motion and not per second, and three parts
     that differ in how they accumulate (see :mod:`gpvo.accumulation`):
@@ -183,7 +183,7 @@ class MotionError:
 
     ``dt_s`` (...): duration. ``status``: of the motion, one for all of a batch; of a ``lost`` one nothing was measured.
     ``nu``: degrees of freedom of the Student-t that the error of one motion has, ``covariance`` being its second
-    moment; infinite for a Gaussian. Filters go by the covariance.
+    moment; infinite for a Gaussian. Filters use the covariance.
     """
 
     mean: Array

@@ -27,7 +27,7 @@ class StereoCamera:
 
     ``fx_px, fy_px, cx_px, cy_px``: intrinsics [px], pixel (0, 0) is the centre of the first pixel.
     ``baseline_m``: distance of the optical centres [m], positive. ``width, height``: image size [px]. Raises
-    CalibrationError for a camera that cannot be.
+    CalibrationError for an impossible camera.
     """
 
     fx_px: float

@@ -104,8 +104,8 @@ class SigmaEstimator:
 class DesignEffect:
     """How many times the variance of a motion is that of one from independent points.
 
-    L. Kish, "Survey sampling", 1965; clusters of a regression: K.-Y. Liang, S. Zeger, 1986. Points near each other are
-    wrong alike: on one surface, or moving thing. The motion's score, summed over each of :data:`_PARTS` parts of the
+    L. Kish, "Survey sampling", 1965; clusters of a regression: K.-Y. Liang, S. Zeger, 1986. Points near each other
+    err alike: on one surface, or one moving object. The motion's score, summed over each of :data:`_PARTS` parts of the
     image, then scatters more than its information says.
     """
 
