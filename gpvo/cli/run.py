@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,7 +54,7 @@ def run(
     """
     from gpvo import runner
     from gpvo.io import open_source
-    from gpvo.learning.check import ENOUGH_INSIDE
+    from gpvo.learning.check import ENOUGH_INSIDE, odometry_problems
     from gpvo.online.predictor import Predictor
 
     config = odometry.config(vehicle.bounds())
@@ -65,6 +66,8 @@ def run(
     sequence = open_source(source, kind=kind, **options)
     state = odometry.state(sequence.camera)
     predictor = None if model is None else Predictor.load(model)
+    for problem in odometry_problems(predictor, asdict(config)) if predictor is not None else ():
+        print(f"gpvo: {problem}", file=sys.stderr)
     show = None
     if view or record_view is not None:
         from gpvo.evaluation.pictures import LiveView

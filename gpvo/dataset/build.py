@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from gpvo.online.observer import Observer
 from gpvo.online.predictor import Predictor
 from gpvo.online.slip import REASON, SlipDetector, flag_slips
 from gpvo.types import Array, Prediction, Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.vo.config import VoConfig
 
 MIN_ROWS = 30
 
@@ -34,6 +36,7 @@ class TrainingSet:
     plausibility alone, also in ``lost``), frames without truth, those at rest whose truth moves, and those in odd
     stretches. ``lost_xi``
     (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from the motion expected.
+    ``odometry``: settings of gpvo's own odometry, empty if another one made the log.
     """
 
     name: str
@@ -49,6 +52,7 @@ class TrainingSet:
     target: str = "frame"
     lost_xi: Array = field(default_factory=lambda: np.zeros((0, 6)))
     lost_jump: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    odometry: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.X)
@@ -195,7 +199,21 @@ def build_run(
         truth = align_rotation(run.log, truth)
     elif align not in ("none", "rotation"):
         raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
-    return build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
+    rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
+    return replace(rows, odometry=that_matter(run.settings))
+
+
+_INDIFFERENT = ("seed", "max_acceleration_mps2", "max_turn_radps2")
+
+
+def that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the settings of gpvo's own odometry, those that its errors depend on; empty if another one made a log."""
+    if "preset" not in settings:
+        return {}
+    # What is None, estimated from the residuals, is left out of a run's file.
+    known = {"sigma_p_px": None, "sigma_m_px": None, **settings}
+    names = [f.name for f in fields(VoConfig) if f.name in known and f.name not in _INDIFFERENT]
+    return {name: list(v) if isinstance(v := known[name], tuple) else v for name in names}
 
 
 def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:

@@ -37,6 +37,7 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
                     "target": s.target,
                     "counts": dict(s.counts),
                     "camera": None if s.camera is None else asdict(s.camera),
+                    "odometry": dict(s.odometry),
                     "columns": list(s.columns),
                     "lost_xi": s.lost_xi.tolist(),
                     "lost_jump": s.lost_jump.tolist(),
@@ -104,6 +105,7 @@ def set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         camera=None if entry["camera"] is None else StereoCamera(**entry["camera"]),
         target=entry["target"],
         lost_xi=np.array(entry.get("lost_xi", []), dtype=np.float64).reshape(-1, 6),
+        odometry=entry.get("odometry", {}),
         lost_jump=np.array(entry.get("lost_jump", []), dtype=np.float64).reshape(-1, 6),
     )
 

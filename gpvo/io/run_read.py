@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import CalibrationError, SourceError, printable
-from gpvo.files import read_json
+from gpvo.files import read_json, read_toml
 from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_table
 from gpvo.io.parquet import read_columns
@@ -36,7 +36,10 @@ _MAX_SCHEMA = 1
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder in memory. ``meta`` is ``run.json``; ``meta["complete"]`` is False for a run that broke off."""
+    """A run folder in memory. ``meta`` is ``run.json``; ``meta["complete"]`` is False for a run that broke off.
+
+    ``settings``: ``config.toml``, those of gpvo's own odometry; empty if the folder does not say.
+    """
 
     path: Path
     name: str
@@ -46,6 +49,7 @@ class Run:
     mounting: Mounting
     predictions: list[Prediction]
     meta: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def predictions_of_motions(self) -> dict[int, Prediction]:
@@ -92,6 +96,7 @@ def read_run(path: str | Path) -> Run:
         mounting=mounting,
         predictions=_read_predictions_of(p),
         meta=meta,
+        settings=read_toml(p / "config.toml") if (p / "config.toml").is_file() else {},
     )
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.build import observe
+from gpvo.dataset.build import observe, that_matter
 from gpvo.io.run_read import Run
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
@@ -37,7 +38,8 @@ class Check:
 def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
     steps = [r.dt_s for r in run.log if r.usable]
-    problems = [*camera_problems(predictor.camera, run.log.camera), *rate_problems(predictor, steps)]
+    problems = [*camera_problems(predictor.camera, run.log.camera), *odometry_problems(predictor, run.settings)]
+    problems += rate_problems(predictor, steps)
     records, X = observe(run.log, predictor.features, predictor.target)
     usable = np.array([r.usable for r in records], dtype=bool)
     missing = [
@@ -55,6 +57,14 @@ def check(predictor: Predictor, run: Run) -> Check:
     if inside < ENOUGH_INSIDE:
         problems.append(f"only {100 * inside:.0f} % of the frames lie inside the training domain")
     return Check(len(run.log), int(usable.sum()), inside, farthest, tuple(problems))
+
+
+def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list[str]:
+    """Whether gpvo's own odometry runs with the ``settings`` that a model was trained with; a line if not."""
+    trained = predictor.header.get("odometry") or {}
+    here = that_matter(settings)
+    other = [f"{k} is {v}, not {trained[k]}" for k, v in here.items() if k in trained and trained[k] != v]
+    return [f"the model was trained on odometry with other settings: {'; '.join(other)}"] if other else []
 
 
 def rate_problems(predictor: Predictor, steps_s: Collection[float]) -> list[str]:

@@ -283,6 +283,7 @@ def header_of_sets(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str
         "model_schema": 1,
         "target": config.target,
         "camera": asdict(cameras[0]) if cameras else None,
+        "odometry": {k: v for k, v in sets[0].odometry.items() if all((k, v) in s.odometry.items() for s in sets)},
         "sequences": [{"name": s.name, "rows": len(s), **s.counts} for s in sets],
         "versions": versions(),
         "training_digest": training_digest(sets),

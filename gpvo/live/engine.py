@@ -20,7 +20,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_positive_definite, symmetrise
 from gpvo.geometry.se3 import is_rigid, rotate_covariance
 from gpvo.io.trajectory import FARTHEST_M
-from gpvo.learning.check import rate_problems
+from gpvo.learning.check import odometry_problems, rate_problems
 from gpvo.live.intake import Arrival
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
@@ -231,6 +231,7 @@ class Engine:
         if self.stage.camera is not None and self.predictor.camera is None:
             out.append("the model was trained on another odometry's poses, not on images")
         out += camera_problems(self.predictor.camera, self.stage.camera)
+        out += odometry_problems(self.predictor, self.stage.odometry)
         if len(self._steps_s) >= 20:
             out += rate_problems(self.predictor, self._steps_s)
         if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:

@@ -5,8 +5,9 @@ by the transforms that ROS publishes on /tf and /tf_static.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -57,6 +58,10 @@ class Stage(Protocol):
         """Of the images; None for poses."""
 
     @property
+    def odometry(self) -> Mapping[str, Any]:
+        """Settings of gpvo's own odometry; empty for poses."""
+
+    @property
     def T_source_cam(self) -> Array:
         """Camera to the frame that messages on ``topic`` name."""
 
@@ -87,6 +92,7 @@ class PoseStage:
 
     method = IMPORTED
     camera: StereoCamera | None = None
+    odometry: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, topic: str, T_body_cam: Array = T_FLU_OPTICAL) -> None:
         self.topic, self.T_body_cam, self.T_source_cam = topic, T_body_cam, T_body_cam
@@ -249,6 +255,11 @@ class BaseFrameStage:
     def camera(self) -> StereoCamera | None:
         """Of the images; None for poses."""
         return self.inner.camera
+
+    @property
+    def odometry(self) -> Mapping[str, Any]:
+        """Of the stage within."""
+        return self.inner.odometry
 
     @property
     def T_source_cam(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,7 @@ class StereoStage:
         masks = (self.settings.mask_left, self.settings.mask_right)
         self._masks = None if masks == (None, None) else [None if m is None else read_mask(m) for m in masks]
         self._state: RigState | None = None
+        self.odometry = asdict(self.settings.config)
         stated = self.settings.config.stated
         self.method = "pointing_matching" if "pointing_matching" in stated else stated[0]
         self.topic, self.left, self.right, self.imu = left, left, right, imu

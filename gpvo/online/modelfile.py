@@ -127,6 +127,7 @@ _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "frame": _TEXT,
     "base_method": _TEXT,
     "camera": _OBJECT,
+    "odometry": _OBJECT,
     "scores": ("an object of objects", lambda v: isinstance(v, dict) and _are(dict, list(v.values()))),
     "calibration": _OBJECT,
     "config": _OBJECT,

@@ -16,10 +16,12 @@ from gpvo.dataset.build import build, build_run
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
-from gpvo.io.run import write_run
+from gpvo.io import open_source
+from gpvo.io.run import read_run, write_run
 from gpvo.learning import train as training
 from gpvo.learning.basefit import rate_changes
 from gpvo.learning.card import model_card
+from gpvo.learning.check import check, odometry_problems
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
 from gpvo.learning.methods import METHODS, best_scale, score
@@ -30,8 +32,11 @@ from gpvo.learning.train import TrainedModel, _slips, train_sets
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.predictor import Predictor
+from gpvo.runner import run
+from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nees
 from gpvo.types import VoLog
+from gpvo.vo.config import make_config
 from small_model import small_model, training_sets
 from synthetic_runs import make_run
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -300,7 +305,7 @@ def test_a_model_of_positions_is_not_updated(tmp_path):
     path = tmp_path / "m.gpvo"
     save_model(_of_three(), path)
     with pytest.raises(GpvoError, match="train again"):
-        _train([tmp_path], asdict(replace(QUICK, target="position")), path)
+        _train([tmp_path], asdict(replace(QUICK, target="position")), path, print)
 
 
 def _as_run(log, truth, name):
@@ -520,4 +525,27 @@ def test_a_run_given_twice_is_refused(tmp_path):
     """Left out in turn, its copy would still be learnt from."""
     run = tmp_path / "run"
     with pytest.raises(GpvoError, match="run.* is given twice"):
-        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], asdict(QUICK), None)
+        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], asdict(QUICK), None, print)
+
+
+def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> None:
+    for name, preset in (("a", "fast"), ("b", "fast"), ("c", "thesis")):
+        source = simulate_points("tunnel-bursts", ord(name), duration_s=8.0, rate_hz=10.0).save(
+            tmp_path / f"{name}.npz"
+        )
+        run(open_source(source), tmp_path / name, make_config(preset))
+    runs = [read_run(tmp_path / name) for name in "abc"]
+    sets = [build_run(r) for r in runs]
+    path = tmp_path / "m.gpvo"
+    save_model(train_sets(sets[:2], QUICK, judge=False), path)
+    predictor = Predictor.load(path)
+    assert not any("settings" in problem for problem in check(predictor, runs[0]).problems)
+    (told,) = (problem for problem in check(predictor, runs[2]).problems if "settings" in problem)
+    assert "keyframe_parallax_px is 0.0, not 1.0" in told
+    assert "self_calibration is False, not True" in told
+    # Kept with the rows for --update; of settings that differ among the runs, nothing is said.
+    assert [s.odometry for s in read_sets(rows_path(path))] == [s.odometry for s in sets[:2]]
+    mixed = train_sets(sets, QUICK, judge=False).predictor()
+    assert not any("settings" in problem for problem in check(mixed, runs[2]).problems)
+    # Another's odometry has no settings of ours.
+    assert not odometry_problems(predictor, {"import": {"frame": "body"}})
