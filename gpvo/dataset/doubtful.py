@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
 from gpvo.stats.series import moving_sums
 from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
-from gpvo.vo.state import ImuMoments
+from gpvo.vo.imu_moments import ImuMoments
 
 STILL_S = 1.0
 """So long a vehicle must stand at least for a wait."""

@@ -13,6 +13,7 @@ from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
+from gpvo.vo.imu_moments import ImuMoments
 from gpvo.vo.klt import KltFrontend
 from gpvo.vo.motion import Motion, refine, whitened
 from gpvo.vo.points import triangulate
@@ -29,7 +30,7 @@ from gpvo.vo.quality import (
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained
 from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
-from gpvo.vo.state import ImuMoments, State, Stopwatch, check_frame
+from gpvo.vo.state import State, Stopwatch, check_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
