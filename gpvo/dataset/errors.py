@@ -53,6 +53,20 @@ def interpolate_truth(
     return T, known
 
 
+def interpolation_sigma(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array:
+    """(6,) standard deviation [m, rad] of interpolated poses of a truth slower than the frames at ``t_ns``; else 0.
+
+    Half of the truth's own poses tell what interpolation misses at twice the step; as for any path smooth at that
+    scale, it misses a quarter of it at the step itself.
+    """
+    if len(truth.t_ns) < 9 or np.median(np.diff(truth.t_ns)) < 1.2 * np.median(np.diff(t_ns)):
+        return np.zeros(6)
+    half = TruthLog(truth.t_ns[::2], truth.T_world_cam[::2])
+    T, known = interpolate_truth(half, truth.t_ns[1::2], 2.0 * MAX_GAP_S)
+    missed = se3.log(se3.inverse(T) @ truth.T_world_cam[1::2])[known]
+    return np.sqrt((missed**2).mean(axis=0)) / 4.0 if len(missed) else np.zeros(6)
+
+
 @dataclass(frozen=True)
 class MotionErrors:
     """Errors of M motions: ``xi = Log(T_true^-1 T_est)``, right perturbation, in ``cam`` [m, rad].

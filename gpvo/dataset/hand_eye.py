@@ -11,10 +11,11 @@ require one, the directions of travel another. The rotation between the two worl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -157,6 +158,24 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
         return None
     rotvec = se3.so3_log(fixed.T_log_truth[:3, :3])
     return FixedRotation(fixed.angle_deg, tuple(rotvec.tolist()), float(changes.mean()))
+
+
+def late_by(log: VoLog, truth: TruthLog) -> float | None:
+    """Seconds to add to the log's stamps, if without such an offset errors over a second are smaller by what matters,
+    in both halves of the run; else None."""
+    try:
+        offset_s = estimate_time_offset(log, truth)
+    except GpvoError:  # too short, or motions unlike each other
+        return None
+    moved = replace(truth, t_ns=truth.t_ns - round(offset_s * 1e9))
+    found = []
+    for against in (truth, moved):
+        A, B, _ = windowed_motions(log, against)
+        if len(A) < _MIN_MOTIONS:
+            return None
+        found.append([np.median(half) for half in np.array_split(_errors_m(A, B, np.eye(4)), 2)])
+    change = np.array(found[1]) / np.maximum(found[0], 1e-12) - 1
+    return offset_s if change.max() < MATTERS else None
 
 
 def _errors_m(A: Array, B: Array, X: Array) -> Array:

@@ -39,7 +39,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
     * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers amount to, in words.
-    * ``time_offset_s``: what was taken off the truth's clock, given or estimated.
+    * ``time_offset_s``: what was taken off the truth's clock, given or estimated. ``clocks_differ_by_s``: what seems to
+      remain of it, None if it does not matter.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
       as used: what ``--truth-sigma`` says, else what the source states (``truth_sigma_stated``) or the run shows
       (:func:`gpvo.dataset.errors.estimate_truth_noise`), whichever is larger. ``truth_sigma_axes``: by axis, x y z [m],
@@ -103,6 +104,7 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "rmse_origin_m": t.rmse_origin_m,
         "final_error_m": t.final_error_m,
         "time_offset_s": e.time_offset_s,
+        "clocks_differ_by_s": e.late_s,
         "truth_sigma": _by_kind(e.truth_sigma),
         "truth_sigma_axes": e.truth_sigma.tolist(),
         "truth_sigma_stated": _by_kind(e.truth_sigma_stated),

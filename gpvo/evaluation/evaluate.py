@@ -12,14 +12,16 @@ from gpvo.dataset.build import align_rotation, predictions_of
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
+    MAX_GAP_S,
     MotionErrors,
     estimate_truth_noise,
     interpolate_truth,
+    interpolation_sigma,
     motion_errors,
     telling_distance_m,
     velocity_path,
 )
-from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation
+from gpvo.dataset.hand_eye import FixedRotation, fixed_rotation, late_by
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
@@ -54,8 +56,9 @@ class Evaluation:
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
     stands. ``odd``: stretches in which odometry and truth differ as nowhere else. ``truth_sigma`` (6,): noise of the
     truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source states. ``tells_from_m``: length of
-    path from which odometry's errors outweigh it. ``turned``: a fixed rotation between truth and odometry, where it
-    matters. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a model.
+    path from which odometry's errors outweigh it. ``late_s``: offset between the clocks, where it matters and none was
+    given; ``turned``: a fixed rotation between truth and odometry, likewise. ``in_domain``: share of the
+    predicted frames that lie in the model's training domain, None without a model.
     ``poses``: scores of the covariances of poses that a log states.
     """
 
@@ -72,6 +75,7 @@ class Evaluation:
     time_offset_s: float
     tells_from_m: float = 0.0
     turned: FixedRotation | None = None
+    late_s: float | None = None
     unscored: int = 0
     odd: Sequence[Stretch] = ()
     in_domain: float | None = None
@@ -116,16 +120,16 @@ def evaluate_run(
     run = replace(run, log=judged(run.log, predictions))
     log = run.log
     T_true, known = interpolate_truth(truth, log.t_ns)
-    if known.sum() < 3:
-        raise SourceError(
-            "ground truth and frames do not overlap in time",
-            where=run.path,
-            cure="use --time-offset auto, or give the truth of this run",
-        )
+    _refuse_too_little(run, truth, int(known.sum()))
     scored = without_wandering_truth(log, truth)
     errors = motion_errors(scored, truth)
     stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
-    sigma = np.maximum(stated, estimate_truth_noise(errors, scored)) if options.truth_sigma is None else stated
+    sigma = stated
+    if options.truth_sigma is None:
+        sigma = np.maximum(stated, estimate_truth_noise(errors, scored))
+        sigma = np.maximum(sigma, interpolation_sigma(truth, log.t_ns))
+    late_s = late_by(scored, truth) if options.time_offset_s == 0.0 else None
+    on_its_clock = replace(truth, t_ns=truth.t_ns - round(late_s * 1e9)) if late_s else truth
     T_est = log.trajectory()
     made = [*statements(log, predictions, predictor), *further]
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
@@ -146,13 +150,29 @@ def evaluate_run(
         truth_sigma=sigma,
         truth_sigma_stated=stated,
         tells_from_m=telling_distance_m(scored, T_true, known, sigma),
-        turned=fixed_rotation(scored, truth) if options.align == "none" else None,
+        turned=fixed_rotation(scored, on_its_clock) if options.align == "none" else None,
         time_offset_s=offset_s,
+        late_s=late_s,
         unscored=int(log.usable.sum() - scored.usable.sum()),
         odd=odd_stretches(scored, truth),
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=_in_domain(predictions),
     )
+
+
+def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:
+    if known >= 3:
+        return
+    t, where = run.log.t_ns, run.path
+    inside = int(((t >= truth.t_ns[0]) & (t <= truth.t_ns[-1])).sum()) if len(truth.t_ns) else 0
+    if inside < min(3, len(t)):
+        cure = "use --time-offset auto, or give the truth of this run"
+        raise SourceError("ground truth and frames do not overlap in time", where=where, cure=cure)
+    if inside < 3:
+        cure = "give a longer sequence"
+        raise SourceError(f"has {len(t)} frames, and three with truth are needed", where=where, cure=cure)
+    cure = f"give a truth whose poses are at most {MAX_GAP_S:g} s apart"
+    raise SourceError(f"only {known} of {len(t)} frames lie near poses of the ground truth", where=where, cure=cure)
 
 
 def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:

@@ -28,7 +28,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import TrainedModel, fold_model
 from gpvo.online.predictor import Predictor
 from gpvo.stats.series import sequence_bootstrap
-from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog
+from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog, VoRecord
 
 POOLED = ("energy_translation_m", "energy_rotation_rad", "nll_per_dim", "nees_dof", "correlation_gain_nats")
 """Scores that are averaged over the sequences, with an interval by whole sequences."""
@@ -76,7 +76,8 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
     evaluation = evaluate_run(run, options=options)
     c = evaluation.consistency.get(IMPORTED)
     if c is None or c.energy_rotation_rad is None or c.nll_per_dim is None or c.one_second is None:
-        raise SourceError("states fewer than two motions with truth", where=stated)
+        what = f"{int(log.usable.sum())} of {len(log) - 1} motions"
+        raise SourceError(f"states {what}, of which fewer than two have truth", where=stated, cure="see --truth")
     usable, lost = int(log.usable.sum()), sum(r.status is Status.LOST for r in log)
     charged_m, charged_rad = _charged(log, evaluation)
     joint = c.nees_dof["joint"]
@@ -101,7 +102,21 @@ def _read(stated: Path) -> VoLog:
     """A file of stated motions; or a CSV with a header, its covariances those of motions in the axes of the frame."""
     if stated.suffix.lower() != ".csv":
         return read_stated(stated)
-    return VoLog(to_records(read_foreign(stated, "csv", covariance_of="motion", covariance_axes="body"))[0])
+    log = read_foreign(stated, "csv", covariance_of="motion", covariance_axes="body")
+    if log.covariance is None:
+        raise SourceError("states no covariances", where=stated, cure="add columns cov_00, cov_01, ... of the motions")
+    return VoLog([_owned_up(r, C, stated) for r, C in zip(to_records(log)[0], log.covariance, strict=True)])
+
+
+def _owned_up(record: VoRecord, covariance: Array, where: Path) -> VoRecord:
+    """A motion without a covariance is lost: what a method does not state, it cannot be spared for."""
+    if not record.usable or IMPORTED in record.covariances:
+        return record
+    if np.isfinite(covariance).all():
+        when = f"{record.t_ns * 1e-9:.9f} s"
+        cure = "write nan for a motion that is lost"
+        raise SourceError(f"the covariance at {when} is not positive definite", where=where, cure=cure)
+    return replace(record, status=Status.LOST, reason="no covariance")
 
 
 def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[str, dict[str, Any]]:

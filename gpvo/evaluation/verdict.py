@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.types import Array
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
 HONEST = (0.5, 2.0)
 """NEES per degree of freedom that counts as honest: sigma right within a factor of 1.4."""
 _FEW_WINDOWS = 5
+_LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
 
 Colour = Literal["green", "amber", "red"]
 
@@ -130,11 +133,32 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
         yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
+    if e.late_s is not None:
+        yield (
+            f"The clocks of odometry and truth seem to differ by {abs(e.late_s):.3g} s: with --time-offset auto, errors"
+            " over a second are smaller."
+        )
+    yield from _of_truth_and_path(e)
     if e.turned is not None:
         yield (
             f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg (mounting or calibration)."
             f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
         )
+
+
+def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
+    """A truth slower than the frames, and a path of another size."""
+    assert e.run.truth is not None
+    step_s, frame_s = (1e-9 * float(np.median(np.diff(t))) for t in (e.run.truth.t_ns, e.run.log.t_ns))
+    if step_s > 1.2 * frame_s:
+        yield (
+            f"The ground truth comes every {step_s:.2g} s, the frames every {frame_s:.2g} s: between its poses it is"
+            " interpolated, and what that misses is only estimated."
+        )
+    own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
+    size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
+    if true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
+        yield f"The path of odometry is {size / true_size:.2g} times as large as the truth's: are both in metres?"
 
 
 def _up_to(sigma: Array) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from gpvo.dataset.build import observe, that_matter
 from gpvo.io.run_read import Run
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
+from gpvo.types import VoRecord
 
 _RATE = 0.2
 ENOUGH_INSIDE = 0.8
@@ -37,9 +38,8 @@ class Check:
 
 def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
-    steps = [r.dt_s for r in run.log if r.usable]
     problems = [*camera_problems(predictor.camera, run.log.camera), *odometry_problems(predictor, run.settings)]
-    problems += rate_problems(predictor, steps)
+    problems += rate_problems(predictor, [r for r in run.log if r.usable])
     records, X = observe(run.log, predictor.features, predictor.target)
     usable = np.array([r.usable for r in records], dtype=bool)
     missing = [
@@ -67,13 +67,15 @@ def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list
     return [f"the model was trained on odometry with other settings: {'; '.join(other)}"] if other else []
 
 
-def rate_problems(predictor: Predictor, steps_s: Collection[float]) -> list[str]:
-    """Whether motions of durations ``steps_s`` [s] come at the rate that a model was trained at; one line if not."""
-    if not steps_s or predictor.target != "frame":
+def rate_problems(predictor: Predictor, records: Sequence[VoRecord]) -> list[str]:
+    """Whether motions, or at least frames, come at the rate that a model was trained at; one line if neither does.
+
+    A motion spans several frames where odometry keeps its reference, as at rest.
+    """
+    if len(records) < 2 or predictor.target != "frame":
         return []
-    here, trained = 1.0 / float(np.median(list(steps_s))), 1.0 / predictor.model.dt_s
-    return (
-        []
-        if abs(here / trained - 1.0) <= _RATE
-        else [f"the rate is {here:.3g} Hz, the model was trained at {trained:.3g} Hz"]
-    )
+    trained, steps_s = 1.0 / predictor.model.dt_s, 1e-9 * np.diff([r.t_ns for r in records])
+    of_motions, of_frames = (1.0 / float(np.median(s)) for s in ([r.dt_s for r in records], steps_s))
+    if any(abs(rate / trained - 1.0) <= _RATE for rate in (of_motions, of_frames)):
+        return []
+    return [f"the rate is {of_frames:.3g} Hz, the model was trained at {trained:.3g} Hz"]

@@ -101,7 +101,7 @@ class Engine:
         self._builder: OdometryBuilder | None = None
         self._seen_ns: int | None = None  # arrival of the last message that was used
         self._latency_ms: deque[float] = deque(maxlen=1000)
-        self._steps_s: deque[float] = deque(maxlen=_RECENT)
+        self._motions: deque[VoRecord] = deque(maxlen=_RECENT)
         self._inside: deque[bool] = deque(maxlen=_RECENT)
         self._reported = (-np.inf, 0)  # seconds and level of the last health
         self._misfit: list[str] = []
@@ -157,7 +157,7 @@ class Engine:
         self._seen_ns, self.last = taken.received_ns, message
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
-            self._steps_s.append(record.dt_s)
+            self._motions.append(record)
             self._inside.append(message.in_domain is None or message.in_domain > 0.5)
         for output in self.outputs:
             output.odometry(message)
@@ -232,8 +232,8 @@ class Engine:
             out.append("the model was trained on another odometry's poses, not on images")
         out += camera_problems(self.predictor.camera, self.stage.camera)
         out += odometry_problems(self.predictor, self.stage.odometry)
-        if len(self._steps_s) >= 20:
-            out += rate_problems(self.predictor, self._steps_s)
+        if len(self._motions) >= 20:
+            out += rate_problems(self.predictor, self._motions)
         if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:
             share = 100 * float(np.mean(self._inside))
             out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain")

@@ -148,6 +148,19 @@ def test_somebody_elses_csv_is_scored_in_one_command(written, tmp_path: Path, ca
     path.write_text("\n".join(lines) + "\n")
     found = json.loads(_call(capsys, path, "--truth", folder / "truth" / "hall.txt", "--json"))
     assert 0.9 < found["sequences"][0]["nees_dof"] < 1.1
+    # What it does not state is lost, and charged; what cannot be a covariance is refused.
+    sparse, zero = tmp_path / "sparse.csv", tmp_path / "zero.csv"
+    poses = [line.split(",")[:8] for line in lines]
+    rows = [",".join([*p, *["nan"] * 36]) if k % 3 == 2 else line for k, (p, line) in enumerate(zip(poses, lines))]
+    sparse.write_text("\n".join(rows))
+    zero.write_text("\n".join([*lines[:5], ",".join([*poses[5], *["0"] * 36]), *lines[6:]]))
+    (less,) = json.loads(_call(capsys, sparse, "--truth", folder / "truth" / "hall.txt", "--json"))["sequences"]
+    (all_,) = found["sequences"]
+    assert less["lost"] > len(lines) // 3 - 2
+    assert less["motions"] + less["lost"] == all_["motions"] + all_["lost"]
+    assert less["energy_translation_m"] > 2 * all_["energy_translation_m"]
+    with pytest.raises(SourceError, match=r"zero.csv: the covariance at .* s is not positive definite"):
+        score_sequence(zero, folder / "truth" / "hall.txt")
     # Beside ours, in the same folder.
     board = tmp_path / "all"
     shutil.copytree(folder, board)

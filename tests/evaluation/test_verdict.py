@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from evaluation_runs import make_run
+from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run
 from gpvo.evaluation.verdict import verdict
 from gpvo.io.run_read import Run
-from gpvo.types import Mounting, VoLog
+from gpvo.types import Mounting, TruthLog, VoLog
 
 
 def evaluated(factors: dict[str, float]) -> Evaluation:
@@ -52,3 +54,57 @@ def test_outside_the_domain_is_never_green() -> None:
 
 def test_nothing_stated_is_said() -> None:
     assert "nothing can be judged" in verdict(evaluated({})).headline
+
+
+def of_truth(change: Callable[[TruthLog], TruthLog]) -> Evaluation:
+    log, truth = make_run(600, v_t=False)
+    return evaluate_run(Run(Path("hall"), "hall", log, change(truth), None, Mounting(), []))
+
+
+def scaled(truth: TruthLog, factor: float) -> TruthLog:
+    T = truth.T_world_cam.copy()
+    T[:, :3, 3] *= factor
+    return replace(truth, T_world_cam=T)
+
+
+def test_clocks_that_differ_are_named_and_not_taken_for_a_rotation() -> None:
+    assert of_truth(lambda truth: truth).late_s is None
+    late = of_truth(lambda truth: replace(truth, t_ns=truth.t_ns + 200_000_000))
+    assert late.late_s == pytest.approx(0.2, abs=0.01)
+    assert late.turned is None
+    assert any("with --time-offset auto, errors" in line for line in verdict(late).lines)
+
+
+@pytest.mark.parametrize("factor,told", [(1.0, False), (1e3, True), (0.5, True), (0.9, False)])
+def test_another_unit_is_named(factor: float, told: bool) -> None:
+    lines = verdict(of_truth(lambda truth: scaled(truth, factor))).lines
+    assert any("times as large as the truth's: are both in metres?" in line for line in lines) == told
+
+
+def test_a_truth_slower_than_the_frames_does_not_make_a_covariance_overconfident() -> None:
+    found = of_truth(lambda truth: replace(truth, t_ns=truth.t_ns[::4], T_world_cam=truth.T_world_cam[::4]))
+    c = found.consistency["triangulation"]
+    plain, joint = c.nees_dof["joint"], c.nees_dof_truth_noise["joint"]
+    assert plain is not None
+    assert joint is not None
+    assert joint < min(plain.mean, 1.2)
+    told = "The ground truth comes every 0.2 s, the frames every 0.05 s"
+    assert any(line.startswith(told) for line in verdict(found).lines)
+    assert not of_truth(lambda truth: truth).truth_sigma.any()
+
+
+@pytest.mark.parametrize(
+    "kept,told",
+    [
+        (slice(0, 2), "has 2 frames, and three with truth are needed"),
+        (slice(None), "only [0-9]* of 601 frames lie near poses of the ground truth"),
+    ],
+)
+def test_too_little_truth_is_told_from_none(kept: slice, told: str) -> None:
+    log, truth = make_run(600, v_t=False)
+    every = 20 if kept == slice(None) else 1
+    truth = replace(truth, t_ns=truth.t_ns[3::every] + 1, T_world_cam=truth.T_world_cam[3::every])
+    if kept != slice(None):
+        log, truth = VoLog(log.records[kept], log.camera), make_run(600)[1]
+    with pytest.raises(SourceError, match=told):
+        evaluate_run(Run(Path("hall"), "hall", log, truth, None, Mounting(), []))

@@ -14,6 +14,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
+from gpvo.learning.check import rate_problems
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
@@ -22,7 +23,7 @@ from gpvo.live.stages import PoseStage
 from gpvo.live.stereo_stage import StereoStage
 from gpvo.publish.odometry import OdometryBuilder
 from gpvo.publish.odometry import messages as offline
-from gpvo.types import Status, StereoCamera, VoLog
+from gpvo.types import Status, StereoCamera, VoLog, VoRecord
 from shim_bags import STATED, TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
 from synthetic_runs import make_run
 
@@ -135,6 +136,10 @@ def test_an_odometry_at_another_rate_or_outside_the_domain_is_called_out() -> No
         live.take(arrival)
     assert any("the rate is 5 Hz" in text for text in told)
     assert kept.reports[-1].level == 1
+    # A reference that is kept, as at rest, makes long motions of frames that come as usual.
+    resting = [VoRecord(k * 50_000_000, 0, Status.OK, np.eye(4)) for k in range(1, 30)]
+    assert rate_problems(live.predictor, resting) == []
+    assert rate_problems(live.predictor, resting[::5]) != []
 
 
 def test_a_bag_replayed_by_the_command_is_the_same_in_a_bag(tmp_path: Path) -> None:
