@@ -39,7 +39,10 @@ def verdict(e: Evaluation) -> Verdict:
     if not judged and e.poses is not None:
         joint = e.poses.nees_dof["joint"].mean
         colour: Colour = "green" if _word(joint) == "honest" else "red" if joint > HONEST[1] else "amber"
-        line = f"NEES/dof {joint:.3g} over {e.poses.count} poses, median {e.poses.nees_dof_median['joint']:.3g}."
+        line = (
+            f"NEES/dof {joint:.3g} over {e.poses.count} poses, median {e.poses.nees_dof_median['joint']:.3g}, after one"
+            " rigid alignment of all: it moves the first poses of an odometry that drifts by more than they state."
+        )
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
     if not e.covered.any():
         told_of_none = (
