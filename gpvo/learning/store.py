@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -40,9 +41,11 @@ def folds_path(model: Path) -> Path:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ModelError, before any work, if no model can be written to ``path``."""
+    """Make the folder of ``path``. Raise ModelError, before any work, if no model can be written there."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ModelError("cannot be written: not a file in a folder that is there and may be written", where=path)
+        raise ModelError("cannot be written", where=path, cure="name a file in a folder that may be written")
 
 
 def save_model(trained: TrainedModel, path: str | Path) -> None:

@@ -549,3 +549,12 @@ def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> No
     assert not any("settings" in problem for problem in check(mixed, runs[2]).problems)
     # Another's odometry has no settings of ours.
     assert not odometry_problems(predictor, {"import": {"frame": "body"}})
+
+
+def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path: Path) -> None:
+    save_model(_of_three(), tmp_path / "new" / "m.gpvo")
+    assert (tmp_path / "new" / "m.gpvo").is_file()
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "m.gpvo", tmp_path / "new"):
+        with pytest.raises(ModelError, match="cannot be written"):
+            save_model(_of_three(), path)
