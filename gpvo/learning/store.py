@@ -44,7 +44,7 @@ def check_writable(path: Path) -> None:
     """Make the folder of ``path``. Raise ModelError, before any work, if no model can be written there."""
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise ModelError("cannot be written", where=path, cure="name a file in a folder that may be written")
 
 
