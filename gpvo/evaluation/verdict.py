@@ -131,8 +131,11 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
         yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
     if e.turned is not None:
+        # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
+        asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
         yield (
-            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg (mounting or calibration)."
+            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg"
+            f" (mounting or calibration{asked})."
             f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
         )
 
