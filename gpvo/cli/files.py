@@ -16,6 +16,7 @@ from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog
+from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import write_run
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
@@ -71,9 +72,10 @@ def import_log(
     """
     frame = _frame(log) if frame == "auto" else frame
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
-    log, given, carrier = log.seen_from(place), None, vehicle or Vehicle()
+    log, given, carrier, assumed = log.seen_from(place), None, vehicle or Vehicle(), list[str]()
     if truth is not None:
         sigma = truth_sigma or (0.0, 0.0)
+        assumed = [f"{truth.path.name}: {n}" for n in truth.notes if n == NO_HEADER]
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
     if time_offset_s is None:
         if given is None:
@@ -81,6 +83,7 @@ def import_log(
         time_offset_s = estimate_time_offset(VoLog(to_records(log)[0]), given)
     log = log.shifted(time_offset_s) if time_offset_s else log
     records, notes = to_records(log)
+    notes += assumed
     fixed: FixedTransform | None = None
     if given is not None and truth is not None:
         check_overlap(given, log.t_ns, truth.path)

@@ -167,7 +167,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table)),
+        (*table.notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table)),
     )
 
 
