@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry import se3
-from gpvo.io.stamps import (
-    cure_of_seconds,
-    growing,
-    integer_ns,
-    ns_to_seconds_text,
-    seconds_text_to_ns,
-    text_lines,
-)
+from gpvo.io.stamps import cure_of_seconds, growing, integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
