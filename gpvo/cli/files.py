@@ -10,12 +10,13 @@ import numpy as np
 import typer
 
 from gpvo.cli import common as options
-from gpvo.cli.output import Json, numbers, one_of, print_json
+from gpvo.cli.output import Json, note, numbers, one_of, print_json
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError, SourceError
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog
+from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import write_run
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import check_overlap
@@ -53,7 +54,7 @@ def import_log(
     truth: ForeignLog | None,
     out: Path,
     *,
-    frame: str = "cam",
+    frame: str = "auto",
     align: str = "none",
     time_offset_s: float | None = 0.0,
     truth_sigma: tuple[float, float] | None = None,
@@ -62,16 +63,19 @@ def import_log(
 ) -> ImportSummary:
     """Make a run folder from another odometry's log, with ground truth of the same frame.
 
-    ``frame``: whose poses these are, ``cam`` or ``body``. ``align``: the fixed transform to fit between log and truth,
-    ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None to estimate it.
-    ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: the bounds by which slips are recognised, any
-    by default. ``overwrite``: also replace a finished run. Raises SourceError: one line that names the file, the place
-    and the cure.
+    ``frame``: whose poses these are, ``cam``, ``body``, or ``auto`` for the log's own
+    :attr:`~gpvo.io.foreign.ForeignLog.frame`, with a note where it is a bag. ``align``: the fixed transform to fit
+    between log and truth, ``rotation``, ``transform`` or ``none``. ``time_offset_s``: to add to the log's stamps, None
+    to estimate it. ``truth_sigma``: noise of the truth per pose [m, rad]. ``vehicle``: the bounds by which slips are
+    recognised, any by default. ``overwrite``: also replace a finished run. Raises SourceError: one line that names the
+    file, the place and the cure.
     """
+    frame = _frame(log) if frame == "auto" else frame
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
-    log, given, carrier = log.seen_from(place), None, vehicle or Vehicle()
+    log, given, carrier, assumed = log.seen_from(place), None, vehicle or Vehicle(), list[str]()
     if truth is not None:
         sigma = truth_sigma or (0.0, 0.0)
+        assumed = [f"{truth.path.name}: {n}" for n in truth.notes if n == NO_HEADER]
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)
     if time_offset_s is None:
         if given is None:
@@ -79,6 +83,7 @@ def import_log(
         time_offset_s = estimate_time_offset(VoLog(to_records(log)[0]), given)
     log = log.shifted(time_offset_s) if time_offset_s else log
     records, notes = to_records(log)
+    notes += assumed
     fixed: FixedTransform | None = None
     if given is not None and truth is not None:
         check_overlap(given, log.t_ns, truth.path)
@@ -112,6 +117,15 @@ def import_log(
         worlds_deg=None if fixed is None else fixed.worlds_deg,
         notes=notes,
     )
+
+
+def _frame(log: ForeignLog) -> str:
+    """The frame that a log is taken to be of; of a bag, it is said which."""
+    if log.topic is not None:
+        of, other = ("a body", "cam") if log.frame == "body" else ("a camera", "body")
+        axes = "x ahead, y left, z up" if log.frame == "body" else "x right, y down, z ahead"
+        note(f"poses on {log.topic} ('{log.frame_id}') are taken as those of {of}: {axes} (else --frame {other})")
+    return log.frame
 
 
 def info(
@@ -160,7 +174,13 @@ def import_(
         Path | None, typer.Option(help="File of stamps in seconds, one line per pose, for KITTI poses.")
     ] = None,
     rate_hz: Annotated[float | None, typer.Option(help="Frame rate, for KITTI poses without stamps.")] = None,
-    frame: Annotated[str, typer.Option(help="Frame of the poses: cam (left optical frame) or body (FLU).")] = "cam",
+    frame: Annotated[
+        str,
+        typer.Option(
+            help="Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless the name "
+            "of its frame says optical; cam for a file."
+        ),
+    ] = "auto",
     align: Annotated[
         str,
         typer.Option(
@@ -197,7 +217,7 @@ def import_(
         "covariance_axes": one_of("--covariance-axes", covariance_axes, ("world", "body")),
     }
     chosen: dict[str, Any] = {
-        "frame": one_of("--frame", frame, ("cam", "body")),
+        "frame": one_of("--frame", frame, ("auto", "cam", "body")),
         "align": one_of("--align", align, ("none", "rotation", "transform")),
     }
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])

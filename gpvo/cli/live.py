@@ -208,7 +208,8 @@ def _nees_of_bag(
     try:
         with TemporaryDirectory(prefix="gpvo-") as folder:
             given = read_foreign(truth, topic=truth_topic, complete=True)
-            import_log(read_foreign(bag, topic=topic), given, Path(folder) / "run", frame="body", align=align)
+            log = read_foreign(bag, topic=topic)
+            import_log(log, given, Path(folder) / "run", frame=log.frame, align=align)
             evaluation = evaluate_run(read_run(Path(folder) / "run"))
     except GpvoError as error:
         return {"poses": None, "motions": None, "problem": str(error)}

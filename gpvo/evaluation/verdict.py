@@ -143,8 +143,11 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         )
     yield from _of_truth_and_path(e)
     if e.turned is not None:
+        # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
+        asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
         yield (
-            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg (mounting or calibration)."
+            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg"
+            f" (mounting or calibration{asked})."
             f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
         )
 

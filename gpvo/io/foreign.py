@@ -31,7 +31,7 @@ class ForeignLog:
 
     ``covariance`` (N, 6, 6) or None: NaN where unknown, house order, axes of the moving frame. ``covariance_of``:
     ``"motion"`` from the row before, ``"pose"`` since the start. ``columns``: further fields of the records, (N,).
-    ``topic``: of a bag.
+    ``topic``: of a bag, and ``frame_id`` the name that its messages give to the frame whose poses they hold.
     """
 
     path: Path
@@ -41,6 +41,16 @@ class ForeignLog:
     columns: Mapping[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     topic: str | None = None
+    frame_id: str | None = None
+
+    @property
+    def frame(self) -> str:
+        """Whose poses these probably are, ``cam`` or ``body``.
+
+        The frame of a ROS message is a FLU body's unless its name says optical (REP 103); a file says nothing, and
+        most hold a camera's.
+        """
+        return "cam" if self.topic is None or "optical" in (self.frame_id or "").lower() else "body"
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
@@ -157,7 +167,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table)),
+        (*table.notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table)),
     )
 
 
@@ -232,18 +242,19 @@ def _read_bag(path: Path, topic: str | None) -> ForeignLog:
 
 def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     t, T, read = read_poses(path, topic)
-    trajectory = Trajectory(t, T)
+    # Where a message has no child frame, its one frame may name what moves, and mostly names the world.
+    frame_id = str(getattr(read[0], "child_frame_id", read[0].header.frame_id))
+    log = ForeignLog(path, Trajectory(t, T), topic=topic, frame_id=frame_id)
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
         dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
-        return ForeignLog(path, trajectory, twist * dt[:, None, None] ** 2, "motion", topic=topic)
+        return replace(log, covariance=twist * dt[:, None, None] ** 2)
     if pose is None:
-        return ForeignLog(path, trajectory, topic=topic)
+        return log
     if _looks_stated(pose):
-        return ForeignLog(path, trajectory, _into_body(trajectory, pose), "pose", topic=topic)
-    left_out = "its covariances are not positive definite and were left out"
-    return ForeignLog(path, trajectory, notes=(left_out,), topic=topic)
+        return replace(log, covariance=_into_body(log.trajectory, pose), covariance_of="pose")
+    return replace(log, notes=("its covariances are not positive definite and were left out",))
 
 
 def _bag_covariance(read: list[Any], name: str) -> Array | None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.stamps import UNITS_NS, check_interval, text_lines, text_to_ns
+from gpvo.io.stamps import UNITS_NS, check_interval, likely_unit, text_lines, text_to_ns
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
@@ -26,6 +26,12 @@ _OPENVINS = {
     **{f"p{a}{b}": f"cov_{i}{j}" for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j},
     **{f"q{a}{b}": f"cov_{i + 3}{j + 3}" for i, a in enumerate("rpy") for j, b in enumerate("rpy") if i <= j},
 }
+# The result files of VINS-Mono and VINS-Fusion have no header; those of the loop closure end with the quaternion.
+_VINS = ("t_ns", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z", "v_x", "v_y", "v_z")
+NO_HEADER = (
+    "it has no header line: read as VINS-Fusion writes it, nanoseconds, position, quaternion with w first; a line of"
+    " column names on top says otherwise"
+)
 _MAX_ROWS = 20_000_000
 _AXES = {
     name: i % 6
@@ -47,10 +53,11 @@ class Table:
     columns: dict[str, Array]
     lines: list[int]
     unused: tuple[str, ...] = ()  # columns that look like an uncertainty and were not understood
+    notes: tuple[str, ...] = ()
 
 
 def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
-    """Read a CSV with a header line (comma, semicolon, tab or blanks between).
+    """Read a CSV with a header line (comma, semicolon, tab or blanks between), or as VINS-Fusion writes it, without.
 
     ``mapping`` gives column name -> target (one of :data:`TARGETS`) and goes before what the names suggest. A stamp is
     in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds. Raises
@@ -58,7 +65,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     """
     lines = _lines(path)
     try:
-        _, header = next(lines)
+        top, header = next(lines)
     except StopIteration:
         raise SourceError("is empty", where=path) from None
     targets = _targets(path, header, mapping)
@@ -86,11 +93,15 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     data = np.array(rows, dtype=np.float64)
     used = {targets[n] for n in targets}
     unused = tuple(c for k, c in enumerate(header) if k not in used and _UNCERTAIN.search(c))
-    return Table(np.array(stamps, dtype=np.int64), {n: data[:, i] for i, n in enumerate(order)}, numbers, unused)
+    columns = {n: data[:, i] for i, n in enumerate(order)}
+    return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, () if top else (NO_HEADER,))
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers."""
+    """Line numbers and fields, the header first: the first line of names, or the last comment before the numbers.
+
+    The header that the layout of VINS-Fusion stands for has the number 0.
+    """
     try:
         comment: tuple[int, str] | None = None
         separator: str | None = None
@@ -102,11 +113,28 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                 separator = next((s for s in (",", ";", "\t") if s in text), " ")
                 if is_number(_split(text, separator)[0]):
                     if comment is None:
-                        raise SourceError("has no header line", where=path, cure="put the column names on top")
-                    yield comment[0], _split(comment[1], separator)
+                        yield 0, _implied_header(path, text, separator)
+                    else:
+                        yield comment[0], _split(comment[1], separator)
             yield number, _split(text, separator)
     except csv.Error as error:
         raise SourceError(f"is not a CSV file: {error}", where=path) from None
+
+
+def _implied_header(path: Path, text: str, separator: str) -> list[str]:
+    """The names that VINS-Fusion's result files leave out.
+
+    Raises SourceError, with the line to put on top, where the first line of numbers is of another file.
+    """
+    fields = _split(text, separator)
+    if fields[-1] == "":  # VINS ends its lines with a comma.
+        fields.pop()
+    unit = likely_unit(fields[0]) or "s"
+    if separator == "," and len(fields) in (8, 11) and unit == "ns" and all(map(is_number, fields)):
+        return list(_VINS[: len(fields)])
+    names = separator.join((f"t_{unit}", *_POSE))
+    cure = f"put the names of its columns on top, in their order, such as '{names}'; any other column may have any name"
+    raise SourceError("has no header line", where=path, cure=cure)
 
 
 def _split(text: str, separator: str) -> list[str]:
@@ -170,7 +198,7 @@ def _suggest(column: str) -> str | None:
         k = int(covariance[1])
         return f"cov_{k // 6}{k % 6}" if k < 36 else None
     pose = re.fullmatch(
-        r"(?:.*_)?(p|t|pos|position|translation|q|quat|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])", name
+        r"(?:.*_)?(p|t|pos|position|translation|q|quat|ori|orientation|rotation)(?:_rs_r|_rs)?_?([xyzw])", name
     )
     if pose is None:
         pose = re.fullmatch(r"()([xyz])", name)

@@ -21,6 +21,8 @@ _MAX_BYTES = 2_000_000_000
 _MAX_CHARACTERS = 1_000_000
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+# Below which size a number is a time of the unit.
+_LIMITS = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (np.inf, "ns"))
 # Usual intervals of any odometry [ns]; beyond them the stamps are in another unit.
 _SHORTEST_NS, _LONGEST_NS = 1e5, 1e12
 
@@ -64,6 +66,30 @@ def text_to_ns(text: str, unit: str) -> int:
     if not value.is_finite() or abs(value) > Decimal(9_200_000_000_000_000_000) / factor:
         raise ValueError(f"'{text}' is not a stamp in {_UNIT_NAMES[unit]}")
     return int((value * factor).to_integral_value())
+
+
+def likely_unit(text: str) -> str | None:
+    """The unit (of :data:`UNITS_NS`) that makes a number a time of 1973 to 2262; seconds for smaller ones.
+
+    None where the text is no number.
+    """
+    try:
+        size = abs(float(text))
+    except ValueError:
+        return None
+    return next((unit for limit, unit in _LIMITS if size < limit), None)
+
+
+def cure_of_seconds(text: str) -> str | None:
+    """What to do about a stamp of a TUM file that is not in seconds; None where it is in no other unit either."""
+    unit = likely_unit(text)
+    if unit is None or unit == "s":
+        return None
+    header = f"t_{unit} p_x p_y p_z q_x q_y q_z q_w"
+    return (
+        f"these look like {_UNIT_NAMES[unit]}, and TUM has seconds: divide them by {UNITS_NS['s'] // UNITS_NS[unit]:,},"
+        f" or give gpvo import the file with '{header}' as its first line"
+    )
 
 
 def integer_ns(text: str) -> int:

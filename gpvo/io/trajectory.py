@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry import se3
-from gpvo.io.stamps import growing, integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
+from gpvo.io.stamps import cure_of_seconds, growing, integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
@@ -151,7 +151,8 @@ def _rows(
         try:
             t_ns = stamp(fields[0])
         except ValueError as error:
-            raise SourceError(f"line {number}: {error}", where=path) from None
+            cure = cure_of_seconds(fields[0]) if stamp is seconds_text_to_ns else None
+            raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
         if behind is not None:
             behind.append(fields[8:])
         yield number, t_ns, _floats(path, number, fields[1:8])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from evaluation_runs import make_run
+from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run
 from gpvo.evaluation.verdict import verdict
@@ -50,6 +51,15 @@ def test_outside_the_domain_is_never_green() -> None:
     assert found.colour == "red"
     assert "does not know these conditions" in found.headline
     assert any(line.startswith("10 % of the frames") for line in found.lines)
+
+
+@pytest.mark.parametrize(("angle_deg", "asks"), [(2.0, False), (89.0, False), (120.0, True), (179.5, True)])
+def test_a_rotation_that_no_mounting_has_is_asked_about(angle_deg: float, asks: bool) -> None:
+    found = verdict(replace(evaluated({"triangulation": 1.0}), turned=FixedRotation(angle_deg, (0.0, 0.0, 0.0), -0.5)))
+    [line] = [line for line in found.lines if f"fixed rotation of {angle_deg:.2f} deg (mounting or calibration" in line]
+    assert ("quaternion's order" in line) is asks
+    assert ("--frame" in line) is asks
+    assert "50 % smaller" in line
 
 
 def test_nothing_stated_is_said() -> None:

@@ -83,21 +83,29 @@ class BagMaker:
         message = self.type("geometry_msgs/msg/TransformStamped")(self.header(t_ns, parent), child, body)
         self.add(topic, message, t_ns)
 
-    def pose_with_covariance(self, topic: str, t_ns: int, T: np.ndarray, cov: np.ndarray) -> None:
+    def pose_with_covariance(self, topic: str, t_ns: int, T: np.ndarray, cov: np.ndarray, frame: str = "odom") -> None:
         p, q = self._pose(T)
         t = self.type
         pose = t("geometry_msgs/msg/Pose")(t("geometry_msgs/msg/Point")(*p), q)
         body = t("geometry_msgs/msg/PoseWithCovariance")(pose, cov.ravel())
-        message = t("geometry_msgs/msg/PoseWithCovarianceStamped")(self.header(t_ns, "odom"), body)
+        message = t("geometry_msgs/msg/PoseWithCovarianceStamped")(self.header(t_ns, frame), body)
         self.add(topic, message, t_ns)
 
-    def odometry(self, topic: str, t_ns: int, T: np.ndarray, pose_cov: np.ndarray, twist_cov: np.ndarray) -> None:
+    def odometry(
+        self,
+        topic: str,
+        t_ns: int,
+        T: np.ndarray,
+        pose_cov: np.ndarray,
+        twist_cov: np.ndarray,
+        child: str = "base_link",
+    ) -> None:
         p, q = self._pose(T)
         t = self.type
         pose = t("geometry_msgs/msg/Pose")(t("geometry_msgs/msg/Point")(*p), q)
         zero = t("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
         message = t("nav_msgs/msg/Odometry")(
-            self.header(t_ns, "odom"), "base_link",
+            self.header(t_ns, "odom"), child,
             t("geometry_msgs/msg/PoseWithCovariance")(pose, pose_cov.ravel()),
             t("geometry_msgs/msg/TwistWithCovariance")(t("geometry_msgs/msg/Twist")(zero, zero), twist_cov.ravel()),
         )  # fmt: skip
