@@ -79,7 +79,7 @@ def new_table(*columns: str) -> Table:
 
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for k, column in enumerate(columns):
-        table.add_column(column, justify="right" if k else "left", overflow="fold", no_wrap=True)
+        table.add_column(column, justify="right" if k else "left", overflow="fold", no_wrap=not k)
     return table
 
 

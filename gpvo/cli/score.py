@@ -63,7 +63,8 @@ _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10
 def _print_board(columns: dict[str, list[Any]]) -> None:
     table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     for row in zip(*columns.values()):
-        table.add_row(*map(cell, row))
+        name, *numbers = row  # NEES and shares to two digits: the table fits 80 columns
+        table.add_row(name, *map(cell, numbers[:3]), *(cell(v, 2) for v in numbers[3:]))
     show(table)
     say(_LEGEND)
     say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
