@@ -25,6 +25,16 @@ FORMATS = ("tum", "kitti", "csv", "bag")
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
 
 
+def is_optical(frame_id: str) -> bool:
+    """Whether a frame of ROS is a camera's, x right and z ahead, by its name (REP 103)."""
+    return "optical" in frame_id.lower()
+
+
+def moving_frame(message: Any) -> str:
+    """The name of the frame whose pose a message holds; without a child frame, its one frame, mostly the world."""
+    return str(getattr(message, "child_frame_id", message.header.frame_id))
+
+
 @dataclass(frozen=True)
 class ForeignLog:
     """Poses of another odometry, with what else it said.
@@ -50,7 +60,7 @@ class ForeignLog:
         The frame of a ROS message is a FLU body's unless its name says optical (REP 103); a file says nothing, and
         most hold a camera's.
         """
-        return "cam" if self.topic is None or "optical" in (self.frame_id or "").lower() else "body"
+        return "cam" if self.topic is None or is_optical(self.frame_id or "") else "body"
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
@@ -242,9 +252,7 @@ def _read_bag(path: Path, topic: str | None) -> ForeignLog:
 
 def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     t, T, read = read_poses(path, topic)
-    # Where a message has no child frame, its one frame may name what moves, and mostly names the world.
-    frame_id = str(getattr(read[0], "child_frame_id", read[0].header.frame_id))
-    log = ForeignLog(path, Trajectory(t, T), topic=topic, frame_id=frame_id)
+    log = ForeignLog(path, Trajectory(t, T), topic=topic, frame_id=moving_frame(read[0]))
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.

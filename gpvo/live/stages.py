@@ -17,7 +17,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import change_body, is_positive_definite, symmetrise
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_reader import pose_of, stamp_ns
-from gpvo.io.foreign import T_FLU_OPTICAL
+from gpvo.io.foreign import T_FLU_OPTICAL, is_optical, moving_frame
 from gpvo.io.stated import UNKNOWN_RAD
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import Arrival, Sequence, StampWatch
@@ -87,18 +87,22 @@ class PoseStage:
 
     The same rules as in :mod:`gpvo.io.foreign`, message by message: the covariance of a motion is that of the twist
     where it is positive definite, else the growth of the pose's. ``T_body_cam``: where the camera sits on the body
-    that the poses describe.
+    that the poses describe; by default as the first message names its frame, optical or not.
     """
 
     method = IMPORTED
     camera: StereoCamera | None = None
     odometry: Mapping[str, Any] = MappingProxyType({})
 
-    def __init__(self, topic: str, T_body_cam: Array = T_FLU_OPTICAL) -> None:
-        self.topic, self.T_body_cam, self.T_source_cam = topic, T_body_cam, T_body_cam
+    def __init__(self, topic: str, T_body_cam: Array | None = None) -> None:
+        self.topic, self._is_placed = topic, T_body_cam is not None
         self.counts: Counter[str] = Counter()
-        self._T_cam_body = se3.inverse(T_body_cam)
+        self._place(T_FLU_OPTICAL if T_body_cam is None else T_body_cam)
         self.reset()
+
+    def _place(self, T_body_cam: Array) -> None:
+        self.T_body_cam = self.T_source_cam = T_body_cam
+        self._T_cam_body = se3.inverse(T_body_cam)
 
     def reset(self) -> None:
         """Begin anew with the next message."""
@@ -122,6 +126,9 @@ class PoseStage:
             return
         if seen is Sequence.RESTART:
             self._last = None
+        if not self._is_placed:
+            self._place(np.eye(4) if is_optical(moving_frame(message)) else T_FLU_OPTICAL)
+            self._is_placed = True
         T_parent_body = se3.from_quaternion(row[None, :3], row[None, 3:] / norm)[0]
         begins = self._last is None
         record = self._record(t_ns, T_parent_body @ self.T_body_cam, message, seen)

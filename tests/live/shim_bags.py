@@ -50,12 +50,14 @@ def flight(seed: int = 9, n: int = 120, rate_hz: float = 20.0, t0_ns: int = 1_70
     return t0_ns + np.arange(len(T)) * round(1e9 / rate_hz), T
 
 
-def messages(stamps, T, *, twist_covariance: np.ndarray | None = None, ros1: bool = False) -> BagMaker:
+def messages(
+    stamps, T, *, twist_covariance: np.ndarray | None = None, ros1: bool = False, child: str = "base_link"
+) -> BagMaker:
     """``nav_msgs/Odometry`` on TOPIC, without a covariance unless one of the twist is given."""
     maker = BagMaker(ros1)
     C = np.zeros((6, 6)) if twist_covariance is None else twist_covariance
     for t, pose in zip(stamps, T, strict=True):
-        maker.odometry(TOPIC, int(t), pose, np.zeros((6, 6)), C)
+        maker.odometry(TOPIC, int(t), pose, np.zeros((6, 6)), C, child)
     return maker
 
 
