@@ -213,9 +213,9 @@ def _across(errors: Array, motions: Array) -> Array:
 
 
 def _moving(length: Array, count: int) -> NDArray[np.bool_]:
-    """Which windows are no slower than half the upper quartile: most of a sequence may be at rest, or truth jump."""
-    usual = float(np.quantile(length, 0.75))
-    return np.asarray(moving_sums(length, count) > max(0.5 * usual * count, 0.5 * _NOWHERE_M))
+    """Which windows are not slow beside the upper quartile: most of a sequence may be at rest, or truth jump."""
+    least = max(0.4 * float(np.quantile(length, 0.75)), 0.5 * _NOWHERE_M)
+    return np.asarray(moving_sums(length, count) > least * count)
 
 
 def _spread(values: Array) -> Array:
