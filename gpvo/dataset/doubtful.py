@@ -6,10 +6,11 @@ blamed for it. Image and IMU together decide whether the vehicle stands still: a
 not escape a gyroscope.
 
 Odd stretches: where odometry and truth differ as nowhere else in the sequence, one of the two is wrong, and a model
-that learned from them would be too cautious everywhere. Two differences are looked for, each against its own median
-and spread in the sequence (by the median absolute deviation): the share of the true motion that odometry shows, if its
-own stated noise does not explain it; and the direction of travel, as when the truth climbs while the vehicle does not.
-Which of the two is wrong is for the user to decide.
+that learned from them would be too cautious everywhere. Two differences are looked for: the share of the true motion
+that odometry shows; and the direction of travel, as when the truth climbs while the vehicle does not. Each must be far
+from its own median in the sequence, both by its spread there (the median absolute deviation, which also holds errors
+that last) and by what white noise leaves over the same window. How noise is spread over the motions, odometry states;
+how large it is, differences between neighbours tell. Which of the two is wrong is for the user to decide.
 """
 
 from __future__ import annotations
@@ -32,8 +33,11 @@ STILL_PX, TRUTH_PX = 1.0, 2.0
 GYRO_STD_RADPS, ACC_STD_MPS2 = 0.005, 0.5
 """Spread up to which an IMU is at rest. Small gyroscopes have 0.0015 to 0.0035 rad/s of noise at 200 Hz; on the road,
 cars are seldom below 0.007 rad/s for a second (KITTI). The limit on accelerations lets an engine idle."""
-_SHORT, _LONG = 5, 50
-"""Motions over which the share, and the direction, are taken."""
+_SHORT_S, _LONG_S = 0.25, 2.5
+"""Windows over which the share, and the direction, are taken."""
+_LEAST_SHORT, _LEAST_LONG = 5, 50
+"""Motions that these hold at least. The long one holds at most half the sequence."""
+_NOWHERE_M = 1e-6  # no motion, and no noise, is smaller
 _LEAST_MOTIONS = 4  # in a row whose share is the same
 
 _SIGMAS = 5.0
@@ -131,14 +135,24 @@ class Stretch:
 
 
 def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
-    """Those of a log against its truth, in order of time."""
+    """Those of a log against its truth, in order of time; none where nothing moves."""
     errors = motion_errors(log, truth)
-    if len(errors.index) < 2 * _LONG:
-        return []
     true, seen = errors.T_true[:, :3, 3], errors.T_est[:, :3, 3]
     length = np.linalg.norm(true, axis=1)
-    share = (true * seen).sum(1) / np.maximum(length**2, 1e-12)
-    found = [*_of_share(share, length, _stated_m(log, errors)), *_of_direction(seen - share[:, None] * true, length)]
+    if len(length) < 2 * _LEAST_LONG or length.max() < _NOWHERE_M:
+        return []
+    rate_hz = 1 / float(np.median(errors.dt_s))
+    short = max(_LEAST_SHORT, round(_SHORT_S * rate_hz))
+    long = max(_LEAST_LONG, min(round(_LONG_S * rate_hz), len(length) // 2))
+    stated = _stated_m(log, errors)
+    share = (true * seen).sum(1) / np.maximum(length**2, _NOWHERE_M**2)
+    usual = float(np.median(share[_moving(length, 1)]))
+    error = seen - usual * true
+    noise = _white_noise(np.column_stack([error, (share - usual) * length]), stated, long)
+    found = _of_share(share, usual, length, noise[:, 3], short)
+    for first, last, _ in found:  # what the share explains is not a matter of direction too
+        error[first : last + 1] = 0.0
+    found += _of_direction(error, true, noise[:, :3], long)
     spans = [(errors.index[a], errors.index[b], what) for a, b, what in found]
     return sorted(
         (Stretch(int(i), int(k), (log.records[i].t_prev_ns, log.records[k].t_ns), what) for i, k, what in spans),
@@ -146,52 +160,80 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
     )
 
 
-def _of_share(own: Array, length: Array, sigma_m: Array) -> list[tuple[int, int, str]]:
-    """By each motion's share ``own`` (M,) of its true ``length`` (M,) [m]."""
-    moving = length > 0.5 * np.median(length)
-    usual = float(np.median(own[moving]))
-    z = moving_sums(np.where(moving, (own - usual) * length / sigma_m, 0.0), _SHORT)
-    far = np.abs(z) > _SIGMAS * 1.4826 * np.median(np.abs(z[_moving(length, _SHORT)]))
+def _white_noise(errors: Array, stated: Array, count: int) -> Array:
+    """(M, D) standard deviation of each error (M, D): what is stated tells motions apart; how large it is, the
+    differences between neighbours tell, by their upper quartile over ``count`` around: no slip disturbs it."""
+    from scipy.ndimage import percentile_filter  # only evaluation and training come here
+
+    steps = np.abs(np.diff(errors / stated[:, None], axis=0, append=0.0))
+    steps[-1] = steps[-2]
+    # Not their median: where noise steps up, half of them are still small.
+    quartile = percentile_filter(steps, 75, size=(count, 1))
+    return np.asarray(quartile / (1.1503 * np.sqrt(2)) * stated[:, None])
+
+
+def _of_share(own: Array, usual: float, length: Array, noise: Array, count: int) -> list[tuple[int, int, str]]:
+    """By each motion's share ``own`` (M,) of its true ``length`` (M,) [m], and its ``noise`` (M,) along that."""
+    error = np.where(_moving(length, 1), (own - usual) * length, 0.0)
+    z = moving_sums(error, count) / _noise_of_sums(noise, count)
+    z /= max(1.0, float(_spread(z[_moving(length, count)])))
     found = []
-    for first, of_window in _runs(far):
-        last = of_window + _SHORT - 1
-        farthest = first + int(np.argmax(np.abs(z[first : of_window + 1])))
-        level = float(np.median(own[farthest : farthest + _SHORT]))
+    for first, last in _runs(_covered(np.abs(z) > _SIGMAS, count)):
+        farthest = first + int(np.argmax(np.abs(z[first : last - count + 2])))
+        level = float(np.median(own[farthest : farthest + count]))
         # The windows at either end hold motions like all others; a level is steady, what noise makes is not.
         alike = np.abs(own - level) < 0.5 * abs(level - usual)
         steady = [(a + first, b + first) for a, b in _runs(alike[first : last + 1])]
         k, m = max(steady, key=lambda run: run[1] - run[0], default=(0, -1))
-        if m - k + 1 >= _LEAST_MOTIONS and abs(level - usual) > _LEAST_SHARE:
+        beyond = abs(error[k : m + 1].sum()) > _SIGMAS * np.sqrt((noise[k : m + 1] ** 2).sum())
+        if m - k + 1 >= _LEAST_MOTIONS and abs(level - usual) > _LEAST_SHARE and beyond:
             level = float(np.mean(own[k : m + 1]))
             found.append((k, m, f"odometry shows {level:.2f} of the true motion, else {usual:.2f}"))
     return found
 
 
-def _of_direction(aside: Array, length: Array) -> list[tuple[int, int, str]]:
-    """By what odometry shows ``aside`` (M, 3) of true motions of a ``length`` (M,) [m]."""
-    turn = moving_sums(aside, _LONG) / np.maximum(moving_sums(length, _LONG), 1e-12)[:, None]
-    off, usual = _beyond(turn, _moving(length, _LONG), _LEAST_TURN)
+def _of_direction(error: Array, true: Array, noise: Array, count: int) -> list[tuple[int, int, str]]:
+    """By the ``error`` (M, 3), with its ``noise`` (M, 3), of motions that are truly ``true`` (M, 3), across these."""
+    length = np.linalg.norm(true, axis=1)
+    moving, path = _moving(length, count), np.maximum(moving_sums(length, count), _NOWHERE_M)[:, None]
+    turn = _across(moving_sums(error, count), moving_sums(true, count)) / path
+    usual = np.median(turn[moving], axis=0)
+    allowed = np.maximum(_spread(turn[moving] - usual), _noise_of_sums(noise, count) / path)
+    off = moving & (np.abs(turn - usual) > np.maximum(_SIGMAS * allowed, _LEAST_TURN)).any(axis=1)
     found = []
-    for first, last in ((a, b + _LONG - 1) for a, b in _runs(off)):
-        here = aside[first : last + 1].sum(0) / length[first : last + 1].sum() - usual
+    for first, last in _runs(_covered(off, count)) if off.mean() <= _MOST else []:
+        here = turn[first : last - count + 2][off[first : last - count + 2]].mean(axis=0) - usual
         degrees = float(np.rad2deg(np.arctan(np.linalg.norm(here))))
         axis = ("sideways", "vertically", "along")[int(np.argmax(np.abs(here)))]
         found.append((first, last, f"truth leaves odometry's direction by {degrees:.1f} deg, {axis}"))
     return found
 
 
+def _across(errors: Array, motions: Array) -> Array:
+    """(W, 3) what of each error lies across its motion."""
+    unit = motions / np.maximum(np.linalg.norm(motions, axis=1, keepdims=True), _NOWHERE_M)
+    return np.asarray(errors - (errors * unit).sum(axis=1, keepdims=True) * unit)
+
+
 def _moving(length: Array, count: int) -> NDArray[np.bool_]:
-    """Which windows are no slower than half the usual."""
-    path = moving_sums(length, count)
-    return np.asarray(path > max(0.5 * float(np.median(path)), 1e-9))
+    """Which windows are not slow beside the upper quartile: most of a sequence may be at rest, or truth jump."""
+    least = max(0.4 * float(np.quantile(length, 0.75)), 0.5 * _NOWHERE_M)
+    return np.asarray(moving_sums(length, count) > least * count)
 
 
-def _beyond(values: Array, moving: NDArray[np.bool_], least: float) -> tuple[NDArray[np.bool_], Array]:
-    """Which moving windows (W, D) are far off the median of all of them, and the median (D,)."""
-    usual = np.median(values[moving], axis=0)
-    sigma = 1.4826 * np.median(np.abs(values[moving] - usual), axis=0)
-    off = moving & (np.abs(values - usual) > np.maximum(_SIGMAS * sigma, least)).any(axis=1)
-    return (off if off.mean() <= _MOST else np.zeros_like(off)), usual
+def _spread(values: Array) -> Array:
+    """Robust standard deviation, by column, of what lies around zero."""
+    return np.asarray(1.4826 * np.median(np.abs(values), axis=0))
+
+
+def _noise_of_sums(noise: Array, count: int) -> Array:
+    """(W, D) what white noise makes of sums over windows."""
+    return np.sqrt(np.maximum(moving_sums(noise**2, count), _NOWHERE_M**2))
+
+
+def _covered(off: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    """(M,) which motions lie in one of the windows (W,) of ``count``: windows that overlap are one stretch."""
+    return np.convolve(off, np.ones(count)) > 0.5
 
 
 def _runs(off: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -208,7 +250,7 @@ def _stated_m(log: VoLog, errors: MotionErrors) -> Array:
         return np.ones(len(records))
     stated = np.sqrt([np.trace(r.covariances[known[0]][:3, :3]) for r in records])
     noise_px = np.array([r.reproj_rms_px for r in records])
-    return np.asarray(stated * np.where(np.isfinite(noise_px), np.maximum(noise_px, 1e-3), 1.0))
+    return np.maximum(stated * np.where(np.isfinite(noise_px), np.maximum(noise_px, 1e-3), 1.0), _NOWHERE_M)
 
 
 def odd_times(stretches: Sequence[Stretch]) -> NDArray[np.int64]:

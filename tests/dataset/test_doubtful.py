@@ -5,6 +5,7 @@ stands, and one that differs from odometry as nowhere else.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from gpvo.learning.train import estimate_set
 from gpvo.runner import run, steps
 from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nll_per_dim
-from gpvo.types import TruthLog, VoLog
+from gpvo.types import Status, TruthLog, VoLog, VoRecord
 from gpvo.vo.config import make_config
 from synthetic_runs import make_run
 
@@ -216,3 +217,47 @@ def test_a_truth_that_climbs_while_the_vehicle_does_not():
     assert "vertically" in found[0].what
     covered = min(found[0].t_ns[1], end) - max(found[0].t_ns[0], start)
     assert covered > 0.8 * (end - start)
+
+
+def white_noise_run(seed: int, rate_hz: int, stepped: bool, speed_mps: float = 1.0):
+    """40 s with a random walk of 1 cm after a second; where it is stepped, a half or four times that, by 10 s."""
+    rng, n = np.random.default_rng(seed), 40 * rate_hz
+    t_s = np.arange(n) / rate_hz
+    twist = np.zeros((n, 6))
+    twist[:, 2] = speed_mps * (1.0 + 0.5 * np.sin(0.4 * t_s + seed))
+    twist[:, 4] = 0.3 * np.sin(0.3 * t_s)
+    size = np.repeat(rng.choice([0.5, 1.0, 4.0], 4), 10 * rate_hz) if stepped else np.ones(n)
+    sigma = np.outer(size, [0.01, 0.01, 0.01, 0.003, 0.003, 0.003]) / np.sqrt(rate_hz)
+    T_true = se3.exp(twist / rate_hz)
+    T_est = T_true @ se3.exp(sigma * rng.standard_normal((n, 6)))
+    t_ns = np.arange(n + 1) * (10**9 // rate_hz)
+    records = [VoRecord(0, 0, Status.START, np.eye(4))]
+    records += [VoRecord(int(b), int(a), Status.OK, T) for a, b, T in zip(t_ns, t_ns[1:], T_est)]
+    poses = list(accumulate(T_true, np.matmul, initial=np.eye(4)))
+    return VoLog(records, None), TruthLog(t_ns, np.array(poses))
+
+
+def test_honest_white_noise_raises_no_alarm_at_any_rate():
+    found = [odd_stretches(*white_noise_run(seed, (10, 50, 200)[seed % 3], seed % 2 == 1)) for seed in range(40)]
+    assert sum(bool(f) for f in found) <= 2, found
+
+
+@pytest.mark.parametrize("rate_hz", [10, 50, 200])
+def test_a_climb_is_one_stretch_at_any_rate(rate_hz):
+    log, truth = white_noise_run(1, rate_hz, stepped=False)
+    T, climbs = truth.T_world_cam.copy(), slice(12 * rate_hz, 18 * rate_hz)
+    T[:, 1, 3] += 0.1 * np.cumsum(np.isin(np.arange(len(T)), np.arange(len(T))[climbs])) / rate_hz
+    (found,) = odd_stretches(log, replace(truth, T_world_cam=T))
+    assert "vertically" in found.what
+    assert found.first < 13 * rate_hz
+    assert found.last > 17 * rate_hz
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rate_hz", [10, 200])
+def test_a_log_at_rest_has_none_and_no_warnings(rate_hz):
+    log, truth = white_noise_run(0, rate_hz, stepped=False)
+    still = replace(truth, T_world_cam=np.broadcast_to(np.eye(4), truth.T_world_cam.shape))
+    resting = [replace(r, T_prev_cur=np.eye(4)) for r in log.records]
+    for records in (white_noise_run(0, rate_hz, False, speed_mps=0.0)[0].records, resting):
+        assert odd_stretches(VoLog(records, None), still) == []
