@@ -70,6 +70,7 @@ def train(
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
     from gpvo.learning.store import check_writable, folds_path, save_model
+    from gpvo.learning.train import unseen_axes
 
     check_writable(out)
     settings: dict[str, Any] = {
@@ -94,6 +95,10 @@ def train(
             trained = _with_origin(_train(paths, settings, update, on_fit), paths)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
+    if trained.header["target"] != "position" and (axes := unseen_axes(trained.sets)):
+        note(
+            f"gpvo: log and truth never differ in {', '.join(axes)} (a plane?): the model states next to nothing there"
+        )
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:

@@ -28,9 +28,10 @@ from gpvo.learning.methods import METHODS, best_scale, score
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.store import card_path, config_of, folds_path, picture_path, rows_path, save_model, update
-from gpvo.learning.train import TrainedModel, _slips, train_sets
+from gpvo.learning.train import TrainedModel, _slips, train_sets, unseen_axes
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
+from gpvo.online.features import AXES
 from gpvo.online.predictor import Predictor
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
@@ -558,3 +559,15 @@ def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path:
     for path in (tmp_path / "file" / "m.gpvo", tmp_path / "new"):
         with pytest.raises(ModelError, match="cannot be written"):
             save_model(_of_three(), path)
+
+
+@pytest.mark.parametrize("axes", [[5], [2, 3, 4], [0, 1, 2, 3, 4, 5]])
+def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int]) -> None:
+    """A robot in a plane: its height, roll and pitch are zero in both."""
+    sets = [replace(s, Y=np.where(np.isin(np.arange(6), axes), 0.0, s.Y)) for s in training_sets(range(3), n=120)]
+    trained = train_sets(sets, QUICK)
+    assert unseen_axes(trained.sets) == [AXES[k] for k in axes]
+    assert 0.7 < trained.table["mean"]["learned"]["nees_dof"]["joint"] < 1.4
+    C = training.estimate_set(trained.predictor().model, sets[0]).covariance
+    assert (np.diagonal(C, axis1=1, axis2=2)[:, axes] < 1e-10).all()
+    assert train_sets(sets, QUICK, judge=False).arrays["share"].tobytes() == trained.arrays["share"].tobytes()
