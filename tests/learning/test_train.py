@@ -312,7 +312,7 @@ def test_a_model_of_positions_is_not_updated(tmp_path):
 def _as_run(log, truth, name):
     from types import SimpleNamespace
 
-    return SimpleNamespace(log=log, truth=truth, name=name, path=Path("runs", name))
+    return SimpleNamespace(log=log, truth=truth, name=name, path=Path("runs", name), settings={})
 
 
 def test_few_sequences_are_calibrated_by_blocks_and_marked():
