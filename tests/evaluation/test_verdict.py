@@ -10,7 +10,7 @@ import pytest
 from evaluation_runs import make_run
 from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.errors import SourceError
-from gpvo.evaluation.evaluate import Evaluation, evaluate_run
+from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.verdict import verdict
 from gpvo.io.run_read import Run
 from gpvo.types import Mounting, TruthLog, VoLog
@@ -118,3 +118,8 @@ def test_too_little_truth_is_told_from_none(kept: slice, told: str) -> None:
         log, truth = VoLog(log.records[kept], log.camera), make_run(600)[1]
     with pytest.raises(SourceError, match=told):
         evaluate_run(Run(Path("hall"), "hall", log, truth, None, Mounting(), []))
+
+
+def test_without_truth_nothing_is_judged() -> None:
+    run = Run(Path("hall"), "hall", make_run(60, v_t=False)[0], None, None, Mounting(), [])
+    assert verdict(unjudged_run(run)).headline == "There is no ground truth, so no covariance can be judged."
