@@ -44,6 +44,11 @@ def estimate_time_offset(log: VoLog, truth: TruthLog, max_offset_s: float = MAX_
     return _refine(moving, truth, coarse, window, 1.5 * step_s)
 
 
+def on_clock_of_log(truth: TruthLog, offset_s: float) -> TruthLog:
+    """The truth with the stamps of a log whose offset to it is ``offset_s``."""
+    return replace(truth, t_ns=truth.t_ns - round(offset_s * 1e9))
+
+
 def _amounts(T: Array, ok: NDArray[np.bool_], window: int) -> Array:
     """(2, N - window) angle [rad] and distance [m] over each window; NaN where an end is unknown."""
     motion = se3.inverse(T[:-window]) @ T[window:]

@@ -53,13 +53,19 @@ def interpolate_truth(
     return T, known
 
 
+def steps_of_slow_truth(truth: TruthLog, t_ns: NDArray[np.int64]) -> tuple[float, float] | None:
+    """Usual steps [s] of a truth that comes more slowly than the frames at ``t_ns``, and of these; else None."""
+    step_s, frame_s = (1e-9 * float(np.median(np.diff(t))) for t in (truth.t_ns, t_ns))
+    return (step_s, frame_s) if step_s > 1.2 * frame_s else None
+
+
 def interpolation_sigma(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array:
     """(6,) standard deviation [m, rad] of interpolated poses of a truth slower than the frames at ``t_ns``; else 0.
 
     Half of the truth's own poses tell what interpolation misses at twice the step; as for any path smooth at that
     scale, it misses a quarter of it at the step itself.
     """
-    if len(truth.t_ns) < 9 or np.median(np.diff(truth.t_ns)) < 1.2 * np.median(np.diff(t_ns)):
+    if len(truth.t_ns) < 9 or steps_of_slow_truth(truth, t_ns) is None:
         return np.zeros(6)
     half = TruthLog(truth.t_ns[::2], truth.T_world_cam[::2])
     T, known = interpolate_truth(half, truth.t_ns[1::2], 2.0 * MAX_GAP_S)

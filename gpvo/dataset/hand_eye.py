@@ -11,11 +11,11 @@ require one, the directions of travel another. The rotation between the two worl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpvo.dataset.clock import estimate_time_offset
+from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -167,9 +167,8 @@ def late_by(log: VoLog, truth: TruthLog) -> float | None:
         offset_s = estimate_time_offset(log, truth)
     except GpvoError:  # too short, or motions unlike each other
         return None
-    moved = replace(truth, t_ns=truth.t_ns - round(offset_s * 1e9))
     found = []
-    for against in (truth, moved):
+    for against in (truth, on_clock_of_log(truth, offset_s)):
         A, B, _ = windowed_motions(log, against)
         if len(A) < _MIN_MOTIONS:
             return None

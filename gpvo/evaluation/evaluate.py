@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import align_rotation, predictions_of
-from gpvo.dataset.clock import estimate_time_offset
+from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
     MAX_GAP_S,
@@ -129,7 +129,7 @@ def evaluate_run(
         sigma = np.maximum(stated, estimate_truth_noise(errors, scored))
         sigma = np.maximum(sigma, interpolation_sigma(truth, log.t_ns))
     late_s = late_by(scored, truth) if options.time_offset_s == 0.0 else None
-    on_its_clock = replace(truth, t_ns=truth.t_ns - round(late_s * 1e9)) if late_s else truth
+    on_its_clock = on_clock_of_log(truth, late_s) if late_s else truth
     T_est = log.trajectory()
     made = [*statements(log, predictions, predictor), *further]
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
@@ -222,7 +222,7 @@ def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
     if offset_s is None:
         offset_s = estimate_time_offset(run.log, truth)
     if offset_s:
-        truth = replace(truth, t_ns=truth.t_ns - round(offset_s * 1e9))
+        truth = on_clock_of_log(truth, offset_s)
     if options.align == "rotation":
         truth = align_rotation(run.log, truth)
     elif options.align != "none":

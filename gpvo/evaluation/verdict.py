@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from gpvo.dataset.errors import steps_of_slow_truth
 from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.types import Array
@@ -156,11 +157,10 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     """A truth slower than the frames, and a path of another size."""
     if e.run.truth is None or not e.covered.any():
         return
-    step_s, frame_s = (1e-9 * float(np.median(np.diff(t))) for t in (e.run.truth.t_ns, e.run.log.t_ns))
-    if step_s > 1.2 * frame_s:
+    if steps_s := steps_of_slow_truth(e.run.truth, e.run.log.t_ns):
         yield (
-            f"The ground truth comes every {step_s:.2g} s, the frames every {frame_s:.2g} s: between its poses it is"
-            " interpolated, and what that misses is only estimated."
+            f"The ground truth comes every {steps_s[0]:.2g} s, the frames every {steps_s[1]:.2g} s: between its poses"
+            " it is interpolated, and what that misses is only estimated."
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))

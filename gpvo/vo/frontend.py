@@ -167,7 +167,7 @@ class DescriptorFrontend:
         self._camera = camera
         self._rig_error = rig_error
         self._config = config
-        self._mask = None if mask is None else np.ascontiguousarray(mask.astype(np.uint8) * 255)
+        self._mask = opencv.as_mask(mask)
         self._reference: _Features | None = None
         self._current: _Features | None = None
         self._images: tuple[opencv.Image, opencv.Image] | None = None

@@ -79,9 +79,9 @@ class KltFrontend:
         self._camera = camera
         self._rig_error = rig_error
         self._config = config
-        self._mask = None if mask is None else np.ascontiguousarray(mask.astype(np.uint8) * 255)
+        self._mask = opencv.as_mask(mask)
         half = None if mask is None else mask[: camera.height // 2 * 2 : 2, : camera.width // 2 * 2 : 2]
-        self._half_mask = None if half is None else np.ascontiguousarray(half.astype(np.uint8) * 255)
+        self._half_mask = opencv.as_mask(half)
         self._reference: _View | None = None
         self._current: _View | None = None
         self._new = _NONE_NEW

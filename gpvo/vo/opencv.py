@@ -25,6 +25,11 @@ _SAME_LIGHT = 1.06
 _NO_PICTURE = 2.0  # grey values of contrast
 
 
+def as_mask(usable: NDArray[np.bool_] | None) -> Image | None:
+    """Usable pixels (H, W) in the form that :func:`corners` and the descriptors take."""
+    return None if usable is None else np.ascontiguousarray(usable.astype(np.uint8) * 255)
+
+
 def halve(image: Image) -> Image:
     """Image of half the width and height, each pixel the mean of four: pixel i covers 2 i and 2 i + 1."""
     h, w = image.shape
