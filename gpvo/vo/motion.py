@@ -178,7 +178,6 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 6
-_AT_FIRST = 4 * CHI2_3_999  # twice the ellipsoid: the first motion errs by as much as the points
 _PLAIN = PointNoise()
 
 
@@ -221,8 +220,7 @@ def refine(
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
         elif iteration <= _CHOOSING:
             close = moved.in_front & within(r, tolerance_px)
-            limit = _AT_FIRST if iteration == 1 else CHI2_3_999
-            keep, scale, weight = _robust_weights((z**2).sum(0), close, limit)
+            keep, scale, weight = _robust_weights((z**2).sum(0), close)
         if keep.sum() < 3:
             return None
         A = apply_whitener(W, moved.H)
@@ -275,14 +273,14 @@ def within(r: Array, tolerance_px: float) -> NDArray[np.bool_]:
     return (np.hypot(r[0], r[1]) < tolerance_px) & (np.abs(r[2]) < 1.5 * tolerance_px)
 
 
-def _robust_weights(m2: Array, close: NDArray[np.bool_], limit: float) -> tuple[NDArray[np.bool_], float, Array]:
+def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float, Array]:
     """Inliers among the ``close`` points (N,), noise scale [px] and Huber weights from squared Mahalanobis distances at
-    unit noise; ``limit``: of an inlier's at that scale."""
+    unit noise."""
     # Floor: below a fiftieth of a pixel the residual is rounding, and everything would look like an outlier.
     # Six of the residuals' degrees of freedom went to the motion.
     freedom = max(1.0 - 2.0 / max(int(close.sum()), 1), 1 / 3)
     scale2 = max(float(np.median(m2[close])) / CHI2_3_MEDIAN / freedom if close.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
-    keep = close & (ratio < limit)
+    keep = close & (ratio < CHI2_3_999)
     distance = np.sqrt(np.maximum(ratio, 1e-12))
     return keep, float(np.sqrt(scale2)), np.minimum(1.0, 3.2 / distance)

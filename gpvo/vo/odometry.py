@@ -269,8 +269,8 @@ class StereoOdometry:
             information=None if adjusted is None else adjusted.information,
         )
         if config.self_calibration:
-            row_error = matches.row_error[motion.inliers]
-            otherwise = otherwise + self.rig_error.update(motion, white, row_error, config.min_disparity_px)
+            row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
+            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px)
         return replace(
             record,
             T_prev_cur=T_prev_cur,
