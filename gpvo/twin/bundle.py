@@ -74,7 +74,7 @@ class Chart:
     def begin(self, seen: Observations, T_world_cam: Array) -> Array:
         """Landmarks (N, 3) as triangulated in that view."""
         T = T_world_cam[seen.frame[self.view]]
-        return transform(T, triangulate(seen.uvd[self.view], seen.camera))
+        return transform(T, triangulate(_ahead(seen.uvd[self.view]), seen.camera))
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,14 @@ class Estimate:
 
     def moved(self, step_cam: Array, step_uvd: Array, chart: Chart, seen: Observations) -> Estimate:
         """After steps (F, 6) of the poses, on the right, and (N, 3) [px] of the landmarks."""
-        uvd = self.uvd(chart, seen) + step_uvd
-        uvd[:, 2] = np.maximum(uvd[:, 2], _MIN_DISPARITY_PX)
+        uvd = _ahead(self.uvd(chart, seen) + step_uvd)
         points = transform(self.T_world_cam[seen.frame[chart.view]], triangulate(uvd, seen.camera))
         return Estimate(self.T_world_cam @ se3.exp(step_cam), points)
+
+
+def _ahead(uvd: Array) -> Array:
+    """(N, 3) the same, none of them beyond infinity."""
+    return np.column_stack([uvd[:, :2], np.maximum(uvd[:, 2], _MIN_DISPARITY_PX)])
 
 
 def _projection_jacobian(P: Array, camera: StereoCamera) -> Array:

@@ -12,6 +12,9 @@ from gpvo.types import Vehicle
 METHODS = ("triangulation", "pointing_matching", "spherical")
 
 
+KNOWN_DEPTH_PX = 0.5  # disparity below which depth is unknown even in order of magnitude
+
+
 @dataclass(frozen=True)
 class VoConfig:
     """Everything that changes what the odometry does. Pixels are those of the rectified image."""
@@ -23,7 +26,7 @@ class VoConfig:
     klt_window_px: int = 15
     klt_levels: int = 4
     max_row_error_px: float = 1.5  # of a left-right match; an ideal rectification gives 0
-    min_disparity_px: float = 0.5  # below, depth is unknown even in order of magnitude
+    min_disparity_px: float = -2.0  # noise puts far points below zero: to leave them out is to choose by noise
     max_disparity_share: float = 0.25  # of the image width
     ransac_threshold_px: float = 2.0
     ransac_iterations: int = 1000  # at most: few where most points agree
@@ -65,6 +68,7 @@ PRESETS: dict[str, VoConfig] = {
         preset="thesis",
         keyframe_parallax_px=0.0,
         max_features=500,
+        min_disparity_px=KNOWN_DEPTH_PX,
         ransac_iterations=150,
         self_calibration=False,
         persistent_noise=False,
@@ -80,7 +84,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "klt_window_px": (3, 101),
     "klt_levels": (1, 10),
     "max_row_error_px": (0.01, 1000),
-    "min_disparity_px": (1e-3, 1000),
+    "min_disparity_px": (-1000, 1000),
     "max_disparity_share": (0.01, 1),
     "ransac_threshold_px": (0.01, 1000),
     "ransac_iterations": (1, 100_000),

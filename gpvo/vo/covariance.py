@@ -15,7 +15,7 @@ import numpy as np
 
 from gpvo.geometry.covariance import symmetrise
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.config import pair_method
+from gpvo.vo.config import KNOWN_DEPTH_PX, pair_method
 from gpvo.vo.motion import Transfer, apply_whitener, residual_covariance, transfer, whitener
 from gpvo.vo.points import (
     point_covariance,
@@ -129,7 +129,7 @@ def covariances_by_method(
     out: dict[str, MotionCovariance] = {}
     for method in methods:
         if method == "spherical":
-            near = (uvd_prev[:, 2] > 0.5) & (uvd_cur[:, 2] > 0.5)
+            near = (uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (uvd_cur[:, 2] > KNOWN_DEPTH_PX)
             out[method] = spherical_covariance(T_prev_cur, uvd_prev[near], uvd_cur[near], camera, S["triangulation"])
         else:
             out[method] = stated(S[method])

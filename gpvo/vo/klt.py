@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gpvo.types import Array, StereoCamera, StereoFrame, TrackFrame
 from gpvo.vo import opencv
-from gpvo.vo.config import VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.frontend import EMPTY, Matches, Observation, RightSearch
 from gpvo.vo.motion import predict_uvd
 from gpvo.vo.opencv import Image, Light, Points, image_stats, in_light_of
@@ -231,13 +231,13 @@ class KltFrontend:
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
         n, off_row = len(row_motion), np.abs(row_error - usual) > self._config.max_row_error_px
-        behind = np.isfinite(row_error) & ~off_row & (disparity < -self._config.min_disparity_px)
+        behind = np.isfinite(row_error) & ~off_row & (disparity < -KNOWN_DEPTH_PX)
         # Points at infinity have no measurable depth, which is nobody's fault.
-        far = np.isfinite(row_error) & (np.abs(disparity) < self._config.min_disparity_px)
+        far = np.isfinite(row_error) & (np.abs(disparity) < KNOWN_DEPTH_PX)
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
         return RightSearch(
             len(uvd) - int(far.sum()),
-            int((good & ~off_row).sum()),
+            int((good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),
             row_error[:n][seen],

@@ -177,7 +177,7 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
 
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
-_CHOOSING = 4
+_CHOOSING = 6
 _PLAIN = PointNoise()
 
 
@@ -190,6 +190,7 @@ def refine(
     max_iterations: int = 12,
     robust: bool = True,
     noise: PointNoise = _PLAIN,
+    tolerance_px: float = np.inf,
 ) -> Motion | None:
     """Weighted reprojection error in left and right of the new frame, by Gauss-Newton.
 
@@ -200,8 +201,10 @@ def refine(
     derivative and biases the motion (errors in variables; B. Triggs et al., "Bundle adjustment, a modern synthesis",
     2000, section 6.1: this is the two-frame problem with the points eliminated).
 
-    If ``robust``, the noise scale is taken from the median residual, points beyond its 99.9 % ellipsoid are left out,
-    and the rest are weighted by Huber's rule.
+    If ``robust``, points within ``tolerance_px`` of the prediction are candidates. The noise scale is taken from their
+    median residual, those beyond its 99.9 % ellipsoid are left out, and the rest are weighted by Huber's rule. They are
+    chosen anew at every step: a first motion from four noisy points disagrees with good ones, and without these the
+    estimate would be biased towards it.
 
     Returns None where the geometry leaves the motion undetermined.
     """
@@ -216,7 +219,8 @@ def refine(
         if not robust:
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
         elif iteration <= _CHOOSING:
-            keep, scale, weight = _robust_weights((z**2).sum(0), moved.in_front)
+            close = moved.in_front & within(r, tolerance_px)
+            keep, scale, weight = _robust_weights((z**2).sum(0), close)
         if keep.sum() < 3:
             return None
         A = apply_whitener(W, moved.H)
@@ -263,13 +267,20 @@ def _smoothing(S: Array, G: Array, W: Array, left: Array, persistent: float) -> 
     return out
 
 
-def _robust_weights(m2: Array, in_front: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float, Array]:
-    """Inliers, noise scale [px] and Huber weights from squared Mahalanobis distances at unit noise."""
+def within(r: Array, tolerance_px: float) -> NDArray[np.bool_]:
+    """(N,) whether residuals (3, N) of (u, v, d) are within a tolerance in the left image, and within one and a half in
+    the disparity."""
+    return (np.hypot(r[0], r[1]) < tolerance_px) & (np.abs(r[2]) < 1.5 * tolerance_px)
+
+
+def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float, Array]:
+    """Inliers among the ``close`` points (N,), noise scale [px] and Huber weights from squared Mahalanobis distances at
+    unit noise."""
     # Floor: below a fiftieth of a pixel the residual is rounding, and everything would look like an outlier.
     # Six of the residuals' degrees of freedom went to the motion.
-    freedom = max(1.0 - 2.0 / max(int(in_front.sum()), 1), 1 / 3)
-    scale2 = max(float(np.median(m2[in_front])) / CHI2_3_MEDIAN / freedom if in_front.any() else 1.0, 0.02**2)
+    freedom = max(1.0 - 2.0 / max(int(close.sum()), 1), 1 / 3)
+    scale2 = max(float(np.median(m2[close])) / CHI2_3_MEDIAN / freedom if close.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
-    keep = in_front & (ratio < CHI2_3_999)
+    keep = close & (ratio < CHI2_3_999)
     distance = np.sqrt(np.maximum(ratio, 1e-12))
     return keep, float(np.sqrt(scale2)), np.minimum(1.0, 3.2 / distance)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
-from gpvo.vo.config import VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
 from gpvo.vo.imu_moments import ImuMoments
@@ -202,7 +202,7 @@ class StereoOdometry:
         """P3P in RANSAC on the left image, then the weighted refinement over both; of the points ``among``, (N,)."""
         camera, config = self.camera, self.config
         among = matches.strong if among is None else among
-        near = among & (matches.uvd_prev[:, 2] > 2 * config.min_disparity_px)
+        near = among & (matches.uvd_prev[:, 2] > 2 * KNOWN_DEPTH_PX)
         if near.sum() < config.min_inliers:
             return None
         found = opencv.pose_from_points(
@@ -215,15 +215,16 @@ class StereoOdometry:
         )
         if found is None:
             return None
-        T_prev_cur = se3.inverse(found[0])
-        close = among & agrees(T_prev_cur, matches, camera, 2 * config.ransac_threshold_px)
-        if close.sum() < config.min_inliers:
+        T_prev_cur, tolerance_px = se3.inverse(found[0]), 2 * config.ransac_threshold_px
+        if (among & agrees(T_prev_cur, matches, camera, tolerance_px)).sum() < config.min_inliers:
             return None
-        motion = refine(T_prev_cur, matches.uvd_prev[close], matches.uvd_cur[close], camera, noise=self._noise.value)
+        uvd_prev, uvd_cur = matches.uvd_prev[among], matches.uvd_cur[among]
+        noise = self._noise.value
+        motion = refine(T_prev_cur, uvd_prev, uvd_cur, camera, noise=noise, tolerance_px=tolerance_px)
         if motion is None:
             return None
-        inliers = np.zeros(len(close), bool)
-        inliers[np.flatnonzero(close)[motion.inliers]] = True
+        inliers = np.zeros(len(among), bool)
+        inliers[among] = motion.inliers
         return replace(motion, inliers=inliers)
 
     def _record(
@@ -268,8 +269,8 @@ class StereoOdometry:
             information=None if adjusted is None else adjusted.information,
         )
         if config.self_calibration:
-            row_error = matches.row_error[motion.inliers]
-            otherwise = otherwise + self.rig_error.update(motion, white, row_error, config.min_disparity_px)
+            row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
+            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px)
         return replace(
             record,
             T_prev_cur=T_prev_cur,

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.types import Array, Status, StereoCamera
-from gpvo.vo.config import VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.frontend import Matches, Observation, RightSearch
-from gpvo.vo.motion import Motion, predict_uvd
+from gpvo.vo.motion import Motion, predict_uvd, within
 from gpvo.vo.opencv import ImageStats
 from gpvo.vo.sigmas import ResidualMoments
 
@@ -47,8 +47,7 @@ class Verdict:
 def agrees(T_prev_cur: Array, matches: Matches, camera: StereoCamera, threshold_px: float) -> NDArray[np.bool_]:
     """(N,) whether the motion predicts each point where it was found, in the left image and in disparity."""
     uvd, in_front = predict_uvd(T_prev_cur, matches.uvd_prev, camera)
-    off = matches.uvd_cur - uvd.T
-    return in_front & (np.hypot(off[:, 0], off[:, 1]) < threshold_px) & (np.abs(off[:, 2]) < 1.5 * threshold_px)
+    return in_front & within(matches.uvd_cur.T - uvd, threshold_px)
 
 
 def judge(
@@ -185,8 +184,8 @@ def _centred(x: Array) -> Array:
 def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moments: ResidualMoments) -> dict[str, Any]:
     """Fields of a :class:`gpvo.types.VoRecord` that describe the match and the solution."""
     uvd = matches.uvd_cur[motion.inliers]
-    p10, p50, p90 = (float(p) for p in np.percentile(uvd[:, 2], [10, 50, 90]))
-    depth_m = camera.fx_px * camera.baseline_m / max(float(p50), 1e-3)
+    p10, p50, p90 = np.maximum(np.percentile(uvd[:, 2], [10, 50, 90]), KNOWN_DEPTH_PX)
+    depth_m = camera.fx_px * camera.baseline_m / float(p50)
     sigma_p, sigma_m = moments.sigmas if len(uvd) >= _ENOUGH_FOR_SIGMAS else (np.nan, np.nan)
     return {
         "n_tracked": matches.n_tracked,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.config import VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.frontend import Matches
 from gpvo.vo.motion import Motion, predict_uvd
 from gpvo.vo.quality import worst_translation_sigma_m
@@ -132,7 +132,7 @@ def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: 
     """(N,) the points, spare ones too, that moved otherwise; None where the motion explains most of the image.
 
     That is the share of the cells with points of the reference, but for those that the motion puts out of sight, in
-    which one agrees.
+    which one agrees. Points at infinity do not count: they agree with any translation.
     """
     if matches.sought_uvd is None:
         return None
@@ -140,9 +140,10 @@ def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: 
     (u, v, d), in_front = predict_uvd(motion.T_prev_cur, matches.sought_uvd, camera)
     margin = config.klt_window_px
     inside = (u - d > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin)
-    sought = np.unique(cells(matches.sought_uvd[in_front & inside], camera))
-    agree = np.isin(sought, cells(matches.uvd_prev[off_px < config.ransac_threshold_px], camera))
-    free = off_px > max(config.ransac_threshold_px, 6 * motion.scale_px)
+    tells, told = (uvd[:, 2] > KNOWN_DEPTH_PX for uvd in (matches.sought_uvd, matches.uvd_prev))
+    sought = np.unique(cells(matches.sought_uvd[in_front & inside & tells], camera))
+    agree = np.isin(sought, cells(matches.uvd_prev[(off_px < config.ransac_threshold_px) & told], camera))
+    free = told & (off_px > max(config.ransac_threshold_px, 6 * motion.scale_px))
     return free if free.sum() >= _LEAST and agree.sum() < _EXPLAINED * len(sought) else None
 
 

@@ -31,9 +31,9 @@ def fused(*arguments):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """Runs of one flight of eight seconds: with its truth, and without."""
+    """Runs of one flight of sixteen seconds: with its truth, and without."""
     folder = tmp_path_factory.mktemp("flown")
-    flight = simulate_points("tunnel-clean", seed=21, duration_s=8.0, tracks=110)
+    flight = simulate_points("tunnel-clean", seed=21, duration_s=16.0, tracks=110)
     run(open_source(flight.save(folder / "flight.npz")), folder / "seen", keep_tracks=True)
     _without_truth(folder / "seen", folder / "blind")
     return folder / "seen", folder / "blind"
