@@ -148,9 +148,10 @@ class PairWatch:
         if abs(late := self._lateness(right)) > 0.25:
             self._seen["late"] += 1
             doubts.append(f"the {'right' if late > 0 else 'left'} image is {abs(late):.1f} frames late")
-        if right.sought > 0 and right.found < 0.6 * right.sought:
-            lost = right.sought - right.found
-            cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
+        lost = right.sought - right.found
+        cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
+        # A point that is not found may be in the dark; one found where it cannot be says that the images are no pair.
+        if lost > (0.4 if cause == "few" else 0.2) * right.sought:
             self._seen[cause] += 1
             doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
         return doubts
