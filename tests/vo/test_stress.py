@@ -96,6 +96,15 @@ def test_rows_that_lag_behind_are_a_delay() -> None:
     assert watch.step(good, RightSearch(200, 200, 0, 0, rng.normal(0, 0.2, 200), motion)) == []
 
 
+def test_wrong_partners_speak_louder_than_missing_ones() -> None:
+    """A quarter of the points has no partner on the right: mostly not found at all, or mostly found in another row."""
+    nothing = np.zeros(0)
+    for off_row, named in ((5, False), (15, True)):
+        watch = PairWatch(pinhole(480, 360))
+        doubts = watch.step(Observation(None, False), RightSearch(100, 75, 0, off_row, nothing, nothing))
+        assert any("found in the right image" in d for d in doubts) is named
+
+
 def test_a_scene_speaks_against_a_patch_with_more_points() -> None:
     """Two hundred points that move as one in a third of the image, forty of the scene all over it."""
     rng = np.random.default_rng(0)
