@@ -27,7 +27,6 @@ from gpvo.vo.rig_error import RigError
 _CHOOSING = 3  # iterations in which weights may change
 _LEAST = 12  # points that a frame before the reference must share
 _CHI2_6_999 = 22.458
-_MIN_DISPARITY_PX = 0.05  # of a place
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,6 @@ def adjust(
         if not np.isfinite(step).all() or np.abs(step[:, 3:]).max() > 1.0:
             return None
         T, uvd = T @ se3.exp(step), uvd + change[:, :3]
-        uvd[:, 2] = np.maximum(uvd[:, 2], _MIN_DISPARITY_PX)
         if noise.persistent:
             kept = kept + change[:, 3]
         if iteration > (_CHOOSING if robust else 0) and np.abs(step).max() < tolerance:
