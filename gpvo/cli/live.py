@@ -24,8 +24,8 @@ def live(
         str | None, typer.Option(help="Topic of another odometry, to be republished with an honest covariance.")
     ] = None,
     odometry_type: Annotated[
-        str, typer.Option(help="Type of that topic: odometry, or pose (PoseWithCovarianceStamped).")
-    ] = ("odometry"),
+        str, typer.Option(help="Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped.")
+    ] = "odometry",
     truth: Annotated[
         str | None, typer.Option(help="Topic of delayed ground truth (mocap, tags): adapts the covariance.")
     ] = None,
