@@ -13,6 +13,7 @@ from gpvo.errors import SourceError
 from gpvo.io.run import read_run, read_tracks
 from gpvo.sim.recorded import longest_flight_s
 from gpvo.types import Array, StereoCamera, StereoTracks, VoLog
+from gpvo.vo.config import KNOWN_DEPTH_PX
 from gpvo.vo.motion import predict_uvd, refine, whitened
 from gpvo.vo.sigmas import NoiseEstimator
 
@@ -79,7 +80,8 @@ def _tracking(log: VoLog, tracks: StereoTracks, camera: StereoCamera, where: Pat
         ended = 1.0 - float(np.isin(old[stays], both).mean())
         # A wrong observation spoils two motions.
         motions.append((motion.scale_px, len(new), ended, 1.0 - float(good.mean()) ** 0.5))
-        depths.append(camera.fx_px * camera.baseline_m / np.maximum(uvd_now[j][good][:, 2], 0.1))
+        # Farther ones are as far as can be told.
+        depths.append(camera.fx_px * camera.baseline_m / np.maximum(uvd_now[j][good][:, 2], KNOWN_DEPTH_PX))
     if len(motions) < _MIN_PAIRS:
         raise SourceError(
             f"only {len(motions)} motions have {_MIN_POINTS} inliers: too few to estimate its noise",

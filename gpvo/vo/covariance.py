@@ -129,8 +129,9 @@ def covariances_by_method(
     out: dict[str, MotionCovariance] = {}
     for method in methods:
         if method == "spherical":
-            near = (uvd_prev[:, 2] > KNOWN_DEPTH_PX) & (uvd_cur[:, 2] > KNOWN_DEPTH_PX)
-            out[method] = spherical_covariance(T_prev_cur, uvd_prev[near], uvd_cur[near], camera, S["triangulation"])
+            # A sphere has a place: those of far points are put where depth begins to be known.
+            prev, cur = (np.column_stack([a[:, :2], np.maximum(a[:, 2], KNOWN_DEPTH_PX)]) for a in (uvd_prev, uvd_cur))
+            out[method] = spherical_covariance(T_prev_cur, prev, cur, camera, S["triangulation"])
         else:
             out[method] = stated(S[method])
     for p, m in sigma_pairs_px:

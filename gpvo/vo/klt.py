@@ -231,9 +231,10 @@ class KltFrontend:
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
         n, off_row = len(row_motion), np.abs(row_error - usual) > self._config.max_row_error_px
-        behind = np.isfinite(row_error) & ~off_row & (disparity < -KNOWN_DEPTH_PX)
+        least_px = self._config.min_disparity_px
+        behind = np.isfinite(row_error) & ~off_row & (disparity < min(least_px, -KNOWN_DEPTH_PX))
         # Points at infinity have no measurable depth, which is nobody's fault.
-        far = np.isfinite(row_error) & (np.abs(disparity) < KNOWN_DEPTH_PX)
+        far = np.isfinite(row_error) & ~behind & (disparity < max(least_px, KNOWN_DEPTH_PX))
         seen = np.abs(row_error[:n]) < self._config.klt_window_px
         return RightSearch(
             len(uvd) - int(far.sum()),

@@ -178,6 +178,9 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
 
 # Iterations in which the inliers may change; then they stand, or a point on the fence would keep the estimate moving.
 _CHOOSING = 6
+# In the first of them, points that tell the translation choose alone: far ones agree with any, and would make good near
+# ones look like outliers.
+_NEAR_FIRST, _NEAR_PX, _ENOUGH = 2, 1.0, 8
 _PLAIN = PointNoise()
 
 
@@ -203,8 +206,8 @@ def refine(
 
     If ``robust``, points within ``tolerance_px`` of the prediction are candidates. The noise scale is taken from their
     median residual, those beyond its 99.9 % ellipsoid are left out, and the rest are weighted by Huber's rule. They are
-    chosen anew at every step: a first motion from four noisy points disagrees with good ones, and without these the
-    estimate would be biased towards it.
+    chosen anew at each of the first six steps: a first motion from four noisy points disagrees with good ones, and
+    without these the estimate would be biased towards it.
 
     Returns None where the geometry leaves the motion undetermined.
     """
@@ -220,6 +223,9 @@ def refine(
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
         elif iteration <= _CHOOSING:
             close = moved.in_front & within(r, tolerance_px)
+            near = close & (uvd_prev[:, 2] > _NEAR_PX)
+            if iteration <= _NEAR_FIRST and near.sum() >= _ENOUGH:
+                close = near
             keep, scale, weight = _robust_weights((z**2).sum(0), close)
         if keep.sum() < 3:
             return None

@@ -74,7 +74,7 @@ def judge(
     if inliers < config.min_inliers or inliers < 0.12 * tracked:
         return Verdict(Status.LOST, f"only {inliers} of {tracked} points agree")
     sigma_m = worst_translation_sigma_m(motion)
-    if not sigma_m < 5 * camera.baseline_m:
+    if not sigma_m < 5 * camera.baseline_m or _all_at_infinity(motion):
         return Verdict(Status.LOST, "the points do not determine the translation")
     doubts = list(doubts)
     if inliers < usual_inliers / 3:
@@ -90,6 +90,14 @@ def judge(
     if spread.max() < 0.05 * camera.width / camera.fx_px:
         doubts.append("all points lie in a small part of the image")
     return Verdict(Status.DEGRADED, "; ".join(doubts)) if doubts else Verdict(Status.OK)
+
+
+def _all_at_infinity(motion: Motion) -> bool:
+    """Whether the disparities are no larger than noise would make those of points at infinity: then they tell no
+    translation, however much information the noise pretends. Over both frames its variance is half of two pixels'."""
+    n, sigma2 = len(motion.uvd_prev), motion.scale_px**2 * (1.0 + motion.noise.persistent)
+    # Three standard deviations of chi-square.
+    return float((motion.uvd_prev[:, 2] ** 2).sum()) < sigma2 * (n + 3.0 * np.sqrt(2.0 * n))
 
 
 def worst_translation_sigma_m(motion: Motion) -> float:
@@ -118,8 +126,10 @@ def lost_covariance(dt_s: float, twist: Array) -> Array:
 
 
 def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
-    """Median image motion of the inliers [px]."""
-    off = matches.uvd_cur[inliers, :2] - matches.uvd_prev[inliers, :2]
+    """Median image motion of the inliers [px], far ones apart if there are others: they stand still while one moves."""
+    near = inliers & (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX)
+    chosen = near if near.any() else inliers
+    off = matches.uvd_cur[chosen, :2] - matches.uvd_prev[chosen, :2]
     return float(np.median(np.hypot(off[:, 0], off[:, 1])))
 
 
@@ -152,7 +162,7 @@ class PairWatch:
         cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
         # A point that is not found may be in the dark; one found where it cannot be says that the images are no pair.
         if lost > (0.4 if cause == "few" else 0.2) * right.sought:
-            self._seen[cause] += 1
+            self._seen[cause] += lost > 0.4 * right.sought
             doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
         return doubts
 

@@ -45,7 +45,7 @@ _TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axi
 _MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
-_NEAR = 6.0  # disparity of the points used, in standard deviations of noise: the limit of disparity selects far ones
+_NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
 
 
 def terms(x: Array, y: Array) -> Array:

@@ -4,9 +4,9 @@ import numpy as np
 from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.sim.points import simulate_points
-from gpvo.types import VoLog
+from gpvo.types import Status, TrackFrame, VoLog
 from gpvo.vo.config import make_config
-from gpvo.vo.motion import refine
+from gpvo.vo.motion import predict_uvd, refine
 from gpvo.vo.odometry import StereoOdometry
 from stereo_points import CAMERA, noisy, scene
 
@@ -48,3 +48,46 @@ def test_nothing_beyond_the_tolerance_is_an_inlier():
     after[:60, :2] += rng.uniform(-30, 30, (60, 2))
     motion = refine(T, before, after, CAMERA, tolerance_px=4.0)
     assert np.hypot(*motion.residuals[:, :2].T).max() < 4.0
+
+
+def test_far_points_do_not_make_near_ones_outliers():
+    """They agree with any translation: of 200 far and 30 near points, none of the 30 agrees with a start 5 cm off."""
+    rng = np.random.default_rng(2)
+    T, before, after = scene(rng, 230, (6, 30))
+    before[30:, 2], after[30:, 2] = 0.0, 0.0
+    after[30:, :2] = predict_uvd(T, before[30:], CAMERA)[0][:2].T
+    before, after = noisy(rng, before, 0.15), noisy(rng, after, 0.15)
+    start = T @ se3.exp(np.array([0.05, 0, 0, 0, 0, 0]))
+    motion = refine(start, before, after, CAMERA, tolerance_px=4.0)
+    assert motion.inliers[:30].sum() > 25
+    assert np.linalg.norm((motion.T_prev_cur - T)[:3, 3]) < 0.01
+
+
+def skyline(rng, near, far, sigma_px, step_m):
+    """Twenty frames of a sideways flight past so many near points, and others at infinity."""
+    count = near + far
+    uvd = np.stack([rng.uniform(0, 640, count), rng.uniform(0, 480, count), rng.uniform(6, 30, count)], 1)
+    uvd[near:, 2] = 0.0
+    for k in range(20):
+        T = se3.exp(np.array([step_m * k, 0, 0, 0, 0, 0]))
+        now = noisy(rng, predict_uvd(T, uvd, CAMERA)[0].T, sigma_px)
+        right = np.column_stack([now[:, 0] - now[:, 2], now[:, 1]])
+        yield TrackFrame(k * 50_000_000, np.arange(count), now[:, :2], right)
+
+
+def test_points_at_infinity_alone_tell_no_translation():
+    """However many there are, and although noise gives them disparities; rms disparity 0.7 px."""
+    odometry = StereoOdometry(CAMERA)
+    records = [odometry.step(f) for f in skyline(np.random.default_rng(0), 0, 200, 0.5, 0.2)]
+    assert all(r.status is Status.LOST for r in records[1:])
+
+
+def test_a_skyline_does_not_stand_for_standing_still():
+    """Most points are at infinity: each frame is a new reference all the same, and every method has a covariance."""
+    config = make_config(methods=("triangulation", "pointing_matching", "spherical"))
+    odometry = StereoOdometry(CAMERA, config)
+    records = [odometry.step(f) for f in skyline(np.random.default_rng(0), 40, 160, 0.3, 0.05)]
+    assert all(r.status is Status.OK and r.is_reference for r in records[1:])
+    moved_m = [r.T_prev_cur[0, 3] for r in records[1:]]
+    np.testing.assert_allclose(moved_m, 0.05, atol=0.01)
+    assert all(set(r.covariances) == set(config.methods) for r in records[1:])
