@@ -254,7 +254,7 @@ class KltFrontend:
         uvd, found, row_error = self._with_new_corners(current, *self._rough(current, uv))
         good = good_before & found[:n]
         self._matched_left, self._matched_uvd = uv[good], uvd[:n][good]
-        # How rows move says nothing among wrong pairs, and these are no second motion: of points sought in vain no word.
+        # Wrong pairs are no second motion: nothing is said of points sought in vain, nor of how rows move.
         right = self._right_search(uvd, found, row_error, np.empty(0))
         return Matches(before[good], uvd[:n][good], row_error[:n][good], n, right=right)
 
