@@ -234,11 +234,13 @@ def test_positions_that_drift_are_told_by_the_velocities_beside_them(flights, tm
         unknown = evaluate_run(replace(run, truth=alone)).consistency["triangulation"].one_second
         assert unknown.truth_drift_m == (0.0, 0.0, 0.0)
         assert max(unknown.z2_truth_noise[:3]) > 5 * max(found.z2_truth_noise[:3])
-        wrong = replace(run, truth=measured(run.truth, seed, 0.1, where="velocities"))
-        innocent += evaluate_run(wrong).consistency["triangulation"].one_second.truth_drift_m
+        for draw in range(4):
+            wrong = replace(run, truth=measured(run.truth, 100 * draw + seed, 0.1, where="velocities"))
+            innocent += evaluate_run(wrong).consistency["triangulation"].one_second.truth_drift_m
     # Over a second an error of 0.1 m/s that lasts for two makes 0.09 m.
     assert np.sqrt(np.mean(np.square(drift))) == pytest.approx(0.09, rel=0.3)
     assert 0.4 < np.mean(z2) < 1.5
-    assert np.count_nonzero(innocent) <= 1
+    # Of five flights, three axes and four draws; of 180 values it was 7 %, and of other flights' 6 %.
+    assert np.count_nonzero(innocent) <= 6
     write_run(tmp_path / "run", run.log, truth=drifting.truth)
     np.testing.assert_array_equal(read_run(tmp_path / "run").truth.v_world_mps, drifting.truth.v_world_mps)
