@@ -240,7 +240,7 @@ def test_positions_that_drift_are_told_by_the_velocities_beside_them(flights, tm
     # Over a second an error of 0.1 m/s that lasts for two makes 0.09 m.
     assert np.sqrt(np.mean(np.square(drift))) == pytest.approx(0.09, rel=0.3)
     assert 0.4 < np.mean(z2) < 1.5
-    # Of five flights, three axes and four draws each; of 180 such values it is 7 %.
-    assert np.count_nonzero(innocent) <= 6
+    # One of fifteen at most, over five flights, three axes and four draws each; of 180 such values it is 7 %.
+    assert np.count_nonzero(innocent) <= len(innocent) / 15
     write_run(tmp_path / "run", run.log, truth=drifting.truth)
     np.testing.assert_array_equal(read_run(tmp_path / "run").truth.v_world_mps, drifting.truth.v_world_mps)
