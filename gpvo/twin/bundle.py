@@ -20,7 +20,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.points import point_jacobian, triangulate, triangulation_pixel_covariance
+from gpvo.vo.points import no_farther_than, point_jacobian, triangulate, triangulation_pixel_covariance
 
 # Rows of (u, v, d) residuals at unit noise of the four image coordinates.
 WHITEN = np.linalg.inv(np.linalg.cholesky(triangulation_pixel_covariance(1.0)))
@@ -74,7 +74,7 @@ class Chart:
     def begin(self, seen: Observations, T_world_cam: Array) -> Array:
         """Landmarks (N, 3) as triangulated in that view."""
         T = T_world_cam[seen.frame[self.view]]
-        return transform(T, triangulate(_ahead(seen.uvd[self.view]), seen.camera))
+        return transform(T, triangulate(no_farther_than(seen.uvd[self.view], _MIN_DISPARITY_PX), seen.camera))
 
 
 @dataclass(frozen=True)
@@ -104,14 +104,9 @@ class Estimate:
 
     def moved(self, step_cam: Array, step_uvd: Array, chart: Chart, seen: Observations) -> Estimate:
         """After steps (F, 6) of the poses, on the right, and (N, 3) [px] of the landmarks."""
-        uvd = _ahead(self.uvd(chart, seen) + step_uvd)
+        uvd = no_farther_than(self.uvd(chart, seen) + step_uvd, _MIN_DISPARITY_PX)
         points = transform(self.T_world_cam[seen.frame[chart.view]], triangulate(uvd, seen.camera))
         return Estimate(self.T_world_cam @ se3.exp(step_cam), points)
-
-
-def _ahead(uvd: Array) -> Array:
-    """(N, 3) the same, none of them beyond infinity."""
-    return np.column_stack([uvd[:, :2], np.maximum(uvd[:, 2], _MIN_DISPARITY_PX)])
 
 
 def _projection_jacobian(P: Array, camera: StereoCamera) -> Array:

@@ -13,6 +13,7 @@ METHODS = ("triangulation", "pointing_matching", "spherical")
 
 
 KNOWN_DEPTH_PX = 0.5  # disparity below which depth is unknown even in order of magnitude
+TELLING_PX = 2 * KNOWN_DEPTH_PX  # disparity above which a point alone tells something of the translation
 
 
 @dataclass(frozen=True)

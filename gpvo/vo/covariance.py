@@ -18,6 +18,7 @@ from gpvo.types import Array, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX, pair_method
 from gpvo.vo.motion import Transfer, apply_whitener, residual_covariance, transfer, whitener
 from gpvo.vo.points import (
+    no_farther_than,
     point_covariance,
     pointing_matching_pixel_covariance,
     triangulate,
@@ -130,7 +131,7 @@ def covariances_by_method(
     for method in methods:
         if method == "spherical":
             # A sphere has a place: those of far points are put where depth begins to be known.
-            prev, cur = (np.column_stack([a[:, :2], np.maximum(a[:, 2], KNOWN_DEPTH_PX)]) for a in (uvd_prev, uvd_cur))
+            prev, cur = (no_farther_than(a, KNOWN_DEPTH_PX) for a in (uvd_prev, uvd_cur))
             out[method] = spherical_covariance(T_prev_cur, prev, cur, camera, S["triangulation"])
         else:
             out[method] = stated(S[method])

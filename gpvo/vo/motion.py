@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
+from gpvo.vo.config import TELLING_PX
 from gpvo.vo.points import PointNoise
 
 # Quantiles of chi-square with 3 degrees of freedom.
@@ -180,7 +181,7 @@ def whitened(motion: Motion, camera: StereoCamera) -> Whitened:
 _CHOOSING = 6
 # In the first of them, points that tell the translation choose alone: far ones agree with any, and would make good near
 # ones look like outliers.
-_NEAR_FIRST, _NEAR_PX, _ENOUGH = 2, 1.0, 8
+_NEAR_FIRST, _ENOUGH = 2, 8
 _PLAIN = PointNoise()
 
 
@@ -223,8 +224,7 @@ def refine(
             keep, scale, weight = moved.in_front, 1.0, np.ones(r.shape[1])
         elif iteration <= _CHOOSING:
             close = moved.in_front & within(r, tolerance_px)
-            near = close & (uvd_prev[:, 2] > _NEAR_PX)
-            if iteration <= _NEAR_FIRST and near.sum() >= _ENOUGH:
+            if iteration <= _NEAR_FIRST and (near := close & (uvd_prev[:, 2] > TELLING_PX)).sum() >= _ENOUGH:
                 close = near
             keep, scale, weight = _robust_weights((z**2).sum(0), close)
         if keep.sum() < 3:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
-from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
 from gpvo.vo.imu_moments import ImuMoments
@@ -202,7 +202,7 @@ class StereoOdometry:
         """P3P in RANSAC on the left image, then the weighted refinement over both; of the points ``among``, (N,)."""
         camera, config = self.camera, self.config
         among = matches.strong if among is None else among
-        near = among & (matches.uvd_prev[:, 2] > 2 * KNOWN_DEPTH_PX)
+        near = among & (matches.uvd_prev[:, 2] > TELLING_PX)
         if near.sum() < config.min_inliers:
             return None
         found = opencv.pose_from_points(

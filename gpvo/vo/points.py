@@ -20,6 +20,11 @@ from gpvo.types import Array, StereoCamera
 _PIXELS_TO_UVD = np.array([[1.0, 0, 0, 0], [0, 0.5, 0, 0.5], [1.0, 0, -1.0, 0]])
 
 
+def no_farther_than(uvd: Array, disparity_px: float) -> Array:
+    """(N, 3) the same measurements, those of farther points with this disparity."""
+    return np.column_stack([uvd[:, :2], np.maximum(uvd[:, 2], disparity_px)])
+
+
 def triangulate(uvd: Array, camera: StereoCamera) -> Array:
     """Points (N, 3) in ``cam`` [m] of measurements (N, 3); disparity must not be zero."""
     u, v, d = np.asarray(uvd, dtype=np.float64).T

@@ -94,7 +94,8 @@ def judge(
 
 def _all_at_infinity(motion: Motion) -> bool:
     """Whether the disparities are no larger than noise would make those of points at infinity: then they tell no
-    translation, however much information the noise pretends. Over both frames its variance is half of two pixels'."""
+    translation, however much information the noise pretends. Smoothed over both frames, each has the variance of one
+    image coordinate."""
     n, sigma2 = len(motion.uvd_prev), motion.scale_px**2 * (1.0 + motion.noise.persistent)
     # Three standard deviations of chi-square.
     return float((motion.uvd_prev[:, 2] ** 2).sum()) < sigma2 * (n + 3.0 * np.sqrt(2.0 * n))
