@@ -21,7 +21,8 @@ EXTRA_OF = {package: extra for extra, packages in _EXTRAS.items() for package in
 
 def printable(text: object) -> str:
     """Text without what a terminal would obey: control and formatting characters become ``?``."""
-    return "".join(c if c.isprintable() else "?" for c in str(text))
+    plain = str(text)
+    return plain if plain.isprintable() else "".join(c if c.isprintable() else "?" for c in plain)
 
 
 class GpvoError(Exception):

@@ -31,6 +31,7 @@ POSE_TYPES = (
     POSE_TYPE,
     "geometry_msgs/msg/TransformStamped",
 )
+_MAX_METADATA_BYTES = 500_000  # a topic takes some 600; the YAML reader needs ten seconds for a megabyte
 
 
 def is_bag(path: Path) -> bool:
@@ -49,6 +50,10 @@ def open_bag(path: Path) -> Iterator[Any]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    metadata = path / "metadata.yaml"
+    if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
+        reason = f"its list of topics has {size} bytes, more than {_MAX_METADATA_BYTES}"
+        raise SourceError(reason, where=metadata, cure="name the .mcap or .db3 file inside the folder")
     try:
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

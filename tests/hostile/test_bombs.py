@@ -235,6 +235,15 @@ def test_json_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
             read_json(tmp_path / "run.json")
 
 
+def test_a_list_of_topics_that_takes_minutes_to_read_is_refused(tmp_path: Path) -> None:
+    bag = stereo_bag(ros1=False, n=2).write(tmp_path / "bag")
+    with (bag / "metadata.yaml").open("a") as metadata:
+        metadata.writelines(f"  k{i}: [1, 2]\n" for i in range(100_000))
+    with pytest.raises(SourceError, match=r"metadata\.yaml: its list of topics has \d+ bytes") as refusal:
+        open_source(bag)
+    assert "\n" not in str(refusal.value)
+
+
 def test_lengths_that_are_none_in_an_mcap_are_refused(tmp_path: Path) -> None:
     """Of each record in turn, and of what a chunk unpacks to."""
     path = next(stereo_bag(ros1=False, n=2).write(tmp_path / "bag", mcap=True).glob("*.mcap"))

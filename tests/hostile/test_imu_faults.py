@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -85,6 +86,11 @@ def fused(flight: Flight) -> FusedRun:
     )[0]
 
 
+@cache
+def fused_without_a_fault() -> FusedRun:
+    return fused(synthetic_flight(3, duration_s=6.0))
+
+
 def after(flight: Flight, run: FusedRun) -> tuple[float, float, float, float]:
     """Mean NEES per degree of freedom of position and attitude after the fault; error of position [m], its largest
     and its last."""
@@ -101,7 +107,7 @@ def after(flight: Flight, run: FusedRun) -> tuple[float, float, float, float]:
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_momentary_fault_costs_little(fault: str) -> None:
     flight = faulty(3, FAULTS[fault], 6.0)
-    sound, hurt = fused(synthetic_flight(3, duration_s=6.0)), fused(flight)
+    sound, hurt = fused_without_a_fault(), fused(flight)
     assert len(hurt.t_ns) == len(sound.t_ns)
     assert np.isfinite(hurt.covariance).all()
     np.linalg.cholesky(hurt.covariance)

@@ -103,10 +103,10 @@ def _newer(root: Path, log: VoLog, truth: TruthLog) -> None:
 
 
 def _broken(path: Path) -> None:
-    """A run that broke off at the sixth of its frames, in the third chunk."""
+    """A run that broke off in its third chunk."""
     path.mkdir()
-    source = simulate_points("tunnel-bursts", 1, duration_s=0.8, rate_hz=10.0).save(path / "source.npz")
-    left = iter(range(6))
+    source = simulate_points("tunnel-bursts", 1, duration_s=0.6, rate_hz=10.0).save(path / "source.npz")
+    left = iter(range(5))
 
     def stop(*_: object) -> None:
         if next(left, None) is None:
