@@ -9,15 +9,16 @@ relative error s of its focal length and a shift (c, e) of its centre displace a
 (H. Longuet-Higgins, K. Prazdny, "The interpretation of a moving retinal image", 1980, eq. 2.12). Lenses add to each
 term, and terms of higher order: a centre shifted under distortion of second and fourth order displaces the image by
 polynomials of that order (D. Brown, "Decentering distortion of lenses", 1966). So the coefficients of both fourth-order
-polynomials are free, and a turn is a part of their prior covariance. A Kalman filter of constant state estimates them:
+polynomials are free, but for the x term of the rows, which no lens makes: it shows a turn about the optical axis. Turns
+are a part of the prior covariance. A Kalman filter of constant state estimates them:
 dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
 motion. What cannot be told apart from motion: the depth's scale.
 
 Two things keep it honest. Errors of neighbouring frames are alike (a feature is off in the same way for as long as it
 is tracked): blocks of frames are compared with their expected scatter, and all information is divided by
 the ratio. And rigs are of several kinds, exact or not, with a mounting and with lenses from good to bad: the
-estimate is the mean over the kinds by their probability (J. Dickey, "The weighted likelihood ratio", 1971), so that an
-exact rig keeps its exact geometry, and a camera knocked out of place keeps its lens.
+estimate is the mean over the kinds by their probability, so that an exact rig keeps its exact geometry, and a camera
+knocked out of place keeps its lens.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ _DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
 # Standard deviations of the prior. Terms beyond the constant are given at half the width of the image.
 _DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
 _ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
-_TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
+_ROW_X_PX = 0.1  # the x term of the rows, beyond the turn
+_TURN_RAD, _ROLL_RAD = 2.5e-4, 4e-3  # of the right camera about its vertical and its optical axis, which rows show
 # Rigs that are not exact: their mounting, and apart from it their lenses, are so many times as wrong, equally likely.
 # A camera can be knocked by any angle; a lens stays what it is.
 _MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
@@ -59,20 +61,24 @@ def terms(x: Array, y: Array) -> Array:
     return out
 
 
-def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0) -> Array:
+def prior_covariance(
+    camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0, roll_rad: float = _ROLL_RAD
+) -> Array:
     """(30, 30) of the coefficients of dx, then of dy, each in the order of :data:`POWERS`.
 
-    Of rigs whose right camera stands ``mounting`` times, and whose lenses bend ``lens`` times as wrong as usual.
+    Of rigs whose right camera stands ``mounting`` times, and whose lenses bend ``lens`` times as wrong as usual;
+    ``roll_rad``: the standard deviation of turns about the optical axis.
     """
     reach = (0.5 * camera.width / camera.fx_px) ** ORDER
     vertical, optical = np.zeros((2, 2 * N_TERMS))
     vertical[[0, 3]] = 1.0
     optical[2], optical[N_TERMS + 1] = -1.0, 1.0
     rows_px = np.where(ORDER == 0, *_ROW_PX)
+    rows_px[1] = _ROW_X_PX
     disparity_px = np.where(ORDER == 0, mounting * _DISPARITY_PX[0], lens * _DISPARITY_PX[1])
     free = np.concatenate([disparity_px / camera.fx_px / reach, rows_px / camera.fy_px / reach])
-    turns = np.outer(vertical, vertical) + np.outer(optical, optical)
-    return np.diag(free**2) + (mounting * _TURN_RAD) ** 2 * turns
+    turned = (mounting * _TURN_RAD) ** 2 * np.outer(vertical, vertical)
+    return np.diag(free**2) + turned + roll_rad**2 * np.outer(optical, optical)
 
 
 def principal_errors(state: RigState, camera: StereoCamera) -> Array:
@@ -129,7 +135,8 @@ class RigError:
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
         kinds = product(_MOUNTINGS, _LENSES) if self._may_be_exact else ()
         covariances = [prior_covariance(camera, *kind) for kind in kinds] or [self._start.covariance]
-        self._priors = _Priors.of(self._start.mean, np.stack(covariances))
+        self._kinds = _Gaussians.of(self._start.mean, np.stack(covariances))
+        self._exact = _Gaussians.of(np.zeros(N_TERMS), prior_covariance(camera, roll_rad=0.0)[None, _DY, _DY])
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
     def correct(self, uvd: Array) -> Array:
@@ -199,31 +206,20 @@ class RigError:
 
     def _mixed(self, information: Array, score: Array) -> RigState:
         """The posterior over rigs of every kind, as one Gaussian of its mean and covariance."""
-        priors = self._priors
-        covariances = np.asarray(np.linalg.inv(priors.precision + information), np.float64)
-        means = np.einsum("kij,kj->ki", covariances, priors.score + score)
+        means, covariances, evidence = self._kinds.given(information, score)
         if len(means) == 1:
             return RigState(means[0], covariances[0], 1.0)
-        # Savage-Dickey: against a rig whose disparities are exact, which is as likely as all kinds of others.
-        P, m = covariances[:, _DX, _DX], means[:, _DX]
-        distance2 = (m * np.linalg.solve(P, m[..., None])[..., 0]).sum(axis=1)
-        log_odds = 0.5 * (distance2 + np.linalg.slogdet(P)[1] - priors.log_det_dx)
-        weight = np.exp(np.append(np.log(len(means)), log_odds) - max(0.0, log_odds.max()))
+        # A rig whose disparities are exact is as likely as all kinds of others.
+        row_means, row_covariances, exact_evidence = self._exact.given(information[_DY, _DY], score[_DY])
+        means, covariances = np.pad(means, ((0, 1), (0, 0))), np.pad(covariances, ((0, 1), (0, 0), (0, 0)))
+        means[-1, _DY], covariances[-1, _DY, _DY] = row_means[0], row_covariances[0]
+        log_weight = np.append(evidence, exact_evidence + np.log(len(evidence)))
+        weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
-        best = int(np.argmax(log_odds))
-        exact_mean, exact_covariance = self._without_disparity(means[best], covariances[best])
-        mean = weight[0] * exact_mean + weight[1:] @ means
+        mean = weight @ means
         squares = covariances + means[:, :, None] * means[:, None]
-        covariance = weight[0] * (exact_covariance + np.outer(exact_mean, exact_mean))
-        covariance = covariance + np.tensordot(weight[1:], squares, 1)
-        return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[0]))
-
-    @staticmethod
-    def _without_disparity(mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """The same fit of the rows, of a rig whose disparities are exact."""
-        mean, covariance = mean.copy(), covariance.copy()
-        mean[_DX], covariance[_DX], covariance[:, _DX] = 0.0, 0.0, 0.0
-        return mean, covariance
+        covariance = np.tensordot(weight, squares, 1) - np.outer(mean, mean)
+        return RigState(mean, covariance, float(1.0 - weight[-1]))
 
     def _terms(self, uvd: Array) -> Array:
         """(15, N) the terms at the place in the right image."""
@@ -237,19 +233,25 @@ class RigError:
 
 
 @dataclass(frozen=True)
-class _Priors:
-    """K kinds of rig: precision (K, 30, 30) and precision times mean (K, 30), log determinant (K,) of the covariance of
-    dx."""
+class _Gaussians:
+    """K beliefs about n coefficients: ``precision`` (K, n, n) and ``score`` (K, n), precision times mean."""
 
     precision: Array
     score: Array
-    log_det_dx: Array
 
     @classmethod
-    def of(cls, mean: Array, covariance: Array) -> _Priors:
-        """Of Gaussians of this mean (30,) and these covariances (K, 30, 30)."""
+    def of(cls, mean: Array, covariance: Array) -> _Gaussians:
+        """Of means (n,) or (K, n) and covariances (K, n, n)."""
         precision = np.asarray(np.linalg.inv(covariance), np.float64)
-        return cls(precision, precision @ mean, np.linalg.slogdet(covariance[:, _DX, _DX])[1])
+        return cls(precision, (precision @ np.broadcast_to(mean, precision.shape[:2])[..., None])[..., 0])
+
+    def given(self, information: Array, score: Array) -> tuple[Array, Array, Array]:
+        """Means (K, n), covariances (K, n, n) and log evidence (K,), up to what all share, after measurements."""
+        covariance = np.asarray(np.linalg.inv(self.precision + information), np.float64)
+        total = self.score + score
+        mean = np.einsum("kij,kj->ki", covariance, total)
+        log_det = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(self.precision)[1]
+        return mean, covariance, 0.5 * ((mean * total).sum(axis=1) + log_det)
 
 
 class _Blocks:

@@ -81,12 +81,21 @@ def test_a_turn_is_found_and_named(axis: int) -> None:
     assert any(f"about the {word} axis" in " ".join(line.split()) for line in findings(state, CAMERA))
 
 
-def test_the_posterior_is_consistent() -> None:
+@pytest.mark.parametrize("degrees", [0.2, -0.2, 0.5])
+def test_rows_show_a_turn_about_the_optical_axis_at_once(degrees: float) -> None:
+    """After one motion, whatever the disparities say: no lens bends rows like that."""
+    truth = _turn(2, np.deg2rad(degrees))
+    share = [_fly(truth, seed=seed, frames=1).state.mean[2] / truth[2] for seed in range(3)]
+    assert 0.8 < np.mean(share) < 1.1
+
+
+@pytest.mark.parametrize("mounting", [1.0, 16.0])
+def test_the_posterior_is_consistent(mounting: float) -> None:
     """30 rigs drawn from the prior, 15 motions each: NEES of the disparity's coefficients per degree of freedom.
 
     Information begins divided by 16, so that short flights state too much rather than too little."""
     rng = np.random.default_rng(7)
-    L = np.linalg.cholesky(prior_covariance(CAMERA))
+    L = np.linalg.cholesky(prior_covariance(CAMERA, mounting))
     scores = []
     for seed in range(30):
         truth = L @ rng.standard_normal(2 * N_TERMS)
