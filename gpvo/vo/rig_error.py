@@ -182,20 +182,27 @@ class RigError:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px, 3)
             if near.sum() >= 3 * 8:
-                self._learn_from(A[near], B[near], phi * self._camera.fy_px, row_error)
+                self._learn_disparities(A[near], B[near])
+            self._learn_rows(phi * self._camera.fy_px, row_error)
+            self._conclude()
         return added
 
-    def _learn_from(self, A: Array, B: Array, rows: Array, row_error: Array) -> None:
-        """``A`` (n, 6) and ``B`` (n, 16): whitened derivatives by the motion, by dx, and residuals; ``rows`` (15, M):
-        of the row errors by dy."""
+    def _learn_disparities(self, A: Array, B: Array) -> None:
+        """``A`` (n, 6) and ``B`` (n, 16): whitened derivatives by the motion, by dx, and residuals."""
         rest = B - A @ np.linalg.solve(A.T @ A, A.T @ B)
         sums = rest.T @ rest
         information = sums[:-1, :-1]
         self._blocks[0].add(information, sums[:-1, -1] + information @ self.state.mean[_DX])
+
+    def _learn_rows(self, rows: Array, row_error: Array) -> None:
+        """``rows`` (15, M): derivatives of the row errors by dy. Far points tell as much as near ones."""
         off = row_error - self.state.mean[_DY] @ rows
         sigma = max(1.4826 * float(np.median(np.abs(off))), 0.05)
         weighted = rows * np.minimum(1.0, 2.5 * sigma / np.maximum(np.abs(off), 1e-9)) / sigma**2
         self._blocks[1].add(weighted @ rows.T, weighted @ row_error)
+
+    def _conclude(self) -> None:
+        """The state given all that was learnt."""
         information, score = np.zeros((2 * N_TERMS, 2 * N_TERMS)), np.zeros(2 * N_TERMS)
         for part, block in zip((_DX, _DY), self._blocks, strict=True):
             information[part, part] = block.information / block.excess

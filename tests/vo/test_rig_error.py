@@ -21,7 +21,12 @@ CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
 
 
 def _fly(
-    coefficients: Array, seed: int, frames: int = 60, sigma_px: float = 0.15, persistent_px: float = 0.0
+    coefficients: Array,
+    seed: int,
+    frames: int = 60,
+    sigma_px: float = 0.15,
+    persistent_px: float = 0.0,
+    depth_m: tuple[float, float] = (1.0, 5.0),
 ) -> RigError:
     """A rig wrong by ``coefficients`` (30,) over motions with fresh points and fresh noise, white and persistent."""
     rng = np.random.default_rng(seed)
@@ -30,7 +35,7 @@ def _fly(
     truth = RigError(CAMERA, RigState(coefficients, 1e-12 * np.eye(2 * N_TERMS), 1.0), learn=False)
     for _ in range(frames):
         T = se3.exp(np.array([*rng.normal(0, 0.05, 2), 0.15, *rng.normal(0, 0.02, 3)]))
-        Z = rng.uniform(1.0, 5.0, 200)
+        Z = rng.uniform(*depth_m, 200)
         uv = rng.uniform([60, 40], [580, 440], (200, 2))
         P = np.column_stack([(uv - [CAMERA.cx_px, CAMERA.cy_px]) / CAMERA.fx_px * Z[:, None], Z])
         seen, shared = [], rng.normal(0, persistent_px, len(P)) if persistent_px else 0.0
@@ -87,6 +92,13 @@ def test_rows_show_a_turn_about_the_optical_axis_at_once(degrees: float) -> None
     truth = _turn(2, np.deg2rad(degrees))
     share = [_fly(truth, seed=seed, frames=1).state.mean[2] / truth[2] for seed in range(3)]
     assert 0.8 < np.mean(share) < 1.1
+
+
+def test_rows_show_it_where_all_points_are_far() -> None:
+    """Disparities of a pixel tell nothing for sure; rows do, of points at any depth."""
+    truth = _turn(2, np.deg2rad(0.2))
+    state = _fly(truth, seed=1, frames=5, depth_m=(60.0, 120.0)).state
+    assert 0.8 < state.mean[2] / truth[2] < 1.2
 
 
 @pytest.mark.parametrize("mounting", [1.0, 16.0])
