@@ -31,7 +31,7 @@ POSE_TYPES = (
     POSE_TYPE,
     "geometry_msgs/msg/TransformStamped",
 )
-_MAX_METADATA_BYTES = 500_000  # a topic takes some 600; the YAML reader needs ten seconds for a megabyte
+_MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
 
 
 def is_bag(path: Path) -> bool:
@@ -52,8 +52,8 @@ def open_bag(path: Path) -> Iterator[Any]:
 
     metadata = path / "metadata.yaml"
     if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
-        reason = f"its list of topics has {size} bytes, more than {_MAX_METADATA_BYTES}"
-        raise SourceError(reason, where=metadata, cure="name the .mcap or .db3 file inside the folder")
+        reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
+        raise SourceError(reason, where=metadata, cure="name one .mcap or .db3 file inside the folder")
     try:
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

@@ -41,10 +41,12 @@ _DX, _DY = slice(0, N_TERMS), slice(N_TERMS, None)
 _DISPARITY_PX = (0.1, 0.3)  # the constant, which motion tells least; the others
 _ROW_PX = (3.0, 1.0)  # the constant, the others: rows are seen at once, and cost nothing to leave free
 _ROW_X_PX = 0.1  # the x term of the rows, beyond the turn
-_TURN_RAD, _ROLL_RAD = 2.5e-4, 4e-3  # of the right camera about its vertical and its optical axis, which rows show
+_TURN_RAD = 2.5e-4  # of the right camera about its vertical and its optical axis
 # Rigs that are not exact: their mounting, and apart from it their lenses, are so many times as wrong, equally likely.
 # A camera can be knocked by any angle; a lens stays what it is.
 _MOUNTINGS, _LENSES = (0.3, 1.0, 4.0, 16.0), (0.3, 1.0, 4.0)
+_ROLLS = (1.0, 16.0)  # the same of the turn about the optical axis, which rows show at once
+_NEGLIGIBLE = 1e-12  # probability of a kind
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
@@ -61,13 +63,11 @@ def terms(x: Array, y: Array) -> Array:
     return out
 
 
-def prior_covariance(
-    camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0, roll_rad: float = _ROLL_RAD
-) -> Array:
+def prior_covariance(camera: StereoCamera, mounting: float = 1.0, lens: float = 1.0, roll: float = 1.0) -> Array:
     """(30, 30) of the coefficients of dx, then of dy, each in the order of :data:`POWERS`.
 
-    Of rigs whose right camera stands ``mounting`` times, and whose lenses bend ``lens`` times as wrong as usual;
-    ``roll_rad``: the standard deviation of turns about the optical axis.
+    Of rigs whose right camera stands ``mounting`` times as wrong as usual, ``roll`` times about its optical axis, and
+    whose lenses bend ``lens`` times as wrong.
     """
     reach = (0.5 * camera.width / camera.fx_px) ** ORDER
     vertical, optical = np.zeros((2, 2 * N_TERMS))
@@ -77,8 +77,8 @@ def prior_covariance(
     rows_px[1] = _ROW_X_PX
     disparity_px = np.where(ORDER == 0, mounting * _DISPARITY_PX[0], lens * _DISPARITY_PX[1])
     free = np.concatenate([disparity_px / camera.fx_px / reach, rows_px / camera.fy_px / reach])
-    turned = (mounting * _TURN_RAD) ** 2 * np.outer(vertical, vertical)
-    return np.diag(free**2) + turned + roll_rad**2 * np.outer(optical, optical)
+    turns = mounting**2 * np.outer(vertical, vertical) + roll**2 * np.outer(optical, optical)
+    return np.diag(free**2) + _TURN_RAD**2 * turns
 
 
 def principal_errors(state: RigState, camera: StereoCamera) -> Array:
@@ -133,10 +133,10 @@ class RigError:
             return
         precision = np.asarray(np.linalg.inv(self._start.covariance), np.float64)
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))
-        kinds = product(_MOUNTINGS, _LENSES) if self._may_be_exact else ()
+        kinds = product(_MOUNTINGS, _LENSES, _ROLLS) if self._may_be_exact else ()
         covariances = [prior_covariance(camera, *kind) for kind in kinds] or [self._start.covariance]
         self._kinds = _Gaussians.of(self._start.mean, np.stack(covariances))
-        self._exact = _Gaussians.of(np.zeros(N_TERMS), prior_covariance(camera, roll_rad=0.0)[None, _DY, _DY])
+        self._exact = _Gaussians.of(np.zeros(N_TERMS), prior_covariance(camera, roll=0.0)[None, _DY, _DY])
         self.state = self._mixed(np.zeros_like(precision), np.zeros(len(precision)))
 
     def correct(self, uvd: Array) -> Array:
@@ -213,20 +213,22 @@ class RigError:
 
     def _mixed(self, information: Array, score: Array) -> RigState:
         """The posterior over rigs of every kind, as one Gaussian of its mean and covariance."""
-        means, covariances, evidence = self._kinds.given(information, score)
+        precision, means, evidence = self._kinds.given(information, score)
         if len(means) == 1:
-            return RigState(means[0], covariances[0], 1.0)
+            return RigState(means[0], np.asarray(np.linalg.inv(precision[0]), np.float64), 1.0)
         # A rig whose disparities are exact is as likely as all kinds of others.
-        row_means, row_covariances, exact_evidence = self._exact.given(information[_DY, _DY], score[_DY])
-        means, covariances = np.pad(means, ((0, 1), (0, 0))), np.pad(covariances, ((0, 1), (0, 0), (0, 0)))
-        means[-1, _DY], covariances[-1, _DY, _DY] = row_means[0], row_covariances[0]
+        row_precision, row_means, exact_evidence = self._exact.given(information[_DY, _DY], score[_DY])
         log_weight = np.append(evidence, exact_evidence + np.log(len(evidence)))
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
-        mean = weight @ means
-        squares = covariances + means[:, :, None] * means[:, None]
-        covariance = np.tensordot(weight, squares, 1) - np.outer(mean, mean)
-        return RigState(mean, covariance, float(1.0 - weight[-1]))
+        likely = weight[:-1] > _NEGLIGIBLE  # inverting the others would cost time and change nothing
+        mean, means = weight[:-1] @ means, means[likely]
+        mean[_DY] += weight[-1] * row_means[0]
+        squares = np.linalg.inv(precision[likely]) + means[:, :, None] * means[:, None]
+        covariance = np.tensordot(weight[:-1][likely], squares, 1)
+        exact = np.linalg.inv(row_precision[0]) + np.outer(row_means[0], row_means[0])
+        covariance[_DY, _DY] += weight[-1] * exact
+        return RigState(mean, covariance - np.outer(mean, mean), float(1.0 - weight[-1]))
 
     def _terms(self, uvd: Array) -> Array:
         """(15, N) the terms at the place in the right image."""
@@ -241,24 +243,26 @@ class RigError:
 
 @dataclass(frozen=True)
 class _Gaussians:
-    """K beliefs about n coefficients: ``precision`` (K, n, n) and ``score`` (K, n), precision times mean."""
+    """K beliefs about n coefficients, of one mean: ``precision`` (K, n, n), ``score`` (K, n), precision times mean, and
+    ``log_det`` (K,) of the precision."""
 
     precision: Array
     score: Array
+    log_det: Array
 
     @classmethod
     def of(cls, mean: Array, covariance: Array) -> _Gaussians:
-        """Of means (n,) or (K, n) and covariances (K, n, n)."""
+        """Of a mean (n,) and covariances (K, n, n)."""
         precision = np.asarray(np.linalg.inv(covariance), np.float64)
-        return cls(precision, (precision @ np.broadcast_to(mean, precision.shape[:2])[..., None])[..., 0])
+        return cls(precision, precision @ mean, np.linalg.slogdet(precision)[1])
 
     def given(self, information: Array, score: Array) -> tuple[Array, Array, Array]:
-        """Means (K, n), covariances (K, n, n) and log evidence (K,), up to what all share, after measurements."""
-        covariance = np.asarray(np.linalg.inv(self.precision + information), np.float64)
-        total = self.score + score
-        mean = np.einsum("kij,kj->ki", covariance, total)
-        log_det = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(self.precision)[1]
-        return mean, covariance, 0.5 * ((mean * total).sum(axis=1) + log_det)
+        """Precisions (K, n, n), means (K, n) and, where the mean was zero, log evidence (K,) up to a common term, after
+        measurements."""
+        precision, total = self.precision + information, self.score + score
+        mean = np.asarray(np.linalg.solve(precision, total[..., None])[..., 0], np.float64)
+        log_det = self.log_det - np.linalg.slogdet(precision)[1]
+        return precision, mean, 0.5 * ((mean * total).sum(axis=1) + log_det)
 
 
 class _Blocks:

@@ -101,6 +101,22 @@ def test_rows_show_it_where_all_points_are_far() -> None:
     assert 0.8 < state.mean[2] / truth[2] < 1.2
 
 
+@pytest.mark.parametrize("wrong", ["a shift of 0.3 px", "a turn of 0.05 deg about the vertical axis"])
+def test_level_rows_do_not_prove_that_a_rig_is_exact(wrong: str) -> None:
+    """That nothing is turned about the optical axis says little of other errors: after three motions they are not yet
+    found, and the covariance says so."""
+    truth = _turn(1, np.deg2rad(0.05))
+    if "shift" in wrong:
+        truth = np.zeros(2 * N_TERMS)
+        truth[0] = 0.3 / CAMERA.fx_px
+    scores = []
+    for seed in range(6):
+        state = _fly(truth, seed=seed, frames=3).state
+        e = (state.mean - truth)[:N_TERMS]
+        scores.append(e @ np.linalg.solve(state.covariance[:N_TERMS, :N_TERMS], e) / N_TERMS)
+    assert np.mean(scores) < 2.0
+
+
 @pytest.mark.parametrize("mounting", [1.0, 16.0])
 def test_the_posterior_is_consistent(mounting: float) -> None:
     """30 rigs drawn from the prior, 15 motions each: NEES of the disparity's coefficients per degree of freedom.
