@@ -221,7 +221,8 @@ class RigError:
         log_weight = np.append(evidence, exact_evidence + np.log(len(evidence)))
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
-        likely = weight[:-1] > _NEGLIGIBLE  # inverting the others would cost time and change nothing
+        # Inverting what is most unlikely would cost time and change nothing; one stays, as no variance is zero.
+        likely = weight[:-1] >= min(_NEGLIGIBLE, weight[:-1].max())
         mean, means = weight[:-1] @ means, means[likely]
         mean[_DY] += weight[-1] * row_means[0]
         squares = np.linalg.inv(precision[likely]) + means[:, :, None] * means[:, None]

@@ -11,6 +11,7 @@ from gpvo.cameras.kalibr import read_camchain
 from gpvo.errors import GpvoError
 from gpvo.files import write_json
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.motion import refine, whitened
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance
@@ -67,6 +68,17 @@ def test_an_exact_rig_is_left_alone() -> None:
     assert rig.state.probability < 0.01
     assert np.abs(rig.state.mean[:N_TERMS]).max() * CAMERA.fx_px < 0.01
     assert findings(rig.state, CAMERA) == []
+
+
+def test_an_exact_rig_is_never_known_without_doubt() -> None:
+    """After months, its state can still be the start of another run."""
+    rig = _fly(np.zeros(2 * N_TERMS), seed=1, frames=5)
+    for block in rig._blocks:
+        block.information = 1e7 * block.information
+    rig._conclude()
+    assert rig.state.probability < 1e-12
+    assert is_positive_definite(rig.state.covariance)
+    RigError(CAMERA, rig.state)
 
 
 def test_persistent_errors_of_single_points_are_no_error_of_the_rig() -> None:
