@@ -1,4 +1,4 @@
-"""A campaign of mutated inputs: 2,000 here, and on to ``GPVO_HOSTILE_CASES`` (by default 6,000) with longer tests."""
+"""A campaign of mutated inputs: 2,000 here, and on to ``GPVO_HOSTILE_CASES`` (by default 30,000) with longer tests."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from typer.testing import CliRunner
 
 CAMPAIGN = Path(__file__).parent / "campaign.py"
 MODEL = Path(__file__).parents[2] / "models" / "tunnel.gpvo"
-USUAL, ALL = 2_000, int(os.environ.get("GPVO_HOSTILE_CASES", "6000"))
+USUAL, ALL = 2_000, int(os.environ.get("GPVO_HOSTILE_CASES", "30000"))
 LENS = "  camera_model: pinhole\n  intrinsics: [60.0, 60.0, 32.0, 24.0]\n  distortion_model: radtan\n" \
     "  distortion_coeffs: [0.01, 0.0, 0.0, 0.0]\n  resolution: [64, 48]\n"  # fmt: skip
 POSE = "  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]\n"
