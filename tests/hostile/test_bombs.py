@@ -235,7 +235,7 @@ def test_json_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
             read_json(tmp_path / "run.json")
 
 
-def test_a_list_of_topics_that_takes_minutes_to_read_is_refused(tmp_path: Path) -> None:
+def test_metadata_that_take_long_to_read_are_refused(tmp_path: Path) -> None:
     bag = stereo_bag(ros1=False, n=2).write(tmp_path / "bag")
     with (bag / "metadata.yaml").open("a") as metadata:
         metadata.writelines(f"  k{i}: [1, 2]\n" for i in range(100_000))

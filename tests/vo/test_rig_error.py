@@ -129,13 +129,13 @@ def test_level_rows_do_not_prove_that_a_rig_is_exact(wrong: str) -> None:
     assert np.mean(scores) < 2.0
 
 
-@pytest.mark.parametrize("mounting", [1.0, 16.0])
-def test_the_posterior_is_consistent(mounting: float) -> None:
+@pytest.mark.parametrize(("mounting", "roll"), [(1.0, 1.0), (16.0, 1.0), (16.0, 16.0)])
+def test_the_posterior_is_consistent(mounting: float, roll: float) -> None:
     """30 rigs drawn from the prior, 15 motions each: NEES of the disparity's coefficients per degree of freedom.
 
     Information begins divided by 16, so that short flights state too much rather than too little."""
     rng = np.random.default_rng(7)
-    L = np.linalg.cholesky(prior_covariance(CAMERA, mounting))
+    L = np.linalg.cholesky(prior_covariance(CAMERA, mounting, roll=roll))
     scores = []
     for seed in range(30):
         truth = L @ rng.standard_normal(2 * N_TERMS)
