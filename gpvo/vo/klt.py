@@ -120,9 +120,10 @@ class KltFrontend:
             return self._find_again(reference, current)
         uvd, left_uv, guess = reference.uvd, reference.left_uv, self._predict(T_prev_cur_guess)
         left = in_light_of(current.left, current.light_left, reference.light_left)
-        cur_left, found = opencv.track(
+        cur_left, followed, found = opencv.track(
             reference.left, left, left_uv, guess[:, :2], config.klt_window_px, config.klt_levels
         )
+        n_followed = int(followed[: reference.strong].sum())
         uvd, from_left, cur_left, disparity = uvd[found], left_uv[found], cur_left[found], guess[found, 2]
         spare = np.flatnonzero(found) >= reference.strong
         both_uvd, both_good, row_error = self._with_new_corners(current, cur_left, disparity)
@@ -131,7 +132,7 @@ class KltFrontend:
         self._matched_left, self._matched_uvd = cur_left[good], uvd_cur[good]
         right = self._right_search(both_uvd, both_good, row_error, cur_left[:, 1] - from_left[:, 1])
         row_error = row_error[:n][good]
-        return Matches(uvd[good], uvd_cur[good], row_error, int((~spare).sum()), spare[good], right, reference.uvd)
+        return Matches(uvd[good], uvd_cur[good], row_error, n_followed, spare[good], right, reference.uvd)
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """Carry on the inliers, and add new corners where there are none."""
@@ -216,7 +217,7 @@ class KltFrontend:
         the right row lies below the left one, NaN where nothing was found."""
         config = self._config
         guess = np.column_stack([uv_left[:, 0] - disparity, uv_left[:, 1]])
-        uv_right, found = opencv.track(view.left, view.right_as_left, uv_left, guess, config.klt_window_px, 2)
+        uv_right, _, found = opencv.track(view.left, view.right_as_left, uv_left, guess, config.klt_window_px, 2)
         d = uv_left[:, 0].astype(np.float64) - uv_right[:, 0]
         row_error = uv_right[:, 1].astype(np.float64) - uv_left[:, 1]
         uvd = np.column_stack([uv_left[:, 0], uv_left[:, 1] + 0.5 * row_error, d])
@@ -226,11 +227,12 @@ class KltFrontend:
 
     def _right_search(self, uvd: Array, good: NDArray[np.bool_], row_error: Array, row_motion: Array) -> RightSearch:
         """What the search in the right image came to; the first points were followed and have moved down so far."""
+        n, measured = len(row_motion), row_error
         d_expected, row_expected = self._rig_error.errors(uvd)
         disparity, row_error = uvd[:, 2] - d_expected, row_error - row_expected
         # A pair that is off by the same rows everywhere is still a pair: its rows are counted from there.
         usual = float(np.median(row_error[np.isfinite(row_error)])) if np.isfinite(row_error).any() else 0.0
-        n, off_row = len(row_motion), np.abs(row_error - usual) > self._config.max_row_error_px
+        off_row = np.abs(row_error - usual) > self._config.max_row_error_px
         least_px = self._config.min_disparity_px
         behind = np.isfinite(row_error) & ~off_row & (disparity < min(least_px, -KNOWN_DEPTH_PX))
         # Points at infinity have no measurable depth, which is nobody's fault.
@@ -241,7 +243,7 @@ class KltFrontend:
             int((good & ~off_row & ~far & ~behind).sum()),
             int(behind.sum()),
             int(off_row.sum()),
-            row_error[:n][seen],
+            measured[:n][seen],  # an image that is late would else be taken for a rig that is off
             row_motion[seen],
         )
 

@@ -22,6 +22,7 @@ from gpvo.vo.quality import (
     Verdict,
     agrees,
     judge,
+    lateness_covariance,
     lost_covariance,
     median_parallax_px,
     motion_fields,
@@ -268,7 +269,9 @@ class StereoOdometry:
             moved=white.moved,
             information=None if adjusted is None else adjusted.information,
         )
-        if config.self_calibration:
+        if self.pair.late:
+            otherwise = otherwise + lateness_covariance(self.pair.late, T_prev_cur)
+        elif config.self_calibration:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
             otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px)
         return replace(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.geometry import se3
 from gpvo.types import Array, Status, StereoCamera
 from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
 from gpvo.vo.frontend import Matches, Observation, RightSearch
@@ -24,6 +25,8 @@ _ENOUGH_FOR_SIGMAS = 8  # points
 _MEMORY = 0.8  # of the running sums: about five frames
 _NAMED_FROM = 0.05  # share of the frames
 _DARKER = 1.25
+_LATE = 0.25  # frames between left and right
+_RIG_PX = 1.0  # by which a wrong rig displaces rows at most, a shift of all apart (a focal length that is 1 % off)
 
 _CURES = {
     "frozen": "the right image repeats itself while the left one changes; look at the right camera's driver",
@@ -135,13 +138,17 @@ def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
 
 
 class PairWatch:
-    """Watches the pairs of a run: :meth:`step` says what is doubtful in one, :meth:`findings` what is in the run."""
+    """Watches the pairs of a run: :meth:`step` says what is doubtful in one, :meth:`findings` what is in the run.
+
+    ``late``: by how many frames the right image is older than the left one, 0 where nothing speaks for it.
+    """
 
     def __init__(self, camera: StereoCamera) -> None:
         # A principal point in the lower right corner is the centre of an image of twice the size.
         doubled = 2 * np.array([camera.cx_px, camera.cy_px]) / [camera.width, camera.height]
         self._half_size = bool((np.abs(doubled - 2.0) < 0.4).all())
         self._rows = np.zeros(4)
+        self.late = 0.0
         self._frames = 0
         self._seen: Counter[str] = Counter()
 
@@ -156,9 +163,10 @@ class PairWatch:
             doubts.append("the principal point lies in the corner of the image")
         if right is None:
             return doubts
-        if abs(late := self._lateness(right)) > 0.25:
+        self.late = self._lateness(right)
+        if self.late:
             self._seen["late"] += 1
-            doubts.append(f"the {'right' if late > 0 else 'left'} image is {abs(late):.1f} frames late")
+            doubts.append(f"the {'right' if self.late > 0 else 'left'} image is {abs(self.late):.1f} frames late")
         lost = right.sought - right.found
         cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
         # A point that is not found may be in the dark; one found where it cannot be says that the images are no pair.
@@ -173,7 +181,8 @@ class PairWatch:
         return [f"{_CURES[cause]} ({n} of {self._frames} pairs)" for n, cause in sorted(often, reverse=True)]
 
     def _lateness(self, right: RightSearch) -> float:
-        """By how many frames the right image is older than the left one; 0 where nothing speaks for it.
+        """By how many frames the right image is older than the left one; 0 where rows agree, and what it was where they
+        do not tell.
 
         Then a point's right row is where the left one was: the error of rows is the motion of rows, with a minus.
         """
@@ -181,11 +190,21 @@ class PairWatch:
         now = np.array([len(error), error @ error, error @ motion, motion @ motion])
         self._rows = _MEMORY * self._rows + now
         n, ee, em, mm = self._rows
-        # Rows must move by more than a pixel, and their motion explain a quarter of the error's variance.
-        if n < 20 or mm < n or em**2 < 0.25 * ee * mm:
+        if n < 20 or mm < n:  # rows must move by a pixel
+            return self.late
+        if ee < _RIG_PX**2 * n:
             return 0.0
+        if em**2 < 0.25 * ee * mm:  # motion must explain a quarter of the error's variance
+            return self.late
         late = -em / mm
-        return float(late) if abs(late) < 2.0 else 0.0
+        return float(late) if _LATE < abs(late) < 2.0 else 0.0
+
+
+def lateness_covariance(late: float, T_prev_cur: Array) -> Array:
+    """(6, 6) of a motion seen by images ``late`` frames apart: what moves meanwhile displaces the right image as depth
+    does, so that share of the motion may be missing, or seen twice, along any axis."""
+    square = (late * se3.log(T_prev_cur)) ** 2
+    return np.diag(np.repeat([square[:3].sum(), square[3:].sum()], 3))
 
 
 def _centred(x: Array) -> Array:

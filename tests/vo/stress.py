@@ -107,6 +107,14 @@ def black(k: int, f: StereoFrame) -> StereoFrame:
     return _both(f, np.zeros_like) if _in_the_middle(k) else f
 
 
+def covered(k: int, f: StereoFrame) -> StereoFrame:
+    """Lenses covered for the first six frames and for six of every twenty: what is left is the sensors' noise."""
+    if k >= 6 and k % 20 < 14:
+        return f
+    rng = np.random.default_rng(k)
+    return _both(f, lambda i: np.clip(np.rint(rng.normal(3, 2, i.shape)), 0, 255).astype(np.uint8))
+
+
 def right_black(k: int, f: StereoFrame) -> StereoFrame:
     """Two black right images of every twelve."""
     return replace(f, right=np.zeros_like(f.right)) if _in_the_middle(k) else f
@@ -206,6 +214,7 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "every 2nd frame": every(2),
     "every 3rd frame": every(3),
     "black": _each(black),
+    "covered": _each(covered),
     "right black": _each(right_black),
     "frozen right": frozen_right,
     "late right": late_right,

@@ -10,6 +10,7 @@ import pytest
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.io.source import open_source
 from gpvo.types import Status, StereoFrame
+from gpvo.vo import opencv
 from gpvo.vo.config import make_config
 from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.motion import refine, transfer
@@ -56,7 +57,7 @@ FATAL = {
 }
 
 
-@pytest.mark.parametrize("fault", [*FATAL, "black", "right black", "noise 10", "JPEG 30", "late right"])
+@pytest.mark.parametrize("fault", [*FATAL, "black", "covered", "right black", "noise 10", "JPEG 30", "late right"])
 def test_no_fault_is_silent(footage: stress.Footage, fault: str) -> None:
     """Sixteen frames of a small clip; the slow test has the whole list."""
     few = stress.Footage(footage.camera, footage.frames[:16], footage.T_world_cam[:16])
@@ -83,6 +84,20 @@ def test_the_cause_is_named_with_its_cure(footage: stress.Footage) -> None:
     for frame in footage.frames:
         assert odometry.step(frame).reason == ""
     assert odometry.pair.findings() == []
+
+
+def test_noise_looks_like_nothing() -> None:
+    """Lucas and Kanade's search succeeds in noise wherever it starts; hardly any patch found there is alike."""
+    rng = np.random.default_rng(0)
+    a, b = (rng.normal(100, 3, (240, 320)).round().astype(np.uint8) for _ in range(2))
+    points = opencv.corners(a, 200, 0.01, 8, None)
+    _, found, alike = opencv.track(a, b, points, points, 21, 3)
+    assert found.mean() > 0.8
+    assert alike.mean() < 0.1
+    noisy = np.clip(a + rng.normal(0, 1, a.shape), 0, 255).round().astype(np.uint8)
+    moved, _, alike = opencv.track(a, noisy, points, points, 21, 3)
+    assert alike.mean() > 0.95
+    assert np.abs(moved - points)[alike].max() < 0.5
 
 
 def test_rows_that_lag_behind_are_a_delay() -> None:
@@ -154,13 +169,22 @@ def test_the_stress_list() -> None:
     assert sum(len(frames) for fault, frames in silent.items() if not ("patch" in fault or "late" in fault)) == 0
 
 
+PARTS = ((0, 60), (20, 60), (45, 108))
+"""Of a drive's frames."""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif("GPVO_DATA" not in os.environ, reason="GPVO_DATA names no folder of real data")
 def test_the_stress_list_on_a_drive() -> None:
-    """Sixty frames of KITTI raw 0001, about 10 m/s: no fault is silent."""
-    whole = drive(60)
-    silent = {fault: stress.run(change(whole)).silent for fault, change in stress.FAULTS.items()}
+    """Sixty frames of KITTI raw 0001, about 10 m/s: no fault is silent. Later stretches are tried with a late image."""
+    whole = drive(108)
+    parts = [stress.Footage(whole.camera, whole.frames[i], whole.T_world_cam[i]) for i in map(slice, *zip(*PARTS))]
+    silent = {fault: stress.run(change(parts[0])).silent for fault, change in stress.FAULTS.items()}
     assert sum(map(len, silent.values())) == 0, silent
+    for part in parts[1:]:
+        late = stress.run(stress.late_right(part))
+        assert late.count(Status.OK) == 0
+        assert (late.error_m[1:] > 0.3 * late.moved_m[1:]).mean() > 0.5  # what it sees is no motion
 
 
 @pytest.mark.slow
