@@ -33,6 +33,7 @@ def predict(
     """
     from gpvo.evaluation.evaluate import distinct
     from gpvo.io.run import read_run, write_predictions
+    from gpvo.io.run_folder import FILES
     from gpvo.online.predictor import Predictor
 
     if len(runs) == 1 and out.suffix.lower() != ".parquet":
@@ -41,6 +42,8 @@ def predict(
     for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
         predictions = list(predictor.replay(read_run(path).log).values())
         target = out if len(runs) == 1 else out / f"{name}.parquet"
+        if target.exists() and target.name in FILES and target.name != "predictions.parquet":
+            raise GpvoError("is a part of a run, and no predictions", where=target, cure="choose another -o")
         target.parent.mkdir(parents=True, exist_ok=True)
         write_predictions(target, predictions)
         documents.append({"run": str(path), "file": str(target), **_summary(predictions)})

@@ -5,6 +5,8 @@ What it keeps in a file lets a restart continue from it.
 
 from __future__ import annotations
 
+import os
+import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
@@ -34,6 +36,8 @@ REPEAT_S = 10.0
 """How often a warning that still holds is repeated."""
 _HEALTH_S, _STALE_S, _SAVE_S = 1.0, 2.0, 10.0
 _RECENT = 100
+_FROM_OUTSIDE = (GpvoError, OSError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError, struct.error)
+"""What a message or a link can raise; neither must end the process."""
 _POSITION_SIGMA_M, _ATTITUDE_SIGMA_RAD = 1.0, 0.1  # a source that starts again need not start where it stopped
 
 
@@ -121,8 +125,7 @@ class Engine:
             for taken in self.stage.flush() if arrival is None else self.stage.take(arrival):
                 out.append(self._step(taken))
                 self._latency_ms.append(1e3 * (time.perf_counter() - start))
-        # A message from outside must not end the process: what follows begins anew, across an unknown motion.
-        except (GpvoError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError) as error:
+        except _FROM_OUTSIDE as error:  # what follows begins anew, across an unknown motion
             self.counts["failed"] += 1
             self._warn(f"a message on {arrival.topic if arrival else 'a topic'} could not be used: {error}", now_s)
             self.stage.reset()
@@ -130,11 +133,29 @@ class Engine:
         return out
 
     def close(self) -> None:
-        """Use what waits, save the state and close the outputs."""
+        """Use what waits, save the state and close the outputs, each whatever becomes of the others.
+
+        Raises GpvoError where an output cannot be finished, as on a full disk.
+        """
         self.take(None)
         self._save()
+        failed = []
         for output in self.outputs:
-            output.close()
+            try:
+                output.close()
+            except GpvoError as error:
+                failed.append(error)
+        if failed:
+            raise failed[0]
+
+    def _deliver(self, give: Callable[[Output], None]) -> None:
+        """Give something to every output; one that fails, as while a link is down, is counted and called out."""
+        for output in self.outputs:
+            try:
+                give(output)
+            except _FROM_OUTSIDE as error:
+                self.counts["output_failed"] += 1
+                self._warn(f"{type(output).__name__} failed: {error}", time.monotonic())
 
     def _step(self, taken: Taken) -> Odometry:
         builder = self._builder
@@ -159,8 +180,7 @@ class Engine:
         if record.dt_s > 0:
             self._motions.append(record)
             self._inside.append(message.in_domain is None or message.in_domain > 0.5)
-        for output in self.outputs:
-            output.odometry(message)
+        self._deliver(lambda output: output.odometry(message))
         return message
 
     def _adapt(self, truth: LateTruth, message: Any) -> None:
@@ -214,8 +234,7 @@ class Engine:
         if due or level != self._reported[1]:
             self._reported = (now_s, level)
             report = self._health(level, problems)
-            for output in self.outputs:
-                output.health(report)
+            self._deliver(lambda output: output.health(report))
         if self.settings.state is not None and now_s - self._saved_s >= _SAVE_S:
             self._saved_s = now_s
             self._save()
@@ -278,7 +297,10 @@ class Engine:
     def _save(self) -> None:
         if self.settings.state is None or self.last is None:
             return
-        _save_state(self.settings.state, KeptState(self.last.T_odom_body, self.last.pose_covariance, self._scale))
+        try:
+            _save_state(self.settings.state, KeptState(self.last.T_odom_body, self.last.pose_covariance, self._scale))
+        except GpvoError as error:
+            self._warn(f"the state is not saved: {error}", time.monotonic())
 
 
 def _unknown(away_s: float, twist: Array) -> Array:
@@ -303,8 +325,12 @@ def _save_state(path: Path, state: KeptState) -> None:
 
 def load_state(path: Path | None) -> KeptState | None:
     """Of a state file; None where there is none yet. Raises GpvoError, one line, for a pose, covariance or scale that
-    cannot be."""
-    if path is None or not path.exists():
+    cannot be, and where no file can be written."""
+    if path is None:
+        return None
+    if not os.access(path.parent, os.W_OK):
+        raise GpvoError("cannot be written: no such folder, or no right to", where=path, cure="another --state")
+    if not path.exists():
         return None
     try:
         document = read_json(path)

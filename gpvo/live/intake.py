@@ -20,6 +20,7 @@ from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, t
 from gpvo.io.stated import GAP_STEPS
 from gpvo.stats.series import Doubt
 
+_LAST_NS = 2**31 * 1_000_000_000
 BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""
 AHEAD_S = 10.0
@@ -68,7 +69,9 @@ class StampWatch:
         self._steps: deque[int] = deque(maxlen=_WINDOW)
 
     def see(self, t_ns: int) -> Sequence:
-        """What the next stamp is."""
+        """What the next stamp is. One that no ROS message can hold is of another clock."""
+        if not 0 <= t_ns < _LAST_NS:
+            return Sequence.CLOCK
         if self._last is None:
             self._last = t_ns
             return Sequence.FIRST

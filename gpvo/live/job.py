@@ -69,6 +69,8 @@ def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) 
     """
     if settings.wire is None and settings.replay is None:
         raise GpvoError("there is no source", cure=f"give --replay BAG, or one of --{', --'.join(WIRES)}")
+    if settings.out and settings.replay and settings.out.resolve() == settings.replay.resolve():
+        raise GpvoError("is the recording itself", where=settings.out, cure="choose another -o")
     wire = open_wire(settings.wire, settings.address, settings.domain) if settings.wire else None
     stop = threading.Event()
     try:

@@ -12,7 +12,7 @@ import shutil
 import sqlite3
 import tempfile
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
+from gpvo.io.bag_reader import open_bag
 from gpvo.publish.mavlink import frd, quality
 from gpvo.publish.odometry import Odometry
 
@@ -75,7 +76,11 @@ def _flat(covariance: np.ndarray) -> np.ndarray:
 
 def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:
     """Write a ROS 1 bag; returns the number of messages."""
-    return _replacing(Path(path), lambda temporary: _fill(Ros1Writer(temporary), odometry, topic, Stores.ROS1_NOETIC))
+
+    def fill(temporary: Path) -> int:
+        return _fill(Ros1Writer(temporary), odometry, topic, Stores.ROS1_NOETIC)
+
+    return _replacing(Path(path), topic, fill)
 
 
 def write_ros2(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, *, mcap: bool = False) -> int:
@@ -88,7 +93,7 @@ def write_ros2(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPI
         writer = Ros2Writer(temporary, version=9, storage_plugin=plugin)
         return _fill(writer, odometry, topic, Stores.ROS2_HUMBLE)
 
-    return _replacing(Path(path), fill)
+    return _replacing(Path(path), topic, fill)
 
 
 def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -> int:
@@ -106,16 +111,16 @@ def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -
     return count
 
 
-def _replacing(path: Path, fill: Any) -> int:
-    """Write beside the target and move it there when done; an older bag of ours is replaced, nothing else."""
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        raise GpvoError("is a folder that holds something else", where=path, cure="choose another -o")
+def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
+    """Write beside the target and move it there when done; a bag of nothing but ``topic`` is replaced, nothing else."""
+    if path.exists() and not _holds_only(path, topic):
+        raise GpvoError(f"exists, and is no bag of {topic} alone", where=path, cure="choose another -o")
     holder: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         holder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         # A bag's files carry its name inside, so the temporary one has the same name in a folder of its own.
-        count: int = fill(holder / path.name)
+        count = fill(holder / path.name)
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(holder / path.name, path)
@@ -125,6 +130,14 @@ def _replacing(path: Path, fill: Any) -> int:
         if holder is not None:
             shutil.rmtree(holder, ignore_errors=True)
     return count
+
+
+def _holds_only(bag: Path, topic: str) -> bool:
+    try:
+        with open_bag(bag) as reader:
+            return all(c.topic == topic for c in reader.connections)
+    except GpvoError:
+        return False
 
 
 def robot_localization_yaml(topic: str = TOPIC, *, rate_hz: float = 30.0, ros1: bool = False) -> str:

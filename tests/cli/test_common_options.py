@@ -133,6 +133,10 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     done = call("predict", MODEL, *runs, "-o", str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [f"tunnel-{k}.parquet" for k in (1, 2, 3)]
+    shutil.copytree(runs[0], tmp_path / "run")
+    refused = call("predict", MODEL, str(tmp_path / "run"), "-o", str(tmp_path / "run" / "truth.parquet"))
+    assert refused.returncode == 2
+    assert "is a part of a run" in refused.stderr
     told = call("evaluate", *runs).stdout
     assert "mean of the 3 runs" in told
     two = call("evaluate", *runs[:2]).stdout

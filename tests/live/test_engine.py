@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from gpvo.live.job import LiveSettings, run_live
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import PoseStage
 from gpvo.live.stereo_stage import StereoStage
-from gpvo.publish.odometry import OdometryBuilder
+from gpvo.publish.odometry import Odometry, OdometryBuilder
 from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog, VoRecord
 from shim_bags import STATED, TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
@@ -151,6 +153,8 @@ def test_a_bag_replayed_by_the_command_is_the_same_in_a_bag(tmp_path: Path) -> N
     stamps, T = flight(n=60)
     bag = messages(stamps, T).write(tmp_path / "vio")
     model = save_model(tmp_path / "vio.gpvo")
+    with pytest.raises(GpvoError, match="is the recording itself"):
+        run_live(LiveSettings(model, replay=bag, fast=True, out=bag))
     result = run_live(LiveSettings(model, replay=bag, fast=True, out=tmp_path / "out.mcap"))
     assert result["counts"]["frames_ok"] == 60
     written = read_foreign(tmp_path / "out.mcap")
@@ -170,6 +174,54 @@ def test_status_lost_is_not_sent_but_reported() -> None:
     assert lost[0].twist_covariance is None
     assert max(r.level for r in kept.reports) == 2
     assert kept.reports[-1].level == 2 or kept.frames[-1].status is Status.OK
+
+
+@pytest.mark.parametrize("sec", [-5, 2**31, 2**32 - 1])
+def test_a_stamp_that_no_message_can_hold_is_dropped(sec: int) -> None:
+    stamps, T = flight(n=30)
+    live, kept, _ = engine()
+    for arrival in flown(stamps, T):
+        live.take(arrival)
+    for arrival in flown(sec * 10**9 + stamps - stamps[0], T):
+        live.take(arrival)
+    assert len(kept.frames) == len(T)
+    assert live.stage.counts["clock"] == len(T)
+
+
+class _Down(Kept):
+    """An output whose link is down in the middle of a flight, and a file that cannot be finished."""
+
+    def odometry(self, odometry: Odometry) -> None:
+        if 10 <= len(self.frames) < 20:
+            self.frames.append(odometry)
+            raise OSError("network is unreachable") if len(self.frames) % 2 else struct.error("too large to pack")
+        super().odometry(odometry)
+
+    def close(self) -> None:
+        raise GpvoError("cannot be written: no space left", where="out.bag")
+
+
+def test_a_link_that_is_down_and_a_state_that_cannot_be_saved_end_nothing(tmp_path: Path) -> None:
+    stamps, T = flight(n=60)
+    folder, told, kept, closed = tmp_path / "gone", [], Kept(), []
+    folder.mkdir()
+    kept.close = lambda: closed.append(True)
+    settings = EngineSettings(state=folder / "state.json")
+    live = Engine(PoseStage(TOPIC), shim_predictor(), [_Down(), kept], settings, tell=told.append)
+    for k, arrival in enumerate(flown(stamps, T)):
+        if k == 1:
+            shutil.rmtree(folder)
+        live.take(replace(arrival, received_ns=k * 10**9))
+    assert len(kept.frames) == len(T)
+    assert live.counts["output_failed"] == 10
+    assert live.counts["failed"] == 0
+    assert any("network is unreachable" in text for text in told)
+    assert any("the state is not saved" in text for text in told)
+    with pytest.raises(GpvoError, match="no space left"):
+        live.close()
+    assert closed
+    with pytest.raises(GpvoError, match="no such folder"):
+        engine(settings)
 
 
 def _with_truth(factor: float, state: Path | None = None, covariance: float = 1e-12) -> tuple[Engine, list[Arrival]]:

@@ -58,7 +58,7 @@ def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -
     [
         ("bag", "file", "file: is a file, and a ROS 2 bag is a folder"),
         ("mcap", "file", "file: is a file"),
-        ("bag", "folder.bag", "folder.bag: is a folder"),
+        ("bag", "folder.bag", "folder.bag: exists"),
         ("mavlink", "folder", "folder: is a folder"),
     ],
 )
