@@ -81,12 +81,13 @@ class EurocSource(FileSource):
         return read_imu_csv(file, shift_s=self.rig.timeshift_cam_imu_s, noise=noise, remark=self.remark)
 
     def _read_truth(self, mav: Path, noise: TruthNoise | None) -> TruthLog | None:
-        if self.mounting.T_imu_cam is None:
-            return None
         for folder, usual in _EUROC_TRUTH:
             file = mav / folder / "data.csv"
             if not file.is_file():
                 continue
+            if self.mounting.T_imu_cam is None:
+                self.remark("ground truth not used: the calibration does not say where the IMU sits")
+                return None
             stated = _stated_noise(mav / folder / "sensor.yaml")
             T_marker_imu = _marker_to_imu(mav, folder)
             truth = carry(read_euroc_csv(file), T_marker_imu @ self.mounting.T_imu_cam, noise or stated or usual)

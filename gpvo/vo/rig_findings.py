@@ -10,11 +10,11 @@ import numpy as np
 
 from gpvo.cameras.kalibr import make_lens
 from gpvo.cameras.rectify import rectifying_rotations
-from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.files import read_json
 from gpvo.geometry import se3
-from gpvo.types import StereoCamera
+from gpvo.types import Array, StereoCamera
 from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 
 STATE_FILE = "calibration_state.json"
@@ -162,15 +162,23 @@ def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRi
             kind = "radtan" if "radtan" in c["model"] else "equidistant"
             width, height = c["resolution_px"]
             lenses.append(make_lens("pinhole", kind, c["intrinsics_px"], c["distortion"], (width, height), "rig.json"))
-        return StereoRig(lenses[0], lenses[1], np.array(calibration["T_right_left"], np.float64))
+        T_imu_left = calibration.get("T_imu_left")
+        return StereoRig(
+            lenses[0],
+            lenses[1],
+            np.array(calibration["T_right_left"], np.float64),
+            T_imu_left=None if T_imu_left is None else check_pose(T_imu_left, "T_imu_left", "rig.json"),
+            timeshift_cam_imu_s=float(calibration.get("timeshift_cam_imu_s", 0.0)),
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"is not what it should be: {error}", where="rig.json") from None
 
 
 def camchain(rig: StereoRig) -> str:
-    """The rig as Kalibr's ``camchain.yaml``."""
+    """The rig as Kalibr's ``camchain.yaml``, with the place and the clock of the IMU where they are known."""
+    T_left_imu = None if rig.T_imu_left is None else se3.inverse(rig.T_imu_left)
     lines = []
-    for name, lens in (("cam0", rig.left), ("cam1", rig.right)):
+    for name, lens, T_cam_left in (("cam0", rig.left, np.eye(4)), ("cam1", rig.right, rig.T_right_left)):
         fisheye = len(lens.distortion) == 4
         numbers = [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px]
         lines += [f"{name}:", "  camera_model: pinhole", f"  intrinsics: {_list(numbers)}"]
@@ -179,7 +187,15 @@ def camchain(rig: StereoRig) -> str:
             f"  distortion_coeffs: {_list(lens.distortion if any(lens.distortion[4:]) else lens.distortion[:4])}",
             f"  resolution: [{lens.width}, {lens.height}]",
         ]
-    return "\n".join([*lines, "  T_cn_cnm1:", *(f"  - {_list(row)}" for row in rig.T_right_left)]) + "\n"
+        if T_left_imu is not None:
+            lines += _matrix("T_cam_imu", T_cam_left @ T_left_imu)
+        if rig.timeshift_cam_imu_s:
+            lines.append(f"  timeshift_cam_imu: {rig.timeshift_cam_imu_s!r}")
+    return "\n".join([*lines, *_matrix("T_cn_cnm1", rig.T_right_left)]) + "\n"
+
+
+def _matrix(name: str, T: Array) -> list[str]:
+    return [f"  {name}:", *(f"  - {_list(row)}" for row in T)]
 
 
 def _list(values: Any) -> str:

@@ -160,6 +160,18 @@ def test_euroc_truth_is_of_the_rectified_left_camera(tmp_path):
     assert source.mounting.T_body_cam is None
 
 
+def test_euroc_truth_without_the_place_of_the_imu(tmp_path):
+    path = seq.write_euroc(tmp_path / "s")
+    (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    source = open_source(path, calibration=tmp_path / "camchain.yaml")
+    assert source.truth is None
+    note = "ground truth not used: the calibration does not say where the IMU sits"
+    assert source.report.notes.count(note) == 1
+    list(source)
+    assert source.report.notes.count(note) == 1
+    assert note not in open_source(path).report.notes
+
+
 def test_body_that_says_it_is_flu_and_stated_noise(tmp_path):
     path = seq.write_euroc(tmp_path / "s")
     (path / "mav0" / "body.yaml").write_text("comment: made\naxes: FLU\n")

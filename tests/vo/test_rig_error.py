@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.cameras.kalibr import read_camchain
+from gpvo.cameras.kalibr import read_camchain, read_yaml
+from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError
 from gpvo.files import write_json
 from gpvo.geometry import se3
@@ -179,3 +180,20 @@ def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
     w = se3.so3_log(read.T_right_left[:3, :3])
     assert w[axis] == pytest.approx(3e-3, rel=0.1)
     assert np.abs(np.delete(w, axis)).max() < 3e-4
+
+
+def test_corrected_camera_chain_keeps_the_imu(tmp_path: Path) -> None:
+    left = rig_of(None, CAMERA).left
+    T_right_left = se3.exp(np.array([-0.12, 0.001, 0.002, 0.01, -0.02, 0.005]))
+    T_imu_left = se3.exp(np.array([0.03, -0.02, 0.05, 0.3, 1.1, -0.7]))
+    calibrated = StereoRig(left, left, T_right_left, T_imu_left=T_imu_left, timeshift_cam_imu_s=-0.0123)
+    rig = rig_of(calibrated.describe(), CAMERA)
+    path = tmp_path / "corrected.yaml"
+    path.write_text(camchain(corrected(rig, RigState(_turn(1, 3e-3), np.eye(2 * N_TERMS), 1.0), CAMERA)))
+    read = read_camchain(path)  # which also compares T_cn_cnm1 with both T_cam_imu
+    assert read.T_imu_left is not None
+    assert np.allclose(read.T_imu_left, T_imu_left, atol=1e-12)
+    assert read.timeshift_cam_imu_s == -0.0123
+    T_right_imu = np.array(read_yaml(path)["cam1"]["T_cam_imu"])
+    assert np.allclose(T_right_imu, read.T_right_left @ se3.inverse(T_imu_left), atol=1e-12)
+    assert "imu" not in camchain(rig_of(None, CAMERA))
