@@ -89,7 +89,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     if not rows:
         raise SourceError("holds a header and no rows", where=path)
     column = header[targets[stamp]]
-    check_interval(stamps, path, f"name the unit: --map {column}=t_us, or t_ms, t_s, t_ns")
+    check_interval(stamps, path, f"name the unit: --map {column}=t_us, or t_ms, t_s, t_ns", is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
     used = {targets[n] for n in targets}
     unused = tuple(c for k, c in enumerate(header) if k not in used and _UNCERTAIN.search(c))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -25,6 +25,9 @@ _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns":
 _LIMITS = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (np.inf, "ns"))
 # Usual intervals of any odometry [ns]; beyond them the stamps are in another unit.
 _SHORTEST_NS, _LONGEST_NS = 1e5, 1e12
+# The same where the stamps, read as nanoseconds, are of the size of today's microseconds: of frames 2 s apart, and no
+# camera's after 28 hours up time.
+_SHORTEST_AS_US_NS = 2e6
 
 
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -179,13 +182,17 @@ def usual_interval(t_ns: Iterable[int]) -> float | None:
     return float(np.median(np.diff(stamps))) if len(stamps) > 2 else None
 
 
-def check_interval(t_ns: Iterable[int], where: object, cure: str) -> None:
+def check_interval(t_ns: Sequence[int], where: object, cure: str, *, is_stated: bool = False) -> None:
     """Refuse stamps whose usual interval no odometry has, because they are in another unit than they were read in.
 
-    Raises SourceError, naming the interval, the likely unit and the ``cure``.
+    ``is_stated``: somebody said the unit, so that the size of the stamps is no reason to doubt it. Raises SourceError,
+    naming the interval, the likely unit and the ``cure``.
     """
     usual_ns = usual_interval(t_ns)
-    if usual_ns is None or _SHORTEST_NS <= usual_ns <= _LONGEST_NS:
+    if usual_ns is None:
+        return
+    is_like_us = not is_stated and likely_unit(str(max(t_ns))) == "us"
+    if (_SHORTEST_AS_US_NS if is_like_us else _SHORTEST_NS) <= usual_ns <= _LONGEST_NS:
         return
     # Too short: read as nanoseconds. Too long: read as seconds. Their own unit makes it a millisecond or more.
     limits = ((1e3, "ms"), (1e15, "us"), (np.inf, "ns"))

@@ -199,6 +199,18 @@ def test_stamps_in_other_units(tmp_path, unit, per_s):
     np.testing.assert_array_equal(read_foreign(path).t_ns, t)
 
 
+def test_microseconds_at_a_low_rate(tmp_path):
+    path = _csv(tmp_path / "a.csv", "timestamp,p_x,p_y,p_z,q_x,q_y,q_z,q_w", stamp="{}")
+    text = path.read_text()
+    for k in range(N):
+        text = text.replace(str(T_NS[k]), str(1_400_000_000_000_000 + 500_000 * k))
+    path.write_text(text)
+    with pytest.raises(SourceError, match="look like microseconds.*--map timestamp=t_us"):
+        read_foreign(path)
+    assert read_foreign(path, mapping={"timestamp": "t_ns"}).t_ns[1] == 1_400_000_000_500_000
+    assert read_foreign(path, mapping={"timestamp": "t_us"}).t_ns[1] == 1_400_000_000_500_000_000
+
+
 def test_a_column_mapped_to_seconds_is_seconds(tmp_path):
     path = _csv(tmp_path / "a.csv", "when,p_x,p_y,p_z,q_x,q_y,q_z,q_w", stamp="{}")
     with pytest.raises(SourceError, match="line 2: '1403636579763555584' is not a stamp in seconds"):

@@ -396,6 +396,30 @@ def test_names_in_another_unit(tmp_path, factor, unit):
     assert "nanoseconds" in _one_line(caught)
 
 
+@pytest.mark.parametrize("rate_hz", [0.6, 2.0, 10.0, 30.0])
+@pytest.mark.parametrize("kind", ["euroc", "folder"])
+def test_microseconds_at_low_rates(tmp_path, kind, rate_hz):
+    """16 digits, whose intervals would do for nanoseconds of a very fast camera."""
+    path = MAKERS[kind](tmp_path / "s")
+    name = {t: str(round(1.4e15 + k * 1e6 / rate_hz)) for k, t in enumerate(seq.stamps(12))}
+    for file in path.rglob("*.png"):
+        file.rename(file.with_stem(name[int(file.stem)]))
+    for camera in ("cam0", "cam1") if kind == "euroc" else ():
+        (path / "mav0" / camera / "data.csv").write_text("".join(f"{t},{t}.png\n" for t in name.values()))
+    with pytest.raises(SourceError, match="look like microseconds"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("uptime_s", [5, 3600, 20 * 86400])
+def test_nanoseconds_since_the_start_of_a_computer(tmp_path, uptime_s):
+    path = seq.write_folder(tmp_path / "s")
+    names = [f"{uptime_s * 10**9 + k * 5_000_000:013d}" for k in range(12)]  # 200 Hz
+    for side in ("left", "right"):
+        for file, name in zip(sorted((path / side).iterdir()), names, strict=True):
+            file.rename(file.with_stem(name))
+    assert [t for t, _ in seq.frames_of(open_source(path))] == [int(n) for n in names]
+
+
 FAR = "99999999999999999999"  # beyond 64 bit
 
 
