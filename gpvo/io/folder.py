@@ -19,8 +19,10 @@ from gpvo.io.trajectory import UNKNOWN, TruthNoise, carry, check_overlap, read_i
 _FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("left/data", "right/data"))
 _SIDE = re.compile(r"(?P<stem>.*?)[_-]?(?P<side>left|right|cam0|cam1|l|r)$", re.IGNORECASE)
 _DIGITS = re.compile(r"\d+(?:\.\d+)?")
+_DATE = re.compile(r"(?:19|20)\d\d\D?[01]\d\D?[0-3]\d\D?[0-2]\d\D?[0-5]\d")
 # Whole numbers of at least this many digits are nanoseconds since an epoch, not indices.
 _STAMP_DIGITS = 13
+_EPOCH_S = 1e6  # Behind other numbers, seconds of at least this size are a stamp, smaller ones part of a date.
 
 
 class FolderSource(FileSource):
@@ -119,7 +121,7 @@ def _key(file: Path) -> str:
 
 def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceReport) -> dict[str, int]:
     """Stamp [ns] of each key."""
-    numbers = {k: found[-1] for k in keys if (found := _DIGITS.findall(k))}
+    numbers = _numbers(keys)
     if len(numbers) == len(keys) and all("." in n or len(n) >= _STAMP_DIGITS for n in numbers.values()):
         try:
             return {k: seconds_text_to_ns(n) if "." in n else integer_ns(n) for k, n in numbers.items()}
@@ -130,11 +132,27 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
         return _stamps_by_line(path, keys, numbers, known)
     if rate_hz is not None and 1e-3 <= rate_hz <= 1e5 and len(numbers) == len(keys):
         return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
+    dates = " (dates are not read)" if _DATE.search(keys[0]) else ""
+    if rate_hz is not None and not numbers:
+        raise SourceError(
+            f"the last number of names such as '{keys[0]}' does not count the images{dates}",
+            where=path,
+            cure="name images by nanoseconds, number them, or add times.txt (seconds, a line per pair)",
+        )
     raise SourceError(
-        "the image names are not stamps, and there is no times.txt",
+        f"the image names are not stamps{dates}, and there is no times.txt",
         where=path,
         cure="name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz",
     )
+
+
+def _numbers(keys: list[str]) -> dict[str, str]:
+    """The last number of each key that has one; none at all where they do not tell the keys apart, or are parts of
+    versions or dates: with a dot, behind other numbers, and too small for seconds since an epoch."""
+    found = {k: f for k in keys if (f := _DIGITS.findall(k))}
+    numbers = {k: f[-1] for k, f in found.items()}
+    is_part = any("." in f[-1] and len(f) > 1 and float(f[-1]) < _EPOCH_S for f in found.values())
+    return {} if is_part or 2 * len(set(numbers.values())) < len(numbers) else numbers
 
 
 def _stamps_by_line(path: Path, keys: list[str], numbers: dict[str, str], known: SourceReport) -> dict[str, int]:

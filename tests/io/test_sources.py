@@ -225,6 +225,45 @@ def test_one_folder_with_sides_and_times(tmp_path):
     assert [k for _, k in seq.frames_of(open_source(tmp_path))] == [0, 1, 2, 4, 5, 6, 7, 9]
 
 
+def _named(path, name):
+    """The folder of 30 pairs with other names."""
+    seq.write_folder(path, 30)
+    for side in ("left", "right"):
+        for k, file in enumerate(sorted((path / side).iterdir())):
+            file.rename(file.with_stem(name(k)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        (
+            lambda k: f"2024-05-01_12-{30 + (k + 10) // 20}-{(570 + k) % 600 / 10:09.6f}",
+            r"not stamps \(dates are not read",
+        ),
+        (lambda k: f"20240501_12{30 + (k + 10) // 20}{(570 + k) % 600 / 10:09.6f}", r"not stamps \(dates are not read"),
+        (lambda k: f"frame_{k:04d}_v1.2", "not stamps, and there is no"),
+        (lambda k: f"frame-{k:04d}-640x480", "not stamps, and there is no"),
+    ],
+)
+def test_numbers_in_names_that_are_no_stamps(tmp_path, name, reason):
+    path = _named(tmp_path / "s", name)
+    with pytest.raises(SourceError, match=reason) as caught:
+        open_source(path)
+    assert "times.txt" in _one_line(caught)
+    with pytest.raises(SourceError, match="does not count the images") as caught:
+        open_source(path, rate_hz=10.0)
+    assert name(0) in _one_line(caught)
+    (path / "times.txt").write_text("".join(f"{10 + 0.1 * k:.3f}\n" for k in range(30)))
+    assert [k for _, k in seq.frames_of(open_source(path))] == list(range(30))
+
+
+@pytest.mark.parametrize("name", ["{:.6f}", "img_{:.6f}", "cam2_v1.2_{:.6f}"])
+def test_names_in_seconds(tmp_path, name):
+    path = _named(tmp_path / "s", lambda k: name.format(1_400_000_000 + 0.1 * k))
+    assert len(seq.frames_of(open_source(path))) == 30
+
+
 def test_folder_with_truth_and_imu(tmp_path):
     path = seq.write_folder(tmp_path / "s")
     euroc = seq.write_euroc(tmp_path / "e")
