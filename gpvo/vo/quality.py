@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.types import Array, Status, StereoCamera
-from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig
+from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
 from gpvo.vo.frontend import Matches, Observation, RightSearch
 from gpvo.vo.motion import Motion, predict_uvd, within
 from gpvo.vo.opencv import ImageStats
@@ -72,7 +72,7 @@ def judge(
     if frozen:
         return Verdict(Status.LOST, frozen)
     if motion is None:
-        return Verdict(Status.LOST, f"no motion fits the {matches.n_tracked} points found again")
+        return Verdict(Status.LOST, _no_motion(matches, config))
     inliers, tracked = int(motion.inliers.sum()), max(matches.n_tracked, 1)
     if inliers < config.min_inliers or inliers < 0.12 * tracked:
         return Verdict(Status.LOST, f"only {inliers} of {tracked} points agree")
@@ -93,6 +93,15 @@ def judge(
     if spread.max() < 0.05 * camera.width / camera.fx_px:
         doubts.append("all points lie in a small part of the image")
     return Verdict(Status.DEGRADED, "; ".join(doubts)) if doubts else Verdict(Status.OK)
+
+
+def _no_motion(matches: Matches, config: VoConfig) -> str:
+    """Why none was found: too far away is all that can be wrong with points before a motion is tried."""
+    strong = matches.strong
+    near, n = int((matches.uvd_prev[strong, 2] > TELLING_PX).sum()), int(strong.sum())
+    if near < config.min_inliers <= n:
+        return f"only {near} of {n} points are near enough to tell a motion (disparity over {TELLING_PX:g} px)"
+    return f"no motion fits the {matches.n_tracked} points found again"
 
 
 def _all_at_infinity(motion: Motion) -> bool:

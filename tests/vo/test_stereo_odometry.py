@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -16,6 +17,7 @@ from gpvo.vo.odometry import StereoOdometry
 
 pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
 from rendered_clip import Clip, pinhole, render_clip, wander
+from stereo_points import CAMERA, scene
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +167,19 @@ def test_few_points_and_far_points_are_doubted(clip: Clip) -> None:
     odometry.step(tracks(0, 9, 1.2, 0.3))
     record = odometry.step(tracks(10**8, 9, 1.2, 0.3))
     assert record.status is not Status.OK
+
+
+def test_points_too_far_away_are_named() -> None:
+    """A camera that looks down from 60 m, its baseline a tenth of a metre: half a pixel of disparity."""
+    rng = np.random.default_rng(0)
+    _, before, after = scene(rng, 200, (0.4, 0.6))
+    odometry = StereoOdometry(CAMERA)
+    records = [
+        odometry.step(TrackFrame(k * 100_000_000, np.arange(200), uvd[:, :2], uvd[:, :2] - uvd[:, 2:] * [1.0, 0.0]))
+        for k, uvd in enumerate((before, after))
+    ]
+    assert records[1].status is Status.LOST
+    assert re.fullmatch(r"only \d of \d+ points are near enough to tell .* \(disparity over 1 px\)", records[1].reason)
 
 
 def test_refuses_what_it_cannot_mean(clip: Clip) -> None:
