@@ -187,7 +187,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     if not path.is_file():
         raise CalibrationError("no such mask image", where=path)
     raw = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE) if is_decodable(raw.data) else None
+    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if is_decodable(raw.data) else None
     if image is None:
         raise CalibrationError("not readable as an image", where=path, cure="give the mask as PNG")
     white = image > 127

@@ -22,6 +22,7 @@ from gpvo.parallel import prefetched
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+_AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _MAX_IMAGE_BYTES = 500_000_000
 _MAX_HEAD_BYTES = 1 << 20  # Thumbnails and colour profiles stand before the size.
 # Are left and right swapped? Points in front of both cameras lie further right in the left image.
@@ -68,14 +69,17 @@ def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
 
 
 def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
-    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8; None where they are no image, or claim to be larger than any."""
+    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8; None where they are no image, or claim to be larger than any.
+
+    As stored, not turned by an Exif orientation: that is what the calibration and the size in the header are of.
+    """
     if not is_decodable(raw.data):
         return None
     # A damaged image is counted and reported by us; OpenCV need not warn as well.
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        image = cv2.imdecode(raw, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        image = cv2.imdecode(raw, _AS_STORED)
     except cv2.error:
         return None
     finally:
@@ -163,10 +167,10 @@ class ImageSource(ABC):
         for raw in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
             yield StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
-        if report.frames == 0:
-            raise SourceError("not one readable image pair", where=self.path)
 
     def _readable(self, report: SourceReport) -> Iterator[StereoFrame]:
+        """The pairs that can be used, as they are. Raises SourceError at the end where there was none."""
+        problem = "not one readable image pair"
         for t_ns, left, right in self.raw_pairs(report):
             if left is None or right is None:
                 report.unreadable += 1
@@ -174,8 +178,15 @@ class ImageSource(ABC):
             elif not (self._fits(left, self.rig.left) and self._fits(right, self.rig.right)):
                 report.unreadable += 1
                 report.note(f"image of another size at {t_ns} ns")
+                sizes = [f"{w}x{h}" for h, w in (left.shape, right.shape)]
+                problem = (
+                    problem and f"no image pair has the size of its calibration: the last is {' and '.join(sizes)}"
+                )
             else:
+                problem = ""
                 yield StereoFrame(t_ns, left, right)
+        if problem:
+            raise SourceError(problem, where=self.path)
 
     @staticmethod
     def _fits(image: Image8, lens: Any) -> bool:

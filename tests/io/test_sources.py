@@ -516,6 +516,29 @@ def test_all_images_unreadable(tmp_path):
         list(open_source(path))
 
 
+def test_all_images_of_another_size(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 4)
+    source = open_source(path)
+    for file in (path / "right").iterdir():
+        seq.write_image(file, seq.grey(0).T)
+    with pytest.raises(SourceError, match=r"no image pair has the size .* 64x48 and 48x64"):
+        list(source)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_an_exif_orientation_turns_nothing(tmp_path, orientation):
+    path = seq.write_folder(tmp_path / "s", 4)
+    picture = np.add.outer(np.arange(seq.HEIGHT), 3 * np.arange(seq.WIDTH)).astype(np.uint8)
+    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+    tag = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)
+    exif = b"\xff\xe1" + (len(tag) + 8).to_bytes(2, "big") + b"Exif\0\0" + tag
+    for file in path.rglob("*.png"):
+        file.with_suffix(".jpg").write_bytes(jpeg[:2] + exif + jpeg[2:])
+        file.unlink()
+    for frame in open_source(path):
+        assert np.abs(frame.left[2:-2, 2:-2].astype(int) - picture[2:-2, 2:-2]).mean() < 3
+
+
 @pytest.mark.parametrize("kind", MAKERS)
 def test_no_traceback_whatever_is_cut(tmp_path, kind):
     """Any one text file cut short or filled with rubbish gives a GpvoError or works, nothing else."""
