@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.images import Image8, decode_grey8, to_grey8
-from gpvo.io.source import SourceReport
+from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import no_pair
 
 # OpenCV names the pattern by its second row and column.
@@ -39,11 +39,11 @@ _LUMA = {
 _WAITING = 12
 
 
-def decode_message(message: Any, bits: int = 16) -> Image8 | None:
+def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
     """A sensor_msgs Image or CompressedImage as (H, W) uint8; None where it is damaged or of unknown encoding."""
     raw = np.asarray(message.data, dtype=np.uint8)
     if not hasattr(message, "encoding"):
-        return decode_grey8(raw, bits)
+        return decode_grey8(raw, depth)
     name = str(message.encoding).lower()
     stride, first = _LUMA.get(name, (1, 0))
     kind, channels, bgr = ("u1", 1, True) if name in _LUMA else _ENCODINGS.get(name, ("", 0, True))
@@ -56,7 +56,7 @@ def decode_message(message: Any, bits: int = 16) -> Image8 | None:
     pixels = pixels.astype(kind, copy=False).reshape(height, width, channels)
     if name.startswith("bayer_"):
         pixels = np.asarray(cv2.cvtColor(pixels, _BAYER[name.rstrip("0123456789")]))
-    return to_grey8(pixels, bgr=bgr, bits=bits)
+    return to_grey8(pixels, bgr=bgr, depth=depth)
 
 
 class PairQueue:

@@ -124,7 +124,7 @@ class BagSource(ImageSource):
         with open_bag(self.path) as reader:
             stream = messages(reader, [topics.left, topics.right])
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
-                yield t_ns, decode_message(left, self.bits), decode_message(right, self.bits)
+                yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
     def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
         try:

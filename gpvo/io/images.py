@@ -16,7 +16,7 @@ from gpvo.cameras.imagesize import image_size, is_decodable
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.source import SourceReport
+from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import check_interval, in_order, usual_interval
 from gpvo.parallel import prefetched
 from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
@@ -39,8 +39,8 @@ _FRAMES = 5
 Image8 = NDArray[np.uint8]
 
 
-def to_grey8(image: NDArray[Any], *, bgr: bool = True, bits: int = 16) -> Image8:
-    """(H, W) uint8 from a grey or colour image of 8 or 16 bit, whose samples fill the lower ``bits`` of the 16."""
+def to_grey8(image: NDArray[Any], *, bgr: bool = True, depth: Depth | None = None) -> Image8:
+    """(H, W) uint8 from a grey or colour image of 8 or 16 bit."""
     if image.ndim == 3:
         channels = image.shape[2]
         if channels == 1:
@@ -50,14 +50,11 @@ def to_grey8(image: NDArray[Any], *, bgr: bool = True, bits: int = 16) -> Image8
             code = (cv2.COLOR_BGRA2GRAY if bgr else cv2.COLOR_RGBA2GRAY) if code is None else code
             image = np.asarray(cv2.cvtColor(image, code))
     if image.dtype == np.uint16:
-        # Rounded, not cut: cutting would darken by half a step.
-        shift = bits - 8
-        half = (1 << shift) >> 1
-        return np.asarray(np.minimum((image.astype(np.uint32) + half) >> shift, 255), dtype=np.uint8)
+        return (depth or Depth()).to8(image)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
-def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
+def read_grey8(path: Path, depth: Depth | None = None) -> Image8 | None:
     """An image file as (H, W) uint8; None where it is missing, damaged or no image."""
     try:
         if not 0 < path.stat().st_size <= _MAX_IMAGE_BYTES:
@@ -65,10 +62,10 @@ def read_grey8(path: Path, bits: int = 16) -> Image8 | None:
         raw = np.fromfile(path, dtype=np.uint8)
     except OSError:
         return None
-    return decode_grey8(raw, bits)
+    return decode_grey8(raw, depth)
 
 
-def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
+def decode_grey8(raw: NDArray[np.uint8], depth: Depth | None = None) -> Image8 | None:
     """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8; None where they are no image, or claim to be larger than any.
 
     As stored, not turned by an Exif orientation: that is what the calibration and the size in the header are of.
@@ -86,7 +83,7 @@ def decode_grey8(raw: NDArray[np.uint8], bits: int = 16) -> Image8 | None:
         cv2.utils.logging.setLogLevel(level)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
-    return to_grey8(image, bits=bits)
+    return to_grey8(image, depth=depth)
 
 
 @dataclass(frozen=True)
@@ -121,8 +118,7 @@ class ImageSource(ABC):
         bits: int = 16,
         prefetch: bool = True,
     ) -> None:
-        if not 8 <= bits <= 16:
-            raise SourceError(f"images of {bits} bits are not possible", cure="bits is from 8 to 16")
+        self.depth, self._prefetch = Depth(bits), prefetch
         if mask_left is not None or mask_right is not None:
             left, right = (None if m is None else read_mask(Path(m)) for m in (mask_left, mask_right))
             rig = rig.with_masks(left, right)
@@ -137,7 +133,6 @@ class ImageSource(ABC):
         self.report = self._fresh_report()
         R_rect_left = self.rectifier.R_rect_left.tolist()
         self.calibration: dict[str, Any] | None = {**rig.describe(), "R_rect_left": R_rect_left}
-        self.bits, self._prefetch = bits, prefetch
         self.span_ns: tuple[int, int] = (0, 0)
         self.usual_interval_ns: float | None = None
 
@@ -167,6 +162,8 @@ class ImageSource(ABC):
         for raw in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
             yield StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
+        if doubt := self.depth.doubt():
+            report.note(doubt)
 
     def _readable(self, report: SourceReport) -> Iterator[StereoFrame]:
         """The pairs that can be used, as they are. Raises SourceError at the end where there was none."""
@@ -219,7 +216,7 @@ class FileSource(ImageSource):
                 report.missing += 1
                 report.note(f"missing {absent[0].parent.name}/{absent[0].name}")
                 continue
-            yield pair.t_ns, read_grey8(pair.left, self.bits), read_grey8(pair.right, self.bits)
+            yield pair.t_ns, read_grey8(pair.left, self.depth), read_grey8(pair.right, self.depth)
 
 
 def _size_of(path: Path) -> tuple[int, int] | None:

@@ -55,6 +55,39 @@ class SourceReport:
         return f"{self.frames} frames" + (f" ({', '.join(bad)})" if bad else "")
 
 
+class Depth:
+    """Depth of 16-bit images: ``bits``, the lower ones of the 16 that samples fill, and ``most``, the largest sample so
+    far.
+
+    Raises SourceError where ``bits`` is not from 8 to 16.
+    """
+
+    def __init__(self, bits: int = 16) -> None:
+        if not 8 <= bits <= 16:
+            raise SourceError(f"images of {bits} bits are not possible", cure="bits is from 8 to 16")
+        self.bits, self.most = bits, 0
+
+    def to8(self, samples: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """Samples of any shape in 8 bit."""
+        self.most = max(self.most, int(samples.max(initial=0)))
+        # Rounded, not cut: cutting would darken by half a step.
+        shift = self.bits - 8
+        half = (1 << shift) >> 1
+        return np.asarray(np.minimum((samples.astype(np.uint32) + half) >> shift, 255), dtype=np.uint8)
+
+    def doubt(self) -> str:
+        """What the largest sample says against ``bits``; empty for nothing."""
+        if self.most >> self.bits:
+            cure = self.most.bit_length()
+            return (
+                f"samples reach {self.most}, more than {self.bits} bits hold: what is brighter is cut (--bits {cure})"
+            )
+        likely = next(n for n in (8, 10, 12, 16) if self.most < 1 << n)
+        if self.most and likely < self.bits == 16:
+            return f"the samples of 16-bit images reach only {self.most}: are these {likely} bits (--bits {likely})?"
+        return ""
+
+
 @runtime_checkable
 class Source(Protocol):
     """A stereo sequence, rectified, or stereo tracks.

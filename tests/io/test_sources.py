@@ -288,6 +288,30 @@ def test_sixteen_bit_images(tmp_path):
     assert [k for _, k in seq.frames_of(open_source(path, bits=12))] == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize(
+    ("bits", "most", "doubt"),
+    [
+        (16, 1020, "reach only 1020: are these 10 bits"),
+        (16, 4095, "reach only 4095: are these 12 bits"),
+        (16, 4096, None),
+        (12, 4095, None),
+        (12, 1020, None),
+        (12, 65520, "reach 65520, more than 12 bits hold"),
+        (10, 4095, r"reach 4095, more than 10 bits hold: .* \(--bits 12\)"),
+    ],
+)
+def test_depth_that_does_not_fit(tmp_path, bits, most, doubt):
+    path = seq.write_folder(tmp_path / "s", 4)
+    for file in path.rglob("*.png"):
+        seq.write_image(file, np.full((seq.HEIGHT, seq.WIDTH), most, np.uint16))
+    source = open_source(path, bits=bits)
+    for _ in range(2):
+        list(source)
+        notes = source.report.notes
+        assert len(notes) == 1 if doubt else not notes
+        assert doubt is None or re.search(doubt, notes[0])
+
+
 def test_user_mask_reaches_the_source(tmp_path):
     path = seq.write_folder(tmp_path / "s", 3)
     mask = np.full((seq.HEIGHT, seq.WIDTH), 255, np.uint8)
