@@ -8,13 +8,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpvo.geometry.covariance import correlation as correlation_of
-from gpvo.geometry.covariance import is_positive_definite, scaled_root, symmetrise
+from gpvo.geometry.covariance import correlation, is_positive_definite, scaled_root, symmetrise
 from gpvo.online.stored import Stored
 from gpvo.types import Array, MotionError
 
 PARTS = ("jitter", "white", "bias")
 LN_FASTEST = float(np.log(20.0))
+LEAST_LEFT = 1e-6  # Of a variance, whatever a wrong calibration takes.
 _RIDGE = 1e-6 * np.eye(6)
 
 
@@ -106,13 +106,13 @@ def of_calibration(variance: Array, patterns: Array, twist: Array) -> tuple[Arra
     A wrong baseline, focal length or rectification makes errors that are linear in the motion and reverse with it: a
     scale that is 1 % off adds on the way out what it takes back on the way home. Each of ``patterns`` (P, D, 6) is one
     way to be wrong, by its usual amount: the error of a motion at unit velocities. ``twist`` (n, 6) [m/s, rad/s];
-    unknown ones contribute nothing. The share never exceeds the whole variance, however fast the motion.
+    unknown ones contribute nothing. However fast the motion, a millionth of the variance is left.
     """
     P, D, _ = patterns.shape
     known = np.where(np.isfinite(twist), twist, 0.0)
     root = (known @ patterns.reshape(P * D, 6).T).reshape(-1, P, D).swapaxes(1, 2)
     left = variance / (variance + (root**2).sum(axis=-1))
-    return root * np.sqrt(left)[..., None], variance * left
+    return root * np.sqrt(left)[..., None], variance * np.maximum(left, LEAST_LEFT)
 
 
 def ln_faster(v_mps: Array, ln_typical: ArrayLike) -> Array:
@@ -134,7 +134,7 @@ def _regular(correlation: Array) -> Array:
 def _correlations(geometry: Array) -> Array:
     """(n, 6, 6) correlations of covariances; NaN throughout where one is not positive semidefinite."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        R = symmetrise(correlation_of(geometry))
+        R = symmetrise(correlation(geometry))
     ridge = R + _RIDGE
     try:
         good = np.isfinite(np.linalg.cholesky(ridge)).all()

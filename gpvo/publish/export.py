@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from gpvo.errors import GpvoError
 from gpvo.files import write_text
 from gpvo.online.base import motion_noise, positions
+from gpvo.online.division import LEAST_LEFT
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.predictor import Predictor
 from gpvo.online.stored import LARGEST
@@ -144,6 +145,7 @@ def _constants(model: ErrorModel) -> list[str]:
         "LN_LARGEST": _number(LN_LARGEST),
         "LARGEST": _number(LARGEST),
         "LEAST_VAR": _number(LEAST_VAR),
+        "LEAST_LEFT": _number(LEAST_LEFT),
         "SHORTEST_S": _number(DURATIONS_S[0]),
         "LONGEST_S": _number(DURATIONS_S[1]),
         "NU": _number(model.nu[0]),

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from gpvo.errors import MissingExtraError
 from gpvo.files import replacing
 from gpvo.online.base import motion_noise, positions
-from gpvo.online.division import LN_FASTEST, PARTS
+from gpvo.online.division import LEAST_LEFT, LN_FASTEST, PARTS
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.stored import LARGEST
 from gpvo.types import Array
@@ -231,7 +231,8 @@ def _of_calibration(g: _Graph, model: ErrorModel, variance: str) -> tuple[str, s
     flat = g("MatMul", g("Where", g.known(v), v, 0.0), g.constant(patterns))
     root = g("Reshape", flat, g.constant([-1, 6, 6], np.int64))
     left = g("Div", variance, g("Add", variance, g.sum(g("Mul", root, root), 2)))
-    return g("Mul", root, g.expand(g("Sqrt", left), 2), out="calibration_root"), g("Mul", variance, left)
+    rest = g("Mul", variance, g("Max", left, LEAST_LEFT))
+    return g("Mul", root, g.expand(g("Sqrt", left), 2), out="calibration_root"), rest
 
 
 def _shares(g: _Graph, model: ErrorModel, variance: str) -> list[str]:

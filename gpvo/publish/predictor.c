@@ -177,7 +177,7 @@ static double gpvo_of_calibration(const double *features, int j, double variance
     }
     left = variance / (variance + sum);
     for (p = 0; p < 6; ++p) root[p] *= sqrt(left);
-    return variance * left;
+    return variance * (left < GPVO_LEAST_LEFT ? GPVO_LEAST_LEFT : left);
 }
 
 /* Standard deviations of jitter, white and bias on axis j, of a variance: what adds up gains on the jitter as the speed

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.errors import GpvoError, ModelError
+from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from gpvo.online.stored import spec_of
@@ -110,6 +111,23 @@ def test_arrays_against_the_schema_are_refused(case: str, parts, tmp_path: Path)
     with pytest.raises(ModelError, match=r"evil\.gpvo: ") as refusal:
         Predictor.load(tmp_path / "evil.gpvo")
     assert "\n" not in str(refusal.value)
+
+
+EXTREMES: dict[str, dict[str, float]] = {
+    "a calibration that explains all": {"calibration_patterns": 1e6},
+}
+
+
+@pytest.mark.parametrize("case", EXTREMES)
+def test_the_schema_leaves_no_room_for_a_covariance_that_is_none(case: str, parts, tmp_path: Path) -> None:
+    arrays, header = parts
+    arrays |= {name: np.full_like(arrays[name], value) for name, value in EXTREMES[case].items()}
+    modelfile.save(tmp_path / "odd.gpvo", arrays, header)
+    model = Predictor.load(tmp_path / "odd.gpvo").model
+    speeds = np.linspace(0.0, 100.0, 50)[:, None] * np.array([c.startswith("v_") for c in model.columns])
+    odd = np.array([np.nan, 1e-9, 10.0, 1e11])[:, None] * np.ones(len(model.columns))
+    stated = model.estimate(np.concatenate([model.domain.centre + speeds, odd])).covariance
+    assert all(is_positive_definite(C) for C in stated)
 
 
 def test_a_file_of_an_older_version_is_refused_with_a_cure(parts, tmp_path: Path) -> None:

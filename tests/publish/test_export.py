@@ -101,6 +101,9 @@ CASES = {
     "no geometry": some_model(method=None),
     "noise of the residuals": some_model(residual=True),
     "errors of calibration": some_model(calibration=some_calibration()),
+    "nothing but errors of calibration": some_model(
+        calibration={"calibration_patterns": np.full((6, 6, 6), 1e6), "calibration_tau_s": np.ones(6)}
+    ),
 }
 
 
