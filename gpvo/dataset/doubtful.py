@@ -196,23 +196,26 @@ def _of_direction(error: Array, true: Array, noise: Array, count: int) -> list[t
     """By the ``error`` (M, 3), with its ``noise`` (M, 3), of motions that are truly ``true`` (M, 3), across these."""
     length = np.linalg.norm(true, axis=1)
     moving, path = _moving(length, count), np.maximum(moving_sums(length, count), _NOWHERE_M)[:, None]
-    turn = _across(moving_sums(error, count), moving_sums(true, count)) / path
+    across = _across(moving_sums(true, count))
+    turn = np.einsum("wij,wj->wi", across, moving_sums(error, count)) / path
     usual = np.median(turn[moving], axis=0)
-    allowed = np.maximum(_spread(turn[moving] - usual), _noise_of_sums(noise, count) / path)
+    # Noise along one axis, as depth's, lies partly along another of what is across.
+    summed = np.sqrt(np.einsum("wij,wj->wi", across**2, _noise_of_sums(noise, count) ** 2))
+    allowed = np.maximum(_spread(turn[moving] - usual), summed / path)
     off = moving & (np.abs(turn - usual) > np.maximum(_SIGMAS * allowed, _LEAST_TURN)).any(axis=1)
     found = []
     for first, last in _runs(_covered(off, count)) if off.mean() <= _MOST else []:
         here = turn[first : last - count + 2][off[first : last - count + 2]].mean(axis=0) - usual
         degrees = float(np.rad2deg(np.arctan(np.linalg.norm(here))))
-        axis = ("sideways", "vertically", "along")[int(np.argmax(np.abs(here)))]
+        axis = ("sideways", "vertically", "in depth")[int(np.argmax(np.abs(here)))]
         found.append((first, last, f"truth leaves odometry's direction by {degrees:.1f} deg, {axis}"))
     return found
 
 
-def _across(errors: Array, motions: Array) -> Array:
-    """(W, 3) what of each error lies across its motion."""
+def _across(motions: Array) -> Array:
+    """(W, 3, 3) projection onto what lies across each motion (W, 3)."""
     unit = motions / np.maximum(np.linalg.norm(motions, axis=1, keepdims=True), _NOWHERE_M)
-    return np.asarray(errors - (errors * unit).sum(axis=1, keepdims=True) * unit)
+    return np.asarray(np.eye(3) - unit[:, :, None] * unit[:, None])
 
 
 def _moving(length: Array, count: int) -> NDArray[np.bool_]:

@@ -67,21 +67,33 @@ def verdict(e: Evaluation) -> Verdict:
         lines.append(f"Use {best} here: it is honest, and has the best likelihood of all.")
     if outside:
         lines.append("Train on runs with this camera in these conditions, with ground truth or with twins.")
-    per_motion = _word(_nees(judged[told]))
+    per_motion = _per_motion(judged[told])
     headline = f"The {told} covariance is {per_motion} per motion"
     if wrong and per_motion == "honest":
         headline += f", but not over {_listed(wrong)}"
     if outside:
         headline += "; the model does not know these conditions"
-    return Verdict("red" if outside or per_motion == "overconfident" else "amber", headline + ".", tuple(lines))
+    return Verdict("red" if outside or "overconfident" in per_motion else "amber", headline + ".", tuple(lines))
 
 
 _ALWAYS = ("triangulation", "pointing_matching", "imported")
 
 
-def _nees(c: Consistency) -> float:
+def _nees(c: Consistency, block: str = "joint") -> float:
     """Per motion; with the truth's own noise counted in, which nobody's odometry can know."""
-    return c.nees_dof_truth_noise["joint"] or float("nan")
+    return c.nees_dof_truth_noise[block] or float("nan")
+
+
+def _per_motion(c: Consistency, *, sized: bool = False) -> str:
+    """What a motion's covariance is; ``sized``: and by how much. Where it seems honest as a whole, translation and
+    rotation are judged apart: one may make up for the other."""
+    blocks = ("joint",) if _word(_nees(c)) != "honest" else ("translation", "rotation")
+    said = []
+    for block, nees in ((b, _nees(c, b)) for b in blocks):
+        if (word := _word(nees)) != "honest":
+            by = f" by a factor of {max(nees, 1.0 / nees) ** 0.5:.1f} in sigma" if sized else ""
+            said.append(word + by + ("" if block == "joint" else f" in {block}"))
+    return " and ".join(said) or "honest"
 
 
 def _word(nees: float, chance: float = 0.0) -> str:
@@ -100,20 +112,17 @@ def _spans(c: Consistency) -> Iterator[tuple[str, Horizon]]:
 
 def _wrong(c: Consistency) -> list[str]:
     """Over what the statement is wrong, beyond chance."""
-    out = [] if _word(_nees(c)) == "honest" else ["one motion"]
+    out = [] if _per_motion(c) == "honest" else ["one motion"]
     # Windows overlap by half, so half of them are independent: the mean of n chi-squared of 6 dof.
     chances = ((name, h, math.sqrt(2 / (6 * h.count / 2))) for name, h in _spans(c))
     return out + [name for name, h, chance in chances if _word(h.nees_dof_truth_noise, chance) != "honest"]
 
 
 def _line(method: str, c: Consistency) -> str:
-    nees = _nees(c)
-    off = max(nees, 1.0 / nees) ** 0.5 if nees > 0 else float("inf")
-    by = "" if _word(nees) == "honest" else f" by a factor of {off:.1f} in sigma"
     wrong = [w for w in _wrong(c) if w != "one motion"]
     then = f", not honest over {_listed(wrong)}" if wrong else ""
     over = "".join(f", {h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
-    return f"{method}: {_word(nees)}{by} per motion{then}; NEES/dof {nees:.2f}{over}."
+    return f"{method}: {_per_motion(c, sized=True)} per motion{then}; NEES/dof {_nees(c):.2f}{over}."
 
 
 def _listed(names: Sequence[str]) -> str:

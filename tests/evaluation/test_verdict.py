@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from evaluation_runs import make_run
 from gpvo.dataset.hand_eye import FixedRotation
@@ -13,11 +14,11 @@ from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.verdict import verdict
 from gpvo.io.run_read import Run
-from gpvo.types import Mounting, TruthLog, VoLog
+from gpvo.types import Array, Mounting, TruthLog, VoLog
 
 
-def evaluated(factors: dict[str, float]) -> Evaluation:
-    """A run whose methods state the true covariance times a factor each."""
+def evaluated(factors: dict[str, float | Array]) -> Evaluation:
+    """A run whose methods state the true covariance times a factor each, a number or (6, 6)."""
     log, truth = make_run(600)
     records = [
         replace(r, v_t={}, covariances={m: f * r.covariances["triangulation"] for m, f in factors.items()})
@@ -37,6 +38,18 @@ def test_one_method(factor: float, colour: str, word: str) -> None:
     assert word in found.headline
     if factor != 1.0:
         assert "by a factor of 3." in found.lines[0]
+
+
+def test_translation_does_not_make_up_for_rotation() -> None:
+    """Translation stated three times too large, rotation 1.55 times too small: as a whole that seems right."""
+    sigma = np.repeat([3.0, 1 / 1.55], 3)
+    evaluation = evaluated({"triangulation": np.outer(sigma, sigma)})
+    assert 0.5 < evaluation.consistency["triangulation"].nees_dof_truth_noise["joint"] < 2.0
+    found = verdict(evaluation)
+    assert found.colour == "red"
+    assert "too cautious in translation and overconfident in rotation" in found.headline
+    assert "too cautious by a factor of 3.0 in sigma in translation" in found.lines[0]
+    assert "overconfident by a factor of 1.6 in sigma in rotation" in found.lines[0]
 
 
 def test_the_method_that_is_true_is_named() -> None:
