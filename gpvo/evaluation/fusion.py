@@ -107,8 +107,20 @@ def fuse_runs(
     failed = [f"{name} is left out: {_why_not(name, constants)}" for name, row in result.scores.items() if not any(row)]
     if len(failed) == len(result.scores):
         raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
+    diverging = _diverging(result) if any(f.imu is not None for f in flights) else []
     origin = simulated_truth([run.meta for run in runs])
-    return FusionReport(result, tuple(traces), tuple(warnings + failed), origin)
+    return FusionReport(result, tuple(traces), tuple(warnings + failed + diverging), origin)
+
+
+def _diverging(result: Study) -> list[str]:
+    """A line where most policies diverge in most runs: then the covariances are not to blame."""
+    judged = {name: [s.diverged for s in row if s and s.diverged is not None] for name, row in result.scores.items()}
+    judged = {name: told for name, told in judged.items() if told}
+    n = sum(2 * sum(told) > len(told) for told in judged.values())
+    if 2 * n <= len(judged):
+        return []
+    suspects = "the accelerometer's sign, the IMU's axes, T_imu_cam and timeshift_cam_imu"
+    return [f"{n} of {len(judged)} policies diverge: suspect {suspects} (compare with --no-imu)"]
 
 
 def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:

@@ -4,26 +4,34 @@ axes, judged by gravity and by the motion of VO.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.filters.imu_motion import (
+    MIN_ROTATION_RAD,
+    MIN_ROTATIONS,
+    ClockShift,
+    Rotations,
+    about_their_means,
+    clock_shift,
+    jerks,
+)
 from gpvo.filters.plausible import MOST_MPS2, MOST_RADPS, on_one_clock, usable
 from gpvo.filters.run import Flight
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, VoRecord
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 # The 48 ways to call three axes by the wrong names and signs; the right one is the first.
 _RELABELLINGS = sorted(
     (np.eye(3)[list(p)] * np.array(s)[:, None] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)),
     key=lambda M: -np.trace(M),
 )
-_MIN_ROTATION_RAD = 0.02  # rms rotation of all motions together below which rotation says nothing about axes
-_WINDOW_S, _MIN_WINDOWS = 2.0, 5  # over which VO's motion is taken to be a cubic
+_WINDOWS_S, _MIN_WINDOWS = (2.0, 1.4, 1.0, 0.7), 5  # the first lengths of which a flight holds so many
 
 
 @dataclass(frozen=True)
@@ -138,9 +146,9 @@ def _units_and_axes(flight: Flight, imu: ImuLog) -> list[Finding]:
         return []
     acc_unit = list(_accelerometer_unit(clean))
     gyro = list(_gyroscope(flight, clean))
-    if acc_unit or gyro:
+    if acc_unit or any(f.kind != "clock" for f in gyro):
         return acc_unit + gyro
-    return list(_accelerometer_axes(clean)) or list(_accelerometer_sign(flight, clean))
+    return gyro + (list(_accelerometer_axes(clean)) or list(_accelerometer_sign(flight, clean)))
 
 
 def _in_time(imu: ImuLog) -> ImuLog:
@@ -178,31 +186,25 @@ def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
     yield Finding("acc_unit", f"the accelerometer's median reading is {g:.4g} m/s^2 where gravity is 9.81 m/s^2")
 
 
-def rotations(flight: Flight, imu: ImuLog) -> tuple[Array, Array]:
-    """Rotation vectors (M, 3) of VO's motions and of the integrated gyroscope, both in IMU axes [rad]."""
-    R_imu_cam = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3]
-    used = [r for r in flight.records if r.usable and np.isfinite(r.T_prev_cur).all() and 0 < r.dt_s < 1.0]
-    used = [r for r in used if imu.t_ns[0] <= r.t_prev_ns and r.t_ns <= imu.t_ns[-1]]
-    if not used:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    vo = se3.so3_log(np.array([r.T_prev_cur[:3, :3] for r in used])) @ R_imu_cam.T
-    t = (imu.t_ns - imu.t_ns[0]) * 1e-9
-    steps = 0.5 * (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) * np.diff(t)[:, None]
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    ends = [np.array([(getattr(r, n) - imu.t_ns[0]) * 1e-9 for r in used]) for n in ("t_ns", "t_prev_ns")]
-    at = [np.stack([np.interp(e, t, turned[:, i]) for i in range(3)], axis=1) for e in ends]
-    return vo, at[0] - at[1]
+def _late(clock: ClockShift) -> Finding:
+    side = "late" if clock.shift_s > 0 else "early"
+    text = (
+        f"the IMU's stamps seem {abs(clock.shift_s) * 1e3:.0f} ms too {side}: gyroscope and VO then turn together"
+        f" (correlation {clock.shifted:.2f}, as given {clock.given:.2f})"
+    )
+    return Finding("clock", text, f"add {clock.shift_s:.3f} to timeshift_cam_imu of the calibration", fatal=False)
 
 
 def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
-    vo, gyro = rotations(flight, imu)
-    if len(vo) >= 10:
-        # The largest twentieth of VO's rotations may be failures.
-        size = np.linalg.norm(vo, axis=1)
-        keep = size <= np.quantile(size, 0.95)
-        vo, gyro = vo[keep] - vo[keep].mean(axis=0), gyro[keep] - gyro[keep].mean(axis=0)
+    late = clock_shift(flight, imu)
+    if late is not None:
+        yield _late(late)
+    turns = Rotations(flight, imu)
+    vo, gyro = turns.vo, turns.gyro(0.0 if late is None else late.shift_s)
+    if len(vo) >= MIN_ROTATIONS:
+        vo, gyro = about_their_means(vo, gyro)
     energy_vo, energy_gyro = (vo**2).sum(), (gyro**2).sum()
-    turned = len(vo) >= 10 and bool(energy_vo >= _MIN_ROTATION_RAD**2)
+    turned = len(vo) >= MIN_ROTATIONS and bool(energy_vo >= MIN_ROTATION_RAD**2)
     if not imu.gyro_radps.any():
         # Of a noiseless simulation that never turns this is true.
         text = "the gyroscope reads exactly zero throughout: nothing measures the rates"
@@ -271,10 +273,14 @@ def _accelerometer_axes(imu: ImuLog, window_s: float = 10.0) -> Iterator[Finding
 def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     """With all axes turned around gravity stays put as well; but the force then falls where VO's motion rises.
 
-    Both are compared by their slopes, from which gravity and constant biases are gone.
+    Both are compared by their slopes, from which gravity and constant biases are gone. Of short windows, in which VO's
+    noise weighs more, nothing fatal is said.
     """
-    jerk, slope = _jerks(flight, imu)
-    if len(jerk) < _MIN_WINDOWS:
+    for window_s in _WINDOWS_S:
+        jerk, slope = jerks(flight, imu, window_s)
+        if len(jerk) >= _MIN_WINDOWS:
+            break
+    else:
         return
     # No window counts for more than three usual ones: in some VO may have failed.
     pair = [v / np.maximum(np.linalg.norm(v, axis=1), 3 * _usual(v))[:, None] for v in (jerk, slope)]
@@ -282,47 +288,11 @@ def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     # By chance the correlation of n pairs of values deviates from zero by 1 / sqrt(n).
     if correlation < -max(0.3, 3.0 / np.sqrt(pair[0].size)):
         text = f"the accelerometer falls where VO's motion rises (correlation {correlation:.2f}): its sign is wrong"
-        yield Finding("acc_sign", text, "multiply its three axes by -1")
+        yield Finding("acc_sign", text, "multiply its three axes by -1", fatal=window_s == _WINDOWS_S[0])
 
 
 def _usual(v: Array) -> float:
     return float(np.median(np.linalg.norm(v, axis=1))) + 1e-300
-
-
-def _jerks(flight: Flight, imu: ImuLog) -> tuple[Array, Array]:
-    """VO's jerk and the slope of the specific force (M, 3) [m/s^3], in camera axes at the start of each window."""
-    R_cam_imu = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3].T
-    t_imu = (imu.t_ns - imu.t_ns[0]) * 1e-9
-    areas = 0.5 * (imu.acc_mps2[1:] + imu.acc_mps2[:-1]) * np.diff(t_imu)[:, None]
-    impulse = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
-    found = []
-    for window in _unbroken(flight.records, _WINDOW_S):
-        t = np.array([(r.t_ns - imu.t_ns[0]) * 1e-9 for r in window])
-        if t[0] < 0 or t[-1] > t_imu[-1] or len(t) < _MIN_WINDOWS:
-            continue
-        chain = [np.eye(4)]
-        for record in window[1:]:
-            chain.append(chain[-1] @ record.T_prev_cur)
-        T = np.array(chain)
-        middle = 0.5 * (t[1:] + t[:-1])
-        felt = np.stack([np.diff(np.interp(t, t_imu, impulse[:, i])) for i in range(3)], axis=1) / np.diff(t)[:, None]
-        force = (T[1:, :3, :3] @ (R_cam_imu @ felt.T).T[:, :, None])[:, :, 0]
-        found.append((6.0 * np.polyfit(t - t[0], T[:, :3, 3], 3)[0], np.polyfit(middle - t[0], force, 1)[0]))
-    jerk, slope = (np.array([f[i] for f in found]).reshape(-1, 3) for i in (0, 1))
-    return jerk, slope
-
-
-def _unbroken(records: Sequence[VoRecord], window_s: float) -> Iterator[list[VoRecord]]:
-    """Windows of usable records each of which starts where the one before ended."""
-    window: list[VoRecord] = []
-    for record in records:
-        good = record.usable and bool(np.isfinite(record.T_prev_cur).all())
-        if window and not (good and record.t_prev_ns == window[-1].t_ns):
-            window = []
-        window.append(record)
-        if (record.t_ns - window[0].t_ns) * 1e-9 >= window_s:
-            yield window
-            window = [record]
 
 
 def _describe(M: Array) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight, require_sane
 from gpvo.types import ImuLog
-from synthetic_flights import synthetic_flight, with_geometric
+from synthetic_flights import ErrorLaw, synthetic_flight, with_geometric
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,38 @@ def test_a_wrong_imu_is_named(flight: Flight, change: Callable[[ImuLog], ImuLog]
     with pytest.raises(GpvoError) as error:
         require_sane(wrong)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("late_ms", [-120, -40, 60])
+def test_another_clock_is_measured(flight: Flight, late_ms: int) -> None:
+    wrong = _with_imu(flight, lambda i: replace(i, t_ns=i.t_ns + late_ms * 10**6))
+    (found,) = require_sane(wrong)
+    shift_s = float(re.search(r"add (-?[\d.]+) to timeshift_cam_imu", found.cure)[1])
+    assert found.kind == "clock"
+    assert shift_s == pytest.approx(late_ms * 1e-3, abs=0.01)
+    assert f"ms too {'late' if late_ms > 0 else 'early'}" in found.text
+    # As a reader applies it: t_imu = t_cam + shift.
+    assert wrong.imu is not None
+    assert require_sane(_with_imu(wrong, lambda i: replace(i, t_ns=i.t_ns - round(shift_s * 1e9)))) == []
+
+
+@pytest.mark.parametrize("late_ms", [0, 15])
+@pytest.mark.parametrize("noise", [1.0, 40.0])
+def test_no_other_clock_is_made_up(late_ms: int, noise: float) -> None:
+    usual = ErrorLaw()
+    law = ErrorLaw(usual.jitter * noise, usual.white * noise, usual.bias * noise)
+    for seed in range(5):
+        noisy = _with_imu(
+            synthetic_flight(seed, duration_s=8, law=law), lambda i: replace(i, t_ns=i.t_ns + late_ms * 10**6)
+        )
+        assert [f for f in check_flight(noisy) if f.kind in ("clock", "acc_sign")] == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_wrong_sign_in_a_short_flight_is_said(seed: int) -> None:
+    wrong = _with_imu(synthetic_flight(seed, duration_s=8), lambda i: replace(i, acc_mps2=-i.acc_mps2))
+    (found,) = require_sane(wrong)
+    assert found.kind == "acc_sign"
 
 
 def test_linear_acceleration_is_not_specific_force(flight: Flight) -> None:

@@ -114,6 +114,14 @@ def test_an_imu_in_g_is_refused_in_one_line(tmp_path: Path) -> None:
     assert "multiply it by 9.80665" in str(error.value)
 
 
+def test_most_policies_diverging_names_the_suspects(runs: list[Path], tmp_path: Path) -> None:
+    """A flight too short for the sign of the accelerometer to be told for sure: it is filtered, with a warning."""
+    settings = FusionSettings()
+    assert not any("diverge" in line for line in fuse_runs(runs[:1], settings).warnings)
+    wrong = fuse_runs([_write(tmp_path / "wrong", 0, imu_scale=-1.0)], settings).warnings
+    assert [line for line in wrong if "policies diverge: suspect the accelerometer's sign" in line]
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [

@@ -1,0 +1,121 @@
+"""What VO and an IMU both measure of one motion: how it turns, how its force changes, and by how much their clocks
+differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpvo.filters.run import Flight
+from gpvo.geometry import se3
+from gpvo.types import Array, ImuLog, VoRecord
+
+MIN_ROTATIONS = 10
+MIN_ROTATION_RAD = 0.02
+"""Rms rotation of all motions together below which rotation says nothing."""
+_MIN_POINTS = 5  # of a cubic
+_LATEST_S, _STEP_S = 0.2, 0.005  # shifts of the clock that are tried
+_SHIFT_S = 0.02  # below, a filter hardly notices
+_MIN_CORRELATION = 0.7
+_LESS_UNEXPLAINED = 0.7  # of the variance, as a factor
+
+
+@dataclass(frozen=True)
+class ClockShift:
+    """By how much the IMU's stamps are late [s], with the correlation of the rotations as given and so shifted."""
+
+    shift_s: float
+    given: float
+    shifted: float
+
+
+class Rotations:
+    """``vo`` (M, 3): rotation vectors of VO's motions, in IMU axes [rad], and those of the gyroscope between the same
+    stamps.
+
+    Motions within ``margin_s`` of the ends of the IMU's log are left out.
+    """
+
+    def __init__(self, flight: Flight, imu: ImuLog, margin_s: float = 0.0) -> None:
+        R_imu_cam = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3]
+        first, last = imu.t_ns[0] + round(margin_s * 1e9), imu.t_ns[-1] - round(margin_s * 1e9)
+        used = [r for r in flight.records if r.usable and np.isfinite(r.T_prev_cur).all() and 0 < r.dt_s < 1.0]
+        used = [r for r in used if first <= r.t_prev_ns and r.t_ns <= last]
+        T = np.array([r.T_prev_cur[:3, :3] for r in used]).reshape(-1, 3, 3)
+        self.vo: Array = se3.so3_log(T) @ R_imu_cam.T
+        self._ends = [np.array([(getattr(r, n) - imu.t_ns[0]) * 1e-9 for r in used]) for n in ("t_ns", "t_prev_ns")]
+        self._t = (imu.t_ns - imu.t_ns[0]) * 1e-9
+        steps = 0.5 * (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) * np.diff(self._t)[:, None]
+        self._turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def __len__(self) -> int:
+        return len(self.vo)
+
+    def gyro(self, late_s: float = 0.0) -> Array:
+        """(M, 3) of the integrated gyroscope [rad], its stamps taken to be late by ``late_s``."""
+        at = [np.stack([np.interp(e + late_s, self._t, axis) for axis in self._turned.T], axis=1) for e in self._ends]
+        return at[0] - at[1]
+
+
+def about_their_means(vo: Array, gyro: Array) -> tuple[Array, Array]:
+    """Both rotations (M, 3) less their means, without the largest twentieth of VO's, which may be failures."""
+    size = np.linalg.norm(vo, axis=1)
+    keep = size <= np.quantile(size, 0.95)
+    return vo[keep] - vo[keep].mean(axis=0), gyro[keep] - gyro[keep].mean(axis=0)
+
+
+def clock_shift(flight: Flight, imu: ImuLog) -> ClockShift | None:
+    """The shift of the IMU's clock, up to 0.2 s, by which it turns as VO does; None where that is no clear gain."""
+    turns = Rotations(flight, imu, _LATEST_S)
+    if len(turns) < MIN_ROTATIONS:
+        return None
+    shifts = np.arange(-round(_LATEST_S / _STEP_S), round(_LATEST_S / _STEP_S) + 1) * _STEP_S
+    pairs = [about_their_means(turns.vo, turns.gyro(s)) for s in shifts]
+    if (pairs[0][0] ** 2).sum() < MIN_ROTATION_RAD**2:
+        return None
+    correlation = np.array([(a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum() + 1e-300) for a, b in pairs])
+    best, given = int(np.argmax(correlation)), float(correlation[len(shifts) // 2])
+    found = ClockShift(float(shifts[best]), given, float(correlation[best]))
+    is_clear = found.shifted > _MIN_CORRELATION and 1 - found.shifted**2 < _LESS_UNEXPLAINED * (1 - given**2)
+    return found if is_clear and abs(found.shift_s) > _SHIFT_S else None
+
+
+def jerks(flight: Flight, imu: ImuLog, window_s: float) -> tuple[Array, Array]:
+    """VO's jerk and the slope of the specific force (M, 3) [m/s^3], in camera axes at the start of each window.
+
+    VO's motion is taken to be a cubic over ``window_s``.
+    """
+    R_cam_imu = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3].T
+    t_imu = (imu.t_ns - imu.t_ns[0]) * 1e-9
+    areas = 0.5 * (imu.acc_mps2[1:] + imu.acc_mps2[:-1]) * np.diff(t_imu)[:, None]
+    impulse = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
+    found = []
+    for window in _unbroken(flight.records, window_s):
+        t = np.array([(r.t_ns - imu.t_ns[0]) * 1e-9 for r in window])
+        if t[0] < 0 or t[-1] > t_imu[-1] or len(t) < _MIN_POINTS:
+            continue
+        chain = [np.eye(4)]
+        for record in window[1:]:
+            chain.append(chain[-1] @ record.T_prev_cur)
+        T = np.array(chain)
+        middle = 0.5 * (t[1:] + t[:-1])
+        felt = np.stack([np.diff(np.interp(t, t_imu, impulse[:, i])) for i in range(3)], axis=1) / np.diff(t)[:, None]
+        force = (T[1:, :3, :3] @ (R_cam_imu @ felt.T).T[:, :, None])[:, :, 0]
+        found.append((6.0 * np.polyfit(t - t[0], T[:, :3, 3], 3)[0], np.polyfit(middle - t[0], force, 1)[0]))
+    jerk, slope = (np.array([f[i] for f in found]).reshape(-1, 3) for i in (0, 1))
+    return jerk, slope
+
+
+def _unbroken(records: Sequence[VoRecord], window_s: float) -> Iterator[list[VoRecord]]:
+    """Windows of usable records each of which starts where the one before ended."""
+    window: list[VoRecord] = []
+    for record in records:
+        good = record.usable and bool(np.isfinite(record.T_prev_cur).all())
+        if window and not (good and record.t_prev_ns == window[-1].t_ns):
+            window = []
+        window.append(record)
+        if (record.t_ns - window[0].t_ns) * 1e-9 >= window_s:
+            yield window
+            window = [record]
