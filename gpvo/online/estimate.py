@@ -15,7 +15,7 @@ from gpvo.online.base import RESIDUAL_COLUMN, BaseVariance, Velocities, feature_
 from gpvo.online.division import Division
 from gpvo.online.guard import Domain, DomainCheck, growth
 from gpvo.online.projected import ProjectedGP
-from gpvo.online.stored import LARGEST, Stored, check_arrays, check_related
+from gpvo.online.stored import LARGEST, Stored, arrays_of_base, check_arrays, check_related
 from gpvo.types import Array, Prediction
 
 LN_LARGEST = 60.0
@@ -33,8 +33,8 @@ class ErrorModel(Stored):
     ``columns``: all features, in order; ``inputs``: positions of those seen by the ``gp``, which gives the log of the
     variance over ``base``. ``factor`` (6,): calibration of the variance; ``outside_power`` (1,): its growth away from
     the training domain. ``high`` (6,): log ratio to the base that few training rows exceeded. ``typical_ln_det`` (1,):
-    median over the training rows. ``nu`` (1,): degrees of freedom of a single motion's error, 0 for a Gaussian.
-    ``dt_s``: usual duration of a motion.
+    median over the training rows. ``nu`` (1,): degrees of freedom of a single motion's error, above 2, 0 for a
+    Gaussian. ``dt_s``: usual duration of a motion.
     """
 
     columns: tuple[str, ...]
@@ -68,7 +68,8 @@ class ErrorModel(Stored):
         check_arrays(arrays, len(columns))
         residual = RESIDUAL_COLUMN in columns
         model = cls.from_arrays(arrays, columns=columns, method=method, residual=residual, dt_s=dt_s)
-        check_related(arrays, len(columns))
+        for related in (arrays, arrays_of_base(arrays)):
+            check_related(related, len(columns))
         if unknown := set(model.base.columns) - set(columns):
             raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")
         if (len(model.gp.centre), len(model.gp.offset)) != (len(model.inputs), 6):

@@ -52,10 +52,9 @@ class Observer:
 
     def step(self, record: VoRecord) -> tuple[VoRecord, Array] | None:
         """The record as judged (or as joined over the window) and its features (d,); None while a window fills."""
-        judged: VoRecord | None = self.slip.step(self._intake.step(record))
-        if self._window is not None:
-            judged = self._window.step(judged) if judged is not None else None
-        return None if judged is None else (judged, self._stream.step(judged))
+        judged = self.slip.step(self._intake.step(record))
+        joint = judged if self._window is None else self._window.step(judged)
+        return None if joint is None else (joint, self._stream.step(joint))
 
 
 class Intake:
@@ -124,10 +123,9 @@ class Window:
         if not record.usable:
             self._motions.clear()
             return None
-        if self._motions and self._motions[-1].t_ns != record.t_prev_ns:
-            # The reference is an older frame: drop the motions that came after it.
-            while self._motions and self._motions[-1].t_ns != record.t_prev_ns:
-                self._motions.pop()
+        # Where the reference is an older frame, the motions that came after it are dropped.
+        while self._motions and self._motions[-1].t_ns != record.t_prev_ns:
+            self._motions.pop()
         self._motions.append(record)
         while len(self._motions) > 1 and self._extent() - self._measure(self._motions[0]) >= self.size * (1 - 1e-9):
             self._motions.popleft()

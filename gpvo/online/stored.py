@@ -189,12 +189,13 @@ def check_arrays(arrays: _Arrays, n_features: int | None = None) -> None:
 
 def check_related(arrays: _Arrays, n_features: int) -> None:
     """Raise ModelError if arrays of an error model, each valid on its own, contradict one another."""
-    for low, high in (("domain.low", "domain.high"), ("domain.least", "domain.most")):
-        if (arrays[low] > arrays[high]).any():
-            raise ModelError("the training domain ends before it begins")
+    if (arrays["domain.low"] > arrays["domain.high"]).any() or (arrays["domain.least"] > arrays["domain.most"]).any():
+        raise ModelError("the training domain ends before it begins")
     if arrays["inputs"].max() >= n_features:
         raise ModelError(f"input {arrays['inputs'].max()} is none of the {n_features} features")
     if (arrays["share"].sum(axis=0) < 1e-6).any():
         raise ModelError("jitter, white and bias have no share of the variance")
     if (arrays["theta"].sum(axis=1) <= 0).any():
         raise ModelError("the base variance 'theta' of an axis is zero")
+    if 0.0 < arrays["nu"][0] <= 2.0:
+        raise ModelError(f"errors of {arrays['nu'][0]:.3g} degrees of freedom ('nu') have no covariance: 0, or above 2")
