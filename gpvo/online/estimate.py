@@ -170,7 +170,7 @@ class ErrorModel(Stored):
 
 
 def within(variance: Array, limit: Array) -> Array:
-    """The variance if small compared with the limit, the limit if far above it; increasing throughout."""
+    """The variance if small compared with the limit, the limit if far above it; LEAST_VAR at least, never falling."""
     # This far above, the result is the limit; squares of larger values would overflow.
     ratio = np.minimum(variance / limit, 1e8)
-    return limit * ratio / np.sqrt(1.0 + ratio**2)
+    return np.maximum(limit * ratio / np.sqrt(1.0 + ratio**2), LEAST_VAR)

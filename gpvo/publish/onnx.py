@@ -180,7 +180,8 @@ def _limit(g: _Graph, model: ErrorModel) -> str:
 
 def _within(g: _Graph, variance: str, limit: str) -> str:
     ratio = g("Min", g("Div", variance, limit), 1e8)
-    return g("Div", g("Mul", limit, ratio), g("Sqrt", g("Add", g("Mul", ratio, ratio), 1.0)))
+    limited = g("Div", g("Mul", limit, ratio), g("Sqrt", g("Add", g("Mul", ratio, ratio), 1.0)))
+    return g("Max", limited, LEAST_VAR)
 
 
 def _base(g: _Graph, model: ErrorModel, theta: Array) -> str:

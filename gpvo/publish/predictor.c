@@ -115,7 +115,8 @@ static void gpvo_limits(const double *features, double dt_s, double limit[2]) {
 static double gpvo_within(double variance, double limit) {
     double ratio = variance / limit;
     if (ratio > 1e8) ratio = 1e8;
-    return limit * ratio / sqrt(1.0 + ratio * ratio);
+    variance = limit * ratio / sqrt(1.0 + ratio * ratio);
+    return variance < GPVO_LEAST_VAR ? GPVO_LEAST_VAR : variance;
 }
 
 /* Log-determinant of a symmetric 6x6 matrix, NaN where it is not positive definite; by its Cholesky factor. */

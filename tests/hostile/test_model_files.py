@@ -16,6 +16,7 @@ from gpvo.cli import app
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online import modelfile
+from gpvo.online.estimate import LEAST_VAR
 from gpvo.online.predictor import Predictor
 from gpvo.online.stored import spec_of
 from gpvo.publish.export import export_model
@@ -118,6 +119,7 @@ def test_arrays_against_the_schema_are_refused(case: str, parts, tmp_path: Path)
 
 EXTREMES: dict[str, dict[str, float]] = {
     "a calibration that explains all": {"calibration_patterns": 1e6},
+    "the smallest numbers": {"factor": 1e-12, "theta": 1e-300, "theta_plain": 0.0, "high": -60.0, "gp.offset": -1e12},
 }
 
 
@@ -131,6 +133,7 @@ def test_the_schema_leaves_no_room_for_a_covariance_that_is_none(case: str, part
     odd = np.array([np.nan, 1e-9, 10.0, 1e11])[:, None] * np.ones(len(model.columns))
     stated = model.estimate(np.concatenate([model.domain.centre + speeds, odd])).covariance
     assert all(is_positive_definite(C) for C in stated)
+    assert np.diagonal(stated, axis1=1, axis2=2).min() > 0.99 * LEAST_VAR
 
 
 def test_a_file_of_an_older_version_is_refused_with_a_cure(parts, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,7 @@ CASES = {
     "nothing but errors of calibration": some_model(
         calibration={"calibration_patterns": np.full((6, 6, 6), 1e6), "calibration_tau_s": np.ones(6)}
     ),
+    "the least variance": replace(some_model(), factor=np.full(6, 1e-22)),
 }
 
 
