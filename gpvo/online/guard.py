@@ -92,11 +92,9 @@ def camera_problems(trained: StereoCamera | None, here: StereoCamera | None) -> 
     """How a camera differs from the one that a model was trained with, one line each."""
     if trained is None or here is None:
         return []
-    out = []
-    for name, a, b in (
+    pairs = (
         ("baseline", trained.baseline_m, here.baseline_m),
         ("focal length over image width", trained.fx_px / trained.width, here.fx_px / here.width),
-    ):
-        if abs(b / a - 1.0) > _CAMERA:
-            out.append(f"{name} is {b:.4g}, the model was trained with {a:.4g}")
-    return out
+    )
+    far = [pair for pair in pairs if abs(pair[2] / pair[1] - 1.0) > _CAMERA]
+    return [f"{name} is {b:.4g}, the model was trained with {a:.4g}" for name, a, b in far]

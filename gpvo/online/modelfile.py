@@ -93,10 +93,7 @@ def _check_document(document: Any, path: Path) -> None:
     if not isinstance(document.get("header"), dict) or not isinstance(document.get("digest"), str):
         raise ModelError("has a damaged header", where=path)
     document["printable"] = _printable(document["header"])
-    try:
-        _check_header(document["header"])
-    except ModelError as problem:
-        raise ModelError(problem.what, where=path) from None
+    _check_header(document["header"], path)
 
 
 def check_version(name: str, found: Any, newest: int, path: Path | None = None) -> None:
@@ -116,6 +113,15 @@ def _are(kind: type, values: Any) -> bool:
     return isinstance(values, list) and all(isinstance(v, kind) for v in values)
 
 
+def _is_calibration(value: Any) -> bool:
+    """Whether it is an object; if it holds intervals, with a width for each axis and level."""
+    if not isinstance(value, dict):
+        return False
+    levels, widths = value.get("interval_levels", []), value.get("interval_sigmas", [[]] * 6)
+    fit = _are(list, [levels, widths]) and _are(list, widths) and [*map(len, widths)] == [len(levels)] * 6
+    return fit and all(_is_number(x) and x >= 0 for row in (levels, *widths) for x in row)
+
+
 _OBJECT = "an object", lambda v: isinstance(v, dict)
 _TEXT = "text", lambda v: isinstance(v, str)
 _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
@@ -129,7 +135,7 @@ _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "camera": _OBJECT,
     "odometry": _OBJECT,
     "scores": ("an object of objects", lambda v: isinstance(v, dict) and _are(dict, list(v.values()))),
-    "calibration": _OBJECT,
+    "calibration": ("an object whose 'interval_sigmas' hold a positive number per level for six axes", _is_calibration),
     "config": _OBJECT,
     "versions": _OBJECT,
     "sequences": (
@@ -140,15 +146,15 @@ _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
 """What a key of a header must be, in words and as a test; absent keys are for the reader to miss."""
 
 
-def _check_header(header: Mapping[str, Any]) -> None:
+def _check_header(header: Mapping[str, Any], path: Path) -> None:
     """Raise ModelError, one line, for the first header key that its readers cannot accept; null means unknown."""
     for name, (words, holds) in _HEADER.items():
         value = header.get(name)
         if value is not None and not holds(value):
-            raise ModelError(f"its header's '{name}' is not {words}")
+            raise ModelError(f"its header's '{name}' is not {words}", where=path)
     features, units = header.get("features"), header.get("units")
     if features and units and len(features) != len(units):
-        raise ModelError(f"its header names {len(units)} units of {len(features)} features")
+        raise ModelError(f"its header names {len(units)} units of {len(features)} features", where=path)
 
 
 def _printable(value: Any) -> Any:

@@ -7,7 +7,6 @@ import hashlib
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -250,13 +249,10 @@ class Predictor:
         xi, slip = se3.log(record.T_prev_cur), self._observer.slip
         # A record that is lost because of its stamps has no usable duration.
         dt_s = record.dt_s if record.dt_s > 0 else self.model.dt_s
-        lost_variance = partial(self.model.velocities.lost_variance, self.model.dt_s)
-        if slip.expected is None:
-            variance = lost_variance(dt_s, np.inf, xi / dt_s, np.zeros(6), np.zeros(6))
-        else:
-            jump = xi - slip.expected * dt_s
-            variance = lost_variance(dt_s, slip.age_s, slip.expected, self._rate_var, jump)
-        return np.maximum(variance, _NO_MOTION_VAR)
+        known = np.inf, xi / dt_s, np.zeros(6), np.zeros(6)
+        if slip.expected is not None:
+            known = slip.age_s, slip.expected, self._rate_var, xi - slip.expected * dt_s
+        return np.maximum(self.model.velocities.lost_variance(self.model.dt_s, dt_s, *known), _NO_MOTION_VAR)
 
     def _unmeasured(self, record: VoRecord, white: Array, confidence: float, in_domain: float) -> Prediction:
         return Prediction(

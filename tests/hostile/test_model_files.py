@@ -159,6 +159,10 @@ HEADERS: dict[str, dict[str, Any]] = {
     "camera behind itself": {"camera": dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 1.0)
                              | {"baseline_m": -0.1, "width": 640, "height": 480}},
     "camera as a list": {"camera": [1, 2, 3]},
+    "intervals without widths": {"calibration": {"interval_levels": [0.9]}},
+    "intervals of text": {"calibration": {"interval_levels": "abc", "interval_sigmas": 3}},
+    "intervals upside down": {"calibration": {"interval_levels": [0.9], "interval_sigmas": [[-1.0]] * 6}},
+    "intervals of five axes": {"calibration": {"interval_levels": [0.9], "interval_sigmas": [[1.0]] * 5}},
     "units of too few": {"units": ["m"]},
     "unknown target": {"target": "window:-3s"},
     "sequences without names": {"sequences": [{}]},
