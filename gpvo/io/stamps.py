@@ -59,14 +59,14 @@ def seconds_text_to_ns(text: str) -> int:
 def text_to_ns(text: str, unit: str) -> int:
     """A decimal number of ``unit`` (of :data:`UNITS_NS`) to whole nanoseconds without passing through a float.
 
-    Raises ValueError where the text is no finite number, or not of the years 0 to 2262.
+    Raises ValueError where the text is no finite number, or more than 292 years from 1970.
     """
     try:
         value = Decimal(text)
     except InvalidOperation:
         raise ValueError(f"'{text}' is not a number") from None
     factor = UNITS_NS[unit]
-    if not value.is_finite() or abs(value) > Decimal(9_200_000_000_000_000_000) / factor:
+    if not value.is_finite() or value.copy_abs() > Decimal(9_200_000_000_000_000_000) / factor:
         raise ValueError(f"'{text}' is not a stamp in {_UNIT_NAMES[unit]}")
     return int((value * factor).to_integral_value())
 

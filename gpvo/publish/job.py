@@ -20,6 +20,7 @@ from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
+_END_OF_ROS_NS = 2**31 * 10**9
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 
 
@@ -130,7 +131,18 @@ def _require(settings: PublishSettings) -> None:
         mavlink.dialect()
 
 
+def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) -> None:
+    """Raise GpvoError where a stamp does not fit the messages: all count from 1970, those of ROS in 31 bits of
+    seconds."""
+    last_ns = max(o.t_ns for o in odometry)
+    early = min(o.t_ns for o in odometry) < 0
+    if early or (settings.to != "mavlink" and last_ns >= _END_OF_ROS_NS):
+        when = "before 1970" if early else "after January 2038, where those of ROS end"
+        raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
+
+
 def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) -> tuple[str, int]:
+    _check_stamps(run, odometry, settings)
     if settings.link is not None:
         return settings.link, _replay(odometry, mavlink.Link(settings.link, settings.system))
     if settings.to == "mavlink":

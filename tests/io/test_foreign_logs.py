@@ -166,6 +166,8 @@ def test_covariance_follows_the_frame(tmp_path):
         ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n", "line 3: the stamp .* repeats"),
         ("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,3\n", "length 3.0000"),
         ("t_ns,x,y,z,qx,qy,qz,qw\n99999999999999999999,0,0,0,0,0,0,1\n", "line 2: .* is not a stamp in nanosec"),
+        ("t_ns,x,y,z,qx,qy,qz,qw\n1e999999999,0,0,0,0,0,0,1\n", "line 2: '1e9{9}' is not a stamp in nanosec"),
+        ("t_ns,x,y,z,qx,qy,qz,qw\n-1e999999999,0,0,0,0,0,0,1\n", "line 2: '-1e9{9}' is not a stamp in nanosec"),
         ("t_ns,x,y,z,qx,qy,qz,qw\ninf,0,0,0,0,0,0,1\n", "line 2: 'inf' is not a stamp in nanosec"),
         ("1,0,0,0,0,0,0,1\n", "no header line"),
         ("1 2 3\n", "not look like a trajectory"),

@@ -106,3 +106,25 @@ def test_a_run_of_poses_alone_needs_a_model(predicted: Path, tmp_path: Path) -> 
     write_run(tmp_path / "bare", VoLog(bare), meta={"source": "made"})
     with pytest.raises(GpvoError, match=r"bare: holds neither predictions nor covariances \(give --model\)"):
         publish_run(tmp_path / "bare", GEOMETRY)
+
+
+@pytest.mark.parametrize("to, seconds, words", [
+    ("bag", 2**31, "after January 2038"), ("mcap", 2**31, "after January 2038"), ("bag", -100, "before 1970"),
+    ("mcap", -100, "before 1970"), ("mavlink", -100, "before 1970"), ("mavlink", 2**31, ""),
+    ("bag", 2**31 - 100, ""),
+])  # fmt: skip
+def test_stamps_that_no_message_holds_are_refused(
+    to: str, seconds: int, words: str, predicted: Path, tmp_path: Path
+) -> None:
+    run = read_run(predicted)
+    shift = seconds * 10**9 - run.log.records[0].t_ns
+    moved = [replace(r, t_ns=r.t_ns + shift, t_prev_ns=r.t_prev_ns + shift) for r in run.log]
+    write_run(tmp_path / "run", VoLog(moved, run.log.camera), meta={"source": "made"})
+    for out in ("out", "out.bag") if to == "bag" else ("out",):
+        settings = replace(GEOMETRY, to=to, out=tmp_path / out)
+        if words:
+            with pytest.raises(GpvoError, match=f"run: has stamps {words}"):
+                publish_run(tmp_path / "run", settings)
+            assert not (tmp_path / out).exists()
+        else:
+            publish_run(tmp_path / "run", settings)
