@@ -32,6 +32,7 @@ from gpvo.types import (
 )
 
 _MAX_SCHEMA = 1
+_LARGEST = 1e12  # No mean or variance that a model states is larger [m, rad, m^2, rad^2].
 
 
 @dataclass(frozen=True)
@@ -111,9 +112,12 @@ def read_predictions(path: str | Path) -> list[Prediction]:
     numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
     if not np.isfinite(numbers).all():
         raise SourceError("holds a prediction that is not finite", where=p)
+    covariance = np.array([q.covariance for q in predictions])
+    if max(np.abs(numbers).max(), np.diagonal(covariance, axis1=1, axis2=2).max()) > _LARGEST:
+        raise SourceError(f"holds a prediction beyond {_LARGEST:g}", where=p, cure="make it again with 'gpvo predict'")
     if not all(q.nu > 2.0 for q in predictions):
         raise SourceError("holds a prediction without a second moment: its 'nu' is not above 2", where=p)
-    _check_covariances(np.array([q.covariance for q in predictions]), "predicted covariance", p)
+    _check_covariances(covariance, "predicted covariance", p)
     for part in ("jitter", "white"):
         _check_covariances(np.array([getattr(q, part) for q in predictions]), f"covariance '{part}'", p, semi=True)
     return predictions

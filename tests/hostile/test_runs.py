@@ -73,7 +73,8 @@ def test_a_mounting_beyond_all_measure_is_refused_without_a_warning(run: Path) -
 
 
 @pytest.mark.parametrize(("column", "value"), [("cov_white_00", -1.0), ("mean_x_m", np.inf), ("cov_jitter_01", 1.0),
-                                               ("cov_bias_00", 1e308)])  # fmt: skip
+                                               ("cov_bias_00", 1e308), ("cov_bias_44", 4.6e18),
+                                               ("mean_ry_rad", -1e30)])  # fmt: skip
 def test_a_prediction_that_is_none_is_refused(column: str, value: float, log: VoLog, tmp_path: Path) -> None:
     predictions = list(Predictor.load(MODEL).replay(log).values())
     write_run(tmp_path / "run", log, predictions=predictions)
