@@ -97,13 +97,13 @@ def main() -> None:
             sys.exit(2)
         where = f"{error.ctx.command_path} --help" if error.ctx is not None else "gpvo --help"
         _fail(f"{' '.join(error.format_message().split())} ({where})")
+    except GpvoError as error:  # a MissingExtraError is an ImportError too
+        _fail(str(error))
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRA_OF:
             raise
         _fail(str(MissingExtraError(package, _extra(package))))
-    except GpvoError as error:
-        _fail(str(error))
     except OSError as error:  # a full disk, a folder in place of a file; a broken pipe has ended inside quietly
         place = f"{error.filename}: " if error.filename else ""
         _fail(place + " ".join((error.strerror or str(error)).split()))

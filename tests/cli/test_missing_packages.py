@@ -43,6 +43,7 @@ def call(absent: tuple[str, ...], *words: str) -> tuple[int, str]:
         ),
         (("cv2", "pyarrow"), ("run", "nowhere", "-o", "unwritten"), "vo"),
         (("cv2",), ("evaluate", "nowhere"), "runs"),
+        (("serial",), ("publish", RUNS[0], "--to", "mavlink", "--link", "serial:/dev/null:57600"), "mavlink"),
         (("scipy", "numba", "mujoco"), ("simulate", "tunnel-clean", "-o", "unwritten"), "sim"),
     ],
 )
