@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+
+from gpvo.cameras.imagesize import MAX_PIXELS
 
 
 def main() -> None:
     """Run the command line; where it is not installed (``pip install --no-deps``), say so in one line."""
+    # OpenCV reads this as it is loaded: a second guard behind the sizes that image headers state.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
     try:
         from gpvo.cli import main as run
     except ModuleNotFoundError as error:

@@ -10,6 +10,8 @@ MAX_PIXELS = 1 << 25
 """33 megapixels: more than any stereo camera has."""
 MAX_SIDE_PX = 16384
 
+_WITHOUT_LENGTH = (0x01, *range(0xD0, 0xD9))  # of JPEG's markers; of those that may stand before a frame
+
 Size = tuple[int, int]
 
 
@@ -57,9 +59,13 @@ def _jpeg(raw: bytes | memoryview) -> Size | None:
     while True:
         while raw[at] == 0xFF and raw[at + 1] == 0xFF:  # fill bytes
             at += 1
-        marker, (length,) = raw[at + 1], struct.unpack(">H", raw[at + 2 : at + 4])
-        if raw[at] != 0xFF or length < 2:
-            return None
+        marker = raw[at + 1]
+        if raw[at] == 0xFF and marker in _WITHOUT_LENGTH:
+            at += 2
+            continue
+        (length,) = struct.unpack(">H", raw[at + 2 : at + 4])
+        if raw[at] != 0xFF or marker == 0 or length < 2:
+            return None  # decoders look for the next marker, wherever it is
         # Start of frame, of any coding; C4, C8 and CC are something else.
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", raw[at + 5 : at + 9])
@@ -73,7 +79,7 @@ def _bmp(raw: bytes | memoryview) -> Size:
     return width, abs(height)  # a negative height: top row first
 
 
-def _tiff(raw: bytes | memoryview) -> Size:
+def _tiff(raw: bytes | memoryview) -> Size | None:
     order = "<" if raw[0] == 0x49 else ">"
     (at,) = struct.unpack(order + "I", raw[4:8])
     (count,) = struct.unpack(order + "H", raw[at : at + 2])
@@ -81,6 +87,8 @@ def _tiff(raw: bytes | memoryview) -> Size:
     for entry in range(at + 2, at + 2 + 12 * count, 12):
         tag, kind = struct.unpack(order + "HH", raw[entry : entry + 4])
         if tag in (256, 257):
+            if tag in found or kind not in (3, 4):
+                return None  # decoders take the first of two; other kinds stand elsewhere in the file
             code, end = ("H", 10) if kind == 3 else ("I", 12)
             (found[tag],) = struct.unpack(order + code, raw[entry + 8 : entry + end])
     return found[256], found[257]

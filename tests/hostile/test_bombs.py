@@ -106,6 +106,30 @@ def test_a_chunk_that_claims_gigabytes_is_not_made_room_for(tmp_path: Path) -> N
     assert _peak_mb() - before < 200
 
 
+def _tiff_of(tags: list[tuple[int, int, int]]) -> bytes:
+    """A TIFF of (tag, kind, value), without strips."""
+    body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
+    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + body + bytes(4)
+
+
+def test_the_size_of_a_tiff_is_what_the_decoder_takes() -> None:
+    size = [(256, 4, 64), (257, 4, 48)]
+    assert image_size(_tiff_of(size)) == (64, 48)
+    for other in ([(256, 4, 15000), *size], [*size, (257, 4, 15000)], [(256, 16, 64), (257, 16, 64)]):
+        assert image_size(_tiff_of(other)) is None
+
+
+@pytest.mark.parametrize("marker", [0x01, 0xD0, 0xD7, 0xD8, 0x00])
+def test_the_size_of_a_jpeg_is_what_the_decoder_takes(marker: int) -> None:
+    """A decoder steps over a marker without a length, and then over a comment that holds another frame's header."""
+    whole = cv2.imencode(".jpg", np.zeros((2000, 3000), np.uint8))[1].tobytes()
+    odd = b"\xff\xd8\xff" + bytes([marker])
+    comments = bytearray(b"\xff\xfe" + struct.pack(">H", 65000) + bytes(64998) + b"\xff\xfe\x07\xd0" + bytes(1998))
+    at = 4 + 0xFFFE - len(odd)
+    comments[at : at + 9] = b"\xff\xc0\x00\x11\x08" + struct.pack(">HH", 48, 64)
+    assert image_size(odd + bytes(comments) + whole[2:]) == (None if marker == 0 else (3000, 2000))
+
+
 def test_a_sequence_of_such_images_is_refused_by_its_calibration(tmp_path: Path) -> None:
     (tmp_path / "left").mkdir()
     (tmp_path / "right").mkdir()
