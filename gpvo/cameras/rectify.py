@@ -173,7 +173,7 @@ def rectifying_rotations(T_right_left: Array) -> tuple[Array, Array]:
 def read_size(text: str) -> tuple[int, int]:
     """Width and height [px] of a text such as 640x480. Raises CalibrationError if it is something else."""
     width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()):
+    if not (width.isdecimal() and height.isdecimal()):
         raise CalibrationError(f"the size is '{text}'", cure="give WIDTHxHEIGHT, such as 640x480")
     return int(width), int(height)
 

@@ -33,7 +33,7 @@ from gpvo.io.bag_reader import (
 )
 from gpvo.io.images import Image8, ImageSource
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, usual_interval
+from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
 from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
 from gpvo.types import TruthLog
 
@@ -99,7 +99,7 @@ class BagSource(ImageSource):
             _check_sizes(size, rig, path, self._topics)
         super().__init__(path, path.stem, rig, **options)
         self.span_ns = span
-        self._tolerance_ns = round(tolerance_s * 1e9)
+        self._tolerance_ns = tolerance_ns(tolerance_s)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
         if self._topics.truth is not None:
             self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)

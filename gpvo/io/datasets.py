@@ -16,7 +16,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, growing, integer_ns, match_nearest, text_lines
+from gpvo.io.stamps import PAIR_TOLERANCE_S, growing, integer_ns, match_nearest, text_lines, tolerance_ns
 from gpvo.io.trajectory import (
     BATCH_ESTIMATE,
     GPS_INS,
@@ -129,7 +129,7 @@ def _body_is_flu(mav: Path) -> bool:
 def _euroc_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
     left, right = (_read_image_list(mav / camera / "data.csv", known) for camera in ("cam0", "cam1"))
     folders = [mav / camera / "data" for camera in ("cam0", "cam1")]
-    pairs = match_nearest(left, right, round(tolerance_s * 1e9), known, mav)
+    pairs = match_nearest(left, right, tolerance_ns(tolerance_s), known, mav)
     return [PairFiles(t, folders[0] / a, folders[1] / b) for t, a, b in pairs]
 
 
@@ -251,7 +251,7 @@ class KittiSource(FileSource):
         folders = (path / f"image_{left}", path / f"image_{right}")
         names: list[dict[int, Path]] = []
         for folder in folders:
-            files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdigit())
+            files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdecimal())
             names.append({int(f.stem): f for f in files})
         if not names[0] or not names[1]:
             empty = folders[0] if not names[0] else folders[1]

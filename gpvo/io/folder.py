@@ -13,7 +13,7 @@ from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns
+from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns, tolerance_ns
 from gpvo.io.trajectory import UNKNOWN, TruthNoise, carry, check_overlap, read_imu_csv, read_times, read_tum
 
 _FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("left/data", "right/data"))
@@ -94,7 +94,7 @@ def _list_pairs(path: Path, rate_hz: float | None, tolerance_s: float, known: So
         )
     stamps = _stamps(path, sorted({*left, *right}), rate_hz, known)
     lists = [[(stamps[key], key) for key in side if key in stamps] for side in (left, right)]
-    pairs = match_nearest(lists[0], lists[1], round(tolerance_s * 1e9), known, path)
+    pairs = match_nearest(lists[0], lists[1], tolerance_ns(tolerance_s), known, path)
     return [PairFiles(t, left[a], right[b]) for t, a, b in pairs]
 
 
@@ -131,6 +131,8 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
     if times.is_file():
         return _stamps_by_line(path, keys, numbers, known)
     if rate_hz is not None and 1e-3 <= rate_hz <= 1e5 and len(numbers) == len(keys):
+        if max(map(float, numbers.values())) * 1e9 / rate_hz > 9.2e18:
+            raise SourceError("the image names hold numbers too large to count frames", where=path)
         return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
     dates = " (dates are not read)" if _DATE.search(keys[0]) else ""
     if rate_hz is not None and not numbers:

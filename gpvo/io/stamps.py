@@ -201,6 +201,13 @@ def check_interval(t_ns: Sequence[int], where: object, cure: str, *, is_stated: 
     raise SourceError(text, where=where, cure=cure)
 
 
+def tolerance_ns(seconds: float) -> int:
+    """How far the stamps of a pair may be apart [ns]; SourceError unless they are 0 to 10 ``seconds``."""
+    if not 0.0 <= seconds <= 10.0:
+        raise SourceError(f"the stamps of a pair cannot differ by {seconds:g} s", cure="--pair-tolerance takes 0 to 10")
+    return round(seconds * 1e9)
+
+
 def match_nearest(
     left: list[tuple[int, str]], right: list[tuple[int, str]], tolerance_ns: int, report: SourceReport, where: object
 ) -> list[tuple[int, str, str]]:

@@ -127,6 +127,28 @@ def test_kitti_times_with_disorder(tmp_path):
     assert (source.report.duplicate, source.report.out_of_order) == (1, 2)
 
 
+def test_kitti_names_that_only_look_like_numbers_are_left_out(tmp_path):
+    path = seq.write_kitti(tmp_path / "s", poses=False)
+    shutil.copy(path / "image_0" / "000000.png", path / "image_0" / "\u00b2.png")
+    assert len(seq.frames_of(open_source(path))) == 12
+
+
+def test_numbers_that_count_no_frames_are_refused(tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    for side in ("left", "right"):
+        for k, file in enumerate(sorted((path / side).iterdir())):
+            file.rename(file.with_name(f"{k}_a.png" if k else f"{'9' * 25}_a.png"))
+    with pytest.raises(SourceError, match=r"s: the image names hold numbers too large"):
+        open_source(path, rate_hz=10.0)
+
+
+@pytest.mark.parametrize("kind", ["euroc", "folder"])
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -0.1, 11.0])
+def test_a_tolerance_that_is_none_is_refused(tmp_path, kind, seconds):
+    with pytest.raises(SourceError, match="stamps of a pair cannot differ by .* takes 0 to 10"):
+        open_source(MAKERS[kind](tmp_path / "s"), tolerance_s=seconds)
+
+
 def test_kitti_more_images_than_times(tmp_path):
     path = seq.write_kitti(tmp_path / "s", poses=False)
     (path / "times.txt").write_text("".join(f"{k * 0.1}\n" for k in range(9)))
