@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
+from gpvo.io.bag_bounds import ChunkTooLarge, bound_chunks, require_tables
 from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
 
@@ -54,12 +55,16 @@ def open_bag(path: Path) -> Iterator[Any]:
     if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
         reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
         raise SourceError(reason, where=metadata, cure="name one .mcap or .db3 file inside the folder")
+    bound_chunks()
     try:
+        require_tables(path)
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
+    except ChunkTooLarge as error:
+        raise SourceError(f"unreadable bag: {error}", where=path, cure="record or convert it again") from None
     # The readers below raise whatever their storage does: struct, sqlite3, zstd, Unicode, index, assertion and
     # memory errors, the last for a length that is no length.
     except Exception as error:
