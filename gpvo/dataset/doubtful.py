@@ -142,8 +142,10 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
     if len(length) < 2 * _LEAST_LONG or length.max() < _NOWHERE_M:
         return []
     rate_hz = 1 / float(np.median(errors.dt_s))
-    short = max(_LEAST_SHORT, round(_SHORT_S * rate_hz))
-    long = max(_LEAST_LONG, min(round(_LONG_S * rate_hz), len(length) // 2))
+    short, long = (
+        max(least, min(round(seconds * rate_hz), len(length) // 2))
+        for least, seconds in ((_LEAST_SHORT, _SHORT_S), (_LEAST_LONG, _LONG_S))
+    )
     stated = _stated_m(log, errors)
     share = (true * seen).sum(1) / np.maximum(length**2, _NOWHERE_M**2)
     usual = float(np.median(share[_moving(length, 1)]))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import write_text
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import from_upper, is_positive_definite, symmetrise, upper
+from gpvo.geometry.covariance import are_positive_definite, from_upper, is_positive_definite, symmetrise, upper
 from gpvo.io.foreign import ForeignLog
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
@@ -116,6 +116,8 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
         notes = [*notes, f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}"]
     if unknown:
         notes = [*notes, f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}"]
+    if cov is not None and (bad := int((np.isfinite(cov).all(axis=(1, 2)) & ~are_positive_definite(cov))[1:].sum())):
+        notes = [*notes, f"{bad} of {len(motions)} covariances are not positive definite and were left out"]
     records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
     for k, motion in enumerate(motions, 1):
         stated: dict[str, Any] = {}

@@ -251,6 +251,12 @@ def test_noise_that_is_larger_in_depth_raises_no_alarm_either():
     assert sum(bool(f) for f in found) <= 2, found
 
 
+def test_a_log_of_impossible_rate_is_too_short_to_have_any():
+    log, truth = white_noise_run(0, 10, stepped=False)
+    faster = [replace(r, t_ns=r.t_ns // 1000, t_prev_ns=r.t_prev_ns // 1000) for r in log.records]
+    assert odd_stretches(VoLog(faster, None), replace(truth, t_ns=truth.t_ns // 1000)) == []
+
+
 @pytest.mark.parametrize("rate_hz", [10, 50, 200])
 def test_a_climb_is_one_stretch_at_any_rate(rate_hz):
     log, truth = white_noise_run(1, rate_hz, stepped=False)

@@ -278,7 +278,7 @@ def test_a_whole_imu_goes_before_halves_and_before_zeros(tmp_path):
     assert any("'/b/imu' not used as IMU" in n for n in source.report.notes)
 
 
-def _odometry_bag(ros1: bool, twist: bool) -> BagMaker:
+def _odometry_bag(ros1: bool, twist: bool, zeros: int = 0) -> BagMaker:
     maker = BagMaker(ros1)
     C = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
     pose = C.copy()
@@ -289,7 +289,7 @@ def _odometry_bag(ros1: bool, twist: bool) -> BagMaker:
             pose = A @ pose @ A.T + C
         B = np.zeros((6, 6))
         B[:3, :3] = B[3:, 3:] = T[k, :3, :3]
-        maker.odometry("/odom", t, T[k], B @ pose @ B.T, C if twist else np.zeros((6, 6)))
+        maker.odometry("/odom", t, T[k], B @ pose @ B.T, C if twist and k >= zeros else np.zeros((6, 6)))
     return maker
 
 
@@ -328,6 +328,13 @@ def test_pose_covariance_gives_the_growth(tmp_path, maker_of):
     expected = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
     for record in records[1:]:
         np.testing.assert_allclose(record.covariances["imported"], expected, atol=1e-12)
+
+
+def test_a_covariance_that_begins_with_zeros_is_stated_from_there_on(tmp_path):
+    maker = _odometry_bag(True, twist=True, zeros=3)
+    records, notes = to_records(read_foreign(maker.write(tmp_path / "a.bag")))
+    assert [bool(r.covariances) for r in records] == [False] * 3 + [True] * 17
+    assert notes == ["2 of 19 covariances are not positive definite and were left out"]
 
 
 def test_which_topic(tmp_path):
