@@ -20,6 +20,7 @@ _WINDOW = 51
 _MAX_BYTES = 2_000_000_000
 _MAX_CHARACTERS = 1_000_000
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+END_OF_ROS_NS = 2**31 * 10**9  # the stamps of ROS count seconds in 31 bits, from 1970 to January 2038
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 # Below which size a number is a time of the unit.
 _LIMITS = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (np.inf, "ns"))

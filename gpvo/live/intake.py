@@ -17,10 +17,10 @@ from typing import Any
 
 from gpvo.errors import SourceError
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, topics_of
+from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.io.stated import GAP_STEPS
 from gpvo.stats.series import Doubt
 
-_LAST_NS = 2**31 * 1_000_000_000
 BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""
 AHEAD_S = 10.0
@@ -70,7 +70,7 @@ class StampWatch:
 
     def see(self, t_ns: int) -> Sequence:
         """What the next stamp is. One that no ROS message can hold is of another clock."""
-        if not 0 <= t_ns < _LAST_NS:
+        if not 0 <= t_ns < END_OF_ROS_NS:
             return Sequence.CLOCK
         if self._last is None:
             self._last = t_ns

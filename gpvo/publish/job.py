@@ -14,13 +14,13 @@ from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError
 from gpvo.files import write_text
 from gpvo.io.run import Run, read_run
+from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.online.predictor import Predictor
 from gpvo.publish import consumers, mavlink, ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
-_END_OF_ROS_NS = 2**31 * 10**9
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
 
 
@@ -136,7 +136,7 @@ def _check_stamps(run: Run, odometry: Sequence[Odometry], settings: PublishSetti
     seconds."""
     last_ns = max(o.t_ns for o in odometry)
     early = min(o.t_ns for o in odometry) < 0
-    if early or (settings.to != "mavlink" and last_ns >= _END_OF_ROS_NS):
+    if early or (settings.to != "mavlink" and last_ns >= END_OF_ROS_NS):
         when = "before 1970" if early else "after January 2038, where those of ROS end"
         raise GpvoError(f"has stamps {when}", where=run.path, cure="subtract an offset from the stamps of its source")
 
