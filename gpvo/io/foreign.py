@@ -23,6 +23,7 @@ from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 FORMATS = ("tum", "kitti", "csv", "bag")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+NONE_STATED = "its covariances are not positive definite and were left out"
 
 
 def is_optical(frame_id: str) -> bool:
@@ -262,7 +263,7 @@ def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
         return log
     if _looks_stated(pose):
         return replace(log, covariance=_into_body(log.trajectory, pose), covariance_of="pose")
-    return replace(log, notes=("its covariances are not positive definite and were left out",))
+    return replace(log, notes=(NONE_STATED,))
 
 
 def _bag_covariance(read: list[Any], name: str) -> Array | None:

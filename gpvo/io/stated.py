@@ -21,7 +21,7 @@ from gpvo.errors import SourceError
 from gpvo.files import write_text
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_positive_definite, from_upper, is_positive_definite, symmetrise, upper
-from gpvo.io.foreign import ForeignLog
+from gpvo.io.foreign import NONE_STATED, ForeignLog
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
 from gpvo.types import COUNT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, VoLog, VoRecord
@@ -150,10 +150,12 @@ def _fields(log: ForeignLog, k: int) -> dict[str, Any]:
 
 
 def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | None, list[str]]:
-    """Name and (N, 6, 6) covariances by row, None where the log has none."""
+    """Name and (N, 6, 6) covariances by row, None where the log has none, and remarks."""
     if log.covariance is None:
         return "", None, []
     C = symmetrise(log.covariance)
+    if np.isfinite(C).all(axis=(1, 2)).any() and not are_positive_definite(C).any():
+        return "", None, [NONE_STATED]
     if log.covariance_of == "motion":
         return IMPORTED, C, _if_of_poses(C[1:], motions)
     A = se3.adjoint(se3.inverse(motions))
