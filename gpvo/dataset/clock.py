@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.errors import interpolate_truth
+from gpvo.dataset.errors import MAX_GAP_S, interpolate_truth
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog
@@ -63,7 +63,7 @@ def _on_grid(poses: TruthLog, step_s: float, window: int) -> tuple[Array, int]:
     if not 2 * window < count < _MAX_SAMPLES:
         raise GpvoError(f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset")
     grid = first + np.rint(np.arange(count) * step_s * 1e9).astype(np.int64)
-    return _amounts(*interpolate_truth(poses, grid), window), first
+    return _amounts(*interpolate_truth(poses, grid, MAX_GAP_S), window), first
 
 
 def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float, max_offset_s: float) -> float:
@@ -125,7 +125,7 @@ def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius
         differences = []
         for offset in offsets:
             moved = replace(log, t_ns=log.t_ns + round(float(offset) * 1e9))
-            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns), window))
+            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns, MAX_GAP_S), window))
         d = np.stack(differences)
         known = np.isfinite(d).all(axis=(0, 1))
         if known.sum() < 10:

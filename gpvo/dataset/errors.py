@@ -18,6 +18,8 @@ from gpvo.stats.series import block_bootstrap, moving_sums
 from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
 MAX_GAP_S = 0.5
+_GAP_STEPS = 3.0
+"""Usual steps, of truth or frames, that the truth is interpolated over, if at most ``MAX_GAP_S``."""
 # Of the truth's noise:
 _ORDER = 3
 """Differences of the poses. Vehicles have little of a third one at 10 Hz, where white noise has the most."""
@@ -34,23 +36,32 @@ _SURE = 0.99
 
 
 def interpolate_truth(
-    truth: TruthLog, t_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S
+    truth: TruthLog, t_ns: NDArray[np.int64], max_gap_s: float | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Truth poses at the stamps (N,): (N, 4, 4) and whether each is known (N,).
 
     A stamp is known where it lies within the truth and the truth's neighbours are no further apart than ``max_gap_s``
-    (or one of them is the stamp itself).
+    (or one of them is the stamp itself). By default that is three times the usual step of the truth, or of the stamps
+    where theirs is longer, and at most ``MAX_GAP_S``: over a longer drop-out, a straight line is no truth.
     """
     t = np.asarray(t_ns, dtype=np.int64)
     if len(truth.t_ns) == 0:
         return np.broadcast_to(np.eye(4), (len(t), 4, 4)).copy(), np.zeros(len(t), dtype=bool)
+    max_gap_ns = _usual_gap_ns(truth.t_ns, t) if max_gap_s is None else max_gap_s * 1e9
     right = np.clip(np.searchsorted(truth.t_ns, t), 1, len(truth.t_ns) - 1)
     t_a, t_b = truth.t_ns[right - 1], truth.t_ns[right]
     fraction = np.clip((t - t_a) / np.maximum(t_b - t_a, 1), 0.0, 1.0)
     T = se3.interpolate(truth.T_world_cam[right - 1], truth.T_world_cam[right], fraction)
     exact = (t == t_a) | (t == t_b)
-    known = exact | ((t >= t_a) & (t <= t_b) & (t_b - t_a <= max_gap_s * 1e9))
+    known = exact | ((t >= t_a) & (t <= t_b) & (t_b - t_a <= max_gap_ns))
     return T, known
+
+
+def _usual_gap_ns(*stamps: NDArray[np.int64]) -> float:
+    """The longest gap [ns] that no drop-out makes: ``_GAP_STEPS`` usual steps of the slower stamps."""
+    steps = (np.diff(np.unique(t)) for t in stamps)
+    usual = max((float(np.median(s)) for s in steps if len(s)), default=np.inf)
+    return min(MAX_GAP_S * 1e9, _GAP_STEPS * usual)
 
 
 def steps_of_slow_truth(truth: TruthLog, t_ns: NDArray[np.int64]) -> tuple[float, float] | None:

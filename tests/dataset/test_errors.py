@@ -103,6 +103,16 @@ def test_outside_and_in_gaps_nothing_is_known():
     assert interpolate_truth(truth, np.array([START_NS + 600_000_000]), max_gap_s=1.0)[1].all()
 
 
+@pytest.mark.parametrize(("rate_hz", "within"), [(20.0, False), (10.0, False), (2.0, True)])
+def test_a_drop_out_of_a_fast_truth_is_not_interpolated(rate_hz, within):
+    """Beside frames of 2 Hz, 0.44 s are no hole, beside those of 10 Hz they are; a pose at the stamp is known."""
+    times = np.arange(0, 10, 0.005)
+    truth = _truth(times[(times < 5.0025) | (times > 5.4375)])  # 5.0 to 5.44 s
+    t_s = np.concatenate([np.arange(0, 5, 1 / rate_hz), [5.0, 5.2, 5.44], np.arange(5.5, 9.9, 1 / rate_hz)])
+    known = interpolate_truth(truth, START_NS + np.round(t_s * 1e9).astype(np.int64))[1]
+    np.testing.assert_array_equal(known, within | (t_s != 5.2))
+
+
 def test_one_pose_is_known_at_its_stamp_alone_and_none_nowhere():
     one = _truth(np.array([0.0]))
     np.testing.assert_array_equal(interpolate_truth(one, START_NS + np.array([-1, 0, 1]))[1], [False, True, False])
