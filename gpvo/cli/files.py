@@ -15,7 +15,7 @@ from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError, SourceError
-from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog
+from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, check_same_rows
 from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import write_run
 from gpvo.io.stated import to_records
@@ -74,6 +74,7 @@ def import_log(
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
     log, given, carrier, assumed = log.seen_from(place), None, vehicle or Vehicle(), list[str]()
     if truth is not None:
+        check_same_rows(truth, log)
         sigma = truth_sigma or (0.0, 0.0)
         assumed = [f"{truth.path.name}: {n}" for n in truth.notes if n == NO_HEADER]
         given = TruthLog(truth.t_ns, truth.seen_from(place).trajectory.T_world_body, *sigma)

@@ -43,6 +43,8 @@ class ForeignLog:
     ``covariance`` (N, 6, 6) or None: NaN where unknown, house order, axes of the moving frame. ``covariance_of``:
     ``"motion"`` from the row before, ``"pose"`` since the start. ``columns``: further fields of the records, (N,).
     ``topic``: of a bag, and ``frame_id`` the name that its messages give to the frame whose poses they hold.
+    ``is_counted``: its stamps are its rows' numbers at a rate that was given, so that another log's rows must be the
+    same.
     """
 
     path: Path
@@ -53,6 +55,7 @@ class ForeignLog:
     notes: tuple[str, ...] = ()
     topic: str | None = None
     frame_id: str | None = None
+    is_counted: bool = False
 
     @property
     def frame(self) -> str:
@@ -145,7 +148,8 @@ def read_foreign(
     if name == "tum":
         return ForeignLog(p, read_tum(p))
     if name == "kitti":
-        return ForeignLog(p, _read_kitti(p, times, rate_hz))
+        trajectory, is_counted = _read_kitti(p, times, rate_hz)
+        return ForeignLog(p, trajectory, is_counted=is_counted)
     if name == "csv":
         return _from_table(p, read_table(p, mapping or {}), covariance_of or "pose", covariance_axes, complete)
     return _read_bag(p, topic)
@@ -216,7 +220,19 @@ def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
     return turned
 
 
-def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> Trajectory:
+def check_same_rows(truth: ForeignLog, log: ForeignLog) -> None:
+    """Refuse a truth whose rows, where only their numbers are stamps, cannot be those of the log.
+
+    Raises SourceError, naming both counts.
+    """
+    if truth.is_counted and log.is_counted and len(truth.t_ns) != len(log.t_ns):
+        text = f"holds {len(truth.t_ns)} poses for the {len(log.t_ns)} of {log.path.name}"
+        cure = "with --rate-hz both must have a line per frame; else give --times, or TUM files with stamps"
+        raise SourceError(text, where=truth.path, cure=cure)
+
+
+def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> tuple[Trajectory, bool]:
+    """Poses with their stamps, and whether these were counted off at the rate."""
     T = read_kitti_poses(path)
     if times is None and rate_hz is None and (path.parent / "times.txt").is_file():
         times = path.parent / "times.txt"
@@ -233,7 +249,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
         t = np.rint(np.arange(len(T)) * (1e9 / rate_hz)).astype(np.int64)
     else:
         raise SourceError("KITTI poses have no stamps", where=path, cure="give --times FILE or --rate-hz RATE")
-    return Trajectory(t, T)
+    return Trajectory(t, T), times is None
 
 
 def _read_bag(path: Path, topic: str | None) -> ForeignLog:

@@ -19,6 +19,9 @@ from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
 FARTHEST_M = 1e9
+_REMOVE = "remove the line: a gap is better than a lie"
+_REMOVE_OF_KITTI = "KITTI poses have no stamps: remove the line and its stamp from copies, for gpvo import --times"
+_MANY = 0.2  # of the stamps: so many repeat only where they are rounded, or every line is there twice
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def read_kitti_poses(path: str | Path) -> Array:
     p = Path(path)
     out = []
     for number, fields in _fields(p, None):
-        values = _floats(p, number, fields)
+        values = _floats(p, number, fields, _REMOVE_OF_KITTI)
         if len(values) != 12:
             raise SourceError(f"line {number} holds {len(values)} numbers, expected 12 (a 3x4 matrix)", where=p)
         out.append(values.reshape(3, 4))
@@ -119,7 +122,7 @@ def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]
             yield number, [f.strip() for f in text.split(separator)]
 
 
-def _floats(path: Path, number: int, fields: list[str]) -> Array:
+def _floats(path: Path, number: int, fields: list[str], cure: str = _REMOVE) -> Array:
     try:
         values = np.array([float(f) for f in fields])
     except ValueError:
@@ -127,9 +130,7 @@ def _floats(path: Path, number: int, fields: list[str]) -> Array:
     if (np.abs(values) > FARTHEST_M).any() and np.isfinite(values).all():
         raise SourceError(f"line {number} holds {np.abs(values).max():.3g}: no position on Earth", where=path)
     if not np.isfinite(values).all():
-        raise SourceError(
-            f"line {number} holds NaN or infinity", where=path, cure="remove the line: a gap is better than a lie"
-        )
+        raise SourceError(f"line {number} holds NaN or infinity", where=path, cure=cure)
     return values
 
 
@@ -182,11 +183,13 @@ def check_growing(path: Path, t_ns: NDArray[np.int64], lines: list[int]) -> None
     if len(bad):
         k = int(bad[0])
         word = "repeats" if t_ns[k + 1] == t_ns[k] else "goes back"
-        raise SourceError(
-            f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(int(t_ns[k + 1]))} s {word}",
-            where=path,
-            cure="sort the file by time and drop repeated lines",
-        )
+        text = f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(int(t_ns[k + 1]))} s {word}"
+        cure = "sort the file by time and drop repeated lines"
+        repeated = len(t_ns) - len(np.unique(t_ns))
+        if repeated > _MANY * len(t_ns):
+            text += f", as {repeated} of {len(t_ns)} do"
+            cure = "they are rounded: write them with all digits, nanoseconds included, or drop lines there twice"
+        raise SourceError(text, where=path, cure=cure)
 
 
 def check_unit(path: Path, q_xyzw: Array, lines: list[int]) -> None:

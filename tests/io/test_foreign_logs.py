@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from foreign_trajectories import write_euroc_csv, write_kitti_poses
+from gpvo.cli.files import import_log
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.io.foreign import T_FLU_OPTICAL, guess_format, read_foreign
+from gpvo.io.foreign import T_FLU_OPTICAL, check_same_rows, guess_format, read_foreign
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import write_tum
 from gpvo.types import Status
@@ -148,6 +149,17 @@ def test_formats_by_their_look(tmp_path):
     assert read_foreign(tmp_path / "b", rate_hz=10.0).t_ns[3] == 300_000_000
     (tmp_path / "times.txt").write_text("".join(f"{0.1 * k:.4f}\n" for k in range(N)))
     assert read_foreign(tmp_path / "b").t_ns[3] == 300_000_000
+
+
+def test_rows_that_only_their_numbers_stamp_must_be_those_of_the_log(tmp_path):
+    write_kitti_poses(tmp_path / "log", POSES)
+    write_kitti_poses(tmp_path / "truth", POSES[1:])
+    write_tum(tmp_path / "truth.tum", T_NS, POSES)
+    log, truth = (read_foreign(tmp_path / name, rate_hz=10.0) for name in ("log", "truth"))
+    check_same_rows(log, log)
+    check_same_rows(read_foreign(tmp_path / "truth.tum"), log)
+    with pytest.raises(SourceError, match="truth: holds 24 poses for the 25 of log .*--times"):
+        import_log(log, truth, tmp_path / "run")
 
 
 def test_body_becomes_camera(tmp_path):

@@ -87,6 +87,31 @@ def test_bad_kitti_and_times(tmp_path):
         read_tum(tmp_path / "nothing.tum")
 
 
+def test_the_cure_of_a_kitti_pose_that_is_none_keeps_the_stamps_of_the_others(tmp_path):
+    path = tmp_path / "poses.txt"
+    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 nan 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(SourceError, match="line 2 holds NaN or infinity .*and its stamp.*--times"):
+        read_kitti_poses(path)
+
+
+@pytest.mark.parametrize(("digits", "cure"), [(5, "12 of 20 do .they are rounded"), (7, None)])
+def test_stamps_that_were_rounded_are_not_dropped(tmp_path, digits, cure):
+    path = tmp_path / "a.tum"
+    path.write_text("".join(f"{1000 + 0.035 * k:.{digits}g} 0 0 0 0 0 0 1\n" for k in range(20)))
+    if cure is None:
+        assert len(read_tum(path)) == 20
+        return
+    with pytest.raises(SourceError, match=f"repeats, as {cure}"):
+        read_tum(path)
+
+
+def test_a_single_line_that_is_there_twice_can_be_dropped(tmp_path):
+    path = tmp_path / "a.tum"
+    path.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in [0, 1, 2, 3, 3, 4, 5]))
+    with pytest.raises(SourceError, match="the stamp 3.0* s repeats .sort the file by time and drop repeated lines"):
+        read_tum(path)
+
+
 def test_quaternions_that_are_nearly_unit_are_normalised(tmp_path):
     path = tmp_path / "a.tum"
     path.write_text("1.0 0 0 0 0 0 0.7071 0.7072\n")
