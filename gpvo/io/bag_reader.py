@@ -33,6 +33,8 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
 )
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
+_BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
+_LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
 
 
 def is_bag(path: Path) -> bool:
@@ -104,10 +106,13 @@ def pose_of(message: Any) -> Array:
     return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], dtype=np.float64)
 
 
-def read_poses(path: Path, topic: str) -> tuple[np.ndarray, Array, list[Any]]:
+def read_poses(
+    path: Path, topic: str, remark: Callable[[str], None] | None = None
+) -> tuple[np.ndarray, Array, list[Any]]:
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
-    Raises SourceError where the topic has no poses, or one that is not finite.
+    ``remark`` is told how many were dropped, or out of order. Raises SourceError where the topic has no poses, or one
+    that is not finite, and where its clock goes back by more than a second or gives many messages one stamp.
     """
     stamps, rows, kept = [], [], []
     with open_bag(path) as reader:
@@ -122,14 +127,33 @@ def read_poses(path: Path, topic: str) -> tuple[np.ndarray, Array, list[Any]]:
     if not rows:
         raise SourceError(f"holds no message on '{topic}'", where=path)
     t, data = np.array(stamps, dtype=np.int64), np.stack(rows)
-    order = np.argsort(t, kind="stable")
-    order = order[np.concatenate([[True], np.diff(t[order]) > 0])]
+    order = _in_time(t, topic, path, remark)
     t, data = t[order], data[order]
     norm = np.linalg.norm(data[:, 3:], axis=1)
     bad = np.flatnonzero(~np.isfinite(data).all(axis=1) | ~(np.abs(norm - 1) < 0.1))
     if len(bad):
         raise SourceError(f"message {order[bad[0]] + 1} on '{topic}' holds no valid pose", where=path)
     return t, se3.from_quaternion(data[:, :3], data[:, 3:]), [kept[i] for i in order]
+
+
+def _in_time(t_ns: Stamps, topic: str, path: Path, remark: Callable[[str], None] | None) -> NDArray[np.intp]:
+    """Indices of the messages at (N,) stamps in order of time, the first of those that share one."""
+    where, steps = f"on '{topic}'", np.diff(t_ns)
+    if len(steps) and -steps.min() > _BACK_NS:
+        text = f"the stamps {where} go back by {-steps.min() * 1e-9:.3f} s at message {int(steps.argmin()) + 2}"
+        raise SourceError(text, where=path, cure="the clock was set or started anew: cut the bag there")
+    order = np.argsort(t_ns, kind="stable")
+    order = order[np.concatenate([[True], np.diff(t_ns[order]) > 0])]
+    repeated, late = len(t_ns) - len(order), int((steps < 0).sum())
+    if len(order) < _LEAST_LEFT * len(t_ns):
+        text = f"{repeated} of {len(t_ns)} messages {where} repeat a stamp"
+        cure = "header.stamp must be the time of each measurement; a clock that starts anew needs a bag of its own"
+        raise SourceError(text, where=path, cure=cure)
+    if remark is not None and repeated:
+        remark(f"{repeated} of {len(t_ns)} messages {where} repeat a stamp and were left out")
+    if remark is not None and late:
+        remark(f"{late} of {len(t_ns)} messages {where} came out of order and were sorted by their stamps")
+    return order
 
 
 def imu_topics(topics: list[str]) -> list[tuple[str, ...]]:

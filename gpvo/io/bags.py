@@ -128,9 +128,9 @@ class BagSource(ImageSource):
 
     def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
         try:
-            t, T, _ = read_poses(self.path, topic)
+            t, T, _ = read_poses(self.path, topic, self.remark)
         except SourceError as error:
-            cure = error.cure or "--truth-topic none does without"
+            cure = "; ".join(filter(None, (error.cure, "--truth-topic none does without")))
             raise SourceError(error.what, where=error.where, cure=cure) from None
         if frame == "imu" and self.mounting.T_imu_cam is None:
             raise CalibrationError("does not say where the IMU sits", where=self.path, cure="use --truth-frame cam")

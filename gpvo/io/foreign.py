@@ -268,8 +268,9 @@ def _read_bag(path: Path, topic: str | None) -> ForeignLog:
 
 
 def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
-    t, T, read = read_poses(path, topic)
-    log = ForeignLog(path, Trajectory(t, T), topic=topic, frame_id=moving_frame(read[0]))
+    notes: list[str] = []
+    t, T, read = read_poses(path, topic, notes.append)
+    log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
@@ -279,7 +280,7 @@ def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
         return log
     if _looks_stated(pose):
         return replace(log, covariance=_into_body(log.trajectory, pose), covariance_of="pose")
-    return replace(log, notes=(NONE_STATED,))
+    return replace(log, notes=(*notes, NONE_STATED))
 
 
 def _bag_covariance(read: list[Any], name: str) -> Array | None:

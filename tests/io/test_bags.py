@@ -337,6 +337,39 @@ def test_a_covariance_that_begins_with_zeros_is_stated_from_there_on(tmp_path):
     assert notes == ["2 of 19 covariances are not positive definite and were left out"]
 
 
+def _stamped(tmp_path, stamps_s):
+    """A bag of odometry with these stamps, recorded in this order."""
+    maker = BagMaker(True)
+    for k, t in enumerate(stamps_s):
+        maker.odometry("/odom", round(t * 1e9), np.eye(4), np.eye(6), np.eye(6))
+        maker.messages[-1] = ((k + 1) * 10**9, *maker.messages[-1][1:])
+    return maker.write(tmp_path / "a.bag")
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "reason"),
+    [
+        ([0.0] * 20, "19 of 20 messages on '/odom' repeat a stamp .header.stamp must be"),
+        ([*range(1, 11), *range(1, 11)], "go back by 9.000 s at message 11 .the clock was set"),
+    ],
+)
+def test_a_clock_that_does_not_run_is_refused(tmp_path, stamps_s, reason):
+    with pytest.raises(SourceError, match=reason):
+        read_foreign(_stamped(tmp_path, stamps_s))
+
+
+def test_messages_out_of_order_are_sorted_and_counted(tmp_path):
+    stamps_s = [0.1 * k for k in range(20)]
+    stamps_s[4:6] = stamps_s[5], stamps_s[4]
+    stamps_s.append(stamps_s[-1])
+    log = read_foreign(_stamped(tmp_path, stamps_s))
+    np.testing.assert_allclose(log.t_ns, np.arange(20) * 1e8)
+    assert log.notes == (
+        "1 of 21 messages on '/odom' repeat a stamp and were left out",
+        "1 of 21 messages on '/odom' came out of order and were sorted by their stamps",
+    )
+
+
 def test_which_topic(tmp_path):
     maker = _odometry_bag(True, twist=True)
     maker.odometry("/other", seq.START_NS, np.eye(4), np.eye(6), np.eye(6))
