@@ -68,7 +68,7 @@ def read_plan(path: str | Path, dt_s: float, frame: str = "cam") -> Plan:
     """
     if frame not in ("cam", "body"):
         raise GpvoError(f"unknown frame '{frame}'", cure="cam or body")
-    given = read_tum(path)
+    given = read_tum(path, any_spacing=True)
     T = given.T_world_body @ T_FLU_OPTICAL if frame == "body" else given.T_world_body
     n = 1 + int((given.t_ns[-1] - given.t_ns[0]) * 1e-9 / dt_s + 1e-6)
     if n < _MIN_MOTIONS + 1:

@@ -16,7 +16,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
 from gpvo.io.foreign_csv import Table, is_number, read_table
-from gpvo.io.stamps import text_lines
+from gpvo.io.stamps import check_interval, text_lines
 from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
@@ -241,6 +241,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
         if len(t) != len(T):
             raise SourceError(f"holds {len(t)} stamps for the {len(T)} poses of {path.name}", where=times)
         check_growing(Path(times), t, list(range(1, len(t) + 1)))
+        check_interval(t, times, lambda _: "the file of --times holds seconds", is_stated=True)
     elif rate_hz is not None:
         if not 1e-3 <= rate_hz <= 1e5:
             raise SourceError(

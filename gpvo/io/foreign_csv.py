@@ -75,21 +75,27 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     order = [name for name in targets if name not in _STAMPS]
     stamp = next(s for s in _STAMPS if s in targets)
     is_stated = stamp in mapping.values()
+    column = header[targets[stamp]]
     for number, fields in lines:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
         if len(fields) < len(header):
             raise SourceError(f"line {number} holds {len(fields)} fields, the header {len(header)}", where=path)
+        text = fields[targets[stamp]]
         try:
-            stamps.append(_stamp(fields[targets[stamp]], stamp[2:], is_stated))
+            stamps.append(_stamp(text, stamp[2:], is_stated))
+        except ValueError as error:
+            unit = likely_unit(text)
+            cure = None if unit is None or f"t_{unit}" == stamp else _unit_cure(column, unit)
+            raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
+        try:
             rows.append([float(fields[targets[name]] or "nan") for name in order])
         except ValueError as error:
             raise SourceError(f"line {number}: {error}", where=path) from None
         numbers.append(number)
     if not rows:
         raise SourceError("holds a header and no rows", where=path)
-    column = header[targets[stamp]]
-    check_interval(stamps, path, f"name the unit: --map {column}=t_us, or t_ms, t_s, t_ns", is_stated=is_stated)
+    check_interval(stamps, path, lambda unit: _unit_cure(column, unit), is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
     used = {targets[n] for n in targets}
     unused = tuple(c for k, c in enumerate(header) if k not in used and _UNCERTAIN.search(c))
@@ -208,6 +214,12 @@ def _suggest(column: str) -> str | None:
     if pose[2] == "w" and not is_quaternion:
         return None
     return f"{'q' if is_quaternion else 'p'}_{pose[2]}"
+
+
+def _unit_cure(column: str, unit: str) -> str:
+    """How to say in which unit a column of stamps is, most likely ``unit``."""
+    others = ", ".join(f"t_{u}" for u in UNITS_NS if u != unit)
+    return f"name the unit: --map {column}=t_{unit} (or {others}), in a ground truth with --truth-map"
 
 
 def _stamp(text: str, unit: str, is_stated: bool) -> int:

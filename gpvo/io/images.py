@@ -198,7 +198,7 @@ class FileSource(ImageSource):
     ) -> None:
         if not pairs:
             raise SourceError("holds no image pair with equal stamps", where=path)
-        check_interval([p.t_ns for p in pairs], path, "names and lists hold nanoseconds, times.txt seconds")
+        check_interval([p.t_ns for p in pairs], path, lambda _: "names and lists hold nanoseconds, times.txt seconds")
         super().__init__(path, name, rig, known=known, **options)
         self._pairs = pairs
         self.span_ns = (min(p.t_ns for p in pairs), max(p.t_ns for p in pairs))

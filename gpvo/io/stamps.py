@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -25,7 +25,7 @@ _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns":
 # Below which size a number is a time of the unit.
 _LIMITS = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (np.inf, "ns"))
 # Usual intervals of any odometry [ns]; beyond them the stamps are in another unit.
-_SHORTEST_NS, _LONGEST_NS = 1e5, 1e12
+_SHORTEST_NS, _LONGEST_NS = 1e5, 2e10
 # The same where the stamps, read as nanoseconds, are of the size of today's microseconds: of frames 2 s apart, and no
 # camera's after 28 hours up time.
 _SHORTEST_AS_US_NS = 2e6
@@ -87,11 +87,14 @@ def likely_unit(text: str) -> str | None:
 def cure_of_seconds(text: str) -> str | None:
     """What to do about a stamp of a TUM file that is not in seconds; None where it is in no other unit either."""
     unit = likely_unit(text)
-    if unit is None or unit == "s":
-        return None
+    return None if unit is None or unit == "s" else f"these look like {_UNIT_NAMES[unit]}, and {cure_of_unit(unit)}"
+
+
+def cure_of_unit(unit: str) -> str:
+    """What to do about a TUM file whose stamps are in ``unit`` (of :data:`UNITS_NS`)."""
     header = f"t_{unit} p_x p_y p_z q_x q_y q_z q_w"
     return (
-        f"these look like {_UNIT_NAMES[unit]}, and TUM has seconds: divide them by {UNITS_NS['s'] // UNITS_NS[unit]:,},"
+        f"TUM has seconds: divide them by {UNITS_NS['s'] // UNITS_NS[unit]:,},"
         f" or give gpvo import the file with '{header}' as its first line"
     )
 
@@ -183,11 +186,13 @@ def usual_interval(t_ns: Iterable[int]) -> float | None:
     return float(np.median(np.diff(stamps))) if len(stamps) > 2 else None
 
 
-def check_interval(t_ns: Sequence[int], where: object, cure: str, *, is_stated: bool = False) -> None:
+def check_interval(
+    t_ns: Sequence[int] | NDArray[np.int64], where: object, cure: Callable[[str], str], *, is_stated: bool = False
+) -> None:
     """Refuse stamps whose usual interval no odometry has, because they are in another unit than they were read in.
 
     ``is_stated``: somebody said the unit, so that the size of the stamps is no reason to doubt it. Raises SourceError,
-    naming the interval, the likely unit and the ``cure``.
+    naming the interval, the likely unit and what ``cure`` makes of that unit (of :data:`UNITS_NS`).
     """
     usual_ns = usual_interval(t_ns)
     if usual_ns is None:
@@ -195,11 +200,11 @@ def check_interval(t_ns: Sequence[int], where: object, cure: str, *, is_stated: 
     is_like_us = not is_stated and likely_unit(str(max(t_ns))) == "us"
     if (_SHORTEST_AS_US_NS if is_like_us else _SHORTEST_NS) <= usual_ns <= _LONGEST_NS:
         return
-    # Too short: read as nanoseconds. Too long: read as seconds. Their own unit makes it a millisecond or more.
-    limits = ((1e3, "ms"), (1e15, "us"), (np.inf, "ns"))
+    # Up to a second they are too short: read as nanoseconds. Else too long: read as seconds.
+    limits = ((1e3, "ms"), (1e9, "us"), (1e12, "ms"), (1e15, "us"), (np.inf, "ns"))
     unit = next(name for limit, name in limits if usual_ns < limit)
     text = f"the stamps look like {_UNIT_NAMES[unit]}: as they were read, the usual interval is {usual_ns * 1e-9:.3g} s"
-    raise SourceError(text, where=where, cure=cure)
+    raise SourceError(text, where=where, cure=cure(unit))
 
 
 def tolerance_ns(seconds: float) -> int:

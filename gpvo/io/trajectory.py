@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry import se3
-from gpvo.io.stamps import cure_of_seconds, growing, integer_ns, ns_to_seconds_text, seconds_text_to_ns, text_lines
+from gpvo.io.stamps import (
+    check_interval,
+    cure_of_seconds,
+    cure_of_unit,
+    growing,
+    integer_ns,
+    ns_to_seconds_text,
+    seconds_text_to_ns,
+    text_lines,
+)
 from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
@@ -35,13 +44,17 @@ class Trajectory:
         return len(self.t_ns)
 
 
-def read_tum(path: str | Path) -> Trajectory:
+def read_tum(path: str | Path, *, any_spacing: bool = False) -> Trajectory:
     """TUM lines ``t[s] tx ty tz qx qy qz qw``; ``#`` starts a comment.
 
-    Raises SourceError, naming file and line: wrong number of fields, NaN, stamps that do not grow, quaternions that are
-    not unit.
+    ``any_spacing``: these are waypoints; else stamps whose usual interval is no odometry's are in another unit. Raises
+    SourceError, naming file and line: wrong number of fields, NaN, stamps that do not grow, or are no seconds,
+    quaternions that are not unit.
     """
-    return read_tum_with(Path(path), 0)[0]
+    trajectory = read_tum_with(Path(path), 0)[0]
+    if not any_spacing:
+        check_interval(trajectory.t_ns, path, cure_of_unit, is_stated=True)
+    return trajectory
 
 
 def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:

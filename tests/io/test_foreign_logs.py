@@ -215,13 +215,35 @@ def test_stamps_in_other_units(tmp_path, unit, per_s):
         text = text.replace(str(T_NS[k]), str(int(t[k]) * per_s // 10**9))
     path.write_text(text)
     reason = (
-        "look like microseconds.*--map timestamp=t_us" if unit == "us" else "'1403636579763' is not a stamp in seconds"
+        "look like microseconds.*--map timestamp=t_us"
+        if unit == "us"
+        else "line 2: '1403636579763' is not a stamp in seconds .*--map timestamp=t_ms"
     )
     with pytest.raises(SourceError, match=reason):
         read_foreign(path)
     np.testing.assert_array_equal(read_foreign(path, mapping={"timestamp": f"t_{unit}"}).t_ns, t)
     path.write_text(text.replace("timestamp", f"#timestamp [{unit}]"))
     np.testing.assert_array_equal(read_foreign(path).t_ns, t)
+
+
+@pytest.mark.parametrize(("unit", "per_s"), [("us", 10**6), ("ms", 10**3)])
+def test_stamps_since_the_start_in_other_units(tmp_path, unit, per_s):
+    """Small enough for seconds; their intervals are none of an odometry."""
+    t = [k * per_s // 20 for k in range(N)]
+    path = _csv(tmp_path / "a.csv", "timestamp,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
+    text = path.read_text()
+    for k in range(N):
+        text = text.replace(str(T_NS[k]), str(t[k]))
+    path.write_text(text)
+    with pytest.raises(SourceError, match=f"--map timestamp=t_{unit}"):
+        read_foreign(path)
+    (tmp_path / "a.tum").write_text("\n".join(line.replace(",", " ") for line in text.splitlines()[1:]))
+    with pytest.raises(SourceError, match=f"divide them by .*'t_{unit} p_x"):
+        read_foreign(tmp_path / "a.tum")
+    write_kitti_poses(tmp_path / "k", POSES)
+    (tmp_path / "times").write_text("\n".join(map(str, t)))
+    with pytest.raises(SourceError, match="times: the stamps look like .*holds seconds"):
+        read_foreign(tmp_path / "k", times=tmp_path / "times")
 
 
 def test_microseconds_at_a_low_rate(tmp_path):

@@ -87,6 +87,14 @@ def test_bad_kitti_and_times(tmp_path):
         read_tum(tmp_path / "nothing.tum")
 
 
+def test_waypoints_may_be_far_apart(tmp_path):
+    path = tmp_path / "a.tum"
+    path.write_text("".join(f"{60 * k} {k} 0 0 0 0 0 1\n" for k in range(5)))
+    assert len(read_tum(path, any_spacing=True)) == 5
+    with pytest.raises(SourceError, match="look like milliseconds: .*interval is 60 s .*'t_ms p_x"):
+        read_tum(path)
+
+
 def test_the_cure_of_a_kitti_pose_that_is_none_keeps_the_stamps_of_the_others(tmp_path):
     path = tmp_path / "poses.txt"
     path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 nan 0 1 0 0 0 0 1 0\n")
