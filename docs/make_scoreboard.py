@@ -14,9 +14,8 @@ import tempfile
 from pathlib import Path
 
 from baselines import baselines
-from gpvo.dataset.build import build_run
+from gpvo.dataset.build import build_run, leave_one_out
 from gpvo.dataset.errors import motion_errors
-from gpvo.dataset.splits import leave_one_out
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.score import score_folder, write_board, write_statements
 from gpvo.io.run import Run, read_run, read_tracks

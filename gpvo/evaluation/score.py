@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gpvo.dataset.build import leave_one_out
 from gpvo.dataset.doubtful import in_waits, wandering_waits
-from gpvo.dataset.splits import leave_one_out
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
 from gpvo.evaluation.statements import corrected

@@ -1,12 +1,16 @@
 """ROS 1 bags, ROS 2 bags (sqlite3) and MCAP through one reader, with their failures as one line; their poses and IMU.
 
+Bags that would fill the memory or never end are refused: chunks unpack to a bound, and databases hold tables alone.
 An IMU is one topic, or two where a driver publishes gyroscope and accelerometer apart.
 """
 
 from __future__ import annotations
 
+import bz2
+import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +19,6 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.io.bag_bounds import ChunkTooLarge, bound_chunks, require_tables
 from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
 
@@ -35,6 +38,11 @@ POSE_TYPES = (
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
 _BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
+MAX_CHUNK_BYTES = 1 << 28
+"""No recorder makes chunks of more than a few megabytes, or of one message where that is larger."""
+_STEP_BYTES = 1 << 22
+# What SQLite itself writes of a table or an index; views, triggers and virtual tables run code of the file's.
+_ALLOWED = ("CREATE TABLE %", "CREATE INDEX %", "CREATE UNIQUE INDEX %")
 
 
 def is_bag(path: Path) -> bool:
@@ -224,3 +232,56 @@ def _with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: A
     # From the first stamp on: nanoseconds of an epoch are finer than a float.
     out[:, 3:] = np.stack([np.interp(t - t_acc[0], t_acc - t_acc[0], acc[:, i]) for i in range(3)], axis=1)
     return t, out
+
+
+class ChunkTooLarge(Exception):
+    """A chunk of a bag unpacks to more than is made room for."""
+
+
+def bound_chunks() -> None:
+    """Make the readers of ``rosbags`` stop unpacking a chunk at what it declares, and at 256 MB in any case."""
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import storage_mcap as mcap
+
+    of: dict[str, Callable[[], Any]] = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
+    if hasattr(mcap, "zstd"):
+        of["zstd"] = mcap.zstd.ZstdDecompressor
+    # Versions of rosbags that have no such table are left as they are.
+    for table in (getattr(ros1, "decompressors", {}), getattr(mcap, "DECOMPRESSORS", {})):
+        table.update({name: partial(unpacked, new=of[name]) for name in of.keys() & table.keys()})
+
+
+def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], Any]) -> bytes:
+    """All that compressed bytes hold, by decompressors that ``new`` makes, one for each of the streams.
+
+    Raises ChunkTooLarge beyond ``declared`` bytes or the bound, EOFError where a stream is cut off.
+    """
+    most, out = min(declared, MAX_CHUNK_BYTES), bytearray()
+    while data:
+        one = new()
+        while not one.eof:
+            part = one.decompress(data, _STEP_BYTES)
+            data = b""  # the decompressor keeps the rest
+            if not part and not one.eof:
+                raise EOFError("a chunk is cut off")
+            out += part
+            if len(out) > most:
+                raise ChunkTooLarge(f"a chunk unpacks to more than {most} bytes")
+        data = one.unused_data or b""
+    return bytes(out)
+
+
+def require_tables(path: Path) -> None:
+    """Raise SourceError where a bag (a file or folder) has a database of more than tables and their indices: a view
+    may have no end. sqlite3.Error where one is damaged."""
+    for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
+        if file.suffix.lower() != ".db3":
+            continue
+        database = sqlite3.connect(f"{file.resolve().as_uri()}?immutable=1", uri=True)
+        try:
+            other = " AND ".join(["sql NOT LIKE ?"] * len(_ALLOWED))
+            if database.execute(f"SELECT 1 FROM sqlite_master WHERE {other}", _ALLOWED).fetchone():
+                raise SourceError("holds more than tables: no bag", where=file, cure="record or convert it again")
+        finally:
+            database.close()

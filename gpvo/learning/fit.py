@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.build import TrainingSet
-from gpvo.dataset.splits import group_folds
+from gpvo.dataset.build import TrainingSet, group_folds
 from gpvo.learning.assemble import assemble
 from gpvo.learning.basefit import fit_coefficients, learn_domain
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded

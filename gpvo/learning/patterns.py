@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.splits import group_folds
+from gpvo.dataset.build import group_folds
 from gpvo.learning.rows import Rows
 from gpvo.learning.spans import cut
 from gpvo.online.base import TWIST_COLUMNS

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.build import TrainingSet
-from gpvo.dataset.splits import leave_one_out
+from gpvo.dataset.build import TrainingSet, leave_one_out
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.methods import METHODS, average, empty, score
 from gpvo.learning.thesis import ThesisModel, fit_thesis

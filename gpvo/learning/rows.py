@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpvo.dataset.build import TrainingSet
-from gpvo.dataset.splits import group_labels
+from gpvo.dataset.build import TrainingSet, group_labels
 from gpvo.geometry import se3
 from gpvo.learning.spans import chains
 from gpvo.online.base import TWIST_COLUMNS

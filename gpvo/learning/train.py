@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo import __version__
-from gpvo.dataset.build import MIN_ROWS, TrainingSet
-from gpvo.dataset.splits import MIN_SEQUENCES, leave_one_out
+from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
 from gpvo.io.run_read import Run

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 from bag_maker import stereo_bag
 from gpvo.errors import SourceError
-from gpvo.io import bag_bounds, open_source
-from gpvo.io.bag_bounds import ChunkTooLarge, unpacked
-from gpvo.io.bag_reader import open_bag
+from gpvo.io import bag_reader, open_source
+from gpvo.io.bag_reader import ChunkTooLarge, open_bag, unpacked
 from lz4.frame import LZ4FrameDecompressor
 from lz4.frame import compress as lz4_compress
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -41,7 +40,7 @@ def test_a_chunk_unpacks_to_what_it_declares_and_no_further(new: Callable[[], An
 
 
 def test_a_bag_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bag_bounds, "MAX_CHUNK_BYTES", 1000)
+    monkeypatch.setattr(bag_reader, "MAX_CHUNK_BYTES", 1000)
     path = tmp_path / "flight.bag"
     writer = Ros1Writer(path)
     writer.set_compression(Ros1Writer.CompressionFormat.BZ2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.dataset.splits import group_folds
+from gpvo.dataset.build import group_folds
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
 
 
