@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.doubtful import in_waits, odd_stretches, odd_times, wandering_waits
-from gpvo.dataset.errors import check_target, motion_targets, position_targets
+from gpvo.dataset.errors import check_target, motion_targets, position_targets, turn_without_truth_deg
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -128,6 +128,12 @@ def build(
             "has no ground truth to learn from",
             where=where or name,
             cure="run a source that has it, or gpvo import --truth",
+        )
+    if target != "position" and (turn_deg := turn_without_truth_deg(log, truth)):
+        raise GpvoError(
+            f"the ground truth holds no attitude: it never turns, odometry by up to {turn_deg:.0f} deg",
+            where=where or name,
+            cure="learn from a truth with orientations, or with --target position",
         )
     records, X = observe(log, names, target)
     if target == "position":

@@ -31,6 +31,7 @@ _MAX_LAG1 = -0.4
 _EVEN_DT = 0.2
 _OUTLIER = 6.0
 _MIN_WINDOWS = 10
+_NO_TURN_DEG, _TURN_DEG = 1e-3, 5.0  # nothing flies or rolls so straight; no odometry drifts so far alone
 _SURE = 0.99
 """Of a drift: few windows of errors that last make intervals of 95 % too narrow."""
 
@@ -108,6 +109,23 @@ def motion_errors(log: VoLog, truth: TruthLog) -> MotionErrors:
     T_est = log.T_prev_cur[index]
     xi = se3.log(se3.inverse(T_true) @ T_est)
     return MotionErrors(index, xi, T_true, T_est, log.column("dt_s")[index])
+
+
+def turn_without_truth_deg(log: VoLog, truth: TruthLog) -> float:
+    """By how much odometry turns [deg] while a truth, as of satellites alone, has one attitude throughout; else 0.
+
+    Neither rotations nor, in the camera's axes, translations of such a truth are true.
+    """
+    if len(truth.t_ns) < 2 or _turn_deg(truth.T_world_cam) > _NO_TURN_DEG:
+        return 0.0
+    turned = _turn_deg(log.trajectory())
+    return turned if turned > _TURN_DEG else 0.0
+
+
+def _turn_deg(T: Array) -> float:
+    """Largest rotation between the first of poses (N, 4, 4) and another."""
+    R = np.swapaxes(T[:1, :3, :3], 1, 2) @ T[:, :3, :3]
+    return float(np.rad2deg(np.linalg.norm(se3.so3_log(R), axis=1).max()))
 
 
 def check_target(target: str) -> str:

@@ -6,14 +6,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpvo.accumulation import PoseError
 from gpvo.dataset.errors import MotionErrors, drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
 from gpvo.learning.methods import score
-from gpvo.stats.consistency import BLOCKS, by_difficulty, correlation_gain, energy_score, nees, nees_by_block
+from gpvo.stats.consistency import (
+    BLOCKS,
+    by_difficulty,
+    correlation_gain,
+    energy_score,
+    marginal,
+    nees_by_block,
+    seen_axes,
+)
 from gpvo.stats.series import Interval, block_bootstrap
 from gpvo.types import Array, MotionError, VoLog
 
@@ -50,11 +58,13 @@ class Consistency:
     ``nll_per_dim`` is that of a Gaussian, ``nll_stated_per_dim`` that of the stated Student-t, which expects a median
     of ``nees_dof_median_stated``. ``energy_*``, ``correlation_gain_nats`` and the quartiles ``*_by_difficulty``: see
     :mod:`gpvo.stats.consistency`.
-    ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames.
+    ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames. ``axes``: those that
+    count, of 0 to 5, :func:`gpvo.stats.consistency.seen_axes`; a block without any has no score.
     """
 
     method: str
     count: int
+    axes: tuple[int, ...]
     nees_dof: dict[str, Interval | None]
     nees_dof_median: dict[str, float | None]
     nees_dof_truth_noise: dict[str, float | None]
@@ -62,9 +72,9 @@ class Consistency:
     nll_per_dim: float | None
     nll_stated_per_dim: float | None
     nees_dof_median_stated: float
-    crps_translation_m: float
+    crps_translation_m: float | None
     crps_rotation_rad: float | None
-    energy_translation_m: float
+    energy_translation_m: float | None
     energy_rotation_rad: float | None
     correlation_gain_nats: float
     nees_dof_by_difficulty: tuple[float, ...]
@@ -99,20 +109,24 @@ def consistency(
     if stated.sum() < 2:
         return None
     index, d = errors.index[stated], statement.dof
+    axes = seen_axes(errors.xi[:, :d])
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
     noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
-    per_block, with_noise = nees_by_block(e, C), nees_by_block(e, C + noise)
-    scores = score(errors.xi[stated], statement.mean[index], C, statement.nu)
+    per_block, with_noise = nees_by_block(e, C, axes), nees_by_block(e, C + noise, axes)
+    scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
+    energy = {n: _energy(e, C, axes[np.isin(axes, BLOCKS[n])]) for n in ("translation", "rotation")}
+    e, C = e[:, axes], marginal(C, axes)
     quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
     progress = se3.path_length_m(T_true[:, :3, 3]), (log.t_ns - log.t_ns[0]) * 1e-9
 
     def over(along: Array, span: float) -> Horizon:
-        return horizon(statement, log, T_true, known, along, span, noise_sigma, by_velocity)
+        return horizon(statement, log, T_true, known, along, span, noise_sigma, by_velocity, axes)
 
     return Consistency(
         method=statement.method,
         count=int(stated.sum()),
+        axes=tuple(axes.tolist()),
         nees_dof={n: block_bootstrap(per_block[n]) if n in per_block else None for n in BLOCKS},
         nees_dof_median=scores["nees_dof_median"],
         nees_dof_truth_noise={n: float(with_noise[n].mean()) if n in with_noise else None for n in BLOCKS},
@@ -122,8 +136,8 @@ def consistency(
         nees_dof_median_stated=scores["nees_dof_median_stated"],
         crps_translation_m=scores["crps"]["translation_m"],
         crps_rotation_rad=scores["crps"]["rotation_rad"],
-        energy_translation_m=float(energy_score(e[:, :3], C[:, :3, :3]).mean()),
-        energy_rotation_rad=float(energy_score(e[:, 3:], C[:, 3:, 3:]).mean()) if d == 6 else None,
+        energy_translation_m=energy["translation"],
+        energy_rotation_rad=energy["rotation"],
         correlation_gain_nats=float(correlation_gain(e, C).mean()),
         nees_dof_by_difficulty=tuple(quartiles[0].tolist()),
         coverage_by_difficulty=tuple(quartiles[1].tolist()),
@@ -132,6 +146,11 @@ def consistency(
         one_second=over(progress[1], 1.0) if d == 6 else None,
         horizons=tuple(over(progress[0], m) for m in HORIZONS_M if d == 6),
     )
+
+
+def _energy(error: Array, covariance: Array, axes: NDArray[np.intp]) -> float | None:
+    """Mean energy score over some of the axes, None for none."""
+    return float(energy_score(error[:, axes], marginal(covariance, axes)).mean()) if len(axes) else None
 
 
 def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) -> tuple[float | None, float | None]:
@@ -168,11 +187,11 @@ def _sum_of(T_prev_cur: Sequence[Array] | Array, errors: Sequence[MotionError]) 
 
 def horizon(
     statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
-    noise_sigma: Array, by_velocity: Array | None = None,
+    noise_sigma: Array, by_velocity: Array | None = None, axes: ArrayLike = BLOCKS["joint"],
 ) -> Horizon:  # fmt: skip
     """NEES over windows of ``span`` of a growing ``progress`` (N,), at most sixty, without lost frames.
 
-    Each begins where the one before has at least half passed.
+    Each begins where the one before has at least half passed. ``axes``: those that count.
     """
     assert statement.errors is not None
     windows = list(_windows(log, known, progress, span))
@@ -194,7 +213,7 @@ def horizon(
         # The white noise of two poses is in the variance of a displacement, too.
         noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
     z2 = (e**2 / np.diagonal(C + noise, axis1=1, axis2=2)).mean(axis=0)
-    plain, noisy = (float(nees(e, S).mean()) / 6 for S in (C, C + noise))
+    plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + noise))
     return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(windows))
 
 

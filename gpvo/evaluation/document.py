@@ -54,6 +54,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
     For each method, besides NEES, coverage, NLL and CRPS:
 
+    * ``axes``: those that count, named x y z rx ry rz; the rest never differ between odometry and truth.
     * ``nees_dof_interval``: by block, 95 % interval [low, high] of ``nees_dof`` by a bootstrap over blocks of time.
     * ``nees_dof_truth_noise``: by block, ``nees_dof`` with the truth's own noise added to what the method states.
     * ``energy`` {``translation_m``, ``rotation_rad``}: energy score, the CRPS for vectors; it rewards sharpness and
@@ -138,6 +139,7 @@ def _method_document(c: Consistency | None) -> dict[str, Any]:
         return of(name) or dict.fromkeys(BLOCKS)
 
     return {
+        "axes": None if c is None else [AXES[k] for k in c.axes],
         "nees_dof": {b: i and i.mean for b, i in by_block("nees_dof").items()},
         "nees_dof_interval": {b: i and [i.low, i.high] for b, i in by_block("nees_dof").items()},
         "nees_dof_median": by_block("nees_dof_median"),

@@ -75,7 +75,7 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
     run = Run(stated, stated.stem, log, TruthLog(poses.t_ns, poses.T_world_body), None, Mounting(), [])
     evaluation = evaluate_run(run, options=options)
     c = evaluation.consistency.get(IMPORTED)
-    if c is None or c.energy_rotation_rad is None or c.nll_per_dim is None or c.one_second is None:
+    if c is None or c.nll_per_dim is None or c.one_second is None:
         what = f"{int(log.usable.sum())} of {len(log) - 1} motions"
         raise SourceError(f"states {what}, of which fewer than two have truth", where=stated, cure="see --truth")
     usable, lost = int(log.usable.sum()), sum(r.status is Status.LOST for r in log)
@@ -86,8 +86,8 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
         sequence=stated.stem,
         motions=usable,
         lost=lost,
-        energy_translation_m=_mean_with(c.energy_translation_m, c.count, charged_m),
-        energy_rotation_rad=_mean_with(c.energy_rotation_rad, c.count, charged_rad),
+        energy_translation_m=_mean_with(c.energy_translation_m or 0.0, c.count, charged_m),
+        energy_rotation_rad=_mean_with(c.energy_rotation_rad or 0.0, c.count, charged_rad),
         nll_per_dim=c.nll_per_dim,
         nees_dof=np.nan if joint is None else joint.mean,
         nees_dof_over={n: h.nees_dof_truth_noise if h.count else None for n, h in over.items()},

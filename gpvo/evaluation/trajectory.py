@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gpvo.evaluation.consistency import Consistency
 from gpvo.filters.metrics import ate_rmse, umeyama
 from gpvo.geometry import se3
-from gpvo.stats.consistency import nees
+from gpvo.stats.consistency import nees_by_block, seen_axes
 from gpvo.stats.series import Interval, block_bootstrap
 from gpvo.types import IMPORTED_POSE, Array, VoLog
 
@@ -172,7 +172,7 @@ def _unbroken(
     return start[whole], end[whole]
 
 
-BLOCKS = {"position": slice(0, 3), "orientation": slice(3, 6), "joint": slice(0, 6)}
+_NAMES = {"translation": "position", "rotation": "orientation", "joint": "joint"}
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,8 @@ class PoseConsistency:
 
     The error is the right perturbation ``Log(T_true^-1 T_est)`` in the body's axes. An alignment acts on the left, so
     it leaves the body's covariance as it is. Covariances in world axes are turned into the body's when they are read;
-    to first order NEES is the same in both conventions.
+    to first order NEES is the same in both conventions. Axes on which odometry and truth never differ do not count; a
+    block without any is left out.
     """
 
     count: int
@@ -208,7 +209,7 @@ def pose_consistency(log: VoLog, T_est: Array, T_true: Array, known: NDArray[np.
     R, t = umeyama(T_est[stated, :3, 3], T_true[stated, :3, 3])
     aligned = se3.from_rt(R, t) @ T_est[stated]
     error, C = se3.log(se3.inverse(T_true[stated]) @ aligned), C[stated]
-    by_block = {n: nees(error[:, b], C[:, b, b]) / (b.stop - b.start) for n, b in BLOCKS.items()}
+    by_block = {_NAMES[n]: values for n, values in nees_by_block(error, C, seen_axes(error)).items()}
     return PoseConsistency(
         count=int(stated.sum()),
         nees_dof={n: block_bootstrap(v) for n, v in by_block.items()},

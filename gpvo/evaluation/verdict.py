@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gpvo.dataset.errors import steps_of_slow_truth
+from gpvo.dataset.errors import steps_of_slow_truth, turn_without_truth_deg
 from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
+from gpvo.online.features import AXES
+from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import Array
 
 if TYPE_CHECKING:
@@ -37,7 +39,12 @@ class Verdict:
 def verdict(e: Evaluation) -> Verdict:
     """The verdict on one evaluated run."""
     judged = {m: c for m, c in e.consistency.items() if c.nll_per_dim is not None}
-    if not judged and e.poses is not None:
+    return _of_motions(e, judged) if judged else _of_others(e)
+
+
+def _of_others(e: Evaluation) -> Verdict:
+    """Where no covariance of a motion can be judged: that of the poses, or why there is none."""
+    if e.poses is not None:
         joint = e.poses.nees_dof["joint"].mean
         colour: Colour = "green" if _word(joint) == "honest" else "red" if joint > HONEST[1] else "amber"
         line = (
@@ -51,29 +58,32 @@ def verdict(e: Evaluation) -> Verdict:
             "gpvo evaluate --twins judges a run by its twins, if made with --keep-tracks.",
         )
         return Verdict("amber", "There is no ground truth, so no covariance can be judged.", told_of_none)
-    if not judged:
-        cure = "gpvo train learns one from such runs; give the model with --model."
-        return Verdict("red", "No covariance was stated, so nothing can be judged.", (*_conditions(e), cure))
+    cure = "gpvo train learns one from such runs; give the model with --model."
+    return Verdict("red", "No covariance was stated, so nothing can be judged.", (*_conditions(e), cure))
+
+
+def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
+    found = {m: _Judgement.of(c, e) for m, c in judged.items()}
     best = min(judged, key=lambda m: judged[m].nll_per_dim or 0.0)
     # What a vehicle would be told is judged first; others only where it is wrong.
-    told = "learned" if "learned" in judged else best
-    wrong = _wrong(judged[told])
+    told = found["learned" if "learned" in judged else best]
+    if not told.of_motions and not told.spans:
+        return Verdict("amber", "This truth is too noisy to judge a covariance of the run.", tuple(_conditions(e)))
+    wrong = told.wrong()
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
-    shown = dict.fromkeys((told, best, *(m for m in judged if m in _ALWAYS)))
-    lines = [*_conditions(e), *(_line(m, judged[m]) for m in shown)]
+    shown = dict.fromkeys((told.method, best, *(m for m in judged if m in _ALWAYS)))
+    lines = [*_conditions(e), *(found[m].line() for m in shown)]
     if not wrong and not outside:
-        return Verdict("green", f"The {told} covariance is honest here, per motion and over distance.", tuple(lines))
-    if told != best and not _wrong(judged[best]):
+        where = "per motion and over distance" if told.of_motions else f"over {_listed([n for n, _ in told.spans])}"
+        return Verdict("green", f"The {told.method} covariance is honest here, {where}.", tuple(lines))
+    if told.method != best and not found[best].wrong():
         lines.append(f"Use {best} here: it is honest, and has the best likelihood of all.")
     if outside:
         lines.append("Train on runs with this camera in these conditions, with ground truth or with twins.")
-    per_motion = _per_motion(judged[told])
-    headline = f"The {told} covariance is {per_motion} per motion"
-    if wrong and per_motion == "honest":
-        headline += f", but not over {_listed(wrong)}"
+    headline = f"The {told.method} covariance is {told.words()}"
     if outside:
         headline += "; the model does not know these conditions"
-    return Verdict("red" if outside or "overconfident" in per_motion else "amber", headline + ".", tuple(lines))
+    return Verdict("red" if outside or "overconfident" in headline else "amber", headline + ".", tuple(lines))
 
 
 _ALWAYS = ("triangulation", "pointing_matching", "imported")
@@ -103,26 +113,54 @@ def _word(nees: float, chance: float = 0.0) -> str:
     return "too cautious" if nees < HONEST[0] * (1 - 2 * chance) else "honest"
 
 
-def _spans(c: Consistency) -> Iterator[tuple[str, Horizon]]:
-    """Names and scores of the windows of which there are enough."""
-    for name, h in (("1 s", c.one_second), *((f"{h.span:g} m", h) for h in c.horizons)):
-        if h is not None and h.count >= _FEW_WINDOWS:
-            yield name, h
+@dataclass(frozen=True)
+class _Judgement:
+    """What this truth tells of a statement: of single motions (``of_motions``), unless its noise outweighs their
+    errors, and over the ``spans`` that are long enough for it and of which there are enough windows."""
 
+    c: Consistency
+    of_motions: bool
+    spans: tuple[tuple[str, Horizon], ...]
 
-def _wrong(c: Consistency) -> list[str]:
-    """Over what the statement is wrong, beyond chance."""
-    out = [] if _per_motion(c) == "honest" else ["one motion"]
-    # Windows overlap by half, so half of them are independent: the mean of n chi-squared of 6 dof.
-    chances = ((name, h, math.sqrt(2 / (6 * h.count / 2))) for name, h in _spans(c))
-    return out + [name for name, h, chance in chances if _word(h.nees_dof_truth_noise, chance) != "honest"]
+    @classmethod
+    def of(cls, c: Consistency, e: Evaluation) -> _Judgement:
+        pace_mps = e.trajectory.path_length_m / max(float(np.ptp(e.t_s[e.covered])), 1e-9)
+        spans = [("1 s", pace_mps, c.one_second), *((f"{h.span:g} m", h.span, h) for h in c.horizons)]
+        enough = ((n, h) for n, m, h in spans if h and h.count >= _FEW_WINDOWS and m >= e.tells_from_m)
+        return cls(c, e.tells_from_m == 0.0, tuple(enough))
 
+    @property
+    def method(self) -> str:
+        return self.c.method
 
-def _line(method: str, c: Consistency) -> str:
-    wrong = [w for w in _wrong(c) if w != "one motion"]
-    then = f", not honest over {_listed(wrong)}" if wrong else ""
-    over = "".join(f", {h.nees_dof_truth_noise:.2f} over {name}" for name, h in _spans(c))
-    return f"{method}: {_per_motion(c, sized=True)} per motion{then}; NEES/dof {_nees(c):.2f}{over}."
+    def wrong(self) -> dict[str, str]:
+        """Over what the statement is wrong, beyond chance, and how."""
+        out = {"one motion": _per_motion(self.c)} if self.of_motions else {}
+        for name, h in self.spans:
+            # Windows overlap by half, so half of them are independent: the mean of n chi-squared of so many dof.
+            chance = math.sqrt(2 / (len(self.c.axes) * h.count / 2))
+            out[name] = _word(h.nees_dof_truth_noise, chance)
+        return {name: word for name, word in out.items() if word != "honest"}
+
+    def words(self) -> str:
+        """How it is wrong, for a headline."""
+        wrong = self.wrong()
+        if not self.of_motions:
+            by_word = {word: [n for n, w in wrong.items() if w == word] for word in dict.fromkeys(wrong.values())}
+            return " and ".join(f"{word} over {_listed(names)}" for word, names in by_word.items()) or "honest"
+        per_motion = _per_motion(self.c)
+        then = f", but not over {_listed(list(wrong))}" if wrong and per_motion == "honest" else ""
+        return f"{per_motion} per motion{then}"
+
+    def line(self) -> str:
+        """The figures."""
+        wrong = [name for name in self.wrong() if name != "one motion"]
+        over = [f"{h.nees_dof_truth_noise:.2f} over {name}" for name, h in self.spans]
+        if not self.of_motions:
+            return f"{self.method}: {self.words()}; NEES/dof {', '.join(over)}."
+        then = f", not honest over {_listed(wrong)}" if wrong else ""
+        figures = ", ".join((f"{_nees(self.c):.2f}", *over))
+        return f"{self.method}: {_per_motion(self.c, sized=True)} per motion{then}; NEES/dof {figures}."
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -146,6 +184,15 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
         yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
+    if len(e.errors.xi) and not (np.abs(e.errors.xi) > SEEN).any():
+        yield "Odometry and truth are the same throughout: is the truth made from the odometry?"
+    elif unseen := [a for k, a in enumerate(AXES) if len(e.errors.xi) and k not in seen_axes(e.errors.xi)]:
+        yield f"Odometry and truth never differ in {_listed(unseen)} (a plane?): those axes are not judged."
+    if e.run.truth and (turn_deg := turn_without_truth_deg(e.run.log, e.run.truth)):
+        yield (
+            f"The ground truth holds no attitude: it never turns, odometry by up to {turn_deg:.0f} deg. Of what is said"
+            " here, the ATE alone holds."
+        )
     if e.late_s is not None:
         yield (
             f"The clocks of odometry and truth seem to differ by {abs(e.late_s):.3g} s: with --time-offset auto, errors"

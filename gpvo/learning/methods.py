@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.stats.consistency import BLOCKS, coverage, crps_gaussian, nees_by_block, nees_median, nll_per_dim
+from gpvo.stats.consistency import BLOCKS, coverage, crps_gaussian, marginal, nees_by_block, nees_median, nll_per_dim
 from gpvo.types import IMPORTED, Array
 
 GEOMETRIC = ("triangulation", "pointing_matching")
@@ -91,38 +91,43 @@ def simple_covariances(
     return out
 
 
-def score(error: Array, mean: Array, covariance: Array, nu: float = math.inf) -> dict[str, Any]:
+def score(
+    error: Array, mean: Array, covariance: Array, nu: float = math.inf, axes: ArrayLike | None = None
+) -> dict[str, Any]:
     """Of errors (n, 6), predicted means (n, 6) and covariances (n, 6, 6) about them, and the stated degrees of freedom.
 
     ``nll_per_dim`` is that of the Gaussian of these covariances, ``nll_stated_per_dim`` that of the stated Student-t;
     ``nees_dof_median_stated`` the median that the latter expects of NEES.
 
     A covariance of the translation alone is (n, 3, 3): fields that need the rotation are then None.
-    Rows whose covariance is not finite are left out; with none left every field is None.
+    Rows whose covariance is not finite are left out; with none left every field is None. ``axes``: those that count, as
+    in :func:`gpvo.stats.consistency.nees_by_block`.
     """
     known = np.isfinite(covariance).all(axis=(1, 2))
-    d = covariance.shape[-1]
+    whole = covariance.shape[-1] == 6
     if known.sum() < 2:
         return empty()
     error, mean, covariance = error[known], mean[known], covariance[known]
-    residual = error - mean
+    counted = np.arange(covariance.shape[-1]) if axes is None else np.asarray(axes)
+    per_block = nees_by_block((error - mean)[:, : covariance.shape[-1]], covariance, counted)
+    residual, covariance = (error - mean)[:, counted], marginal(covariance, counted)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    per_block = nees_by_block(residual[:, :d], covariance)
-    crps = crps_gaussian(residual[:, :d], sigma)
-    level = coverage(residual[:, :d], sigma)
+    crps = crps_gaussian(residual, sigma)
+    level = coverage(residual, sigma)
+    d = len(counted)
     return {
         "nees_dof": {n: None if n not in per_block else float(per_block[n].mean()) for n in BLOCKS},
         "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in BLOCKS},
         "coverage": {str(k + 1): float(c) for k, c in enumerate(level)},
-        "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if d == 6 else None,
-        "nll_stated_per_dim": float(np.mean(nll_per_dim(residual, covariance, nu))) if d == 6 else None,
+        "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if whole else None,
+        "nll_stated_per_dim": float(np.mean(nll_per_dim(residual, covariance, nu))) if whole else None,
         "nees_dof_median_stated": nees_median(d, nu) / d,
         "crps": {
-            "translation_m": float(crps[:, :3].mean()),
-            "rotation_rad": float(crps[:, 3:].mean()) if d == 6 else None,
+            "translation_m": float(crps[:, counted < 3].mean()) if (counted < 3).any() else None,
+            "rotation_rad": float(crps[:, counted > 2].mean()) if (counted > 2).any() else None,
         },
-        "rmse_raw": _rmse(error, d),
-        "rmse_corrected": _rmse(residual, d),
+        "rmse_raw": _rmse(error, whole),
+        "rmse_corrected": _rmse(error - mean, whole),
     }
 
 
@@ -161,7 +166,7 @@ def average(values: Sequence[Any]) -> Any:
     return float(np.mean(numbers)) if numbers else first
 
 
-def _rmse(error: Array, d: int) -> dict[str, float | None]:
+def _rmse(error: Array, whole: bool) -> dict[str, float | None]:
     """Of the length of the translation and of the rotation."""
-    rotation = float(np.sqrt((error[:, 3:] ** 2).sum(1).mean())) if d == 6 else None
+    rotation = float(np.sqrt((error[:, 3:] ** 2).sum(1).mean())) if whole else None
     return {"translation_m": float(np.sqrt((error[:, :3] ** 2).sum(1).mean())), "rotation_rad": rotation}

@@ -38,13 +38,13 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import AXES, known_columns
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
-from gpvo.stats.consistency import nees
+from gpvo.stats.consistency import SEEN, nees
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, Prediction
 
 OnFit = Callable[[int, int], None]
 """Told how many fits of a training are done, of how many."""
-_UNSEEN = 1e-6  # m, rad
+_UNSEEN = 0.5 * SEEN
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
@@ -134,7 +134,7 @@ def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
 
 def unseen_axes(sets: Sequence[TrainingSet]) -> list[str]:
     """The axes on which a training has filled in errors, because log and truth never differ there."""
-    return [name for name, rms in zip(AXES, _rms(sets)) if rms < 2.0 * _UNSEEN]
+    return [name for name, rms in zip(AXES, _rms(sets)) if rms < SEEN]
 
 
 def _rms(sets: Sequence[TrainingSet]) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from gpvo.stats import student_t
 from gpvo.types import Array
@@ -38,14 +39,33 @@ def nees(error: Array, covariance: Array) -> Array:
     return (whiten(error, covariance) ** 2).sum(-1)
 
 
-BLOCKS = {"translation": slice(0, 3), "rotation": slice(3, 6), "joint": slice(0, 6)}
+BLOCKS = {"translation": (0, 1, 2), "rotation": (3, 4, 5), "joint": (0, 1, 2, 3, 4, 5)}
 """Of the tangent vector."""
+SEEN = 2e-6
+"""m, rad: an axis whose errors are smaller throughout, as height, roll and pitch of a robot in a plane, tells nothing
+of a covariance: neither odometry nor truth speaks of it."""
 
 
-def nees_by_block(error: Array, covariance: Array) -> dict[str, Array]:
-    """NEES per degree of freedom (n,) of each of :data:`BLOCKS` that errors (n, 6), or (n, 3) of translations, hold."""
-    held = ((name, b) for name, b in BLOCKS.items() if b.stop <= error.shape[-1])
-    return {name: nees(error[:, b], covariance[:, b, b]) / (b.stop - b.start) for name, b in held}
+def seen_axes(error: Array) -> NDArray[np.intp]:
+    """The axes (k,) of errors (n, d) that exceed :data:`SEEN` in the root mean square; all d where none does."""
+    seen = np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
+    return seen if len(seen) else np.arange(error.shape[-1])
+
+
+def marginal(covariance: Array, axes: ArrayLike) -> Array:
+    """Covariances (..., k, k) of some of the axes of (..., d, d)."""
+    return np.asarray(covariance)[..., np.asarray(axes)[:, None], np.asarray(axes)]
+
+
+def nees_by_block(error: Array, covariance: Array, axes: ArrayLike | None = None) -> dict[str, Array]:
+    """NEES per degree of freedom (n,) of each of :data:`BLOCKS` that errors (n, 6), or (n, 3) of translations, hold.
+
+    ``axes``: those that count, all by default; a block without any is left out.
+    """
+    d = error.shape[-1]
+    counted = np.arange(d) if axes is None else np.asarray(axes)
+    held = {name: counted[np.isin(counted, b)] for name, b in BLOCKS.items() if max(b) < d}
+    return {n: nees(error[:, b], marginal(covariance, b)) / len(b) for n, b in held.items() if len(b)}
 
 
 def nees_median(d: int, nu: float = math.inf) -> float:

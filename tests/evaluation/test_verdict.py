@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import make_run
+from evaluation_runs import START_NS, make_run
+from gpvo.dataset.build import build
 from gpvo.dataset.hand_eye import FixedRotation
-from gpvo.errors import SourceError
+from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.verdict import verdict
+from gpvo.geometry import se3
 from gpvo.io.run_read import Run
-from gpvo.types import Array, Mounting, TruthLog, VoLog
+from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog, VoRecord
 
 
 def evaluated(factors: dict[str, float | Array]) -> Evaluation:
@@ -136,3 +138,74 @@ def test_too_little_truth_is_told_from_none(kept: slice, told: str) -> None:
 def test_without_truth_nothing_is_judged() -> None:
     run = Run(Path("hall"), "hall", make_run(60, v_t=False)[0], None, None, Mounting(), [])
     assert verdict(unjudged_run(run)).headline == "There is no ground truth, so no covariance can be judged."
+
+
+@pytest.mark.parametrize("unseen_variance", [1e-9, 1e6])
+def test_axes_on_which_odometry_and_truth_never_differ_are_not_judged(unseen_variance: float) -> None:
+    """A robot in a plane: its errors have three degrees of freedom, whatever its driver states of the others."""
+    sigma, n, rng = np.array([1e-3, 2e-3, 5e-4]), 600, np.random.default_rng(0)
+    seen, moved = [0, 2, 4], np.zeros((n, 6))
+    moved[:, 2], moved[:, 4] = 0.05, 0.02 * np.cos(0.03 * np.arange(n))
+    xi = np.zeros((n, 6))
+    xi[:, seen] = rng.normal(0.0, sigma, (n, 3))
+    C = np.diag(np.full(6, unseen_variance))
+    C[seen, seen] = sigma**2
+    t = START_NS + np.arange(n + 1) * 50_000_000
+    T = se3.exp(moved)
+    poses = [np.eye(4)]
+    for step in T:
+        poses.append(poses[-1] @ step)
+    records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4))] + [
+        VoRecord(int(t[k + 1]), int(t[k]), Status.OK, T[k] @ se3.exp(xi[k]), n_inliers=100, covariances={IMPORTED: C})
+        for k in range(n)
+    ]
+    run = Run(Path("hall"), "hall", VoLog(records), TruthLog(t, np.array(poses)), None, Mounting(), [])
+    found = evaluate_run(run)
+    c = found.consistency[IMPORTED]
+    assert c.axes == (0, 2, 4)
+    assert c.nees_dof["joint"] is not None
+    # 1,800 squared normal values: 0.033 is one standard deviation.
+    assert c.nees_dof["joint"].mean == pytest.approx(1.0, abs=0.14)
+    assert c.horizons[1].nees_dof == pytest.approx(1.0, abs=0.7)
+    assert c.coverage[0] == pytest.approx(0.683, abs=0.05)
+    assert c.energy_rotation_rad is not None
+    assert c.energy_rotation_rad < 5e-4
+    told = verdict(found)
+    assert told.colour == "green"
+    assert any("never differ in y, rx and rz (a plane?)" in line for line in told.lines)
+
+
+def test_a_copy_of_the_odometry_is_no_truth() -> None:
+    log, _ = make_run(200, v_t=False)
+    run = Run(Path("hall"), "hall", log, TruthLog(log.t_ns, log.trajectory()), None, Mounting(), [])
+    assert any("is the truth made from the odometry?" in line for line in verdict(evaluate_run(run)).lines)
+
+
+def test_a_truth_that_cannot_tell_motions_judges_none() -> None:
+    """Positions 5 cm off, motions of 5 cm with errors of 2 mm: only over metres do the errors show."""
+    noise = np.random.default_rng(1).normal(0.0, 0.05, (601, 3))
+
+    def noisy(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        T[:, :3, 3] += noise
+        return replace(truth, T_world_cam=T)
+
+    found = of_truth(noisy)
+    assert found.tells_from_m > 0.5
+    told = verdict(found)
+    assert "per motion" not in " ".join((told.headline, *told.lines))
+    assert all(f"over {span}" not in line for line in told.lines for span in ("1 s", "1 m"))
+
+
+def test_a_truth_without_attitude_is_named() -> None:
+    def without(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        T[:, :3, :3] = np.eye(3)
+        return replace(truth, T_world_cam=T)
+
+    assert any("holds no attitude" in line for line in verdict(of_truth(without)).lines)
+    assert not any("holds no attitude" in line for line in verdict(of_truth(lambda truth: truth)).lines)
+    log, truth = make_run(200)
+    with pytest.raises(GpvoError, match=r"never turns, odometry by up to [0-9]+ deg"):
+        build(log, without(truth), name="hall")
+    assert len(build(log, without(truth), name="hall", target="position")) == 200
