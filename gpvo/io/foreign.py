@@ -276,7 +276,9 @@ def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
         dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
-        return replace(log, covariance=twist * dt[:, None, None] ** 2)
+        if pose is not None and _looks_stated(pose):
+            notes.append("the covariances of its velocities are used, those of its poses are not")
+        return replace(log, covariance=twist * dt[:, None, None] ** 2, notes=tuple(notes))
     if pose is None:
         return log
     if _looks_stated(pose):

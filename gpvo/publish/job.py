@@ -125,6 +125,7 @@ def _require(settings: PublishSettings) -> None:
         raise GpvoError(f"--consumer is '{settings.consumer}'", cure=f"choose {', '.join(consumers.CONSUMERS)}")
     if not 1 <= settings.system <= 255:
         raise GpvoError(f"--system is {settings.system}", cure="give an id of 1 to 255")
+    ros.check_topic(settings.topic)
     if settings.link is not None and settings.to != "mavlink":
         raise GpvoError("--link sends MAVLink", cure="add --to mavlink")
     if settings.to == "mavlink":

@@ -8,6 +8,7 @@ in ``header.frame_id``, twist in ``child_frame_id``. Lost frames are not written
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -72,6 +73,13 @@ def odometry_message(odometry: Odometry, types: dict[str, Any], *, seq: int | No
 
 def _flat(covariance: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
+
+
+def check_topic(topic: str) -> str:
+    """The topic, or GpvoError where it is no name of ROS: words of letters, digits and ``_``, ``/`` between them."""
+    if not re.fullmatch(r"/?[A-Za-z]\w*(/[A-Za-z_]\w*)*", topic, re.ASCII):
+        raise GpvoError(f"--topic is {topic[:80]!r}, no name of ROS", cure="give one like /gpvo/odometry")
+    return topic
 
 
 def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:

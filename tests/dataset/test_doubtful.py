@@ -268,6 +268,15 @@ def test_a_climb_is_one_stretch_at_any_rate(rate_hz):
     assert found.last > 17 * rate_hz
 
 
+@pytest.mark.parametrize("rate_hz", [10, 50])
+def test_a_slip_is_no_stretch(rate_hz):
+    """One motion 0.5 m off, sideways: a slip of the odometry or a jump of the truth, and nothing around it is odd."""
+    log, truth = white_noise_run(1, rate_hz, stepped=False)
+    T = truth.T_world_cam.copy()
+    T[12 * rate_hz :, 0, 3] += 0.5
+    assert odd_stretches(log, replace(truth, T_world_cam=T)) == []
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("rate_hz", [10, 200])
 def test_a_log_at_rest_has_none_and_no_warnings(rate_hz):

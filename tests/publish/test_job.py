@@ -82,6 +82,13 @@ def test_the_system_is_a_byte(predicted: Path, tmp_path: Path, system: int) -> N
         publish_run(predicted, replace(GEOMETRY, out=tmp_path / "out", system=system))
 
 
+@pytest.mark.parametrize("topic", ["", "/", "vo\nodom1: /imu", "/a//b", "/3d", "/odom: x", "/odomé"])
+def test_a_topic_that_is_no_name_of_ros_is_refused(tmp_path: Path, topic: str) -> None:
+    """It goes into a parameter file."""
+    with pytest.raises(GpvoError, match="no name of ROS"):
+        publish_run(tmp_path, PublishSettings(topic=topic))
+
+
 def test_a_run_without_a_motion_makes_no_bag(predicted: Path, tmp_path: Path) -> None:
     run = read_run(predicted)
     write_run(tmp_path / "one", VoLog(run.log.records[:1], run.log.camera), meta={"source": "made"})
