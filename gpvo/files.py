@@ -25,7 +25,23 @@ except ImportError:  # Windows: two writers there are not told of one another.
 
 _MAX_BYTES = 50_000_000
 _MAX_TOML_BYTES = 200_000
+_STEP_BYTES = 1 << 20
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+class TooLarge(Exception):
+    """A file is longer than anything that may stand in its place."""
+
+
+def read_bounded(path: Path, most: int) -> bytes:
+    """All of a file or pipe. Raises TooLarge where it holds more than ``most`` bytes, OSError where unreadable."""
+    data = bytearray()
+    with path.open("rb") as file:
+        while part := file.read(_STEP_BYTES):  # one of all that is allowed would be made room for at once
+            data += part
+            if len(data) > most:
+                raise TooLarge(f"holds more than {most} bytes")
+    return bytes(data)
 
 
 @contextmanager
@@ -128,9 +144,9 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a document. Raises SourceError where the file is missing, too large, or not a JSON object."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise SourceError("is larger than 50 MB", where=path)
-        document = parse_json(path.read_text(encoding="utf-8"))
+        document = parse_json(read_bounded(path, _MAX_BYTES).decode("utf-8"))
+    except TooLarge:
+        raise SourceError("is larger than 50 MB", where=path) from None
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
     except (ValueError, RecursionError) as error:
@@ -161,9 +177,9 @@ def _whole(text: str) -> int:
 def read_toml(path: Path) -> dict[str, Any]:
     """Settings of a file. Raises GpvoError where it cannot be read."""
     try:
-        if path.stat().st_size > _MAX_TOML_BYTES:
-            raise GpvoError("is larger than 200 kB, too large for settings", where=path)
-        return parse_toml(path.read_text(encoding="utf-8"))
+        return parse_toml(read_bounded(path, _MAX_TOML_BYTES).decode("utf-8"))
+    except TooLarge:
+        raise GpvoError("is larger than 200 kB, too large for settings", where=path) from None
     except (OSError, ValueError, RecursionError) as problem:
         raise GpvoError(f"cannot be read as TOML: {problem}", where=path) from None
 

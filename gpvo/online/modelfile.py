@@ -39,7 +39,7 @@ from safetensors.numpy import load as _load_tensors
 from safetensors.numpy import save as _save_tensors
 
 from gpvo.errors import ModelError, printable
-from gpvo.files import parse_json, plain, replacing
+from gpvo.files import TooLarge, parse_json, plain, read_bounded, replacing
 
 SCHEMA = 1
 KIND = "gpvo-error-model"
@@ -67,9 +67,9 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
     """Arrays and header of a model file; ModelError (one line) if it is missing, damaged, truncated or too new."""
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ModelError(f"is larger than {MAX_FILE_BYTES} bytes: not a model file", where=path)
-        blob = path.read_bytes()
+        blob = read_bounded(path, MAX_FILE_BYTES)
+    except TooLarge:
+        raise ModelError(f"is larger than {MAX_FILE_BYTES} bytes: not a model file", where=path) from None
     except OSError as problem:
         raise ModelError(f"cannot be opened: {problem.strerror}", where=path) from None
     try:

@@ -18,9 +18,10 @@ import pyarrow.parquet as pq
 import pytest
 from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
+from gpvo.cameras.kalibr import calibration_text
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import CalibrationError, GpvoError, SourceError
-from gpvo.files import read_json
+from gpvo.files import read_json, read_toml
 from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
@@ -287,3 +288,13 @@ def test_lengths_that_are_none_in_an_mcap_are_refused(tmp_path: Path) -> None:
     assert len(refusals) > 5
     assert all(path.name in told and "\n" not in told for told in refusals)
     assert _peak_mb() - before < 500
+
+
+def test_a_file_without_an_end_is_left_at_its_bound() -> None:
+    """Its size is 0 to whoever asks before reading."""
+    with pytest.raises(SourceError, match="larger than 50 MB"):
+        read_json(Path("/dev/zero"))
+    with pytest.raises(GpvoError, match="too large for settings"):
+        read_toml(Path("/dev/zero"))
+    with pytest.raises(CalibrationError, match="too large for a calibration"):
+        calibration_text(Path("/dev/zero"))

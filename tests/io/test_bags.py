@@ -367,6 +367,7 @@ def test_messages_out_of_order_are_sorted_and_counted(tmp_path):
     assert log.notes == (
         "1 of 21 messages on '/odom' repeat a stamp and were left out",
         "1 of 21 messages on '/odom' came out of order and were sorted by their stamps",
+        "the covariances of its velocities are used, those of its poses are not",
     )
 
 
