@@ -28,7 +28,9 @@ Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
 class JudgeOptions:
     """How runs are judged."""
 
-    model: Annotated[Path | None, typer.Option(help="Error model: adds the rows constant, scaled and learned.")] = None
+    model: Annotated[
+        Path | None, typer.Option(help="Error model: adds the rows constant, scaled, gp_thesis, base and learned.")
+    ] = None
     truth: Annotated[
         Path | None, typer.Option(help="Ground truth (TUM lines, left camera) to use instead of the run's own.")
     ] = None

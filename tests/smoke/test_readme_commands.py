@@ -45,7 +45,7 @@ def prepare(folder: Path) -> dict[str, str]:
     scaled = [se3.from_rt(T[:3, :3], 1.01 * T[:3, 3]) for T in flight.T_world_cam]
     log = [tum_line(t, T) for t, T in zip(stamps, scaled, strict=True)]
     (folder / "log.tum").write_text("\n".join(log) + "\n")
-    return {"PATH": "flight.npz", "LOG": "log.tum", "GT": "truth.tum", "PLAN.tum": "truth.tum"}
+    return {"PATH": "flight.npz", "NAME": "kitti", "LOG": "log.tum", "GT": "truth.tum", "PLAN.tum": "truth.tum"}
 
 
 def test_the_readme_names_commands() -> None:
