@@ -240,7 +240,7 @@ def _print(d: dict[str, Any]) -> None:
             f" ({s['count']})"
         )
     if poses := d.get("poses"):
-        blocks = (b for b in ("position", "orientation", "joint") if b in poses)
+        blocks = (b for b in ("position", "orientation", "joint") if poses[b])
         shown = ", ".join(f"{b} {poses[b]['nees_dof']:.3g} (median {poses[b]['median']:.3g})" for b in blocks)
         say(f"  covariances of poses, after alignment: NEES/dof {shown}")
     _print_methods(d)

@@ -133,7 +133,7 @@ def build(
         raise GpvoError(
             f"the ground truth holds no attitude: it never turns, odometry by up to {turn_deg:.0f} deg",
             where=where or name,
-            cure="learn from a truth with orientations, or with --target position",
+            cure="give one with orientations, or learn from twins",
         )
     records, X = observe(log, names, target)
     if target == "position":

@@ -31,7 +31,7 @@ _MAX_LAG1 = -0.4
 _EVEN_DT = 0.2
 _OUTLIER = 6.0
 _MIN_WINDOWS = 10
-_NO_TURN_DEG, _TURN_DEG = 1e-3, 5.0  # nothing flies or rolls so straight; no odometry drifts so far alone
+_NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's extent, what it has across
 _SURE = 0.99
 """Of a drift: few windows of errors that last make intervals of 95 % too narrow."""
 
@@ -59,9 +59,10 @@ def interpolate_truth(
 
 
 def _usual_gap_ns(*stamps: NDArray[np.int64]) -> float:
-    """The longest gap [ns] that no drop-out makes: ``_GAP_STEPS`` usual steps of the slower stamps."""
+    """The longest gap [ns] that no drop-out makes: ``_GAP_STEPS`` usual steps of the slower stamps, which may come in
+    bursts."""
     steps = (np.diff(np.unique(t)) for t in stamps)
-    usual = max((float(np.median(s)) for s in steps if len(s)), default=np.inf)
+    usual = max((float(np.quantile(s, 0.95)) for s in steps if len(s)), default=np.inf)
     return min(MAX_GAP_S * 1e9, _GAP_STEPS * usual)
 
 
@@ -112,11 +113,16 @@ def motion_errors(log: VoLog, truth: TruthLog) -> MotionErrors:
 
 
 def turn_without_truth_deg(log: VoLog, truth: TruthLog) -> float:
-    """By how much odometry turns [deg] while a truth, as of satellites alone, has one attitude throughout; else 0.
+    """By how much odometry turns [deg] while a truth, as of satellites alone, has one attitude along a path that is not
+    straight; else 0.
 
     Neither rotations nor, in the camera's axes, translations of such a truth are true.
     """
     if len(truth.t_ns) < 2 or _turn_deg(truth.T_world_cam) > _NO_TURN_DEG:
+        return 0.0
+    p = truth.T_world_cam[:, :3, 3]
+    extent = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
+    if extent[1] < _STRAIGHT * extent[0]:
         return 0.0
     turned = _turn_deg(log.trajectory())
     return turned if turned > _TURN_DEG else 0.0

@@ -153,7 +153,7 @@ def nees(e: Evaluation) -> list[Panel]:
     if not len(e.errors.index):
         return []
     for s, error, C, t in _stated_errors(e):
-        values = consistency.nees(error, C) / s.dof
+        values = consistency.nees(error, C) / error.shape[1]
         ones = np.ones(min(len(values), max(1, round(_NEES_WINDOW_S / max(float(np.median(e.errors.dt_s)), 1e-3)))))
         # Divide by what lies under the window, or both ends would seem more honest than they are.
         smooth = np.convolve(values, ones, mode="same") / np.convolve(np.ones(len(values)), ones, mode="same")
@@ -162,13 +162,15 @@ def nees(e: Evaluation) -> list[Panel]:
 
 
 def _stated_errors(e: Evaluation) -> Iterator[tuple[Statement, Array, Array, Array]]:
-    """Of each method that speaks of all six axes of at least two motions with truth: itself, the errors about its mean
-    (K, 6), the covariances (K, 6, 6) and the times [s] of these motions."""
+    """Of each method that speaks of all axes of at least two motions with truth: itself, the errors about its mean on
+    the d axes that count (K, d), the covariances (K, d, d) and the times [s] of these motions."""
     index = e.errors.index
     for s in e.statements:
         known = np.isfinite(s.covariance[index]).all(axis=(1, 2))
         if s.errors is not None and known.sum() >= 2:
-            yield s, (e.errors.xi - s.mean[index])[known], s.covariance[index][known], e.t_s[e.errors.index][known]
+            axes = np.array(e.consistency[s.method].axes)
+            error = (e.errors.xi - s.mean[index])[known][:, axes]
+            yield s, error, consistency.marginal(s.covariance[index][known], axes), e.t_s[e.errors.index][known]
 
 
 def memory(e: Evaluation) -> list[Panel]:

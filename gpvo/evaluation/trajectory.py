@@ -218,10 +218,12 @@ def pose_consistency(log: VoLog, T_est: Array, T_true: Array, known: NDArray[np.
 
 
 def nees_document(found: PoseConsistency | Consistency | None) -> dict[str, object] | None:
-    """NEES of poses or of motions for scripts: by block the mean, its 95 % ``interval`` and the ``median``."""
+    """NEES of poses or of motions for scripts: by block the mean, its 95 % ``interval`` and the ``median``; None of
+    poses where odometry and truth never differ in a block."""
     if found is None:
         return None
-    blocks = {
+    blocks: dict[str, object] = dict.fromkeys(_NAMES.values()) if isinstance(found, PoseConsistency) else {}
+    blocks |= {
         name: {"nees_dof": i.mean, "interval": [i.low, i.high], "median": found.nees_dof_median[name]}
         for name, i in found.nees_dof.items()
         if i is not None

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gpvo.dataset.errors import steps_of_slow_truth, turn_without_truth_deg
+from gpvo.dataset.errors import MAX_GAP_S, steps_of_slow_truth, turn_without_truth_deg
 from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.online.features import AXES
-from gpvo.stats.consistency import SEEN, seen_axes
+from gpvo.stats.consistency import seen_axes
 from gpvo.types import Array
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 HONEST = (0.5, 2.0)
 """NEES per degree of freedom that counts as honest: sigma right within a factor of 1.4."""
 _FEW_WINDOWS = 5
+_FEW_BARE = 0.01  # of the frames, without truth: its ends
 _LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
 
 Colour = Literal["green", "amber", "red"]
@@ -38,12 +39,31 @@ class Verdict:
 
 def verdict(e: Evaluation) -> Verdict:
     """The verdict on one evaluated run."""
+    if reason := _why_blind(e):
+        return Verdict("amber", reason, tuple(_conditions(e)))
     judged = {m: c for m, c in e.consistency.items() if c.nll_per_dim is not None}
     return _of_motions(e, judged) if judged else _of_others(e)
 
 
+def _why_blind(e: Evaluation) -> str:
+    """Why this truth can judge no covariance at all; empty where it can."""
+    if not e.covered.any():
+        return "There is no ground truth, so no covariance can be judged."
+    if len(e.errors.xi) and not len(seen_axes(e.errors.xi)):
+        return (
+            "Odometry and truth are the same throughout, so nothing can be judged: is the truth made from the odometry?"
+        )
+    if e.run.truth and (turn_deg := turn_without_truth_deg(e.run.log, e.run.truth)):
+        return (
+            f"The truth holds no attitude (it never turns, odometry by up to {turn_deg:.0f} deg): the ATE alone holds."
+        )
+    if len(e.errors.index) < 2 and e.run.log.methods and e.poses is None:
+        return "Fewer than two motions have ground truth at both ends, so no covariance can be judged."
+    return ""
+
+
 def _of_others(e: Evaluation) -> Verdict:
-    """Where no covariance of a motion can be judged: that of the poses, or why there is none."""
+    """Where no covariance of a motion is stated: that of the poses, if there is one."""
     if e.poses is not None:
         joint = e.poses.nees_dof["joint"].mean
         colour: Colour = "green" if _word(joint) == "honest" else "red" if joint > HONEST[1] else "amber"
@@ -52,19 +72,13 @@ def _of_others(e: Evaluation) -> Verdict:
             " rigid alignment of all: it moves the first poses of an odometry that drifts by more than they state."
         )
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
-    if not e.covered.any():
-        told_of_none = (
-            *_conditions(e),
-            "gpvo evaluate --twins judges a run by its twins, if made with --keep-tracks.",
-        )
-        return Verdict("amber", "There is no ground truth, so no covariance can be judged.", told_of_none)
     cure = "gpvo train learns one from such runs; give the model with --model."
     return Verdict("red", "No covariance was stated, so nothing can be judged.", (*_conditions(e), cure))
 
 
 def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
     found = {m: _Judgement.of(c, e) for m, c in judged.items()}
-    best = min(judged, key=lambda m: judged[m].nll_per_dim or 0.0)
+    best = min(found, key=lambda m: found[m].loss())
     # What a vehicle would be told is judged first; others only where it is wrong.
     told = found["learned" if "learned" in judged else best]
     if not told.of_motions and not told.spans:
@@ -77,7 +91,7 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
         where = "per motion and over distance" if told.of_motions else f"over {_listed([n for n, _ in told.spans])}"
         return Verdict("green", f"The {told.method} covariance is honest here, {where}.", tuple(lines))
     if told.method != best and not found[best].wrong():
-        lines.append(f"Use {best} here: it is honest, and has the best likelihood of all.")
+        lines.append(f"Use {best} here: it is honest{', and has the best likelihood of all' * told.of_motions}.")
     if outside:
         lines.append("Train on runs with this camera in these conditions, with ground truth or with twins.")
     headline = f"The {told.method} covariance is {told.words()}"
@@ -133,6 +147,12 @@ class _Judgement:
     def method(self) -> str:
         return self.c.method
 
+    def loss(self) -> float:
+        """What statements are ranked by: the likelihood of the motions, or how far the longest span is from honest."""
+        if self.of_motions or not self.spans:
+            return self.c.nll_per_dim or 0.0
+        return abs(math.log(max(self.spans[-1][1].nees_dof_truth_noise, 1e-300)))
+
     def wrong(self) -> dict[str, str]:
         """Over what the statement is wrong, beyond chance, and how."""
         out = {"one motion": _per_motion(self.c)} if self.of_motions else {}
@@ -181,17 +201,18 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             f"The truth itself has an estimated noise of {_up_to(e.truth_sigma)} per pose (its source states {stated})."
             " This is taken into account."
         )
+    if not e.covered.any():
+        yield "gpvo evaluate --twins judges a run by its twins, if made with --keep-tracks."
+    elif (bare := int((~e.covered).sum())) > _FEW_BARE * len(e.covered):
+        yield f"{bare} of {len(e.covered)} frames have no ground truth."
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
         yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
-    if len(e.errors.xi) and not (np.abs(e.errors.xi) > SEEN).any():
-        yield "Odometry and truth are the same throughout: is the truth made from the odometry?"
-    elif unseen := [a for k, a in enumerate(AXES) if len(e.errors.xi) and k not in seen_axes(e.errors.xi)]:
-        yield f"Odometry and truth never differ in {_listed(unseen)} (a plane?): those axes are not judged."
-    if e.run.truth and (turn_deg := turn_without_truth_deg(e.run.log, e.run.truth)):
+    unseen = [a for k, a in enumerate(AXES) if len(e.errors.xi) and k not in seen_axes(e.errors.xi)]
+    if 0 < len(unseen) < len(AXES):
         yield (
-            f"The ground truth holds no attitude: it never turns, odometry by up to {turn_deg:.0f} deg. Of what is said"
-            " here, the ATE alone holds."
+            f"Odometry and truth never differ in {_listed(unseen)} of the camera (x right, y down, z ahead; a plane?):"
+            " those axes are not judged."
         )
     if e.late_s is not None:
         yield (
@@ -199,7 +220,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             " over a second are smaller."
         )
     yield from _of_truth_and_path(e)
-    if e.turned is not None:
+    if e.turned is not None and len(unseen) < len(AXES):
         # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
         asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
         yield (
@@ -214,10 +235,12 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     if e.run.truth is None or not e.covered.any():
         return
     if steps_s := steps_of_slow_truth(e.run.truth, e.run.log.t_ns):
-        yield (
-            f"The ground truth comes every {steps_s[0]:.2g} s, the frames every {steps_s[1]:.2g} s: between its poses"
-            " it is interpolated, and what that misses is only estimated."
+        between = (
+            "between its poses it is interpolated, and what that misses is only estimated"
+            if steps_s[0] <= MAX_GAP_S
+            else f"nothing is interpolated over more than {MAX_GAP_S:g} s"
         )
+        yield f"The ground truth comes every {steps_s[0]:.2g} s, the frames every {steps_s[1]:.2g} s: {between}."
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
     if true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:

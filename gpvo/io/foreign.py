@@ -18,11 +18,13 @@ from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read
 from gpvo.io.foreign_csv import Table, is_number, read_table
 from gpvo.io.stamps import check_interval, text_lines
 from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
+from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 FORMATS = ("tum", "kitti", "csv", "bag")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+_GROWS = 1e-6  # of a variance: what a step adds to it, beyond rounding
 NONE_STATED = "its covariances are not positive definite and were left out"
 
 
@@ -175,6 +177,8 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     cov = _table_covariance(c, known)
     if cov is not None and axes == "world":
         cov = _into_body(trajectory, cov)
+    if cov is not None:
+        cov = definite_in_plane(cov, trajectory.T_world_body)
     lost = int((~known).sum())
     return ForeignLog(
         path,
@@ -218,6 +222,23 @@ def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
     B[:, :3, :3] = B[:, 3:, 3:] = Rt
     turned: Array = B @ covariance @ np.swapaxes(B, -1, -2)
     return turned
+
+
+def definite_in_plane(covariance: Array, T_world_body: Array, variance: Array | None = None) -> Array:
+    """Covariances (N, 6, 6) for poses (N, 4, 4), those that are not definite filled in on axes along which the poses
+    never move and of which nothing is stated.
+
+    A robot in a plane has three such axes; drivers state zero for them, or a constant, which does not grow. They get
+    ``variance`` (N, 6), by default their own, but at least ``SEEN`` squared.
+    """
+    still = np.ones(6, dtype=bool)
+    still[seen_axes(se3.log(se3.inverse(T_world_body[:-1]) @ T_world_body[1:]))] = False
+    own = np.diagonal(covariance, axis1=1, axis2=2)
+    variance = own if variance is None else variance
+    empty = still & ~still.all() & (own <= _GROWS * variance)
+    filled = np.where(empty[:, :, None] | empty[:, None], 0.0, covariance)
+    filled += empty[:, None] * np.eye(6) * np.maximum(np.where(empty, variance, 1.0), SEEN**2)[:, None]
+    return np.where(transport.are_positive_definite(covariance)[:, None, None], covariance, filled)
 
 
 def check_same_rows(truth: ForeignLog, log: ForeignLog) -> None:
@@ -273,6 +294,8 @@ def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     t, T, read = read_poses(path, topic, notes.append)
     log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
+    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose), T)
+    twist = None if twist is None else definite_in_plane(twist, T)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
         dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])
@@ -282,7 +305,7 @@ def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     if pose is None:
         return log
     if _looks_stated(pose):
-        return replace(log, covariance=_into_body(log.trajectory, pose), covariance_of="pose")
+        return replace(log, covariance=pose, covariance_of="pose")
     return replace(log, notes=(*notes, NONE_STATED))
 
 

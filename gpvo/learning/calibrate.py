@@ -20,6 +20,7 @@ from gpvo.types import Array
 LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95)
 # Standard deviation of the log variance between flights of one vehicle, and how many groups that guess is worth.
 _PRIOR_SPREAD, _PRIOR_GROUPS = 0.3, 2
+_FAR_BELOW = 3.0  # of the log variance: ten prior spreads
 _OUTSIDE, _MOST_OUTSIDE = 0.5, 5.0
 _POWERS = (1.0, 1.25, 1.5, 2.0)
 
@@ -42,9 +43,11 @@ class Scale:
 
         The log scale of a group is taken as normal; the mean of its log-normal over a new group, whose centre is itself
         known from G groups, is ``exp(m + s^2 (1 + 1/G) / 2)``. The spread is that of each block of three axes, drawn
-        towards the prior: few groups cannot show how much groups differ.
+        towards the prior: few groups cannot show how much groups differ. A group whose errors vanish, as of a vehicle
+        at rest, counts as ``_FAR_BELOW`` under the median: it does not show how large errors can be.
         """
-        logs, G = np.log(by_group), len(by_group)
+        logs, G = np.log(np.maximum(by_group, 1e-300)), len(by_group)
+        logs = np.maximum(logs, np.median(logs, axis=0) - _FAR_BELOW)
         seen = by_block(logs.var(axis=0, ddof=1)) if G > 1 else np.zeros(logs.shape[1])
         spread = np.sqrt((_PRIOR_GROUPS * _PRIOR_SPREAD**2 + (G - 1) * seen) / (_PRIOR_GROUPS + G - 1))
         return cls(np.exp(logs.mean(axis=0) + 0.5 * spread**2 * (1.0 + 1.0 / G)), spread, by_group)

@@ -38,7 +38,7 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import AXES, known_columns
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
-from gpvo.stats.consistency import SEEN, nees
+from gpvo.stats.consistency import SEEN, nees, seen_axes
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, Prediction
 
@@ -221,7 +221,12 @@ def _fold(
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
     stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)
-    methods = {name: score(held_out.Y, *stated[name]) if name in stated else empty() for name in METHODS}
+    axes = seen_axes(held_out.Y)
+
+    def scored(mean: Array, covariance: Array, nu: float = np.inf) -> dict[str, Any]:
+        return score(held_out.Y, mean, covariance, nu, axes)
+
+    methods = {name: scored(*stated[name]) if name in stated else empty() for name in METHODS}
     return {
         "held_out": held_out.name,
         "rows": len(held_out),

@@ -47,9 +47,8 @@ of a covariance: neither odometry nor truth speaks of it."""
 
 
 def seen_axes(error: Array) -> NDArray[np.intp]:
-    """The axes (k,) of errors (n, d) that exceed :data:`SEEN` in the root mean square; all d where none does."""
-    seen = np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
-    return seen if len(seen) else np.arange(error.shape[-1])
+    """The axes (k,) of errors, or of motions, (n, d) that reach :data:`SEEN` in the root mean square."""
+    return np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
 
 
 def marginal(covariance: Array, axes: ArrayLike) -> Array:
@@ -60,10 +59,10 @@ def marginal(covariance: Array, axes: ArrayLike) -> Array:
 def nees_by_block(error: Array, covariance: Array, axes: ArrayLike | None = None) -> dict[str, Array]:
     """NEES per degree of freedom (n,) of each of :data:`BLOCKS` that errors (n, 6), or (n, 3) of translations, hold.
 
-    ``axes``: those that count, all by default; a block without any is left out.
+    ``axes``: those that count, by default and where there is none all; a block without any is left out.
     """
     d = error.shape[-1]
-    counted = np.arange(d) if axes is None else np.asarray(axes)
+    counted = np.arange(d) if axes is None or not np.size(axes) else np.asarray(axes)
     held = {name: counted[np.isin(counted, b)] for name, b in BLOCKS.items() if max(b) < d}
     return {n: nees(error[:, b], marginal(covariance, b)) / len(b) for n, b in held.items() if len(b)}
 

@@ -338,10 +338,10 @@ def test_a_covariance_that_begins_with_zeros_is_stated_from_there_on(tmp_path):
 
 
 def _stamped(tmp_path, stamps_s):
-    """A bag of odometry with these stamps, recorded in this order."""
+    """A bag of odometry that moves, with these stamps, recorded in this order."""
     maker = BagMaker(True)
     for k, t in enumerate(stamps_s):
-        maker.odometry("/odom", round(t * 1e9), np.eye(4), np.eye(6), np.eye(6))
+        maker.odometry("/odom", round(t * 1e9), se3.exp(np.full(6, 0.01 * k)), np.eye(6), np.eye(6))
         maker.messages[-1] = ((k + 1) * 10**9, *maker.messages[-1][1:])
     return maker.write(tmp_path / "a.bag")
 
@@ -349,7 +349,7 @@ def _stamped(tmp_path, stamps_s):
 @pytest.mark.parametrize(
     ("stamps_s", "reason"),
     [
-        ([0.0] * 20, "19 of 20 messages on '/odom' repeat a stamp .header.stamp must be"),
+        ([0.0] * 20, "19 of 20 messages on '/odom' repeat a stamp with another pose .header.stamp must be"),
         ([*range(1, 11), *range(1, 11)], "go back by 9.000 s at message 11 .the clock was set"),
     ],
 )
@@ -369,6 +369,14 @@ def test_messages_out_of_order_are_sorted_and_counted(tmp_path):
         "1 of 21 messages on '/odom' came out of order and were sorted by their stamps",
         "the covariances of its velocities are used, those of its poses are not",
     )
+
+
+def test_poses_that_a_driver_publishes_twice_count_once(tmp_path):
+    maker = _odometry_bag(True, twist=False)
+    maker.messages[:] = [(t + j, *rest) for t, *rest in maker.messages for j in (0, 1)]
+    log = read_foreign(maker.write(tmp_path / "a.bag"))
+    assert len(log.t_ns) == 20
+    assert log.notes == ("20 of 40 messages on '/odom' repeat a stamp and were left out",)
 
 
 def test_which_topic(tmp_path):

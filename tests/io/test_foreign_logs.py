@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from foreign_trajectories import write_euroc_csv, write_kitti_poses
@@ -11,7 +13,8 @@ from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, check_same_rows, guess_format, read_foreign
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import write_tum
-from gpvo.types import Status
+from gpvo.stats.consistency import SEEN
+from gpvo.types import IMPORTED, Status
 
 N = 25
 T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
@@ -289,3 +292,34 @@ def test_real_logs(real_data):
     for name in ("odometry", "of_opencv_odometry", "optical_flow_odometry"):
         records, _ = to_records(read_foreign(real_data / "euroc_v1_01_vo" / f"stamped_{name}_trajectory_all.txt"))
         assert len(records) > 2600
+
+
+@pytest.mark.parametrize("unseen", [0.0, 1e-9, 1e6])
+@pytest.mark.parametrize("of", ["motion", "pose"])
+def test_a_robot_in_a_plane_states_three_axes(tmp_path: Path, of: str, unseen: float) -> None:
+    """Drivers of wheels state zero, or a constant, for height, roll and pitch: those do not unmake the others."""
+    n, seen, variance = 60, [0, 1, 5], np.array([1e-6, 4e-6, 1e-6])
+    motion, T, C = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.02])), np.eye(4), np.diag([unseen] * 6)
+    A, C[seen, seen] = se3.adjoint(se3.inverse(motion)), 0.0
+    rows = []
+    for k in range(n):
+        q = se3.rotation_to_quaternion_xyzw(T[:3, :3])
+        rows.append([1e9 * 0.05 * (k + 1), *T[:3, 3], *q, *C.ravel()])
+        T = T @ motion
+        C = A @ C @ A.T if of == "pose" else np.zeros((6, 6))
+        C[seen, seen] += variance
+        for axis in (2, 3, 4):
+            C[axis], C[:, axis] = 0.0, 0.0
+            C[axis, axis] = unseen
+    names = ",".join(f"cov_{i}{j}" for i in range(6) for j in range(6))
+    lines = [
+        "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + names,
+        *(",".join([str(int(r[0])), *map(repr, map(float, r[1:]))]) for r in rows),
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    records, notes = to_records(read_foreign(tmp_path / "log.csv", covariance_of=of, covariance_axes="body"))
+    assert not notes
+    for r in records[1:]:
+        stated = np.diag(r.covariances[IMPORTED])
+        np.testing.assert_allclose(stated[seen], variance, rtol=1e-6)
+        np.testing.assert_allclose(stated[2:5], max(unseen, SEEN**2))

@@ -571,3 +571,16 @@ def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int])
     C = training.estimate_set(trained.predictor().model, sets[0]).covariance
     assert (np.diagonal(C, axis1=1, axis2=2)[:, axes] < 1e-10).all()
     assert train_sets(sets, QUICK, judge=False).arrays["share"].tobytes() == trained.arrays["share"].tobytes()
+
+
+def test_a_flight_that_begins_at_rest_is_learned_from() -> None:
+    """Its first blocks have no errors at all; they do not show how large errors can be."""
+    (s,) = training_sets([0], n=240)
+    resting = replace(s, Y=np.where(np.arange(240)[:, None] < 80, 0.0, s.Y))
+    stated = train_sets([resting], QUICK, judge=False).predictor()
+    plain = train_sets([s], QUICK, judge=False).predictor()
+    sigma, usual = (
+        np.sqrt(np.diagonal(training.estimate_set(p.model, s).covariance, axis1=1, axis2=2)) for p in (stated, plain)
+    )
+    assert np.isfinite(sigma).all()
+    assert (np.median(sigma[80:], axis=0) < 3.0 * np.median(usual[80:], axis=0)).all()
