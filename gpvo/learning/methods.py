@@ -108,8 +108,10 @@ def score(
     if known.sum() < 2:
         return empty()
     error, mean, covariance = error[known], mean[known], covariance[known]
-    counted = np.arange(covariance.shape[-1]) if axes is None or not np.size(axes) else np.asarray(axes)
-    per_block = nees_by_block((error - mean)[:, : covariance.shape[-1]], covariance, counted)
+    d = covariance.shape[-1]
+    counted = np.intersect1d(np.arange(d) if axes is None else axes, np.arange(d))
+    counted = counted if len(counted) else np.arange(d)
+    per_block = nees_by_block((error - mean)[:, :d], covariance, counted)
     residual, covariance = (error - mean)[:, counted], marginal(covariance, counted)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     crps = crps_gaussian(residual, sigma)
