@@ -43,8 +43,8 @@ class Scale:
 
         The log scale of a group is taken as normal; the mean of its log-normal over a new group, whose centre is itself
         known from G groups, is ``exp(m + s^2 (1 + 1/G) / 2)``. The spread is that of each block of three axes, drawn
-        towards the prior: few groups cannot show how much groups differ. A group whose errors vanish, as of a vehicle
-        at rest, counts as ``_FAR_BELOW`` under the median: it does not show how large errors can be.
+        towards the prior: few groups cannot show how much groups differ. One whose errors vanish, as of a vehicle at
+        rest, counts as ``_FAR_BELOW`` under the median: it does not show how large they can be.
         """
         logs, G = np.log(np.maximum(by_group, 1e-300)), len(by_group)
         logs = np.maximum(logs, np.median(logs, axis=0) - _FAR_BELOW)

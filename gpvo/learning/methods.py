@@ -100,30 +100,25 @@ def score(
     ``nees_dof_median_stated`` the median that the latter expects of NEES.
 
     A covariance of the translation alone is (n, 3, 3): fields that need the rotation are then None.
-    Rows whose covariance is not finite are left out; with none left every field is None. ``axes``: those that count, as
-    in :func:`gpvo.stats.consistency.nees_by_block`.
+    Rows whose covariance is not finite are left out; with none left every field is None. ``axes``: those that count.
     """
-    known = np.isfinite(covariance).all(axis=(1, 2))
-    whole = covariance.shape[-1] == 6
+    known, d = np.isfinite(covariance).all(axis=(1, 2)), covariance.shape[-1]
     if known.sum() < 2:
         return empty()
-    error, mean, covariance = error[known], mean[known], covariance[known]
-    d = covariance.shape[-1]
+    error, mean, covariance, whole = error[known], mean[known], covariance[known], d == 6
     counted = np.intersect1d(np.arange(d) if axes is None else axes, np.arange(d))
     counted = counted if len(counted) else np.arange(d)
     per_block = nees_by_block((error - mean)[:, :d], covariance, counted)
     residual, covariance = (error - mean)[:, counted], marginal(covariance, counted)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    crps = crps_gaussian(residual, sigma)
-    level = coverage(residual, sigma)
-    d = len(counted)
+    crps, level = crps_gaussian(residual, sigma), coverage(residual, sigma)
     return {
         "nees_dof": {n: None if n not in per_block else float(per_block[n].mean()) for n in BLOCKS},
         "nees_dof_median": {n: None if n not in per_block else float(np.median(per_block[n])) for n in BLOCKS},
         "coverage": {str(k + 1): float(c) for k, c in enumerate(level)},
         "nll_per_dim": float(np.mean(nll_per_dim(residual, covariance))) if whole else None,
         "nll_stated_per_dim": float(np.mean(nll_per_dim(residual, covariance, nu))) if whole else None,
-        "nees_dof_median_stated": nees_median(d, nu) / d,
+        "nees_dof_median_stated": nees_median(len(counted), nu) / len(counted),
         "crps": {
             "translation_m": float(crps[:, counted < 3].mean()) if (counted < 3).any() else None,
             "rotation_rad": float(crps[:, counted > 2].mean()) if (counted > 2).any() else None,

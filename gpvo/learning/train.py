@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -126,19 +127,15 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
 def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
     """Where errors of an axis are zero throughout, as of a robot in a plane, noise of ``_UNSEEN`` stands for what the
     truth cannot show; seeded, so that the same rows give the same bytes."""
-    quiet, rng = _rms(sets) < 0.1 * _UNSEEN, np.random.default_rng(0)
-    return (
-        [replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) for s in sets] if quiet.any() else list(sets)
-    )
+    rms, rng = np.sqrt((np.concatenate([s.Y for s in sets]) ** 2).mean(axis=0)), np.random.default_rng(0)
+    quiet = rms < 0.1 * _UNSEEN
+    return [replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s for s in sets]
 
 
 def unseen_axes(sets: Sequence[TrainingSet]) -> list[str]:
     """The axes on which a training has filled in errors, because log and truth never differ there."""
-    return [name for name, rms in zip(AXES, _rms(sets)) if rms < SEEN]
-
-
-def _rms(sets: Sequence[TrainingSet]) -> Array:
-    return np.asarray(np.sqrt((np.concatenate([s.Y for s in sets]) ** 2).mean(axis=0)))
+    seen = seen_axes(np.concatenate([s.Y for s in sets]))
+    return [name for k, name in enumerate(AXES) if k not in seen]
 
 
 def train_table(
@@ -221,12 +218,8 @@ def _fold(
     estimate, of_base = (estimate_set(model, held_out) for model in (learned.model, learned.base))
     stated["learned"] = (estimate.mean, estimate.covariance, estimate.nu)
     stated["base"] = (of_base.mean, of_base.covariance, of_base.nu)
-    axes = seen_axes(held_out.Y)
-
-    def scored(mean: Array, covariance: Array, nu: float = np.inf) -> dict[str, Any]:
-        return score(held_out.Y, mean, covariance, nu, axes)
-
-    methods = {name: scored(*stated[name]) if name in stated else empty() for name in METHODS}
+    of = partial(score, held_out.Y, axes=seen_axes(held_out.Y))
+    methods = {name: of(*stated[name]) if name in stated else empty() for name in METHODS}
     return {
         "held_out": held_out.name,
         "rows": len(held_out),
