@@ -17,6 +17,7 @@ from gpvo.stats.consistency import (
     BLOCKS,
     by_difficulty,
     correlation_gain,
+    counted_axes,
     energy_score,
     marginal,
     nees_by_block,
@@ -109,8 +110,7 @@ def consistency(
     if stated.sum() < 2:
         return None
     index, d = errors.index[stated], statement.dof
-    axes = seen_axes(errors.xi[:, :d])
-    axes = axes if len(axes) else np.arange(d)
+    axes = counted_axes(seen_axes(errors.xi), d)
     e, C = (errors.xi[stated] - statement.mean[index])[:, :d], C[stated]
     noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
     per_block, with_noise = nees_by_block(e, C, axes), nees_by_block(e, C + noise, axes)

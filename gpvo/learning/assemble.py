@@ -21,7 +21,7 @@ from gpvo.learning.calibrate import (
 from gpvo.learning.logvariance import log_ratio
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
-from gpvo.learning.poses import Motions, added_factor, pose_losses, with_added
+from gpvo.learning.poses import Motions, Poses, added_factor, pose_losses, poses_of, with_added
 from gpvo.learning.rows import Rows, significant_gain
 from gpvo.learning.spans import at_most
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
@@ -149,43 +149,39 @@ def _most_likely(model: ErrorModel, of: _Residuals) -> _Consistent:
 
 def _consistent(model: ErrorModel, of: _Residuals) -> _Consistent:
     """The model, calibrated for poses and for all six axes jointly."""
-    parts, root = of.divided(model)
-    factor = fit_joint_factor(of.error, _whole(parts, root), of.rows.group)
-    added = added_factor(*_motions(model, of, parts * factor, root * np.sqrt(factor)), model.division.share)
-    model = _with_division(model, share=with_added(model.division.share, added))
-    parts, root = of.divided(model)
-    whole = _whole(parts, root)
-    joint = fit_joint_factor(of.error, whole, of.rows.group)
-    losses = pose_losses(*_motions(model, of, parts * joint, root * np.sqrt(joint)))
-    nu = student_t.fit_dof(nees(of.error, whole * joint), of.error.shape[1], of.rows.weight)
-    typical = float(np.median(np.linalg.slogdet(whole * joint)[1]))
+    whole, joint, poses = _jointly(model, of)
+    added = added_factor(poses, model.division.share)
+    if added != 1.0:
+        model = _with_division(model, share=with_added(model.division.share, added))
+        whole, joint, poses = _jointly(model, of)
+    nu = student_t.fit_dof(nees(of.error, whole), of.error.shape[1], of.rows.weight)
+    typical = float(np.median(np.linalg.slogdet(whole)[1]))
     model = replace(
         model,
         factor=model.factor * joint,
         typical_ln_det=np.array([typical]),
         nu=np.array([0.0 if np.isinf(nu) else nu]),
     )
-    rooted = model.division.calibration_patterns * np.sqrt(joint)
-    model = _with_division(model, level=model.division.level + np.log(joint), calibration_patterns=rooted)
-    return _Consistent(model, added, joint, losses)
+    level, patterns = model.division.level + np.log(joint), model.division.calibration_patterns * np.sqrt(joint)
+    model = _with_division(model, level=level, calibration_patterns=patterns)
+    return _Consistent(model, added, joint, pose_losses(poses))
+
+
+def _jointly(model: ErrorModel, of: _Residuals) -> tuple[Array, float, list[Poses]]:
+    """Covariances (n, 6, 6) of motions, times the factor that makes their joint NEES right; the factor; and poses with
+    such covariances."""
+    parts, root = of.divided(model)
+    whole = parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2)
+    joint = fit_joint_factor(of.error, whole, of.rows.group)
+    parts, root, T_prev_cur = parts * joint, root * np.sqrt(joint), of.rows.motions()
+    chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
+    chains = [Motions(i, T_prev_cur[c], of.error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
+    phi = np.exp(-of.rows.step_s / model.division.persistent_tau_s.reshape(2, 6))
+    return whole * joint, joint, poses_of(chains, phi)
 
 
 def _with_division(model: ErrorModel, **changed: Array) -> ErrorModel:
     return replace(model, division=replace(model.division, **changed))
-
-
-def _whole(parts: Array, root: Array) -> Array:
-    """(n, 6, 6) covariances of motions, from those of their parts and the root due to calibration."""
-    return np.asarray(parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2))
-
-
-def _motions(model: ErrorModel, of: _Residuals, parts: Array, root: Array) -> tuple[list[Motions], Array]:
-    """All chains with their stated covariances, and the correlations (2, 6) of bias and calibration from one motion to
-    the next."""
-    T_prev_cur = of.rows.motions()
-    chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
-    chains = [Motions(i, T_prev_cur[c], of.error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
-    return chains, np.exp(-of.rows.step_s / model.division.persistent_tau_s.reshape(2, 6))
 
 
 _Found = tuple[Parts, _Consistent]

@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.stats.consistency import BLOCKS, coverage, crps_gaussian, marginal, nees_by_block, nees_median, nll_per_dim
+from gpvo.stats.consistency import (
+    BLOCKS,
+    counted_axes,
+    coverage,
+    crps_gaussian,
+    marginal,
+    nees_by_block,
+    nees_median,
+    nll_per_dim,
+)
 from gpvo.types import IMPORTED, Array
 
 GEOMETRIC = ("triangulation", "pointing_matching")
@@ -106,8 +115,7 @@ def score(
     if known.sum() < 2:
         return empty()
     error, mean, covariance, whole = error[known], mean[known], covariance[known], d == 6
-    counted = np.intersect1d(np.arange(d) if axes is None else axes, np.arange(d))
-    counted = counted if len(counted) else np.arange(d)
+    counted = counted_axes(axes, d)
     per_block = nees_by_block((error - mean)[:, :d], covariance, counted)
     residual, covariance = (error - mean)[:, counted], marginal(covariance, counted)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

@@ -20,8 +20,7 @@ from gpvo.learning.spans import SPANS, cut
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
-_LONG = tuple(m for m in SPANS if m >= 10)
-_LEAST_WINDOWS = 3
+_LONG, _LEAST_WINDOWS = 10, 3
 _PRIOR_SPREAD = 0.3
 """Expected deviation of the factor's log from 0."""
 _LEAST_FACTOR, _LEAST_JITTER = 0.25, 0.01
@@ -41,40 +40,30 @@ class Motions:
     calibration: Array
 
 
-def added_factor(chains: Sequence[Motions], phi: Array, share: Array) -> float:
+def added_factor(poses: Sequence[Poses], share: Array) -> float:
     """Factor on white noise and bias (jitter is the remainder of each motion) under which poses are likeliest.
 
-    ``share`` (3, D) of the parts; ``phi`` (2, D): correlation of bias and calibration from one motion to the next.
-    Spans of ten and more motions count alike, as they contain the same errors, and so do sequences. The factor is
-    shrunk towards 1, and is 1 unless its gain is significant. Every axis keeps some jitter.
+    ``share`` (3, D) of the parts. Spans of ten and more motions count alike, as they contain the same errors, and so do
+    sequences. The factor is shrunk towards 1, and is 1 unless its gain is significant. Every axis keeps some jitter.
     """
-    spans = _spans(chains, phi, _LONG)
-    if not spans:
+    poses = [p for p in poses if p.span >= _LONG]
+    if not poses:
         return 1.0
     most = max((1.0 - _LEAST_JITTER) / float((share[1] + share[2]).max()), 1.0)
 
     def loss(ln_factor: float) -> float:
-        return float(_losses(spans, float(np.exp(ln_factor))).sum() + 0.5 * (ln_factor / _PRIOR_SPREAD) ** 2)
+        return float(pose_losses(poses, float(np.exp(ln_factor))).sum() + 0.5 * (ln_factor / _PRIOR_SPREAD) ** 2)
 
     bounds = (np.log(_LEAST_FACTOR), np.log(most))
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x
     factor = float(np.exp(found))
-    return factor if significant_gain(_losses(spans, 1.0) - _losses(spans, factor)) else 1.0
+    return factor if significant_gain(pose_losses(poses) - pose_losses(poses, factor)) else 1.0
 
 
-def pose_losses(chains: Sequence[Motions], phi: Array) -> Array:
-    """(S,) mean negative log-likelihood, without its constant, of the motions of each sequence and of its poses after
-    ten and more of them; all spans count alike."""
-    return _losses(_spans(chains, phi, (1, *_LONG)), 1.0)
-
-
-def _spans(chains: Sequence[Motions], phi: Array, spans: Sequence[int]) -> list[_Poses]:
-    """The poses over each span that has enough windows."""
-    return [_Poses.over(chains, m, phi) for m in spans if _count(chains, m) >= _LEAST_WINDOWS]
-
-
-def _losses(spans: Sequence[_Poses], factor: float) -> Array:
-    return np.asarray(np.mean([poses.losses(factor) for poses in spans], axis=0))
+def pose_losses(poses: Sequence[Poses], factor: float = 1.0) -> Array:
+    """(S,) mean negative log-likelihood, without its constant, of the poses of each sequence, with ``factor`` on what
+    adds up; all spans count alike."""
+    return np.asarray(np.mean([p.losses(factor) for p in poses], axis=0))
 
 
 def with_added(share: Array, factor: float) -> Array:
@@ -83,17 +72,14 @@ def with_added(share: Array, factor: float) -> Array:
     return np.vstack([1.0 - added.sum(axis=0), added])
 
 
-def _count(chains: Sequence[Motions], m: int) -> int:
-    return sum(len(c.error) // m for c in chains)
-
-
 @dataclass(frozen=True)
-class _Poses:
-    """Errors (w, 6) of the poses after m motions each, in the axes of the last camera, and covariances (w, 6, 6): that
-    of ``jitter`` and calibration, of what has ``added`` up, and of the first and last motion's part of that, were it
-    jitter too (``at_ends``). ``belongs`` (w, S): to which sequence, its columns summing to one: a sequence counts as
-    one, however many windows it has, as its errors go together."""
+class Poses:
+    """Errors (w, 6) of the poses after ``span`` motions each, in the axes of the last camera, and covariances
+    (w, 6, 6): that of ``jitter`` and calibration, of what has ``added`` up, and of the first and last motion's part of
+    that, were it jitter too (``at_ends``). ``belongs`` (w, S): to which sequence, its columns summing to one: a
+    sequence counts as one, however many windows it has, as its errors go together."""
 
+    span: int
     error: Array
     jitter: Array
     added: Array
@@ -101,13 +87,14 @@ class _Poses:
     belongs: Array
 
     @classmethod
-    def over(cls, chains: Sequence[Motions], m: int, phi: Array) -> _Poses:
-        """Of the separate windows of all chains."""
+    def over(cls, chains: Sequence[Motions], m: int, phi: Array) -> Poses:
+        """Of the separate windows of all chains; ``phi`` (2, D): correlation of bias and calibration from one motion to
+        the next."""
         long = [c for c in chains if len(c.error) >= m]
         error, jitter, added, at_ends = (np.concatenate(x) for x in zip(*(_windows(c, m, phi) for c in long)))
         sequence = np.concatenate([np.full(len(c.error) // m, c.sequence) for c in long])
         belongs = (sequence[:, None] == np.unique([c.sequence for c in chains])).astype(np.float64)
-        return cls(error, jitter, added, at_ends, belongs / np.maximum(belongs.sum(axis=0), 1.0))
+        return cls(m, error, jitter, added, at_ends, belongs / np.maximum(belongs.sum(axis=0), 1.0))
 
     def losses(self, factor: float) -> Array:
         """(S,) negative log-likelihood of each sequence, without its constant; 0 for one without a window. Gross errors
@@ -117,22 +104,32 @@ class _Poses:
         return np.asarray((0.5 * (np.linalg.slogdet(C)[1] + squared)) @ self.belongs)
 
 
+def poses_of(chains: Sequence[Motions], phi: Array) -> list[Poses]:
+    """Single motions, and the poses after ten and more of them as far as a span has enough windows."""
+    counts = {m: sum(len(c.error) // m for c in chains) for m in SPANS if m == 1 or m >= _LONG}
+    return [Poses.over(chains, m, phi) for m, count in counts.items() if count >= _LEAST_WINDOWS]
+
+
 def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array]:
-    """Error, jitter, added and at_ends of :class:`_Poses`, of the windows of one chain: as
+    """Error, jitter, added and at_ends of :class:`Poses`, of the windows of one chain: as
     :class:`gpvo.accumulation.PoseError` adds up, for all at once and with one time step."""
     T, error, parts, calibration = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts, c.calibration))
-    to_end = adjoints_to_end(T)
-    jitter, white, bias = np.moveaxis(to_end[:, :, None] @ parts @ np.swapaxes(to_end, -1, -2)[:, :, None], 2, 0)
+    to_end, ends = adjoints_to_end(T), [0, -1]
+    jitter, bias = (_carried(parts[:, ends, part], to_end[:, ends]) for part in (0, 2))
+    white = _carried(parts[:, :, 1], to_end)
     bias_phi, calibration_phi = (np.broadcast_to(x, to_end.shape[:3]) for x in phi)
     added = white.sum(axis=1) + persistent_sum(to_end @ _roots(parts[:, :, 2]), bias_phi)
     lasting = persistent_sum(to_end @ calibration, calibration_phi) if calibration.any() else np.zeros_like(added)
-    ends = [0, -1]
     return (
         np.einsum("wkij,wkj->wi", to_end, error),
-        0.5 * jitter[:, ends].sum(axis=1) + lasting,
+        0.5 * jitter.sum(axis=1) + lasting,
         added,
-        0.5 * (white + bias)[:, ends].sum(axis=1),
+        0.5 * (white[:, ends] + bias).sum(axis=1),
     )
+
+
+def _carried(C: Array, adjoint: Array) -> Array:
+    return np.asarray(adjoint @ C @ np.swapaxes(adjoint, -1, -2))
 
 
 def _roots(C: Array) -> Array:

@@ -51,6 +51,12 @@ def seen_axes(error: Array) -> NDArray[np.intp]:
     return np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
 
 
+def counted_axes(axes: ArrayLike | None, d: int) -> NDArray[np.intp]:
+    """Those of the first d axes that are among ``axes``; all d where none is, and for None."""
+    counted = np.arange(d) if axes is None else np.intersect1d(axes, np.arange(d)).astype(np.intp)
+    return counted if len(counted) else np.arange(d)
+
+
 def marginal(covariance: Array, axes: ArrayLike) -> Array:
     """Covariances (..., k, k) of some of the axes of (..., d, d)."""
     return np.asarray(covariance)[..., np.asarray(axes)[:, None], np.asarray(axes)]
@@ -59,10 +65,10 @@ def marginal(covariance: Array, axes: ArrayLike) -> Array:
 def nees_by_block(error: Array, covariance: Array, axes: ArrayLike | None = None) -> dict[str, Array]:
     """NEES per degree of freedom (n,) of each of :data:`BLOCKS` that errors (n, 6), or (n, 3) of translations, hold.
 
-    ``axes``: those that count, by default and where there is none all; a block without any is left out.
+    ``axes``: those that count, as in :func:`counted_axes`; a block without any is left out.
     """
     d = error.shape[-1]
-    counted = np.arange(d) if axes is None or not np.size(axes) else np.asarray(axes)
+    counted = counted_axes(axes, d)
     held = {name: counted[np.isin(counted, b)] for name, b in BLOCKS.items() if max(b) < d}
     return {n: nees(error[:, b], marginal(covariance, b)) / len(b) for n, b in held.items() if len(b)}
 

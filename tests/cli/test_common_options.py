@@ -14,6 +14,8 @@ import pytest
 import typer.main
 from gpvo.cli import app
 from gpvo.cli.common import GROUPS
+from gpvo.io.run import write_run
+from synthetic_runs import make_run
 
 ROOT = Path(__file__).parents[2]
 UNSEEN, MODEL = str(ROOT / "data" / "unseen"), str(ROOT / "models" / "tunnel.gpvo")
@@ -99,7 +101,10 @@ def on_a_terminal(*words: str) -> str:
 
 
 def test_training_shows_how_far_it_is_and_how_long_it_will_take(tmp_path: Path):
-    runs = [str(ROOT / "data" / f"tunnel-{k}") for k in (1, 2)]
+    runs = [str(tmp_path / f"run-{k}") for k in (1, 2)]
+    for k, path in enumerate(runs):
+        log, truth = make_run(k, n=120)
+        write_run(Path(path), log, truth=truth)
     words = ("train", *runs, "-o", str(tmp_path / "m.gpvo"), "--features", "velocity")
     shown = on_a_terminal(*words)
     steps = [shown.index(f"{done}/3") for done in (0, 1, 2)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from gpvo.accumulation import PoseError
 from gpvo.geometry import se3
-from gpvo.learning.poses import Motions, _windows, added_factor, with_added
+from gpvo.learning.poses import Motions, _windows, added_factor, poses_of, with_added
 
 from motion_errors import motion_error
 
@@ -53,12 +54,16 @@ def _flight(rng: np.random.Generator, sequence: int, n: int, added: float) -> Mo
     return Motions(sequence, T, error, parts, np.zeros((n, 6, 6)))
 
 
+def _factor(flights: Sequence[Motions]) -> float:
+    return added_factor(poses_of(flights, BOTH), SHARE)
+
+
 def test_right_parts_stay_as_they_are():
     """Ten trials of twelve flights: within 15 % in each, within 5 % in the middle."""
     found = []
     for trial in range(10):
         rng = np.random.default_rng(trial)
-        found.append(added_factor([_flight(rng, i, 600, 1.0) for i in range(12)], BOTH, SHARE))
+        found.append(_factor([_flight(rng, i, 600, 1.0) for i in range(12)]))
     np.testing.assert_allclose(found, 1.0, atol=0.15)
     assert np.median(found) == pytest.approx(1.0, abs=0.05)
 
@@ -68,7 +73,7 @@ def test_the_factor_is_found_as_far_as_flights_show_it(truth):
     """Of few flights a part, of many nearly all: on a log scale, by 64 flights at least 85 % and at most 115 %."""
     rng = np.random.default_rng(0)
     flights = [_flight(rng, i, 600, truth) for i in range(64)]
-    part = [np.log(added_factor(flights[:n], BOTH, SHARE)) / np.log(truth) for n in (2, 8, 64)]
+    part = [np.log(_factor(flights[:n])) / np.log(truth) for n in (2, 8, 64)]
     assert 0.0 < part[0] < part[1] < part[2]
     assert part[2] == pytest.approx(1.0, abs=0.15)
 
@@ -82,24 +87,24 @@ def test_a_flight_cut_in_two_says_more_and_a_longer_one_does_not():
         for f in flights
         for h, rows in enumerate((slice(0, 600), slice(600, 1200)))
     ]
-    assert added_factor(cut, BOTH, SHARE) < added_factor(flights, BOTH, SHARE) < 1.0
+    assert _factor(cut) < _factor(flights) < 1.0
 
 
 def test_what_flights_do_not_agree_on_is_chance():
     """Half of them say that too much is stated, half that too little; of all six the likeliest factor is 0.88."""
     rng = np.random.default_rng(4)
     flights = [_flight(rng, i, 600, 0.4 if i % 2 else 1.6) for i in range(6)]
-    assert added_factor(flights, BOTH, SHARE) == 1.0
-    assert added_factor(flights[::2], BOTH, SHARE) > 1.0
+    assert _factor(flights) == 1.0
+    assert _factor(flights[::2]) > 1.0
 
 
 def test_too_little_changes_nothing():
     rng = np.random.default_rng(2)
     short, long = _flight(rng, 0, 9, 0.5), _flight(rng, 0, 600, 0.5)
-    assert added_factor([], BOTH, SHARE) == 1.0
-    assert added_factor([short, replace(short, sequence=1)], BOTH, SHARE) == 1.0
-    assert added_factor([long], BOTH, SHARE) == 1.0
-    assert added_factor([long, replace(long, sequence=1), replace(short, sequence=2)], BOTH, SHARE) < 1.0
+    assert _factor([]) == 1.0
+    assert _factor([short, replace(short, sequence=1)]) == 1.0
+    assert _factor([long]) == 1.0
+    assert _factor([long, replace(long, sequence=1), replace(short, sequence=2)]) < 1.0
 
 
 def test_shares_still_sum_to_one():

@@ -238,7 +238,7 @@ def test_table_has_every_row_and_every_key(tmp_path):
 def test_the_row_base_is_the_model_with_its_gp_at_the_mean_function(tmp_path):
     """Noise that only the inlier count tells: the GP gains over its base, which the file can still state."""
     sets = []
-    for s in training_sets(range(4), n=300):
+    for s in training_sets(range(4), n=200):
         louder = np.exp(np.tanh(s.select(["n_inliers"]) / 60.0 - 1.5))
         sets.append(replace(s, Y=s.Y * louder))
     trained = train_sets(sets, replace(QUICK, features="n_inliers"))
@@ -475,13 +475,13 @@ def _theirs(seed: int, state=lambda C: {"imported": C}):
 
 def test_what_another_odometry_states_is_compared_and_learnt_from():
     config = TrainConfig()
-    trained = train_sets([_theirs(k) for k in range(4)], config)
+    trained = train_sets([_theirs(k) for k in range(3)], config)
     said = trained.table["mean"]
     assert said["imported"]["nees_dof"]["joint"] > 5
     assert 0.5 < said["imported_scaled"]["nees_dof"]["joint"] < 2
     assert said["imported_scaled"]["nll_per_dim"] < said["constant"]["nll_per_dim"]
     assert trained.header["base_method"] == "imported"
-    without = train_sets([_theirs(k, lambda C: {}) for k in range(4)], config).table["mean"]
+    without = train_sets([_theirs(k, lambda C: {}) for k in range(3)], config).table["mean"]
     assert without["imported"]["nees_dof"]["joint"] is None
     assert said["learned"]["nll_per_dim"] < without["learned"]["nll_per_dim"] - 0.05
 
@@ -561,7 +561,7 @@ def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path:
             save_model(_of_three(), path)
 
 
-@pytest.mark.parametrize("axes", [[5], [2, 3, 4], [0, 1, 2, 3, 4, 5]])
+@pytest.mark.parametrize("axes", [[2, 3, 4], [0, 1, 2, 3, 4, 5]])
 def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int]) -> None:
     """A robot in a plane: its height, roll and pitch are zero in both."""
     sets = [replace(s, Y=np.where(np.isin(np.arange(6), axes), 0.0, s.Y)) for s in training_sets(range(3), n=120)]

@@ -31,9 +31,9 @@ def fused(*arguments):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """Runs of one flight of sixteen seconds: with its truth, and without."""
+    """Runs of one flight of twelve seconds: with its truth, and without."""
     folder = tmp_path_factory.mktemp("flown")
-    flight = simulate_points("tunnel-clean", seed=21, duration_s=16.0, tracks=110)
+    flight = simulate_points("tunnel-clean", seed=21, duration_s=12.0, tracks=110)
     run(open_source(flight.save(folder / "flight.npz")), folder / "seen", keep_tracks=True)
     _without_truth(folder / "seen", folder / "blind")
     return folder / "seen", folder / "blind"
@@ -63,11 +63,11 @@ def test_twins_foretell_the_filters_error(flown, imu):
 
 
 def test_the_table_says_that_truth_is_simulated_and_fits_80_columns(flown):
-    shown = fused(flown[1], "--twins", "--replicates", 7, "--policies", "pointing_matching", "--tolerance", "kitti")
-    assert "blind has no ground truth: means over 7 twins, whose truth is simulated (tolerance kitti)" in shown
+    shown = fused(flown[1], "--twins", "--replicates", 2, "--policies", "pointing_matching", "--tolerance", "kitti")
+    assert "blind has no ground truth: means over 2 twins, whose truth is simulated (tolerance kitti)" in shown
     table = shown[shown.index("\npolicy") + 1 :]
     assert max(map(len, table.splitlines())) <= 80
-    assert "         7\n" in table
+    assert "         2\n" in table
 
 
 def test_the_imu_of_a_twin_flew_its_path(flown, tmp_path):
