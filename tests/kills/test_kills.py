@@ -165,7 +165,7 @@ def test_trainings(flights: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("kind", "share"), [("sequence", 0.1), ("campaign of two workers", 0.2)])
 def test_simulations(kind: str, share: float, tmp_path: Path) -> None:
     pytest.importorskip("numba", reason="images need the extra gpvo[sim]")
-    scene = ["tunnel-clean", "--duration", "2", "--rate", "5", "--set", "speed_mps=0.5"]
+    scene = ["tunnel-clean", "--duration", "4", "--rate", "5", "--set", "speed_mps=0.5"]
     many = ["--seeds", "0..1", "--jobs", "2"] if "campaign" in kind else []
     finish(*GPVO, "simulate", *scene, *many, "-o", tmp_path / "warm")  # the world is built once, into the cache
     takes_s = finish(*GPVO, "simulate", *scene, *many, "-o", tmp_path / "wanted")
