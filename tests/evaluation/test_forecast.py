@@ -166,7 +166,7 @@ def test_a_model_of_windows_is_refused_by_name(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_forecast_along_unseen_simulated_flights(tmp_path):
-    """Odometry on simulated tracks: training on ten flights, forecast along the truth of twelve others."""
+    """Odometry on simulated tracks: training on ten flights, forecast along the truth of twenty others."""
     from bench.experiment_flights import Campaign, flights
     from gpvo.dataset.build import build_run
     from gpvo.learning.config import TrainConfig
@@ -178,7 +178,7 @@ def test_forecast_along_unseen_simulated_flights(tmp_path):
         [build_run(r) for r in flights(campaign, range(1000, 1010))], config, judge=False
     ).predictor()
     predicted, actual = [], []
-    for run in flights(campaign, range(12)):
+    for run in flights(campaign, range(20)):
         truth = run.truth
         plan = resample(Trajectory(truth.t_ns[::10], truth.T_world_cam[::10]), np.arange(200) * predictor.model.dt_s)
         f = forecast(predictor, plan, draws=3)

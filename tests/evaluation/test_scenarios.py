@@ -34,8 +34,9 @@ def test_a_test_flight_that_taught_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_learned_covariance_is_true_on_flights_not_seen(tmp_path):
-    scores = judge(fly("tunnel-bursts", tmp_path, train=4, test=3, test_seed=7000, duration_s=40.0))
+@pytest.mark.parametrize("name", ["tunnel-bursts", "lunar-straight"])
+def test_the_learned_covariance_is_true_on_flights_not_seen(name, tmp_path):
+    scores = judge(fly(name, tmp_path, train=4, test=3, test_seed=7000, duration_s=40.0))
     frame, one, ten = scores["learned"].nees[:, :3].mean(axis=0)
     assert 0.8**2 < frame < 1.25**2
     assert 0.7**2 < one < 1.5**2

@@ -34,7 +34,7 @@ def test_a_new_sequence_is_covered():
     """Scales drawn per sequence: the mean NEES of new ones stays near one, where pooling would do no worse."""
     rng = np.random.default_rng(2)
     stated = []
-    for _ in range(100):
+    for _ in range(200):
         scale = np.exp(0.5 * rng.standard_normal(6))
         z = np.concatenate([np.sqrt(c) * rng.standard_normal((200, 6)) for c in scale])
         fitted = fit_scale(z, np.repeat(np.arange(6), 200))
