@@ -28,6 +28,9 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 demo: .venv/demo-ready
 	$(BIN)/python examples/demo.py
 
+# Two workers share the machine: more threads would only wait for one another.
+test check: export OMP_NUM_THREADS = 1
+
 test: .venv/test-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

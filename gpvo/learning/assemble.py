@@ -30,7 +30,7 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.projected import ProjectedGP
 from gpvo.stats import student_t
 from gpvo.stats.consistency import nees
-from gpvo.types import Array, MotionError
+from gpvo.types import Array
 
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _LEAST_KNOWN = 0.5
@@ -107,24 +107,22 @@ class _Residuals:
             root[fold], rest[fold] = of_calibration(self.variance[fold], patterns, twist[fold])
         return root, rest, self.error - self.patterns.error
 
-    def divided(self, model: ErrorModel) -> tuple[Array, Array]:
-        """Covariances (n, 3, 6, 6) of jitter, white noise and bias, and the root (n, 6, 6) of that due to calibration,
-        which is not in the bias, by the patterns of the other flights."""
+    def divided(self, model: ErrorModel) -> tuple[Array, ...]:
+        """Covariances (n, 6, 6) of jitter and white noise, and the root (n, 6, 12) of bias and calibration, by the
+        patterns of the other flights."""
+        twist, geometry = model.twist(self.X), self.geometry
+
+        def split(of: Any, division: Division) -> tuple[Array, ...]:
+            e = division.split(self.variance[of], twist[of], None if geometry is None else geometry[of])
+            return e.jitter, e.white, e.persistent_root
+
         if self.patterns is None:
-            return _covariances(model.division.split(self.variance, model.twist(self.X), self.geometry))
-        parts, root = np.empty((len(self.error), 3, 6, 6)), np.empty((len(self.error), 6, 6))
+            return split(slice(None), model.division)
+        out = tuple(np.empty((len(twist), 6, k)) for k in (6, 6, 12))
         for fold, patterns in self._folds():
-            of_fold = replace(model.division, calibration_patterns=patterns)
-            geometry = None if self.geometry is None else self.geometry[fold]
-            split = of_fold.split(self.variance[fold], model.twist(self.X[fold]), geometry)
-            parts[fold], root[fold] = _covariances(split)
-        return parts, root
-
-
-def _covariances(e: MotionError) -> tuple[Array, Array]:
-    """Covariances (n, 3, 6, 6) of the parts of an error, and the root (n, 6, 6) of that due to calibration."""
-    bias = e.persistent_root[..., :6]
-    return np.stack([e.jitter, e.white, bias @ np.swapaxes(bias, -1, -2)], axis=1), e.persistent_root[..., 6:]
+            for whole, part in zip(out, split(fold, replace(model.division, calibration_patterns=patterns))):
+                whole[fold] = part
+        return out
 
 
 @dataclass(frozen=True)
@@ -170,13 +168,13 @@ def _consistent(model: ErrorModel, of: _Residuals) -> _Consistent:
 def _jointly(model: ErrorModel, of: _Residuals) -> tuple[Array, float, list[Poses]]:
     """Covariances (n, 6, 6) of motions, times the factor that makes their joint NEES right; the factor; and poses with
     such covariances."""
-    parts, root = of.divided(model)
-    whole = parts.sum(axis=1) + root @ np.swapaxes(root, -1, -2)
+    jitter, white, root = of.divided(model)
+    whole = jitter + white + root @ np.swapaxes(root, -1, -2)
     joint = fit_joint_factor(of.error, whole, of.rows.group)
-    parts, root, T_prev_cur = parts * joint, root * np.sqrt(joint), of.rows.motions()
+    stated = (of.rows.motions(), of.error, jitter * joint, white * joint, root * np.sqrt(joint))
     chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
-    chains = [Motions(i, T_prev_cur[c], of.error[c], parts[c], root[c]) for i, cs in enumerate(chosen) for c in cs]
-    phi = np.exp(-of.rows.step_s / model.division.persistent_tau_s.reshape(2, 6))
+    chains = [Motions(i, *(x[c] for x in stated)) for i, cs in enumerate(chosen) for c in cs]
+    phi = np.exp(-of.rows.step_s / model.division.persistent_tau_s)
     return whole * joint, joint, poses_of(chains, phi)
 
 

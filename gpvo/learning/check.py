@@ -42,11 +42,8 @@ def check(predictor: Predictor, run: Run) -> Check:
     problems += rate_problems(predictor, [r for r in run.log if r.usable])
     records, X = observe(run.log, predictor.features, predictor.target)
     usable = np.array([r.usable for r in records], dtype=bool)
-    missing = [
-        n
-        for n, known in zip(predictor.features, np.isfinite(X[usable]).mean(axis=0) if usable.any() else [])
-        if known < 0.5
-    ]
+    known = np.isfinite(X[usable]).mean(axis=0) if usable.any() else np.ones(X.shape[1])
+    missing = [n for n, share in zip(predictor.features, known) if share < 0.5]
     if missing:
         problems.append(f"the run lacks features the model needs: {', '.join(missing)}")
     place = predictor.model.locate(X[usable], np.array([r.dt_s for r in records])[usable])

@@ -10,7 +10,7 @@ correlations of the sums tell how the axes are correlated in each part.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 from gpvo.geometry.covariance import correlation
 from gpvo.learning.calibrate import residual_correlation
-from gpvo.learning.spans import Chains, at_most, cut, span_variances
+from gpvo.learning.spans import Chains, at_most, span_variances
 from gpvo.stats.series import moving_sums
 from gpvo.types import Array
 
@@ -57,42 +57,32 @@ class Parts:
 
 @dataclass(frozen=True)
 class _Windows:
-    """W windows of all spans, one after the other, with R motions in all, of one block of d axes.
+    """W windows of all spans over the N motions of all chains, of one block of d axes.
 
-    Squared sums (d, W), other variance known to add up (d, W), weights of the windows (W,); stated variances of the
-    motions (d, R), their logs above the typical level (d, R), and those of the speed (R,). ``spans``: numbers of
-    windows and motions of each span.
+    Squared sums (d, W), other variance known to add up (d, W), weights of the windows (W,); the motions ``first`` to
+    ``end - 1`` (W,) of each; stated variances of the motions (d, N + 1), their logs above the typical level, and those
+    of the speed (N + 1,), all closed (see :func:`_closed`). ``spans``: windows of each span.
     """
 
     square: Array
     known: Array
     count: Array
+    first: NDArray[np.int64]
+    end: NDArray[np.int64]
     variance: Array
     above: Array
     faster: Array
-    spans: Sequence[tuple[int, int]]
+    spans: Sequence[int]
 
-    def split(self, each: Array) -> Iterator[Array]:
-        """Per span (d, w, m) of values (d, R) of the motions."""
-        at = 0
-        for w, m in self.spans:
-            yield each[:, at : at + w * m].reshape(-1, w, m)
-            at += w * m
+    def products(self, amplitude: Array, phi: float) -> Array:
+        """(d, W) sum over the pairs of motions of a window, k apart, of ``phi^k`` times both amplitudes (d, N + 1).
 
-    def sums(self, each: Array) -> Array:
-        """(d, W) over each window of values (d, R) of the motions."""
-        return np.concatenate([x.sum(axis=2) if x.shape[2] > 1 else x[:, :, 0] for x in self.split(each)], axis=1)
-
-    def ends(self, each: Array) -> Array:
-        """(d, W) mean of the first and the last motion of each window."""
-        return 0.5 * np.concatenate([x[:, :, 0] + x[:, :, -1] for x in self.split(each)], axis=1)
-
-    def carried(self, amplitude: Array, phi: float) -> Array:
-        """(d, R) share of each motion in biases of ``amplitude`` (d, R) that persist from earlier motions of its
-        window."""
-        given = self.split(amplitude)
-        told = [lfilter([0.0, phi], [1.0, -phi], x, axis=2) if x.shape[2] > 1 else np.zeros_like(x) for x in given]
-        return np.concatenate([x.reshape(len(x), -1) for x in told], axis=1)
+        One filter over all motions holds what came before a window too, which is taken away again.
+        """
+        before = lfilter([0.0, phi], [1.0, -phi], amplitude, axis=1)
+        after = lfilter([1.0], [1.0, -phi], amplitude[:, ::-1], axis=1)[:, ::-1]
+        within = after[:, self.first] - phi ** (self.end - self.first) * after[:, self.end]
+        return np.asarray(_sums(amplitude * before, self.first, self.end) - before[:, self.first] * within)
 
 
 @dataclass(frozen=True)
@@ -170,18 +160,35 @@ def _loss(choice: _Choice) -> float:
 
 
 def _windows(given: Sequence[Chains], spans: NDArray[np.int64], block: slice, level: Array) -> _Windows:
-    parts, sizes = [], []
+    lengths, firsts = np.array([len(c) for chains in given[0] for c in chains]), []
     for m in spans:
-        e, v, u, root = (np.concatenate([cut(c, m) for chains in x for c in chains]) for x in given)
-        some = slice(None, None, max(len(e) // _MOST_WINDOWS, 1))
-        e, v, u, root = e[some, :, block], v[some, :, block], u[some], root[some, :, block]
-        known = (root.sum(axis=1) ** 2).sum(axis=-1)
-        each = v.reshape(-1, v.shape[2]).T
-        count = np.full(len(e), min(len(e), _MOST_COUNT) / len(e))
-        parts.append((e.sum(axis=1).T ** 2, known.T, count, each, u.ravel()))
-        sizes.append((len(e), int(m)))
-    square, known, counts, ln_var, faster = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
-    return _Windows(square, known, counts, np.exp(ln_var), ln_var - level[block, None], faster, sizes)
+        some = np.concatenate([at + m * np.arange(n // m) for at, n in zip(np.cumsum(lengths) - lengths, lengths)])
+        firsts.append(some[:: max(len(some) // _MOST_WINDOWS, 1)])
+    sizes = [len(f) for f in firsts]
+    first, end = np.concatenate(firsts), np.concatenate([f + m for f, m in zip(firsts, spans)])
+    error, ln_var, faster, root = (np.concatenate([c for chains in x for c in chains]).T for x in given)
+    ln_var, known = ln_var[block], _sums(_closed(root[:, block]), first, end)
+    return _Windows(
+        square=_sums(_closed(error[block]), first, end) ** 2,
+        known=(known**2).sum(axis=0),
+        count=np.repeat(np.minimum(sizes, _MOST_COUNT) / sizes, sizes),
+        first=first,
+        end=end,
+        variance=_closed(np.exp(ln_var)),
+        above=_closed(ln_var - level[block, None]),
+        faster=_closed(faster[0]),
+        spans=sizes,
+    )
+
+
+def _closed(each: Array) -> Array:
+    """(..., N + 1) values of the motions, and zero, with which the last window ends."""
+    return np.concatenate([each, np.zeros((*each.shape[:-1], 1))], axis=-1)
+
+
+def _sums(each: Array, first: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
+    """(..., W) sums of values (..., N + 1) over ``first`` to ``end - 1`` of each window."""
+    return np.asarray(np.add.reduceat(each, np.stack([first, end], axis=1).ravel(), axis=-1)[..., ::2])
 
 
 def _fit_shape(windows: _Windows, shape: _Shape, widen: Array | None = None) -> _Fit:
@@ -190,7 +197,7 @@ def _fit_shape(windows: _Windows, shape: _Shape, widen: Array | None = None) -> 
     The standard deviation of a squared sum is its own stated variance (times root two). So the fit is reweighted by
     its own stated variances: weights from the observed squares would favour variances that are too small.
     """
-    d, sizes = len(windows.square), [w for w, _ in windows.spans]
+    d, sizes = len(windows.square), windows.spans
     widen = np.ones((len(sizes), d)) if widen is None else widen
     share = np.repeat([[0.5], [0.4], [0.1]], d, axis=1)
     square, known = windows.square * np.repeat(widen.T, sizes, axis=1), windows.known
@@ -222,8 +229,9 @@ def _terms(w: _Windows, gains: tuple[Array, Array] | None, tau: float, share: Ar
         each = w.variance / (share[0, :, None] + share[1, :, None] * gains[0] + share[2, :, None] * gains[1])
         white, bias = each * gains[0], each * gains[1]
     amplitude = np.sqrt(bias)
-    bias = bias + 2.0 * amplitude * w.carried(amplitude, float(np.exp(-1.0 / tau)))
-    return np.stack([w.ends(each), w.sums(white), w.sums(bias)])
+    pairs = w.products(amplitude, float(np.exp(-1.0 / tau)))
+    white, bias = (_sums(x, w.first, w.end) for x in (white, bias))
+    return np.stack([0.5 * (each[:, w.first] + each[:, w.end - 1]), white, bias + 2.0 * pairs])
 
 
 def _solve(A: Array, square: Array, weight: Array) -> Array:

@@ -9,7 +9,7 @@ few principal axes of that covariance are patterns, each scaled by how wrong cal
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,30 +94,30 @@ def _rms(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What a flight says about its K, in the least-squares sense: ``gram`` (6, c, c) and ``moment`` (6, c) of each
-    axis, sum of squares ``square`` (6,), number of windows."""
+    """What flights (..., leading axes) say about their K, in the least-squares sense: ``gram`` (..., 6, c, c) and
+    ``moment`` (..., 6, c) of each axis, sum of squares ``square`` (..., 6), number of windows."""
 
     gram: Array
     moment: Array
     square: Array
-    count: int
+    count: int | Array
 
     def posterior(self, S: Array, noise: Array) -> tuple[Array, Array]:
-        """Mean (6 c,) and covariance of ``vec K`` for a flight, given the covariance S over flights and the noise (6,)
-        of a window."""
-        c = self.gram.shape[-1]
-        P = np.asarray(np.linalg.inv(S), dtype=np.float64)
-        for i in range(_D):
-            P[i * c : (i + 1) * c, i * c : (i + 1) * c] += self.gram[i] / noise[i]
-        C = np.asarray(np.linalg.inv(P), dtype=np.float64)
-        return C @ (self.moment / noise[:, None]).ravel(), C
+        """Mean (..., 6 c) and covariance of ``vec K``, given the covariance S over flights and the noise (6,) of a
+        window."""
+        c, each, lead = self.gram.shape[-1], np.arange(_D), self.gram.shape[:-3]
+        P = np.zeros((*lead, _D, c, _D, c))
+        P[..., each, :, each, :] = np.moveaxis(self.gram / noise[:, None, None], -3, 0)
+        C = np.linalg.inv(np.linalg.inv(S) + P.reshape(*lead, _D * c, _D * c))
+        moment = (self.moment / noise[:, None]).reshape(*lead, _D * c)
+        return (C @ moment[..., None])[..., 0], C
 
     def residual(self, mean: Array, C: Array) -> Array:
-        """(6,) expected sum of squares that K does not explain."""
-        c = self.gram.shape[-1]
-        K, blocks = mean.reshape(_D, c), C.reshape(_D, c, _D, c)
-        own = np.einsum("iaib->iab", blocks) + K[:, :, None] * K[:, None, :]
-        return np.asarray(self.square - 2.0 * (K * self.moment).sum(axis=1) + (self.gram * own).sum(axis=(1, 2)))
+        """(..., 6) expected sum of squares that K does not explain."""
+        K = mean.reshape(self.moment.shape)
+        blocks = C.reshape(K.shape + K.shape[-2:])
+        own = np.einsum("...iaib->...iab", blocks) + K[..., :, None] * K[..., None, :]
+        return np.asarray(self.square - 2.0 * (K * self.moment).sum(axis=-1) + (self.gram * own).sum(axis=(-1, -2)))
 
 
 @dataclass(frozen=True)
@@ -163,14 +163,12 @@ class _Unit:
 
 def _spread(evidence: Sequence[_Evidence]) -> tuple[Array, Array]:
     """Covariance of ``vec K`` over the flights, shrunk towards its diagonal, and noise (6,) of the windows."""
-    n = _D * evidence[0].gram.shape[-1]
-    S, noise, count = _BEGIN_VAR * np.eye(n), np.ones(_D), sum(e.count for e in evidence)
+    every = _Evidence(*(np.array([getattr(e, f.name) for e in evidence]) for f in fields(_Evidence)))
+    n = _D * every.gram.shape[-1]
+    S, noise = _BEGIN_VAR * np.eye(n), np.ones(_D)
     for _ in range(_ROUNDS):
-        second, left = np.zeros((n, n)), np.zeros(_D)
-        for e in evidence:
-            mean, C = e.posterior(S, noise)
-            second += np.outer(mean, mean) + C
-            left += e.residual(mean, C)
-        S = (second + _DIAGONAL * np.diag(np.diag(second)) / len(evidence)) / (len(evidence) + _DIAGONAL)
-        noise = np.maximum(left / count, 1e-12)
+        mean, C = every.posterior(S, noise)
+        second = mean.T @ mean + C.sum(axis=0)
+        S = (second + _DIAGONAL * np.diag(np.diag(second)) / len(mean)) / (len(mean) + _DIAGONAL)
+        noise = np.maximum(every.residual(mean, C).sum(axis=0) / np.sum(every.count), 1e-12)
     return S, noise

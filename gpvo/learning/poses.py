@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from gpvo.accumulation import adjoints_to_end, persistent_sum
-from gpvo.geometry.covariance import scaled_root
 from gpvo.learning.rows import significant_gain
 from gpvo.learning.spans import SPANS, cut
 from gpvo.stats.consistency import nees
@@ -29,15 +28,16 @@ _MOST_NEES = 16.0
 
 @dataclass(frozen=True)
 class Motions:
-    """One unbroken chain of n motions of a sequence: ``T_prev_cur`` (n, 4, 4), ``error`` (n, 6), and ``parts``
-    (n, 3, 6, 6), the stated covariances of its jitter, white and bias; ``calibration`` (n, 6, 6), the root of what a
-    wrong calibration adds to them."""
+    """One unbroken chain of n motions of a sequence: ``T_prev_cur`` (n, 4, 4), ``error`` (n, 6), and of what is stated
+    the covariances ``jitter`` and ``white`` (n, 6, 6), and ``root`` (n, 6, 12) of the bias and of what a wrong
+    calibration adds."""
 
     sequence: int
     T_prev_cur: Array
     error: Array
-    parts: Array
-    calibration: Array
+    jitter: Array
+    white: Array
+    root: Array
 
 
 def added_factor(poses: Sequence[Poses], share: Array) -> float:
@@ -88,10 +88,11 @@ class Poses:
 
     @classmethod
     def over(cls, chains: Sequence[Motions], m: int, phi: Array) -> Poses:
-        """Of the separate windows of all chains; ``phi`` (2, D): correlation of bias and calibration from one motion to
+        """Of the separate windows of all chains; ``phi`` (12,): correlation of bias and calibration from one motion to
         the next."""
         long = [c for c in chains if len(c.error) >= m]
-        error, jitter, added, at_ends = (np.concatenate(x) for x in zip(*(_windows(c, m, phi) for c in long)))
+        every = zip(*((c.T_prev_cur, c.error, c.jitter, c.white, c.root) for c in long))
+        error, jitter, added, at_ends = _sums(phi, *(np.concatenate([cut(v, m) for v in of]) for of in every))
         sequence = np.concatenate([np.full(len(c.error) // m, c.sequence) for c in long])
         belongs = (sequence[:, None] == np.unique([c.sequence for c in chains])).astype(np.float64)
         return cls(m, error, jitter, added, at_ends, belongs / np.maximum(belongs.sum(axis=0), 1.0))
@@ -110,29 +111,24 @@ def poses_of(chains: Sequence[Motions], phi: Array) -> list[Poses]:
     return [Poses.over(chains, m, phi) for m, count in counts.items() if count >= _LEAST_WINDOWS]
 
 
-def _windows(c: Motions, m: int, phi: Array) -> tuple[Array, Array, Array, Array]:
-    """Error, jitter, added and at_ends of :class:`Poses`, of the windows of one chain: as
+def _sums(
+    phi: Array, T_prev_cur: Array, error: Array, jitter: Array, white: Array, root: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Error, jitter, added and at_ends of :class:`Poses`, of windows (w, m, ...) of motions: as
     :class:`gpvo.accumulation.PoseError` adds up, for all at once and with one time step."""
-    T, error, parts, calibration = (cut(v, m) for v in (c.T_prev_cur, c.error, c.parts, c.calibration))
-    to_end, ends = adjoints_to_end(T), [0, -1]
-    jitter, bias = (_carried(parts[:, ends, part], to_end[:, ends]) for part in (0, 2))
-    white = _carried(parts[:, :, 1], to_end)
-    bias_phi, calibration_phi = (np.broadcast_to(x, to_end.shape[:3]) for x in phi)
-    added = white.sum(axis=1) + persistent_sum(to_end @ _roots(parts[:, :, 2]), bias_phi)
-    lasting = persistent_sum(to_end @ calibration, calibration_phi) if calibration.any() else np.zeros_like(added)
+    to_end, ends = adjoints_to_end(T_prev_cur), [0, -1]
+    jitter, white, root = _carried(jitter[:, ends], to_end[:, ends]), _carried(white, to_end), to_end @ root
+    bias, calibration = root[..., :6], root[..., 6:]
+    phi = np.broadcast_to(phi, (*root.shape[:2], len(phi)))
+    added = white.sum(axis=1) + persistent_sum(bias, phi[..., :6])
+    lasting = persistent_sum(calibration, phi[..., 6:]) if calibration.any() else np.zeros_like(added)
     return (
-        np.einsum("wkij,wkj->wi", to_end, error),
+        (to_end @ error[..., None]).sum(axis=1)[..., 0],
         0.5 * jitter.sum(axis=1) + lasting,
         added,
-        0.5 * (white[:, ends] + bias).sum(axis=1),
+        0.5 * (white[:, ends] + bias[:, ends] @ np.swapaxes(bias[:, ends], -1, -2)).sum(axis=1),
     )
 
 
 def _carried(C: Array, adjoint: Array) -> Array:
     return np.asarray(adjoint @ C @ np.swapaxes(adjoint, -1, -2))
-
-
-def _roots(C: Array) -> Array:
-    """Roots of covariances (w, m, 6, 6) that share one correlation matrix."""
-    sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
-    return sigma[..., None] * scaled_root(C[0, 0]) / sigma[0, 0][:, None]

@@ -110,16 +110,20 @@ def fit_thesis(
     inducing: int = 128,
 ) -> ThesisModel:
     """GPs of the errors on ``columns``, by default velocity and inlier count (velocity alone where the log has no
-    counts): one isotropic RBF kernel for each axis, or ``shared`` by all, and constant noise."""
+    counts): one isotropic RBF kernel for each axis, or one that all ``shared``, by ``regressor``; constant noise."""
     names = supported_columns(sets, columns) or THESIS[:3]
     X, Y = np.concatenate([s.select(names) for s in sets]), np.concatenate([s.Y for s in sets])
     known = np.isfinite(X).all(axis=1)
     X, Y = X[known], Y[known]
     centre, spread = X.mean(axis=0), np.maximum(X.std(axis=0), 1e-9)
     scale = np.maximum(Y.std(axis=0), 1e-12)
-    points = {} if regressor in ("exact", "sklearn") else {"inducing": inducing}
-    gps = []
-    for y in [Y / scale] if shared else np.split(Y / scale, len(scale), axis=1):
-        fit = get_regressor(regressor, n_rows=len(X), isotropic=True, **points).fit((X - centre) / spread, y, seed=seed)
-        gps.append(NoisyGP(fit.gp, np.log(fit.hyper.noise_var)))
-    return ThesisModel(tuple(names), centre, spread, scale, tuple(gps))
+    U, Y = (X - centre) / spread, Y / scale
+    if shared:
+        points = {} if regressor in ("exact", "sklearn") else {"inducing": inducing}
+        fits = [get_regressor(regressor, n_rows=len(X), isotropic=True, **points).fit(U, Y, seed=seed)]
+    else:
+        from gpvo.learning.regressors.sparse import SparseRegressor  # with torch, which reading a model does without
+
+        fits = SparseRegressor(inducing=inducing).fit_each(U, Y, seed=seed)
+    gps = tuple(NoisyGP(fit.gp, np.log(fit.hyper.noise_var)) for fit in fits)
+    return ThesisModel(tuple(names), centre, spread, scale, gps)

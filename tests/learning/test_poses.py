@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from gpvo.accumulation import PoseError
 from gpvo.geometry import se3
-from gpvo.learning.poses import Motions, _windows, added_factor, poses_of, with_added
+from gpvo.geometry.covariance import scaled_root
+from gpvo.learning.poses import Motions, _sums, added_factor, poses_of, with_added
 
 from motion_errors import motion_error
 
 PHI, LASTING = 0.9, 0.99
-BOTH = np.repeat([[PHI], [LASTING]], 6, axis=1)
+BOTH = np.repeat([PHI, LASTING], 6)
 SHARE = np.repeat([[0.6], [0.3], [0.1]], 6, axis=1)
 
 
@@ -30,9 +31,10 @@ def test_what_is_stated_of_a_pose_is_what_adds_up_along_a_path():
     n = 14
     T, parts = se3.exp(0.3 * rng.standard_normal((n, 6))), _covariances(rng, n)
     root = rng.standard_normal((n, 6, 1)) * rng.standard_normal((6, 6))
-    _, jitter, added, _ = _windows(Motions(0, T, np.zeros((n, 6)), parts, root), n, BOTH)
+    whole = np.concatenate([scaled_root(parts[:, 2]), root], axis=-1)
+    _, jitter, added, _ = _sums(BOTH, *(x[None] for x in (T, np.zeros((n, 6)), parts[:, 0], parts[:, 1], whole)))
     pose = PoseError()
-    tau_s, lasting_s = -1.0 / np.log(BOTH)
+    tau_s, lasting_s = np.split(-1.0 / np.log(BOTH), 2)
     for T_prev_cur, (jit, white, bias), L in zip(T, parts, root):
         pose = pose.after(T_prev_cur, motion_error(jit, white, bias, tau_s, L, lasting_s, dt_s=1.0))
     np.testing.assert_allclose((jitter + added)[0], pose.covariance, rtol=1e-9)
@@ -50,8 +52,8 @@ def _flight(rng: np.random.Generator, sequence: int, n: int, added: float) -> Mo
         slow[k] = state
     back = se3.adjoint(se3.inverse(T)) @ frames[:-1, :, None]
     error = frames[1:] - back[..., 0] + white * rng.standard_normal((n, 6)) + bias * slow
-    parts = np.tile(SHARE[:, 0, None, None] * np.eye(6), (n, 1, 1, 1))
-    return Motions(sequence, T, error, parts, np.zeros((n, 6, 6)))
+    jitter, white, bias = (np.tile(share * np.eye(6), (n, 1, 1)) for share in SHARE[:, 0])
+    return Motions(sequence, T, error, jitter, white, np.concatenate([np.sqrt(bias), np.zeros((n, 6, 6))], axis=-1))
 
 
 def _factor(flights: Sequence[Motions]) -> float:
@@ -83,7 +85,7 @@ def test_a_flight_cut_in_two_says_more_and_a_longer_one_does_not():
     rng = np.random.default_rng(3)
     flights = [_flight(rng, i, 1200, 0.5) for i in range(4)]
     cut = [
-        Motions(2 * f.sequence + h, f.T_prev_cur[rows], f.error[rows], f.parts[rows], f.calibration[rows])
+        Motions(2 * f.sequence + h, *(x[rows] for x in (f.T_prev_cur, f.error, f.jitter, f.white, f.root)))
         for f in flights
         for h, rows in enumerate((slice(0, 600), slice(600, 1200)))
     ]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
@@ -21,10 +20,8 @@ LOG_LENGTH_BOUNDS = (np.log(0.05), np.log(50.0))
 LOG_SIGNAL_BOUNDS = (np.log(1e-6), np.log(1e3))
 LOG_NOISE_BOUNDS = (np.log(1e-6), np.log(1e2))
 """Bounds of the learned quantities for inputs and outputs of unit variance: sums of many features rarely need more."""
-
-
 CHUNK_ROWS = 8192
-
+_ROUNDS, _TRIED = 4, 25
 _RANK_TOLERANCE = 1e-11
 """Directions of the points' kernel matrix below this share of the largest are rounding errors, not information."""
 
@@ -39,11 +36,6 @@ def fixed_threads(n: int) -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(before)
-
-
-def pick_device(name: str) -> torch.device:
-    """``auto`` is CUDA if available."""
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
 
 
 def unit_kernel(A: Tensor, B: Tensor) -> Tensor:
@@ -67,28 +59,14 @@ def cholesky(K: Tensor) -> Tensor:
     raise ValueError("the kernel matrix is not positive definite")
 
 
-def pack(hyper: Hyperparameters, isotropic: bool) -> Array:
-    """Logarithms (1 or d, D, D) for the optimiser."""
-    lengths = np.log(hyper.lengthscale)
-    lengths = lengths.mean(keepdims=True) if isotropic else lengths
-    return np.concatenate([lengths, np.log(hyper.signal_var), np.log(hyper.noise_var)])
+def pack(hyper: Hyperparameters) -> Array:
+    """Logarithms (d, D, D) for the optimiser."""
+    return np.log(np.concatenate([hyper.lengthscale, hyper.signal_var, hyper.noise_var]))
 
 
-def unpack(theta: Array, d: int, D: int) -> Hyperparameters:
-    """The inverse of :func:`pack`; one length scale is spread over all d inputs."""
-    lengths, signal, noise = theta[: -2 * D], theta[-2 * D : -D], theta[-D:]
-    return Hyperparameters(np.exp(np.broadcast_to(lengths, d)).copy(), np.exp(signal), np.exp(noise))
-
-
-def bounds(theta: Array, D: int) -> list[tuple[float, float]]:
-    """Box for the optimiser."""
-    n_lengths = len(theta) - 2 * D
-    return [LOG_LENGTH_BOUNDS] * n_lengths + [LOG_SIGNAL_BOUNDS] * D + [LOG_NOISE_BOUNDS] * D
-
-
-def first_guess(d: int, D: int, length: float) -> Hyperparameters:
-    """For standardised data: ``length`` times sqrt(d) for every input, half signal, half noise."""
-    return Hyperparameters(np.full(d, length * np.sqrt(d)), np.full(D, 0.5), np.full(D, 0.5))
+def unpack(theta: Array, D: int) -> Hyperparameters:
+    """The inverse of :func:`pack`."""
+    return Hyperparameters(*np.split(np.exp(theta), [len(theta) - 2 * D, len(theta) - D]))
 
 
 _CANDIDATES = 8000
@@ -172,43 +150,39 @@ class Posterior:
             kk, ky = sums(Xs, Ys, Z, lengthscale)
             S = whiten @ kk @ whiten.T
             eigenvalues, U = torch.linalg.eigh(0.5 * (S + S.T))
-            P, eigenvalues = (U.flip(1).T @ whiten).contiguous(), eigenvalues.flip(0).clamp_min(0.0)
+            # Less than rounding errors, which the points' rarest directions enlarge, is not known to be less.
+            least = np.finfo(np.float64).eps * float(kk.trace() / prior[kept][0])
+            P, eigenvalues = (U.flip(1).T @ whiten).contiguous(), eigenvalues.flip(0).clamp_min(least)
             z_y = P @ ky
         lost = max(len(Xs) - float(eigenvalues.sum()), 0.0)
         return cls(P.numpy().copy(), eigenvalues.numpy(), z_y.numpy(), (Ys**2).sum(axis=0), lost, len(Xs))
 
-    def value_and_gradient(self, output: int, logs: Array) -> tuple[float, Array]:
-        """Negative bound of one output, per row, and its gradient, at log(signal, noise variance): O(r)."""
-        s, v = np.exp(logs)
-        ratio, zy2, lam = s / v, self.z_y[:, output] ** 2, self.eigenvalues
-        grown = 1.0 + ratio * lam
-        left = (self.yy[output] - ratio * (zy2 / grown).sum()) / v
-        log_det = np.log(grown).sum() + self.n * (logs[1] + np.log(2 * np.pi))
-        d_ratio = 0.5 * ratio * ((lam / grown).sum() - (zy2 / grown**2).sum() / v + self.lost)
-        gradient = np.array([d_ratio, 0.5 * (self.n - left) - d_ratio])
-        return 0.5 * (log_det + left + ratio * self.lost) / self.n, gradient / self.n
+    def at_ratio(self, ratio: Array, noise_var: Array | None = None) -> tuple[Array, Array]:
+        """Lower bounds (D, G) on the log marginal likelihood of each output [nats], at ratios (D, G) of signal to noise
+        variance, and the noise variances: those given, or those that make the outputs likeliest."""
+        grown = 1.0 + ratio[..., None] * self.eigenvalues
+        explained = ratio * (1.0 / grown @ self.z_y.T[..., None] ** 2)[..., 0]
+        left = np.maximum(self.yy[:, None] - explained, 0.0)
+        noise = np.clip(left / self.n, *np.exp(LOG_NOISE_BOUNDS)) if noise_var is None else noise_var
+        log_det = np.log(grown).sum(axis=-1) + self.n * np.log(2 * np.pi * noise)
+        return -0.5 * (log_det + left / noise + ratio * self.lost), noise
 
-    def maximise(self, hyper: Hyperparameters) -> Hyperparameters:
-        """Signal and noise variances of each output, relearned on all rows; length scales are kept."""
-        box = [LOG_SIGNAL_BOUNDS, LOG_NOISE_BOUNDS]
-        found = []
-        for j, logs in enumerate(np.log(np.stack([hyper.signal_var, hyper.noise_var], 1))):
-            best = minimize(
-                lambda t, j=j: self.value_and_gradient(j, t),
-                np.clip(logs, *np.array(box).T),
-                jac=True,
-                method="L-BFGS-B",
-                bounds=box,
-                options={"ftol": 1e-10, "gtol": 1e-7},
-            )
-            found.append(np.exp(best.x))
-        signal, noise = np.array(found).T.copy()
-        return Hyperparameters(hyper.lengthscale, signal, noise)
+    def most_likely(self) -> tuple[Array, Array, Array]:
+        """Signal and noise variances (D,) under which each output is likeliest, and its bound (D,) there: the ratio of
+        the two is found on ever finer grids."""
+        ln_ratio, width = np.zeros(len(self.yy)), LOG_SIGNAL_BOUNDS[1] - LOG_NOISE_BOUNDS[0]
+        for _ in range(_ROUNDS):
+            tried = ln_ratio[:, None] + np.linspace(-width, width, _TRIED)
+            bound, noise = self.at_ratio(np.exp(tried))
+            each, best = np.arange(len(tried)), bound.argmax(axis=1)
+            ln_ratio, width = tried[each, best], 2.0 * width / (_TRIED - 1)
+        signal = np.clip(np.exp(ln_ratio) * noise[each, best], *np.exp(LOG_SIGNAL_BOUNDS))
+        return signal, noise[each, best], bound[each, best]
 
     def bound(self, hyper: Hyperparameters) -> float:
         """Lower bound on the log marginal likelihood, all outputs [nats]."""
-        logs = np.log(np.stack([hyper.signal_var, hyper.noise_var], 1))
-        return -self.n * sum(self.value_and_gradient(j, logs[j])[0] for j in range(len(logs)))
+        signal, noise = hyper.signal_var[:, None], hyper.noise_var[:, None]
+        return float(self.at_ratio(signal / noise, noise)[0].sum())
 
     def projected(self, hyper: Hyperparameters, scaling: Scaling, points: Array) -> ProjectedGP:
         """In the units of the data; ``hyper`` and ``points`` (over the length scales) of the standardised data."""

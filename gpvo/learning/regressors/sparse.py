@@ -13,16 +13,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
 from gpvo.learning.regressors import FittedGP, Hyperparameters, Scaling, checked
 from gpvo.learning.regressors.numerics import (
+    LOG_LENGTH_BOUNDS,
+    LOG_NOISE_BOUNDS,
+    LOG_SIGNAL_BOUNDS,
     Posterior,
-    bounds,
     cholesky,
     chunks,
-    first_guess,
     fixed_threads,
     greedy_points,
     length_gradient,
@@ -33,13 +35,10 @@ from gpvo.learning.regressors.numerics import (
 )
 from gpvo.types import Array
 
-START_ROWS, START_ITERATIONS, PROBE_ITERATIONS = 400, 15, 8
-START_LENGTHS = (0.8, 0.2)
-"""Times sqrt(d): the typical distance of two standardised rows is sqrt(2 d)."""
-
-FEW_POINTS = 128
+START_ROWS = 400
+_STEP = 0.2
 TIGHT, TIGHT_EXACT = 0.05, 0.005
-"""Slack of the bound, in nats per row and output, above which more points are worth their time."""
+"""What the points leave unexplained of a row, in nats per output, above which more of them are worth their time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,16 +67,20 @@ class OnPoints(ABC):
         """See :class:`~gpvo.learning.regressors.Regressor`."""
         X, Y = checked(X, Y)
         scaling = Scaling.of(X, Y)
-        Xs, Ys = scaling.inputs(X), scaling.outputs(Y)
         with fixed_threads(self.threads):
             if self.hyper is not None:
                 hyper, points = scaling.scaled(self.hyper), None
             else:
-                hyper, points = self._learn(Xs, Ys, seed)
-            if points is None:
-                points = greedy_points(Xs / hyper.lengthscale, self.inducing or len(X), seed=seed)
-            relearn = self.relearns and self.hyper is None
-            return close(Xs, Ys, scaling, hyper, points, self.name, relearn=relearn)
+                hyper, points = self._learn(scaling.inputs(X), scaling.outputs(Y), seed)
+            return self._closed(X, Y, scaling, hyper, points, seed)
+
+    def _closed(
+        self, X: Array, Y: Array, scaling: Scaling, hyper: Hyperparameters, points: Array | None, seed: int
+    ) -> FittedGP:
+        Xs, relearn = scaling.inputs(X), self.relearns and self.hyper is None
+        if points is None:
+            points = greedy_points(Xs / hyper.lengthscale, self.inducing or len(X), seed=seed)
+        return close(Xs, scaling.outputs(Y), scaling, hyper, points, self.name, relearn=relearn)
 
     @abstractmethod
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array | None]:
@@ -101,11 +104,25 @@ class SparseRegressor(OnPoints):
 
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array | None]:
         """First guess from a few hundred rows, then the bound of ``optimise_rows`` rows."""
-        hyper = start(Xs, Ys, isotropic=self.isotropic, seed=seed)
-        some = np.sort(np.random.default_rng(seed).permutation(len(Xs))[: self.optimise_rows])
-        most, tight = self.inducing or len(some), TIGHT_EXACT if self.inducing is None else TIGHT
-        bound = tight_bound(Xs[some], Ys[some], hyper, most, tight, seed=seed)
-        return bound.maximise(hyper, isotropic=self.isotropic, iterations=self.max_iterations), None
+        some = some_rows(len(Xs), self.optimise_rows, seed)
+        if self.isotropic:
+            return OneLength(Xs[some], Ys[some], self.inducing).hyper(slice(None)), None
+        hyper, tight = start(Xs, Ys, seed), TIGHT_EXACT if self.inducing is None else TIGHT
+        # With fewer, the bound's maximum would take structure for noise, because the points cannot represent it.
+        tolerance = 2.0 * tight * float((hyper.noise_var / hyper.signal_var).min())
+        most = min(self.inducing or len(some), len(some) - 1)
+        points = greedy_points(Xs[some] / hyper.lengthscale, most, seed=seed, tolerance=tolerance)
+        bound = CollapsedBound(Xs[some], Ys[some], points * hyper.lengthscale)
+        return bound.maximise(hyper, self.max_iterations), None
+
+    def fit_each(self, X: Array, Y: Array, *, seed: int = 0) -> list[FittedGP]:
+        """Of each output, with one length scale of its own. What the rows say at a length serves all outputs."""
+        X, Y = checked(X, Y)
+        scaling, some = Scaling.of(X, Y), some_rows(len(X), self.optimise_rows, seed)
+        with fixed_threads(self.threads):
+            rows = OneLength(scaling.inputs(X[some]), scaling.outputs(Y[some]), self.inducing)
+            each = [slice(j, j + 1) for j in range(Y.shape[1])]
+            return [self._closed(X, Y[:, j], Scaling.of(X, Y[:, j]), rows.hyper(j), None, seed) for j in each]
 
 
 def exact(**options: Any) -> SparseRegressor:
@@ -113,20 +130,49 @@ def exact(**options: Any) -> SparseRegressor:
     return SparseRegressor(inducing=None, **options)
 
 
-def start(Xs: Array, Ys: Array, *, isotropic: bool, seed: int) -> Hyperparameters:
-    """Where to start from: the likelihood of a few hundred standardised rows, roughly maximised.
+def some_rows(n: int, most: int, seed: int) -> NDArray[np.int64]:
+    """At most that many of n rows, in order."""
+    return np.sort(np.random.default_rng(seed).permutation(n)[:most])
 
-    Smooth and rough guesses both climb a little first: from a smooth one alone a rough function can look like noise.
+
+class OneLength:
+    """Kernels with one length scale for all inputs: how likely it makes standardised rows, at most points ``most``.
+
+    All that is to be found of such a kernel is a number: it is searched for on a grid of :data:`_STEP`, and between.
     """
-    rows = np.sort(np.random.default_rng(seed).permutation(len(Xs))[:START_ROWS])
-    guesses = []
-    for length in START_LENGTHS:
-        guess = first_guess(Xs.shape[1], Ys.shape[1], length)
-        bound = tight_bound(Xs[rows], Ys[rows], guess, FEW_POINTS, TIGHT, seed=seed)
-        climbed = bound.maximise(guess, isotropic=isotropic, iterations=PROBE_ITERATIONS)
-        guesses.append((bound.value_and_gradient(pack(climbed, False))[0], climbed, bound))
-    _, hyper, bound = min(guesses, key=lambda g: g[0])
-    return bound.maximise(hyper, isotropic=isotropic, iterations=START_ITERATIONS)
+
+    def __init__(self, Xs: Array, Ys: Array, most: int | None) -> None:
+        self.Xs, self.Ys, self.most = Xs, Ys, most or len(Xs)
+        self._found: dict[int, tuple[Array, Array, Array]] = {}
+
+    def at(self, place: int) -> tuple[Array, Array, Array]:
+        """Signal and noise variances, and bounds, of all outputs (D,) at a place of the grid."""
+        if place not in self._found:
+            length = np.full(self.Xs.shape[1], np.exp(LOG_LENGTH_BOUNDS[0] + _STEP * place))
+            points = greedy_points(self.Xs / length, self.most)
+            self._found[place] = Posterior.of(self.Xs, self.Ys, points, length).most_likely()
+        return self._found[place]
+
+    def hyper(self, outputs: slice) -> Hyperparameters:
+        """Those under which some outputs, which share the length scale, are likeliest."""
+
+        def bound(place: int) -> float:
+            return float(self.at(place)[2][outputs].sum())
+
+        best = max(range(1, int((LOG_LENGTH_BOUNDS[1] - LOG_LENGTH_BOUNDS[0]) / _STEP), 2), key=bound)
+        best = max(best, best - 1, best + 1, key=bound)
+        low, mid, high = (bound(best + k) for k in (-1, 0, 1))
+        # The top of the parabola through the three.
+        between = np.clip(0.5 * (high - low) / max(2.0 * mid - low - high, 1e-12), -1.0, 1.0)
+        signal, noise, _ = (x[outputs] for x in self.at(best))
+        length = np.exp(LOG_LENGTH_BOUNDS[0] + _STEP * (best + between))
+        return Hyperparameters(np.full(self.Xs.shape[1], length), signal, noise)
+
+
+def start(Xs: Array, Ys: Array, seed: int) -> Hyperparameters:
+    """Where to start from: the best single length scale of a few hundred standardised rows."""
+    rows = some_rows(len(Xs), START_ROWS, seed)
+    return OneLength(Xs[rows], Ys[rows], None).hyper(slice(None))
 
 
 def close(
@@ -138,7 +184,7 @@ def close(
     """
     posterior = Posterior.of(Xs, Ys, points, hyper.lengthscale)
     if relearn:
-        hyper = posterior.maximise(hyper)
+        hyper = Hyperparameters(hyper.lengthscale, *posterior.most_likely()[:2])
     evidence = posterior.bound(hyper) - len(Xs) * np.log(scaling.y_scale).sum()
     gp = posterior.projected(hyper, scaling, points)
     return FittedGP(gp, scaling.unscaled(hyper), float(evidence), name, len(Xs))
@@ -154,7 +200,7 @@ class CollapsedBound:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """At log(length scales, signal variances, noise variances); infeasible points give a large value."""
-        hyper, n_lengths = unpack(theta, self.d, self.D), len(theta) - 2 * self.D
+        hyper = unpack(theta, self.D)
         lengthscale = torch.tensor(hyper.lengthscale)
         Z = self.points / lengthscale
         R = unit_kernel(Z, Z)
@@ -172,7 +218,6 @@ class CollapsedBound:
             U = X / lengthscale
             k = unit_kernel(U, Z)
             lengths += length_gradient(torch.addmm(Y @ d_ky.T, k, d_kk).mul_(k), U, Z)
-        lengths = lengths.sum()[None] if n_lengths < self.d else lengths
         return float(value.detach()) / (self.n * self.D), torch.cat([lengths, d_logs]).numpy() / (self.n * self.D)
 
     def _value(self, kk: Tensor, ky: Tensor, R: Tensor, logs: Tensor) -> Tensor:
@@ -189,30 +234,10 @@ class CollapsedBound:
         log_det = 2.0 * LB.diagonal(dim1=1, dim2=2).log().sum() + self.n * log_v.sum()
         return 0.5 * (log_det + fit + lost + self.D * self.n * np.log(2 * np.pi))
 
-    def slack(self, hyper: Hyperparameters) -> float:
-        """What the points leave unexplained of the rows' prior variance, as the bound charges it.
-
-        If this is large, the bound's maximum takes structure for noise, because the points cannot represent it.
-        """
-        lost = Posterior.of(*self.rows, self.points.numpy() / hyper.lengthscale, hyper.lengthscale).lost
-        return float(0.5 * lost * (hyper.signal_var / hyper.noise_var).sum() / (self.n * self.D))
-
-    def maximise(self, hyper: Hyperparameters, *, isotropic: bool, iterations: int) -> Hyperparameters:
+    def maximise(self, hyper: Hyperparameters, iterations: int) -> Hyperparameters:
         """Better hyperparameters by L-BFGS, all of them at once."""
-        theta = pack(hyper, isotropic)
-        box = bounds(theta, self.D)
-        theta = np.clip(theta, *np.array(box).T)
+        box = [LOG_LENGTH_BOUNDS] * self.d + [LOG_SIGNAL_BOUNDS] * self.D + [LOG_NOISE_BOUNDS] * self.D
+        theta = np.clip(pack(hyper), *np.array(box).T)
         options = {"maxiter": iterations, "ftol": 1e-6, "gtol": 1e-5}
         found = minimize(self.value_and_gradient, theta, jac=True, method="L-BFGS-B", bounds=box, options=options)
-        return unpack(found.x, self.d, self.D)
-
-
-def tight_bound(Xs: Array, Ys: Array, hyper: Hyperparameters, most: int, tight: float, *, seed: int) -> CollapsedBound:
-    """The bound on as few greedy points as hold the rows at ``hyper``, ``most`` at most."""
-    m = FEW_POINTS
-    while True:
-        points = greedy_points(Xs / hyper.lengthscale, min(m, most), seed=seed)
-        bound = CollapsedBound(Xs, Ys, points * hyper.lengthscale)
-        if m >= min(most, len(Xs)) or len(points) < m or bound.slack(hyper) < tight:
-            return bound
-        m *= 2
+        return unpack(found.x, self.D)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gpvo.learning.regressors import Hyperparameters
-from gpvo.learning.regressors.numerics import greedy_points, pick_device
+from gpvo.learning.regressors.numerics import greedy_points
 from gpvo.learning.regressors.sparse import OnPoints, start
 from gpvo.types import Array
 
@@ -39,9 +39,9 @@ class SvgpRegressor(OnPoints):
 
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array]:
         """Maximise the variational bound by Adam; standardised hyperparameters, points over the length scales."""
-        guess = start(Xs, Ys, isotropic=self.isotropic, seed=seed)
+        guess = start(Xs, Ys, seed)
         points = greedy_points(Xs / guess.lengthscale, self.inducing, seed=seed) * guess.lengthscale
-        device = pick_device(self.device)
+        device = "cuda" if self.device == "auto" and torch.cuda.is_available() else self.device.replace("auto", "cpu")
         batches = _minibatches(Xs, Ys, self.batch, seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
