@@ -1,4 +1,4 @@
-"""Remake the trained model of this folder: ``python models/remake.py [FOLDER]`` (two minutes of one core).
+"""Remake the trained model of this folder: ``python models/remake.py [FOLDER]`` (a minute and a half of one core).
 
 It learns from six simulated flights of 30 s at 10 frames/s (stereo tracks and IMU, no pictures) and is judged by
 leaving each flight out in turn; the scores are in the card beside the model.

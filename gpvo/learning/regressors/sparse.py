@@ -149,7 +149,7 @@ class OneLength:
         """Signal and noise variances, and bounds, of all outputs (D,) at a place of the grid."""
         if place not in self._found:
             length = np.full(self.Xs.shape[1], np.exp(LOG_LENGTH_BOUNDS[0] + _STEP * place))
-            points = greedy_points(self.Xs / length, self.most)
+            points = greedy_points(self.Xs / length, self.most, tolerance=1e-3)
             self._found[place] = Posterior.of(self.Xs, self.Ys, points, length).most_likely()
         return self._found[place]
 
