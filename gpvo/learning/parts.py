@@ -82,7 +82,7 @@ class _Windows:
         before = lfilter([0.0, phi], [1.0, -phi], amplitude, axis=1)
         after = lfilter([1.0], [1.0, -phi], amplitude[:, ::-1], axis=1)[:, ::-1]
         within = after[:, self.first] - phi ** (self.end - self.first) * after[:, self.end]
-        return np.asarray(_sums(amplitude * before, self.first, self.end) - before[:, self.first] * within)
+        return np.maximum(_sums(amplitude * before, self.first, self.end) - before[:, self.first] * within, 0.0)
 
 
 @dataclass(frozen=True)

@@ -136,10 +136,8 @@ def some_rows(n: int, most: int, seed: int) -> NDArray[np.int64]:
 
 
 class OneLength:
-    """Kernels with one length scale for all inputs: how likely it makes standardised rows, at most points ``most``.
-
-    All that is to be found of such a kernel is a number: it is searched for on a grid of :data:`_STEP`, and between.
-    """
+    """Kernels with one length scale for all inputs: how likely standardised rows are at each, on at most ``most``
+    points, fewer where these explain every row to a thousandth. The length is one number: it is searched for."""
 
     def __init__(self, Xs: Array, Ys: Array, most: int | None) -> None:
         self.Xs, self.Ys, self.most = Xs, Ys, most or len(Xs)
