@@ -67,20 +67,20 @@ class OnPoints(ABC):
         """See :class:`~gpvo.learning.regressors.Regressor`."""
         X, Y = checked(X, Y)
         scaling = Scaling.of(X, Y)
+        Xs, Ys = scaling.inputs(X), scaling.outputs(Y)
         with fixed_threads(self.threads):
             if self.hyper is not None:
                 hyper, points = scaling.scaled(self.hyper), None
             else:
-                hyper, points = self._learn(scaling.inputs(X), scaling.outputs(Y), seed)
-            return self._closed(X, Y, scaling, hyper, points, seed)
+                hyper, points = self._learn(Xs, Ys, seed)
+            return self._closed(Xs, Ys, scaling, hyper, points, seed)
 
     def _closed(
-        self, X: Array, Y: Array, scaling: Scaling, hyper: Hyperparameters, points: Array | None, seed: int
+        self, Xs: Array, Ys: Array, scaling: Scaling, hyper: Hyperparameters, points: Array | None, seed: int
     ) -> FittedGP:
-        Xs, relearn = scaling.inputs(X), self.relearns and self.hyper is None
         if points is None:
-            points = greedy_points(Xs / hyper.lengthscale, self.inducing or len(X), seed=seed)
-        return close(Xs, scaling.outputs(Y), scaling, hyper, points, self.name, relearn=relearn)
+            points = greedy_points(Xs / hyper.lengthscale, self.inducing or len(Xs), seed=seed)
+        return close(Xs, Ys, scaling, hyper, points, self.name, relearn=self.relearns and self.hyper is None)
 
     @abstractmethod
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array | None]:
@@ -119,10 +119,11 @@ class SparseRegressor(OnPoints):
         """Of each output, with one length scale of its own. What the rows say at a length serves all outputs."""
         X, Y = checked(X, Y)
         scaling, some = Scaling.of(X, Y), some_rows(len(X), self.optimise_rows, seed)
+        Xs, Ys = scaling.inputs(X), scaling.outputs(Y)
         with fixed_threads(self.threads):
-            rows = OneLength(scaling.inputs(X[some]), scaling.outputs(Y[some]), self.inducing)
+            rows = OneLength(Xs[some], Ys[some], self.inducing)
             each = [slice(j, j + 1) for j in range(Y.shape[1])]
-            return [self._closed(X, Y[:, j], Scaling.of(X, Y[:, j]), rows.hyper(j), None, seed) for j in each]
+            return [self._closed(Xs, Ys[:, j], Scaling.of(X, Y[:, j]), rows.hyper(j), None, seed) for j in each]
 
 
 def exact(**options: Any) -> SparseRegressor:

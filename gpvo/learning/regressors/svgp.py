@@ -41,7 +41,8 @@ class SvgpRegressor(OnPoints):
         """Maximise the variational bound by Adam; standardised hyperparameters, points over the length scales."""
         guess = start(Xs, Ys, seed)
         points = greedy_points(Xs / guess.lengthscale, self.inducing, seed=seed) * guess.lengthscale
-        device = "cuda" if self.device == "auto" and torch.cuda.is_available() else self.device.replace("auto", "cpu")
+        fastest = "cuda" if torch.cuda.is_available() else "cpu"
+        device = fastest if self.device == "auto" else self.device
         batches = _minibatches(Xs, Ys, self.batch, seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
