@@ -63,75 +63,116 @@ def persistence(dt_s: ArrayLike, tau_s: Array) -> Array:
 
 
 class PoseError:
-    """Mean and covariance of the error of a pose, motion by motion.
+    """Mean and covariance of the error of a pose, or of a batch of poses, motion by motion.
 
     The joint state is (e, n, u): error of the pose, noise of its frame, and the persistent vector, so that a part
     whose size or sign changes stays correlated with what it was.
     """
 
-    def __init__(self) -> None:
-        self._mean = np.zeros(6)
-        self._P = np.zeros((_U, _U))
+    def __init__(self, *batch: int) -> None:
+        self._mean = np.zeros((*batch, 6))
+        self._P = np.zeros((*batch, _U, _U))
         self._jitter_known = False
-        self._unaged_s = 0.0
+        self._unaged_s: float | Array = 0.0
 
     @property
     def mean(self) -> Array:
-        """(6,) of the pose."""
+        """(..., 6) of the pose."""
         return self._mean
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of the pose."""
-        return symmetrise(self._P[_E, _E])
+        """(..., 6, 6) of the pose."""
+        return symmetrise(self._P[..., _E, _E])
+
+    def head(self, n: int) -> PoseError:
+        """The first ``n`` of a batch."""
+        few = PoseError()
+        few._mean, few._P, few._jitter_known = self._mean[:n], self._P[:n], self._jitter_known
+        few._unaged_s = self._unaged_s if np.ndim(self._unaged_s) == 0 else np.asarray(self._unaged_s)[:n]
+        return few
 
     def after(self, T_prev_cur: Array, error: MotionError) -> PoseError:
-        """The error of the pose at the end of a motion ``T_prev_cur`` (4, 4) of this error; several may start here.
+        """The error of the pose after a motion ``T_prev_cur`` (..., 4, 4) of this error; several may start here.
 
         Raises ValueError where the persistent vector has another length than before.
         """
         if not (self._jitter_known or error.lost):
             # The first motion that starts here says how noisy this frame is.
-            self._P[_N, _N] = first_jitter(T_prev_cur, error.jitter)
+            self._P[..., _N, _N] = first_jitter(T_prev_cur, error.jitter)
             self._jitter_known = True
         further = PoseError()
         further._P, further._unaged_s = self._P, self._unaged_s
         root, phi = further._aged(error)
         own, P, moved = from_end(error), further._P, carry(T_prev_cur)
+        kept, U = phi[..., None, :], slice(_U, P.shape[-1])
         A = np.zeros_like(P)
-        A[_E, _E] = moved
-        A[_E, _N] = from_start(error, moved)
-        A[_E, _U:] = root * phi
-        A[_U:, _U:] = np.diag(phi)
-        P = A @ P @ A.T
+        A[..., _E, _E] = moved
+        A[..., _E, _N] = from_start(error, moved)
+        A[..., _E, U] = root * kept
+        A[..., U, U] = kept * np.eye(phi.shape[-1])
+        P = A @ P @ np.swapaxes(A, -1, -2)
         # What is new: the frame's noise enters the error and its own place, and so does the innovation of u.
-        innovation = 1.0 - phi**2
-        P[_E, _E] += independent_part(error) + own + (root * innovation) @ root.T
-        for block in ((_E, _N), (_N, _E), (_N, _N)):
-            P[block] += own
-        P[_E, _U:] += root * innovation
-        P[_U:, _E] += (root * innovation).T
-        P[_U:, _U:] += np.diag(innovation)
+        innovation = 1.0 - kept**2
+        new = root * innovation
+        P[..., _E, _E] += independent_part(error) + own + new @ np.swapaxes(root, -1, -2)
+        for row, column in ((_E, _N), (_N, _E), (_N, _N)):
+            P[..., row, column] += own
+        P[..., _E, U] += new
+        P[..., U, _E] += np.swapaxes(new, -1, -2)
+        P[..., U, U] += innovation * np.eye(phi.shape[-1])
         further._P, further._jitter_known = P, not error.lost
-        further._mean = moved @ self._mean + error.mean
+        further._mean = (moved @ self._mean[..., None])[..., 0] + error.mean
         return further
 
     def _aged(self, error: MotionError) -> tuple[Array, Array]:
-        """Root (6, P) and correlation (P,) since the vector last aged; an error without one lets time pass."""
-        known, P = len(self._P) - _U, len(error.persistent_tau_s)
-        elapsed_s = self._unaged_s + float(error.dt_s)
+        """Root (..., 6, P) and correlation (..., P) since the vector last aged; an error without one lets time pass."""
+        known, P = self._P.shape[-1] - _U, len(error.persistent_tau_s)
+        elapsed_s = self._unaged_s + error.dt_s
         if P == 0:
             self._unaged_s = elapsed_s
             return np.zeros((6, known)), np.ones(known)
         if known == 0:
             # It starts in its steady state.
-            joint = np.eye(_U + P)
-            joint[:_U, :_U] = self._P
+            joint = np.zeros((*self._P.shape[:-2], _U + P, _U + P))
+            joint[..., :_U, :_U] = self._P
+            joint[..., range(_U, _U + P), range(_U, _U + P)] = 1.0
             self._P = joint
         elif known != P:
             raise ValueError(f"the persistent vector has {P} elements, and had {known}")
         self._unaged_s = 0.0
         return error.persistent_root, persistence(elapsed_s, error.persistent_tau_s)
+
+
+def over_windows(T_prev_cur: Array, errors: Sequence[MotionError], windows: Sequence[Sequence[int]]) -> Array:
+    """Covariance (W, 6, 6) of the motion over each of several windows of a log, all of them step by step together.
+
+    ``T_prev_cur`` (N, 4, 4) motions with their ``errors``, of one model; ``windows``: the motions in each, none lost.
+    """
+    order = sorted(range(len(windows)), key=lambda w: -len(windows[w]))
+    used = sorted({k for window in windows for k in window})
+    T, batch, at = T_prev_cur[used], _stacked([errors[k] for k in used]), {k: i for i, k in enumerate(used)}
+    pose, covariance = PoseError(len(windows)), np.empty((len(windows), 6, 6))
+    for step in range(len(windows[order[0]])):
+        going = [w for w in order if len(windows[w]) > step]
+        now = [at[windows[w][step]] for w in going]
+        pose = pose.head(len(now)).after(T[now], batch.row(now))
+        covariance[going] = pose.covariance
+    return covariance
+
+
+def _stacked(errors: Sequence[MotionError]) -> MotionError:
+    """A batch of the errors; one without a persistent vector has a root of zero."""
+    tau_s = max((e.persistent_tau_s for e in errors), key=len)
+    none = np.zeros((6, len(tau_s)))
+    return MotionError(
+        mean=np.array([e.mean for e in errors]),
+        jitter=np.array([e.jitter for e in errors]),
+        white=np.array([e.white for e in errors]),
+        persistent_root=np.array([e.persistent_root if len(e.persistent_tau_s) else none for e in errors]),
+        persistent_tau_s=tau_s,
+        dt_s=np.array([e.dt_s for e in errors]),
+    )
 
 
 def along(T_prev_cur: Array, errors: Sequence[MotionError], parent: Iterable[int]) -> tuple[Array, Array]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from evaluation_runs import curved_path, stated_covariance
-from gpvo.accumulation import PoseError, along
+from gpvo.accumulation import PoseError, along, over_windows
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import scaled_root
 from gpvo.types import MotionError
@@ -106,6 +108,19 @@ def test_an_error_without_persistent_part_lets_time_pass():
     expected = C * (3 + 2 * np.exp(-4 * DT_S / TAU_S))
     for end in ends:
         np.testing.assert_allclose(end.covariance, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("without", [set(), {0, 1, 5, 17}, set(range(N))], ids=["all", "some", "none"])
+def test_many_windows_together_add_up_as_each_of_them(without):
+    """Of unequal length, overlapping, with motions of other durations, and some without a persistent part."""
+    errors = [replace(e, dt_s=DT_S * (1 + k % 3)) for k, e in enumerate(_errors(0.5, 0.3, 0.2, 2.0))]
+    errors = [MotionError.independent(e.covariance, dt_s=e.dt_s) if k in without else e for k, e in enumerate(errors)]
+    windows = [[5], range(3, 20), [0, 1, 3, 6], range(N), range(10, 12), range(3, 20)]
+    for window, together in zip(windows, over_windows(PATH, errors, windows), strict=True):
+        pose = PoseError()
+        for k in window:
+            pose = pose.after(PATH[k], errors[k])
+        np.testing.assert_allclose(together, pose.covariance, rtol=1e-10, atol=1e-18)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 8])

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpvo.accumulation import PoseError
+from gpvo.accumulation import PoseError, over_windows
 from gpvo.dataset.errors import MotionErrors, drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import compound
 from gpvo.learning.methods import score
 from gpvo.stats.consistency import (
     BLOCKS,
@@ -24,7 +25,7 @@ from gpvo.stats.consistency import (
     seen_axes,
 )
 from gpvo.stats.series import Interval, block_bootstrap
-from gpvo.types import Array, MotionError, VoLog
+from gpvo.types import Array, VoLog
 
 HORIZONS_M = (1.0, 10.0, 100.0)
 _MAX_WINDOWS = 60
@@ -163,9 +164,12 @@ def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) ->
         return None, None
     covered = np.flatnonzero(known)
     chain = _ancestors(int(covered[-1]), int(covered[0]), log.parent)
-    T, parts = log.T_prev_cur[chain], [statement.errors[k] for k in chain]
-    independent = [MotionError.independent(error.covariance) for error in parts]
-    a, b = (float(np.sqrt(np.trace(_sum_of(T, errors)[:3, :3]))) for errors in (parts, independent))
+    pose, independent = PoseError(), np.zeros((6, 6))
+    for k in chain:
+        T = log.records[k].T_prev_cur
+        pose = pose.after(T, statement.errors[k])
+        independent = compound(T, independent, statement.errors[k].covariance)
+    a, b = (float(np.sqrt(np.trace(C[:3, :3]))) for C in (pose.covariance, independent))
     return a, b
 
 
@@ -176,14 +180,6 @@ def _ancestors(frame: int, root: int, parent: NDArray[np.int64]) -> list[int]:
         chain.append(frame)
         frame = int(parent[frame])
     return chain[::-1]
-
-
-def _sum_of(T_prev_cur: Sequence[Array] | Array, errors: Sequence[MotionError]) -> Array:
-    """(6, 6) covariance after a chain of motions."""
-    pose = PoseError()
-    for T, error in zip(T_prev_cur, errors, strict=True):
-        pose = pose.after(T, error)
-    return pose.covariance
 
 
 def horizon(
@@ -201,12 +197,12 @@ def horizon(
         return Horizon(span, nan, nan, (nan,) * 6, (0.0,) * 3, 0)
     starts, ends = np.array([[start, chain[-1]] for start, chain in windows]).T
     T = se3.inverse(T_true[starts]) @ T_true[ends]
-    T_est, C = np.tile(np.eye(4), (len(T), 1, 1)), np.empty((len(T), 6, 6))
+    # The mean is taken off each motion, as a filter would.
+    motion, T_est = log.T_prev_cur @ se3.exp(-statement.mean), np.tile(np.eye(4), (len(T), 1, 1))
     for i, (_, chain) in enumerate(windows):
-        # The mean is taken off each motion, as a filter would.
         for k in chain:
-            T_est[i] = T_est[i] @ log.records[k].T_prev_cur @ se3.exp(-statement.mean[k])
-        C[i] = _sum_of([log.records[k].T_prev_cur for k in chain], [statement.errors[k] for k in chain])
+            T_est[i] = T_est[i] @ motion[k]
+    C = over_windows(log.T_prev_cur, statement.errors, [chain for _, chain in windows])
     e, noise, drift = se3.log(se3.inverse(T) @ T_est), truth_noise(T, noise_sigma), np.zeros(3)
     if by_velocity is not None:
         moved = T_true[ends, :3, 3] - T_true[starts, :3, 3] - (by_velocity[ends] - by_velocity[starts])

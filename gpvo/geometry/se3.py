@@ -33,6 +33,8 @@ def skew(v: Array) -> Array:
 
 def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:
     """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 from t^2, by series near zero."""
+    if np.ndim(theta2) == 0:
+        return _coefficients_of_one(theta2)
     theta = np.sqrt(theta2)
     small = theta < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, theta)
@@ -42,6 +44,18 @@ def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:
     c_small = 1.0 / 6.0 - theta2 / 120.0
     c = np.where(theta < 1e-2, c_small + theta2**2 / 5040.0, (safe - np.sin(safe)) / safe**3)
     return a, b, c
+
+
+def _coefficients_of_one(theta2: Array) -> tuple[Array, Array, Array]:
+    """The same of one value, to the last bit; it works out only what it needs."""
+    theta = np.sqrt(theta2)
+    if theta < _SMALL_ANGLE_RAD:
+        a, b = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0
+    else:
+        a, b = np.sin(theta) / theta, 2.0 * np.sin(theta / 2.0) ** 2 / np.square(theta)
+    if theta < 1e-2:
+        return a, b, 1.0 / 6.0 - theta2 / 120.0 + np.square(theta2) / 5040.0
+    return a, b, (theta - np.sin(theta)) / np.power(theta, 3)
 
 
 def so3_exp(phi: Array) -> Array:
@@ -95,8 +109,11 @@ def exp(xi: Array) -> Array:
     """Tangent (..., 6) to pose (..., 4, 4)."""
     xi = np.asarray(xi, dtype=np.float64)
     T = np.zeros((*xi.shape[:-1], 4, 4))
-    T[..., :3, :3] = so3_exp(xi[..., 3:])
-    T[..., :3, 3] = (so3_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    a, b, c = (v[..., None, None] for v in _coefficients((xi[..., 3:] ** 2).sum(-1)))
+    W, eye = skew(xi[..., 3:]), np.eye(3)
+    WW = W @ W
+    T[..., :3, :3] = eye + a * W + b * WW
+    T[..., :3, 3] = ((eye + b * W + c * WW) @ xi[..., :3, None])[..., 0]
     T[..., 3, 3] = 1.0
     return T
 
@@ -114,17 +131,7 @@ def log(T: Array) -> Array:
 def _log_one(T: Array) -> Array:
     """The same of a single pose, in plain numbers: a tenth of the time, as arrays of three are all overhead."""
     (r00, r01, r02, tx), (r10, r11, r12, ty), (r20, r21, r22, tz), _ = T.tolist()
-    # The quaternion by its largest component, as rotation_to_quaternion_xyzw does.
-    trace = r00 + r11 + r22
-    largest = max(r00, r11, r22, trace)
-    if largest == r00:
-        q = (1 + r00 - r11 - r22, r01 + r10, r20 + r02, r21 - r12)
-    elif largest == r11:
-        q = (r01 + r10, 1 - r00 + r11 - r22, r12 + r21, r02 - r20)
-    elif largest == r22:
-        q = (r20 + r02, r12 + r21, 1 - r00 - r11 + r22, r10 - r01)
-    else:
-        q = (r21 - r12, r02 - r20, r10 - r01, 1 + trace)
+    q = _long_quaternion((r00, r01, r02), (r10, r11, r12), (r20, r21, r22))
     length = math.copysign(math.hypot(*q), q[3] if q[3] else 1.0)
     x, y, z, w = (v / length for v in q) if length else (math.nan,) * 4
     sine = math.hypot(x, y, z)
@@ -140,6 +147,20 @@ def _log_one(T: Array) -> Array:
     ax, ay, az = y * tz - z * ty, z * tx - x * tz, x * ty - y * tx
     bx, by, bz = y * az - z * ay, z * ax - x * az, x * ay - y * ax
     return np.array([tx - 0.5 * ax + d * bx, ty - 0.5 * ay + d * by, tz - 0.5 * az + d * bz, x, y, z])
+
+
+def _long_quaternion(*rows: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    """Multiple of the quaternion x y z w of a rotation, by its largest component (S. W. Shepperd, 1978)."""
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
+    trace = r00 + r11 + r22
+    largest = max(r00, r11, r22, trace)
+    if largest == r00:
+        return 1 + r00 - r11 - r22, r01 + r10, r20 + r02, r21 - r12
+    if largest == r11:
+        return r01 + r10, 1 - r00 + r11 - r22, r12 + r21, r02 - r20
+    if largest == r22:
+        return r20 + r02, r12 + r21, 1 - r00 - r11 + r22, r10 - r01
+    return r21 - r12, r02 - r20, r10 - r01, 1 + trace
 
 
 def inverse(T: Array) -> Array:
@@ -201,6 +222,9 @@ def rotation_to_quaternion_xyzw(R: Array) -> Array:
     Picks the largest of the four components to divide by (S. W. Shepperd, 1978).
     """
     R = np.asarray(R, dtype=np.float64)
+    if R.ndim == 2:
+        q = np.array(_long_quaternion(*R.tolist()))
+        return q / math.copysign(np.linalg.norm(q), q[3] if q[3] else 1.0)
     d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     choice = np.argmax(np.stack([d0, d1, d2, d0 + d1 + d2], -1), axis=-1)
     yz, zx, xy = (R[..., i, j] + R[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1)))

@@ -56,7 +56,7 @@ class Scale:
 def fit_scale(z: Array, group: NDArray) -> Scale:
     """Scale of the variance of each axis, from normalised residuals z (n, D)."""
     of = [z[group == g] ** 2 for g in np.unique(group)]
-    return Scale.of_new_group(np.array([[student_t.second_moment(column) for column in square.T] for square in of]))
+    return Scale.of_new_group(np.array([student_t.second_moment(square) for square in of]))
 
 
 def fit_outside_power(distance: Array, square: Array, group: NDArray) -> float:

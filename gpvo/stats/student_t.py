@@ -57,22 +57,18 @@ def log_second_moment(nu: ArrayLike) -> Array:
     return -np.log1p(-2.0 / np.asarray(nu, dtype=np.float64))
 
 
-def fit(ratio: Array, count: Array | None = None, *, heavy: bool = True) -> tuple[float, float]:
-    """Degrees of freedom and log of the squared scale of residuals whose squares over stated squared scales are
-    ``ratio`` (n,).
+def fit(ratio: Array) -> tuple[Array, Array]:
+    """Degrees of freedom (D,) and log of the squared scale (D,) of each column of residuals, whose squares over stated
+    squared scales are ``ratio`` (n, D).
 
-    ``count`` (n,): how often each row counts. ``heavy`` False: the Gaussian and its scale. The t is taken only where it
-    explains the residuals better.
+    The t is taken only where it explains the residuals better than the Gaussian.
     """
-    count = np.full(len(ratio), 1.0 / len(ratio)) if count is None else count / count.sum()
-    gaussian = (np.inf, math.log(max(float(count @ ratio), 1e-300)))
-    if not heavy:
-        return gaussian
-    log_nu = _minimum(lambda x: _loss(ratio, count, math.exp(x)), math.log(NU_MIN), math.log(2 * NU_GAUSSIAN))
-    nu = math.exp(log_nu)
-    if nu >= NU_GAUSSIAN or _loss(ratio, count, nu) >= 0.5 * (gaussian[1] + 1.0 + math.log(2 * np.pi)):
-        return gaussian
-    return nu, _log_scale(ratio, count, nu)
+    start = np.log(np.maximum(np.median(ratio, axis=0) / 0.455, 1e-300))
+    low, high = np.broadcast_to([[math.log(NU_MIN)], [math.log(2 * NU_GAUSSIAN)]], (2, len(start)))
+    nu = np.exp(_minimum(lambda ln_nu: _loss(ratio, np.exp(ln_nu), start), low, high))
+    gaussian = np.log(np.maximum(ratio.mean(axis=0), 1e-300))
+    light = (nu >= NU_GAUSSIAN) | (_loss(ratio, nu, start) >= 0.5 * (gaussian + 1.0 + math.log(2 * np.pi)))
+    return np.where(light, np.inf, nu), np.where(light, gaussian, _log_scale(ratio, nu, start))
 
 
 def joint_nll(squared: Array, d: int, nu: float) -> Array:
@@ -93,51 +89,53 @@ def fit_dof(squared: Array, d: int, count: Array) -> float:
     ``count`` (n,): how often each row counts. The tails alone are fitted: the second moment is given.
     """
 
-    def loss(ln_excess: float) -> float:
-        return float(count @ joint_nll(squared, d, 2.0 + math.exp(ln_excess)))
+    def loss(ln_excess: Array) -> Array:
+        return np.array([count @ joint_nll(squared, d, 2.0 + math.exp(x)) for x in ln_excess])
 
-    ln_excess = _minimum(loss, math.log(LEAST_NU - 2.0), math.log(2.0 * NU_GAUSSIAN))
-    nu = 2.0 + math.exp(ln_excess)
-    return math.inf if nu >= NU_GAUSSIAN or loss(ln_excess) >= count @ joint_nll(squared, d, math.inf) else nu
+    (nu,) = 2.0 + np.exp(_minimum(loss, np.log([LEAST_NU - 2.0]), np.log([2.0 * NU_GAUSSIAN])))
+    worse = count @ joint_nll(squared, d, nu) >= count @ joint_nll(squared, d, math.inf)
+    return math.inf if nu >= NU_GAUSSIAN or worse else float(nu)
 
 
-def second_moment(square: Array) -> float:
-    """Second moment of residuals (n,), given their squares, by the best t: a few gross errors hardly move it."""
+def second_moment(square: Array) -> Array:
+    """Second moment (D,) of each column of residuals, given their squares (n, D), by the best t: a few gross errors
+    hardly move it."""
     nu, log_scale = fit(np.maximum(square, 1e-300))
-    return math.exp(log_scale + float(log_second_moment(nu)))
+    return np.exp(log_scale + log_second_moment(nu))
 
 
-def _minimum(loss: Callable[[float], float], low: float, high: float, tolerance: float = 1e-3) -> float:
-    """By golden sections."""
+def _minimum(loss: Callable[[Array], Array], low: Array, high: Array, tolerance: float = 1e-3) -> Array:
+    """Of functions of one variable each, by golden sections."""
     a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_a, at_b = loss(a), loss(b)
-    while high - low > tolerance:
-        if at_a < at_b:
-            high, b, at_b = b, a, at_a
-            a = high - _GOLDEN * (high - low)
-            at_a = loss(a)
-        else:
-            low, a, at_a = a, b, at_b
-            b = low + _GOLDEN * (high - low)
-            at_b = loss(b)
+    while (high - low).max() > tolerance:
+        left = at_a < at_b
+        low, high = np.where(left, low, a), np.where(left, b, high)
+        kept, at_kept = np.where(left, a, b), np.where(left, at_a, at_b)
+        new = np.where(left, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
+        at_new = loss(new)
+        a, b = np.where(left, new, kept), np.where(left, kept, new)
+        at_a, at_b = np.where(left, at_new, at_kept), np.where(left, at_kept, at_new)
     return 0.5 * (low + high)
 
 
-def _log_scale(ratio: Array, count: Array, nu: float) -> float:
-    """Maximum-likelihood log squared scale by Newton with the expected information; monotone in practice."""
-    log_scale = math.log(max(float(np.median(ratio)) / 0.455, 1e-300))
+def _log_scale(ratio: Array, nu: Array, log_scale: Array) -> Array:
+    """Maximum-likelihood log squared scale (D,) by Newton from ``log_scale`` (D,): the loss is convex in it."""
     for _ in range(60):
-        score = float(count @ log_scale_score(ratio * math.exp(-log_scale), nu))
-        step = score / float(log_fisher(nu))
-        log_scale += min(max(step, -2.0), 2.0)
-        if abs(step) < 1e-10:
+        r = ratio * np.exp(-log_scale)
+        weight = (nu + 1.0) / (nu + r)
+        score = 0.5 * ((weight * r).mean(axis=0) - 1.0)
+        information = 0.5 * (weight * r * nu / (nu + r)).mean(axis=0)
+        step = np.clip(score / np.maximum(information, 1e-12), -2.0, 2.0)
+        log_scale = log_scale + step
+        if np.abs(step).max() < 1e-10:
             break
     return log_scale
 
 
-def _loss(ratio: Array, count: Array, nu: float) -> float:
-    """Negative log-likelihood at the best scale."""
-    log_scale = _log_scale(ratio, count, nu)
-    constant = math.lgamma(nu / 2) - math.lgamma((nu + 1) / 2) + 0.5 * math.log(nu * np.pi)
-    tail = 0.5 * (nu + 1) * np.log1p(ratio * math.exp(-log_scale) / nu)
-    return constant + 0.5 * log_scale + float(count @ tail)
+def _loss(ratio: Array, nu: Array, start: Array) -> Array:
+    """Negative log-likelihood of each column at its best scale."""
+    log_scale = _log_scale(ratio, nu, start)
+    constant = np.array([math.lgamma(n / 2) - math.lgamma((n + 1) / 2) for n in nu]) + 0.5 * np.log(nu * np.pi)
+    tail = 0.5 * (nu + 1) * np.log1p(ratio * np.exp(-log_scale) / nu).mean(axis=0)
+    return constant + 0.5 * log_scale + tail
