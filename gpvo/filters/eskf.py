@@ -41,7 +41,6 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
-_EYE = np.eye(JOINT)
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
 
 
@@ -218,8 +217,9 @@ class ErrorStateFilter:
             K[:, consider] = 0.0
             # A wider R turns S into alpha S, and the gain into a 1/alpha of itself.
             R = R + (alpha - 1.0)[:, None, None] * S
-            self._joseph(K * (used / alpha)[:, None, None], H, R)
-            self.dx += (K @ r[:, :, None])[:, :, 0] * (used / alpha)[:, None]
+            K *= (used / alpha)[:, None, None]
+            self._joseph(K, H, PHt, R)
+            self.dx += (K @ r[:, :, None])[:, :, 0]
         return Innovation(r, S, nis, passed, used, own_fault)
 
     def _own_part(self, H: Array, S: Array, r: Array) -> Array:
@@ -237,9 +237,10 @@ class ErrorStateFilter:
             D[:, block] = np.sqrt(np.maximum(np.minimum(factor, room), 1.0))[:, None]
         self.P = self.P * (D[:, :, None] * D[:, None, :])
 
-    def _joseph(self, K: Array, H: Array, R: Array) -> None:
-        A = _EYE - K @ H
-        new = A @ self.P @ kernels.transpose(A) + K @ R @ kernels.transpose(K)
+    def _joseph(self, K: Array, H: Array, PHt: Array, R: Array) -> None:
+        """``A P A^T + K R K^T`` with ``A = I - K H``, which is never formed: its rank is that of the measurement."""
+        AP = self.P - K @ kernels.transpose(PHt)
+        new = AP + (K @ R - AP @ kernels.transpose(H)) @ kernels.transpose(K)
         self.P = 0.5 * (new + kernels.transpose(new))
 
     def inject(self) -> None:
