@@ -1,5 +1,5 @@
 # make demo   set up and show the main job, in a few minutes
-# make test   set up and run lint, import contracts, types and tests
+# make test   set up and run lint, import contracts, types and tests; of these `make lint` runs all but the tests
 # make check  the longer tests: every README command, Monte Carlo, memory, pictures, a browser
 # make docs   the documentation, as pages in docs/_build
 # make dist   the source archive and the wheel, checked
@@ -8,7 +8,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test check bench docs dist clean
+.PHONY: demo test lint tests check bench docs dist clean
 
 .venv/pip-ready:
 	$(PYTHON) -m venv .venv
@@ -29,13 +29,19 @@ demo: .venv/demo-ready
 	$(BIN)/python examples/demo.py
 
 # Two workers share the machine: more threads would only wait for one another.
-test check: export OMP_NUM_THREADS = 1
+tests check: export OMP_NUM_THREADS = 1
 
+# Types are checked beside the tests, which leave a processor idle now and then.
 test: .venv/test-ready
+	@$(MAKE) --no-print-directory --jobs 2 lint tests
+
+lint: .venv/test-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
+
+tests: .venv/test-ready
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
 check: .venv/test-ready

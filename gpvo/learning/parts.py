@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
+from scipy.linalg import lapack
 
 from gpvo.geometry.covariance import correlation
 from gpvo.learning.calibrate import residual_correlation
@@ -79,8 +79,10 @@ class _Windows:
 
         One filter over all motions holds what came before a window too, which is taken away again.
         """
-        before = lfilter([0.0, phi], [1.0, -phi], amplitude, axis=1)
-        after = lfilter([1.0], [1.0, -phi], amplitude[:, ::-1], axis=1)[:, ::-1]
+        # y_k = x_k + phi y_(k-1), a bidiagonal system, and its transpose, which runs backwards.
+        band = np.stack([np.ones(amplitude.shape[1]), np.full(amplitude.shape[1], -phi)])
+        before, after = (lapack.dtbtrs(band, amplitude.T, uplo="L", trans=t, diag="U")[0].T for t in ("N", "T"))
+        before = before - amplitude
         within = after[:, self.first] - phi ** (self.end - self.first) * after[:, self.end]
         return np.maximum(_sums(amplitude * before, self.first, self.end) - before[:, self.first] * within, 0.0)
 
