@@ -1,4 +1,4 @@
-"""Calibration from residuals of sequences that the model has not seen: scale, correlation, conformal intervals.
+"""Calibration from residuals of sequences that the model has not seen: scale, growth outside, conformal intervals.
 
 A new sequence is a new draw: the spread of the scale between sequences enters the stated variance.
 """
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.geometry.covariance import correlation
 from gpvo.learning.spans import by_block
 from gpvo.online.guard import growth
 from gpvo.stats import student_t
@@ -87,20 +86,6 @@ def fit_joint_factor(error: Array, covariance: Array, group: NDArray) -> float:
 def robust_mean(values: Array) -> float:
     """Mean, with the upper half per cent replaced by the quantile there."""
     return float(np.minimum(values, np.quantile(values, 0.995)).mean())
-
-
-def residual_correlation(z: Array, nu: float = 5.0) -> Array:
-    """(D, D) correlation of normalised residuals, by the scatter of a multivariate t (iterated weights)."""
-    d = z.shape[1]
-    C = np.eye(d)
-    for _ in range(20):
-        w = (nu + d) / (nu + (np.linalg.solve(C, z.T).T * z).sum(1))
-        C_new = (z * w[:, None]).T @ z / len(z) + 1e-9 * np.eye(d)
-        done = np.abs(C_new - C).max() < 1e-6
-        C = C_new
-        if done:
-            break
-    return correlation(C)
 
 
 def conformal_quantiles(score: Array, group: NDArray) -> tuple[list[float], list[bool]]:

@@ -47,13 +47,15 @@ class BaseChoice:
 class VarianceModel:
     """The variance of a motion: ``base``, times the exponential of ``gp`` on ``inputs`` where it has any.
 
-    ``oof`` (n, 6): the variance of each training row by a fit without its group.
+    ``oof`` (n, 6): the variance of each training row by a fit without its group. ``means``: coefficients (6, 5) of the
+    base fitted without a GP, to all rows and to those outside of each fold.
     """
 
     inputs: tuple[str, ...]
     base: BaseVariance
     gp: ProjectedGP | None
     oof: Array
+    means: Sequence[Array]
 
 
 @dataclass(frozen=True)
@@ -111,36 +113,44 @@ def choose_inputs(
     """
     tried = {NONE: alone}
     for name, inputs in candidates(rows.sets, config).items():
-        tried[name] = fit_variance(rows, choice, inputs)
+        tried[name] = fit_variance(rows, choice, inputs, alone.means)
     losses = {name: _losses(rows, model) for name, model in tried.items()}
     best = simplest_sufficient(losses)
     return best, tried[best], {name: float(loss.mean()) for name, loss in losses.items()}
 
 
-def fit_variance(rows: Rows, choice: BaseChoice, inputs: tuple[str, ...]) -> VarianceModel:
-    """The variance on ``inputs``, and out of fold: no row is predicted by a fit that saw its group."""
-    columns = _base_inputs(rows, base_columns(choice.method, choice.residual))
-    terms, U = parts(columns, rows.dt_s), _gp_inputs(rows, inputs)
-    theta, gp, left = _fit(rows, terms, U, np.ones(len(terms), dtype=bool))
+def fit_variance(
+    rows: Rows, choice: BaseChoice, inputs: tuple[str, ...], means: Sequence[Array] | None = None
+) -> VarianceModel:
+    """The variance on ``inputs``, and out of fold: no row is predicted by a fit that saw its group.
+
+    ``means``: see :class:`VarianceModel`, if the base has been fitted before.
+    """
+    C = rows.select(base_columns(choice.method, choice.residual))
+    terms = parts(np.where(np.isfinite(C), C, np.nanmedian(C, axis=0)), rows.dt_s)
+    U = _gp_inputs(rows, inputs)
+    fold = group_folds(rows.group, MOST_FOLDS)
+    kept = [np.ones(len(terms), dtype=bool), *(fold != f for f in np.unique(fold))]
+    means = means or [fit_coefficients(terms[of], rows.error[of], rows.weight[of]) for of in kept]
+    (theta, gp, left), *others = (_fit(rows, terms, U, of, mean) for of, mean in zip(kept, means, strict=True))
     plain = fit_coefficients(terms * OF_MOTION, left, rows.weight)
-    oof, fold = np.empty_like(rows.error), group_folds(rows.group, MOST_FOLDS)
-    for f in np.unique(fold):
-        out = fold == f
-        theta_without, gp_without, _ = _fit(rows, terms, U, ~out)
-        lift = 0.0 if gp_without is None else log_ratio(gp_without, U[out])
-        oof[out] = (terms[out] * theta_without).sum(axis=-1) * np.exp(lift)
-    return VarianceModel(inputs, BaseVariance(theta, plain, choice.method, choice.residual), gp, oof)
+    oof = np.empty_like(rows.error)
+    for of, (theta_without, gp_without, _) in zip(kept[1:], others, strict=True):
+        lift = 0.0 if gp_without is None else log_ratio(gp_without, U[~of])
+        oof[~of] = (terms[~of] * theta_without).sum(axis=-1) * np.exp(lift)
+    return VarianceModel(inputs, BaseVariance(theta, plain, choice.method, choice.residual), gp, oof, means)
 
 
-def _fit(rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_]) -> tuple[Array, ProjectedGP | None, Array]:
-    """Coefficients of the base, GP, and what it leaves of the errors, for the rows ``of``. The base is the GP's mean
-    function, and is fitted once more with it.
+def _fit(
+    rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_], theta: Array
+) -> tuple[Array, ProjectedGP | None, Array]:
+    """Coefficients of the base, GP, and what it leaves of the errors, for the rows ``of``. The base, ``theta`` if
+    alone, is the GP's mean function, and is fitted once more with it.
 
     Explicit basis functions: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006),
     section 2.7; here of the variance, so in turn.
     """
     terms, error, weight = terms[of], rows.error[of], rows.weight[of]
-    theta = fit_coefficients(terms, error, weight)
     if U.shape[1] == 0:
         return theta, None, error
     gp = fit_log_variance(U[of], error**2 / (terms * theta).sum(axis=-1), weight, rows.group[of])
@@ -151,11 +161,6 @@ def _fit(rows: Rows, terms: Array, U: Array, of: NDArray[np.bool_]) -> tuple[Arr
 def _losses(rows: Rows, model: VarianceModel) -> Array:
     """(G,) heavy-tailed negative log-likelihood per axis of each group left out [nats]."""
     return rows.by_group(negative_log_likelihood(rows.error**2, model.oof)).mean(axis=1)
-
-
-def _base_inputs(rows: Rows, columns: Sequence[str]) -> Array:
-    C = rows.select(columns)
-    return np.where(np.isfinite(C), C, np.nanmedian(C, axis=0))
 
 
 def _gp_inputs(rows: Rows, inputs: Sequence[str]) -> Array:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from gpvo.geometry.covariance import correlation
-from gpvo.learning.calibrate import residual_correlation
 from gpvo.learning.spans import Chains, at_most, span_variances
+from gpvo.stats import student_t
 from gpvo.stats.series import moving_sums
 from gpvo.types import Array
 
@@ -276,7 +276,7 @@ def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float)
     """
     part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
     whole = part.sum(axis=2).T
-    measured = np.array([residual_correlation(_scaled_sums(error, sigma, m)) for m in split.spans])
+    measured = np.array([correlation(student_t.scatter(_scaled_sums(error, sigma, m))) for m in split.spans])
     windows = 2.0 / split.doubt
     out = np.tile(np.eye(6), (3, 1, 1))
     for i, j in zip(*np.triu_indices(6, 1)):
@@ -298,5 +298,4 @@ def _scaled_sums(error: Chains, sigma: Chains, m: int) -> Array:
 def _nearest_correlation(R: Array) -> Array:
     """Positive definite, with a unit diagonal."""
     values, vectors = np.linalg.eigh(R)
-    R = (vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
-    return correlation(R)
+    return correlation((vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T)

@@ -104,6 +104,20 @@ def second_moment(square: Array) -> Array:
     return np.exp(log_scale + log_second_moment(nu))
 
 
+def scatter(z: Array, nu: float = NU) -> Array:
+    """Scatter matrix (D, D) of residuals (n, D) by a multivariate t: iterated weights (Lange et al., section 3)."""
+    d = z.shape[1]
+    C = np.eye(d)
+    for _ in range(20):
+        w = (nu + d) / (nu + (np.linalg.solve(C, z.T).T * z).sum(1))
+        C_new = (z * w[:, None]).T @ z / len(z) + 1e-9 * np.eye(d)
+        done = np.abs(C_new - C).max() < 1e-6
+        C = C_new
+        if done:
+            break
+    return C
+
+
 def _minimum(loss: Callable[[Array], Array], low: Array, high: Array, tolerance: float = 1e-3) -> Array:
     """Of functions of one variable each, by golden sections."""
     a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.geometry.covariance import correlation
 from gpvo.learning.basefit import fit_coefficients
 from gpvo.learning.calibrate import (
     conformal_quantiles,
     fit_outside_power,
     fit_scale,
-    residual_correlation,
 )
 from gpvo.online.base import parts
 from gpvo.online.guard import growth
-from gpvo.stats.student_t import negative_log_likelihood, second_moment
+from gpvo.stats.student_t import negative_log_likelihood, scatter, second_moment
 from scipy.optimize import minimize
 
 
@@ -67,7 +67,7 @@ def test_correlation_of_heavy_tailed_residuals():
     rng = np.random.default_rng(4)
     R = np.array([[1, 0.8], [0.8, 1]])
     z = rng.standard_normal((5000, 2)) @ np.linalg.cholesky(R).T / np.sqrt(rng.chisquare(4, (5000, 1)) / 4)
-    np.testing.assert_allclose(residual_correlation(z), R, atol=0.05)
+    np.testing.assert_allclose(correlation(scatter(z)), R, atol=0.05)
 
 
 def test_base_variance_finds_its_parts():
