@@ -20,6 +20,11 @@ for folder in {Path(__file__).parents[1], *(p.parent for p in Path(__file__).par
         sys.path.append(str(folder))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Kills come first: they wait more than they compute, and at the end nothing would be left to run beside them."""
+    items.sort(key=lambda item: "kills" not in item.path.parts)
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real sequences named by GPVO_DATA; the test is skipped where it is unset."""
