@@ -34,7 +34,7 @@ def score(
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
     from gpvo.cli.evaluate import JudgeOptions
-    from gpvo.evaluation.score import board, score_folder, write_board
+    from gpvo.evaluation.score import board, on_other_axes, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
 
     truth = truth or []
@@ -47,6 +47,8 @@ def score(
             print_json({"schema": 1, "methods": list(methods.values())})
         else:
             _print_board(board(methods))
+            for method, axes in on_other_axes(methods).items():
+                say(f"{method}: NLL and NEES are of {', '.join(axes)} alone; they do not compare with those of others.")
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")

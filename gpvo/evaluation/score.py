@@ -26,6 +26,7 @@ from gpvo.io.stated import read_stated, to_records, write_stated
 from gpvo.io.trajectory import read_tum, write_tum
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import TrainedModel, fold_model
+from gpvo.online.features import AXES
 from gpvo.online.predictor import Predictor
 from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog, VoRecord
@@ -36,11 +37,15 @@ POOLED = ("energy_translation_m", "energy_rotation_rad", "nll_per_dim", "nees_do
 
 @dataclass(frozen=True)
 class SequenceScore:
-    """Of one sequence. Means over its motions; ``nees_dof_over`` {"1s", "1m", "10m", "100m"} None where none fits."""
+    """Of one sequence. Means over its motions; ``nees_dof_over`` {"1s", "1m", "10m", "100m"} None where none fits.
+
+    ``axes``: names of those that NLL and NEES are of, see :func:`gpvo.stats.consistency.seen_axes`.
+    """
 
     sequence: str
     motions: int
     lost: int
+    axes: tuple[str, ...]
     energy_translation_m: float
     energy_rotation_rad: float
     nll_per_dim: float
@@ -86,6 +91,7 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
         sequence=stated.stem,
         motions=usable,
         lost=lost,
+        axes=tuple(AXES[k] for k in c.axes),
         energy_translation_m=_mean_with(c.energy_translation_m or 0.0, c.count, charged_m),
         energy_rotation_rad=_mean_with(c.energy_rotation_rad or 0.0, c.count, charged_rad),
         nll_per_dim=c.nll_per_dim,
@@ -175,6 +181,16 @@ def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
         for name, value in row.items():
             out.setdefault(name, []).append(None if value is None else float(f"{value:.3g}"))
     return out
+
+
+def on_other_axes(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
+    """Methods whose NLL and NEES are of other axes than those of the method with the most, and of which.
+
+    As of a robot in a plane, whose height never differs from the truth's: such numbers do not compare.
+    """
+    axes = {m: tuple(a for a in AXES if all(a in s["axes"] for s in scores["sequences"])) for m, scores in found.items()}
+    most = max(axes.values(), key=len)
+    return {method: judged for method, judged in axes.items() if judged != most}
 
 
 def _mean_with(mean: float, count: int, charged: Array) -> float:

@@ -134,6 +134,27 @@ def test_a_folder_of_methods_is_scored_in_one_command(written, tmp_path: Path, c
     assert (out / "board.csv").read_text().splitlines()[0].startswith("method,energy [mm]")
 
 
+def test_a_method_that_moves_in_a_plane_is_not_compared_with_others(tmp_path: Path, capsys) -> None:
+    """The camera's x, z and turn about y err in both; only one of the methods lets it rise and roll."""
+    rng = np.random.default_rng(0)
+    t_ns, xi = np.arange(201) * 10**8, np.zeros((201, 6))
+    xi[1:, 2], xi[1:, 4] = 0.1, 0.01 * np.sin(np.arange(200) / 9)
+    truth = np.array([T := np.eye(4), *(T := T @ se3.exp(x) for x in xi[1:])])
+    (tmp_path / "truth").mkdir()
+    write_tum(tmp_path / "truth" / "a.txt", t_ns, truth)
+    for method, free in (("flat", [0, 2, 4]), ("free", range(6))):
+        error = np.zeros((201, 6))
+        error[1:, free] = 0.01 * rng.standard_normal((200, len(free)))
+        motions = [np.eye(4), *(se3.exp(x) @ se3.exp(e) for x, e in zip(xi[1:], error[1:], strict=True))]
+        log = VoLog([VoRecord(t, t - 10**8 * (k > 0), Status.OK if k else Status.START, motions[k], {})
+                     for k, t in enumerate(t_ns.tolist())])  # fmt: skip
+        (tmp_path / method).mkdir()
+        write_stated(tmp_path / method / "a.txt", log, log.trajectory(), np.tile(1e-4 * np.eye(6), (201, 1, 1)))
+    told = _call(capsys, tmp_path)
+    assert "flat: NLL and NEES are of x, z, ry alone; they do not compare with those of others." in told
+    assert "free: NLL" not in told
+
+
 def test_somebody_elses_csv_is_scored_in_one_command(written, tmp_path: Path, capsys) -> None:
     folder, evaluation = written
     T, log = evaluation.T_est, evaluation.run.log
