@@ -188,7 +188,9 @@ def on_other_axes(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str
 
     As of a robot in a plane, whose height never differs from the truth's: such numbers do not compare.
     """
-    axes = {m: tuple(a for a in AXES if all(a in s["axes"] for s in scores["sequences"])) for m, scores in found.items()}
+    axes = {}
+    for method, scores in found.items():
+        axes[method] = tuple(a for a in AXES if all(a in s["axes"] for s in scores["sequences"]))
     most = max(axes.values(), key=len)
     return {method: judged for method, judged in axes.items() if judged != most}
 
