@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.errors import interpolate_truth
@@ -73,6 +74,12 @@ def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) ->
 
     Windows that hold a lost frame or lack truth at an end are left out.
     """
+    start, end, T, T_world = _windows(log, truth, window_s)
+    return _between(T, start, end), _between(T_world, start, end), T_world[end, :3, :3]
+
+
+def _windows(log: VoLog, truth: TruthLog, window_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+    """First and last frame of each window, and the poses (N, 4, 4) of log and truth."""
     t, T = log.t_ns, log.trajectory()
     dt = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     span = max(1, round(window_s * 1e9 / dt)) if dt > 0 else 1
@@ -82,9 +89,11 @@ def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) ->
     whole = (lost[end] == lost[start]) & (t[end] - t[start] < 2 * max(window_s * 1e9, dt))
     T_world, known = interpolate_truth(truth, t)
     keep = whole & known[start] & known[end]
-    start, end = start[keep], end[keep]
-    motions = se3.inverse(T[start]) @ T[end], se3.inverse(T_world[start]) @ T_world[end]
-    return *motions, T_world[end, :3, :3]
+    return start[keep], end[keep], T, T_world
+
+
+def _between(T: Array, start: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
+    return np.asarray(se3.inverse(T[start]) @ T[end])
 
 
 def fit_fixed_transform(
@@ -158,6 +167,40 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
         return None
     rotvec = se3.so3_log(fixed.T_log_truth[:3, :3])
     return FixedRotation(fixed.angle_deg, tuple(rotvec.tolist()), float(changes.mean()))
+
+
+@dataclass(frozen=True)
+class InversePoses:
+    """``of``: odometry or truth, whose poses seem to be inverse; ``error_change``: see :class:`FixedRotation`."""
+
+    of: str
+    error_change: float
+
+
+_EXPLAINS = -0.5
+"""Change of the error from which poses are called inverse."""
+
+
+def inverse_poses(log: VoLog, truth: TruthLog) -> InversePoses | None:
+    """Whether one of both holds ``T_cam_world`` for ``T_world_cam``: inverted, it agrees far better with the other.
+
+    A log is known from its first pose only, which counts as the origin of its world.
+    """
+    start, end, T, T_world = _windows(log, truth, WINDOW_S)
+    if len(start) < _MIN_MOTIONS:
+        return None
+    A, B = _between(T, start, end), _between(T_world, start, end)
+    pairs = {
+        "as they are": (A, B),
+        "odometry": (_between(se3.inverse(T), start, end), B),
+        "truth": (A, _between(se3.inverse(T_world), start, end)),
+    }
+    error = {of: np.array([np.median(h) for h in np.array_split(_errors_m(*pair, np.eye(4)), 2)])
+             for of, pair in pairs.items()}  # fmt: skip
+    plain = np.maximum(error.pop("as they are"), 1e-12)
+    best = min(error, key=lambda of: error[of].sum())
+    change = error[best] / plain - 1
+    return InversePoses(best, float(change.mean())) if change.max() < _EXPLAINS else None
 
 
 def late_by(log: VoLog, truth: TruthLog) -> float | None:

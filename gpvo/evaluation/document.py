@@ -111,6 +111,7 @@ def _run_document(e: Evaluation) -> dict[str, Any]:
         "truth_sigma_stated": _by_kind(e.truth_sigma_stated),
         "truth_tells_from_m": e.tells_from_m,
         "fixed_rotation": None if e.turned is None else asdict(e.turned),
+        "inverse_poses": None if e.inverse is None else asdict(e.inverse),
         "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},
         "segments": [asdict(s) for s in t.segments],
         "poses": nees_document(e.poses),

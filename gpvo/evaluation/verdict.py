@@ -219,6 +219,11 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             f"The clocks of odometry and truth seem to differ by {abs(e.late_s):.3g} s: with --time-offset auto, errors"
             " over a second are smaller."
         )
+    if e.inverse is not None:
+        yield (
+            f"The poses of the {e.inverse.of} seem to be inverse, T_cam_world: the other way round, errors over a"
+            f" second are {-100 * e.inverse.error_change:.0f} % smaller. Write them as T_world_cam."
+        )
     yield from _of_truth_and_path(e)
     if e.turned is not None and len(unseen) < len(AXES):
         # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.

@@ -121,6 +121,27 @@ def test_a_quaternion_in_the_wrong_order_is_asked_about(tmp_path):
     assert "quaternion's order and --frame right?" in " ".join(out.split())
 
 
+@pytest.mark.parametrize("inverse", ["log", "gt", None])
+def test_poses_from_world_to_camera_are_named(tmp_path, inverse):
+    """Some odometries write T_cam_world. Their motions look like motions; only the other poses tell."""
+    rng, stamps = np.random.default_rng(5), np.array(seq.stamps(400))
+    motions = se3.exp([0, 0, AHEAD, 0, 0, 0] + np.cumsum(0.003 * rng.standard_normal((400, 6)), axis=0))
+    poses = np.array(list(accumulate([np.eye(4), *motions[1:]], np.matmul)))
+    noisy = np.array(
+        list(accumulate([np.eye(4), *(motions @ se3.exp(2e-3 * rng.standard_normal((400, 6))))[1:]], np.matmul))
+    )
+    for name, T in (("log", noisy), ("gt", poses)):
+        write_tum(tmp_path / f"{name}.tum", stamps, se3.inverse(T) if name == inverse else T)
+    _call("import", tmp_path / "log.tum", "--truth", tmp_path / "gt.tum", "-o", tmp_path / "run")
+    out, _ = _call("evaluate", tmp_path / "run")
+    told, whose = " ".join(out.split()), {"log": "odometry", "gt": "truth"}
+    assert "fixed rotation" not in told
+    if inverse is None:
+        assert "inverse" not in told
+    else:
+        assert f"The poses of the {whose[inverse]} seem to be inverse, T_cam_world" in told
+
+
 def test_the_doctor_judges_a_bag_as_import_and_evaluate_do(tmp_path):
     rng = np.random.default_rng(3)
     noisy = se3.exp(np.cumsum(0.01 * rng.standard_normal((N, 6)), axis=0))
