@@ -178,7 +178,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     if cov is not None and axes == "world":
         cov = _into_body(trajectory, cov)
     if cov is not None:
-        cov = definite_in_plane(cov, trajectory.T_world_body)
+        cov = definite_in_plane(cov, still_axes(trajectory.T_world_body))
     lost = int((~known).sum())
     return ForeignLog(
         path,
@@ -224,15 +224,20 @@ def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
     return turned
 
 
-def definite_in_plane(covariance: Array, T_world_body: Array, variance: Array | None = None) -> Array:
-    """Covariances (N, 6, 6) for poses (N, 4, 4), those that are not definite filled in on axes along which the poses
-    never move and of which nothing is stated.
+def still_axes(T_world_body: Array) -> NDArray[np.bool_]:
+    """(6,) along and about which of the body's axes poses (N, 4, 4) never move."""
+    still = np.ones(6, dtype=bool)
+    still[seen_axes(se3.log(se3.inverse(T_world_body[:-1]) @ T_world_body[1:]))] = False
+    return still
+
+
+def definite_in_plane(covariance: Array, still: NDArray[np.bool_], variance: Array | None = None) -> Array:
+    """Covariances (N, 6, 6), those that are not definite filled in on axes that are ``still`` (6,), but not all, and of
+    which nothing is stated.
 
     A robot in a plane has three such axes; drivers state zero for them, or a constant, which does not grow. They get
     ``variance`` (N, 6), by default their own, but at least ``SEEN`` squared.
     """
-    still = np.ones(6, dtype=bool)
-    still[seen_axes(se3.log(se3.inverse(T_world_body[:-1]) @ T_world_body[1:]))] = False
     own = np.diagonal(covariance, axis1=1, axis2=2)
     variance = own if variance is None else variance
     empty = still & ~still.all() & (own <= _GROWS * variance)
@@ -294,8 +299,9 @@ def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
     t, T, read = read_poses(path, topic, notes.append)
     log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
-    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose), T)
-    twist = None if twist is None else definite_in_plane(twist, T)
+    still = still_axes(T)
+    pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose), still)
+    twist = None if twist is None else definite_in_plane(twist, still)
     if twist is not None and _looks_stated(twist):
         # Of the velocity in the child frame over the step that ends at the stamp.
         dt = np.concatenate([[np.nan], np.diff(t) * 1e-9])

@@ -14,13 +14,14 @@ import numpy as np
 
 from gpvo.errors import printable
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import change_body, is_positive_definite, symmetrise
+from gpvo.geometry.covariance import are_positive_definite, change_body, is_positive_definite, symmetrise
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_reader import pose_of, stamp_ns
-from gpvo.io.foreign import T_FLU_OPTICAL, is_optical, moving_frame
+from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, is_optical, moving_frame
 from gpvo.io.stated import UNKNOWN_RAD
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import Arrival, Sequence, StampWatch
+from gpvo.stats.consistency import SEEN
 from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, StereoCamera, VoRecord
 
 _MAX_M, _MAX_MPS, _MAX_RADPS = 1e7, 300.0, 50.0
@@ -86,8 +87,9 @@ class PoseStage:
     """Somebody else's ``nav_msgs/Odometry`` or ``PoseWithCovarianceStamped`` as records of relative motions.
 
     The same rules as in :mod:`gpvo.io.foreign`, message by message: the covariance of a motion is that of the twist
-    where it is positive definite, else the growth of the pose's. ``T_body_cam``: where the camera sits on the body
-    that the poses describe; by default as the first message names its frame, optical or not.
+    where it is positive definite, else the growth of the pose's; of a robot in a plane, on the axes along which it has
+    moved. ``T_body_cam``: where the camera sits on the body that the poses describe; by default as the first message
+    names its frame, optical or not.
     """
 
     method = IMPORTED
@@ -109,6 +111,7 @@ class PoseStage:
         self._watch = StampWatch()
         self._last: tuple[int, Array, Array | None] | None = None  # stamp, T_parent_cam, covariance of the pose
         self._growth: deque[bool] = deque(maxlen=200)
+        self._still = np.ones(6, dtype=bool)  # axes of the body that have not moved
 
     def take(self, arrival: Arrival) -> Iterator[Taken]:
         """One record, unless the message is late, repeated, absurd or of another clock."""
@@ -145,13 +148,13 @@ class PoseStage:
         return []
 
     def _record(self, t_ns: int, T_parent_cam: Array, message: Any, seen: Sequence) -> VoRecord:
-        before, pose = self._last, self._pose_covariance(message, T_parent_cam)
+        before, pose = self._last, _pose_covariance(message, T_parent_cam @ self._T_cam_body)
         self._last = (t_ns, T_parent_cam, pose)
         if before is None:
             return VoRecord(t_ns, t_ns, Status.START, np.eye(4))
         T_prev_cur = se3.inverse(before[1]) @ T_parent_cam
         dt_s = (t_ns - before[0]) * 1e-9
-        stated = self._stated(message, T_prev_cur, dt_s, before[2], pose)
+        stated = self._stated(message, self.T_body_cam @ T_prev_cur @ self._T_cam_body, dt_s, before[2], pose)
         status, reason = Status.OK, ""
         rate = np.abs(se3.log(T_prev_cur)) / dt_s
         if seen is Sequence.GAP:
@@ -163,38 +166,43 @@ class PoseStage:
             status, reason = Status.LOST, "stated as unknown"
         return VoRecord(t_ns, before[0], status, T_prev_cur, reason=reason, covariances=stated)
 
-    def _pose_covariance(self, message: Any, T_parent_cam: Array) -> Array | None:
-        """(6, 6) in the camera's axes, None where none is stated."""
-        C = _matrix(getattr(message, "pose", None))
-        if C is None:
-            return None
-        R_parent_body = (T_parent_cam @ self._T_cam_body)[:3, :3]
-        return change_body(self._T_cam_body, rotate_covariance(R_parent_body.T, C))
-
     def _stated(
-        self, message: Any, T_prev_cur: Array, dt_s: float, before: Array | None, now: Array | None
+        self, message: Any, T_body_prev_cur: Array, dt_s: float, before: Array | None, now: Array | None
     ) -> dict[str, Array]:
+        """What is stated of the body's motion, or else of its poses, in the camera's axes."""
+        self._still = self._still & (np.abs(se3.log(T_body_prev_cur)) < SEEN)
         twist = _matrix(getattr(message, "twist", None))
-        if twist is not None:
-            return {IMPORTED: symmetrise(change_body(self._T_cam_body, twist) * dt_s**2)}
+        if twist is not None and (found := self._of_camera(IMPORTED, twist)):
+            return {IMPORTED: found[IMPORTED] * dt_s**2}
         if before is None or now is None:
             return {}
-        A = se3.adjoint(se3.inverse(T_prev_cur))
-        growth = symmetrise(now - A @ before @ A.T)
-        grows = is_positive_definite(growth)
-        self._growth.append(grows)
+        A = se3.adjoint(se3.inverse(T_body_prev_cur))
+        found = self._of_camera(IMPORTED, now - A @ before @ A.T, np.diagonal(now))
+        self._growth.append(bool(found))
         if len(self._growth) >= _ENOUGH and np.mean(self._growth) < _GROWS:
-            return {IMPORTED_POSE: symmetrise(now)}
-        return {IMPORTED: growth} if grows else {}
+            return self._of_camera(IMPORTED_POSE, now)
+        return found
+
+    def _of_camera(self, name: str, covariance: Array, variance: Array | None = None) -> dict[str, Array]:
+        """A covariance (6, 6) of the body in the camera's axes, by name; nothing where it is none."""
+        C = symmetrise(covariance)
+        C = definite_in_plane(C[None], self._still, None if variance is None else variance[None])[0]
+        return {name: symmetrise(change_body(self._T_cam_body, C))} if is_positive_definite(C) else {}
+
+
+def _pose_covariance(message: Any, T_parent_body: Array) -> Array | None:
+    """(6, 6) in the body's axes, None where none is stated."""
+    C = _matrix(getattr(message, "pose", None))
+    return None if C is None else rotate_covariance(T_parent_body[:3, :3].T, C)
 
 
 def _matrix(holder: Any) -> Array | None:
-    """The (6, 6) covariance of a PoseWithCovariance or TwistWithCovariance; None where it states nothing."""
+    """The (6, 6) covariance of a PoseWithCovariance or TwistWithCovariance, zeros too; None where it is none."""
     flat = getattr(holder, "covariance", None)
     if flat is None or np.size(flat) != 36:
         return None
     C = np.asarray(flat, dtype=np.float64).reshape(6, 6)
-    return C if is_positive_definite(C) else None
+    return C if are_positive_definite(C[None], semi=True)[0] and np.allclose(C, C.T, 1e-8, 0.0) else None
 
 
 def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) -> VoRecord:

@@ -14,6 +14,7 @@ from gpvo.errors import GpvoError
 from gpvo.files import write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
 from gpvo.learning.check import rate_problems
@@ -57,6 +58,24 @@ def test_the_shim_equals_the_imported_run(stated: np.ndarray | None, child: str,
     assert (told == []) == (child == "base_link")
     assert kept.reports[-1].level == (child != "base_link")
     assert "sigma x" in kept.reports[-1].values["driven_by"]
+
+
+@pytest.mark.parametrize("of", ["twist", "pose"])
+def test_a_robot_in_a_plane_states_three_axes_as_in_an_import(of: str, tmp_path: Path) -> None:
+    """Its driver states zero for height, roll and pitch; what it says of the others counts, message by message."""
+    motion, T, C = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.02])), np.eye(4), np.zeros((6, 6))
+    own, A = np.diag([1e-6, 4e-6, 0.0, 0.0, 0.0, 1e-6]), se3.adjoint(se3.inverse(motion))
+    maker, live, zero = BagMaker(ros1=False), PoseStage(TOPIC), np.zeros((6, 6))
+    for k in range(60):
+        in_world = rotate_covariance(T[:3, :3], C) if of == "pose" else zero
+        maker.odometry(TOPIC, 10**18 + k * 50_000_000, T, in_world, own if of == "twist" else zero, "base_link")
+        T, C = T @ motion, A @ C @ A.T + own
+    log = read_foreign(maker.write(tmp_path / "wheels"), topic=TOPIC)
+    imported = to_records(log.seen_from(T_FLU_OPTICAL))[0]
+    records = [taken.record for t, topic, m in maker.messages for taken in live.take(Arrival(topic, m, t))]
+    for ours, theirs in zip(records[1:], imported[1:], strict=True):
+        assert set(ours.covariances) == set(theirs.covariances) == {"imported"}
+        np.testing.assert_allclose(ours.covariances["imported"], theirs.covariances["imported"], rtol=1e-5, atol=1e-12)
 
 
 def test_the_twist_is_in_the_child_frame_and_the_pose_in_its_parent() -> None:
