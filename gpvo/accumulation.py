@@ -73,7 +73,7 @@ class PoseError:
         self._mean = np.zeros((*batch, 6))
         self._P = np.zeros((*batch, _U, _U))
         self._jitter_known = False
-        self._unaged_s: float | Array = 0.0
+        self._unaged_s: Array = np.zeros(batch)
 
     @property
     def mean(self) -> Array:
@@ -88,8 +88,8 @@ class PoseError:
     def head(self, n: int) -> PoseError:
         """The first ``n`` of a batch."""
         few = PoseError()
-        few._mean, few._P, few._jitter_known = self._mean[:n], self._P[:n], self._jitter_known
-        few._unaged_s = self._unaged_s if np.ndim(self._unaged_s) == 0 else np.asarray(self._unaged_s)[:n]
+        few._mean, few._P, few._unaged_s = self._mean[:n], self._P[:n], self._unaged_s[:n]
+        few._jitter_known = self._jitter_known
         return few
 
     def after(self, T_prev_cur: Array, error: MotionError) -> PoseError:
@@ -140,7 +140,7 @@ class PoseError:
             self._P = joint
         elif known != P:
             raise ValueError(f"the persistent vector has {P} elements, and had {known}")
-        self._unaged_s = 0.0
+        self._unaged_s = np.zeros_like(elapsed_s)
         return error.persistent_root, persistence(elapsed_s, error.persistent_tau_s)
 
 

@@ -195,8 +195,7 @@ def inverse_poses(log: VoLog, truth: TruthLog) -> InversePoses | None:
         "odometry": (_between(se3.inverse(T), start, end), B),
         "truth": (A, _between(se3.inverse(T_world), start, end)),
     }
-    error = {of: np.array([np.median(h) for h in np.array_split(_errors_m(*pair, np.eye(4)), 2)])
-             for of, pair in pairs.items()}  # fmt: skip
+    error = {of: _errors_of_halves(*pair) for of, pair in pairs.items()}
     plain = np.maximum(error.pop("as they are"), 1e-12)
     best = min(error, key=lambda of: error[of].sum())
     change = error[best] / plain - 1
@@ -215,13 +214,18 @@ def late_by(log: VoLog, truth: TruthLog) -> float | None:
         A, B, _ = windowed_motions(log, against)
         if len(A) < _MIN_MOTIONS:
             return None
-        found.append([np.median(half) for half in np.array_split(_errors_m(A, B, np.eye(4)), 2)])
-    change = np.array(found[1]) / np.maximum(found[0], 1e-12) - 1
+        found.append(_errors_of_halves(A, B))
+    change = found[1] / np.maximum(found[0], 1e-12) - 1
     return offset_s if change.max() < MATTERS else None
 
 
 def _errors_m(A: Array, B: Array, X: Array) -> Array:
     return np.asarray(np.linalg.norm(_residuals(A, B, X)[0][:, :3], axis=1))
+
+
+def _errors_of_halves(A: Array, B: Array) -> Array:
+    """(2,) median error [m] in the first and the second half of the run."""
+    return np.array([np.median(half) for half in np.array_split(_errors_m(A, B, np.eye(4)), 2)])
 
 
 def _start(A: Array, B: Array) -> Array:

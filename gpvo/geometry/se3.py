@@ -58,12 +58,18 @@ def _coefficients_of_one(theta2: Array) -> tuple[Array, Array, Array]:
     return a, b, (theta - np.sin(theta)) / np.power(theta, 3)
 
 
+def _powers(phi: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """The coefficients of a rotation vector (..., 3) [rad], each (..., 1, 1), and its skew matrix and its square."""
+    phi = np.asarray(phi, dtype=np.float64)
+    a, b, c = (v[..., None, None] for v in _coefficients((phi**2).sum(-1)))
+    W = skew(phi)
+    return a, b, c, W, W @ W
+
+
 def so3_exp(phi: Array) -> Array:
     """Rotation vector [rad] to rotation matrix (Rodrigues). (..., 3) -> (..., 3, 3)."""
-    phi = np.asarray(phi, dtype=np.float64)
-    a, b, _ = _coefficients((phi**2).sum(-1))
-    W = skew(phi)
-    return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
+    a, b, _, W, WW = _powers(phi)
+    return np.eye(3) + a * W + b * WW
 
 
 def so3_log(R: Array) -> Array:
@@ -82,10 +88,8 @@ def so3_log(R: Array) -> Array:
 
 def so3_left_jacobian(phi: Array) -> Array:
     """Left Jacobian of SO(3), ``V`` in the SE(3) exponential. (..., 3) -> (..., 3, 3)."""
-    phi = np.asarray(phi, dtype=np.float64)
-    _, b, c = _coefficients((phi**2).sum(-1))
-    W = skew(phi)
-    return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
+    _, b, c, W, WW = _powers(phi)
+    return np.eye(3) + b * W + c * WW
 
 
 def so3_left_jacobian_inverse(phi: Array) -> Array:
@@ -109,9 +113,7 @@ def exp(xi: Array) -> Array:
     """Tangent (..., 6) to pose (..., 4, 4)."""
     xi = np.asarray(xi, dtype=np.float64)
     T = np.zeros((*xi.shape[:-1], 4, 4))
-    a, b, c = (v[..., None, None] for v in _coefficients((xi[..., 3:] ** 2).sum(-1)))
-    W, eye = skew(xi[..., 3:]), np.eye(3)
-    WW = W @ W
+    (a, b, c, W, WW), eye = _powers(xi[..., 3:]), np.eye(3)
     T[..., :3, :3] = eye + a * W + b * WW
     T[..., :3, 3] = ((eye + b * W + c * WW) @ xi[..., :3, None])[..., 0]
     T[..., 3, 3] = 1.0

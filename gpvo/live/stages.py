@@ -172,22 +172,25 @@ class PoseStage:
         """What is stated of the body's motion, or else of its poses, in the camera's axes."""
         self._still = self._still & (np.abs(se3.log(T_body_prev_cur)) < SEEN)
         twist = _matrix(getattr(message, "twist", None))
-        if twist is not None and (found := self._of_camera(IMPORTED, twist)):
-            return {IMPORTED: found[IMPORTED] * dt_s**2}
+        if twist is not None and (of_velocity := self._of_camera(twist)) is not None:
+            return {IMPORTED: of_velocity * dt_s**2}
         if before is None or now is None:
             return {}
         A = se3.adjoint(se3.inverse(T_body_prev_cur))
-        found = self._of_camera(IMPORTED, now - A @ before @ A.T, np.diagonal(now))
-        self._growth.append(bool(found))
+        name, found = IMPORTED, self._of_camera(now - A @ before @ A.T, np.diagonal(now))
+        self._growth.append(found is not None)
         if len(self._growth) >= _ENOUGH and np.mean(self._growth) < _GROWS:
-            return self._of_camera(IMPORTED_POSE, now)
-        return found
+            name, found = IMPORTED_POSE, self._of_camera(now)
+        return {} if found is None else {name: found}
 
-    def _of_camera(self, name: str, covariance: Array, variance: Array | None = None) -> dict[str, Array]:
-        """A covariance (6, 6) of the body in the camera's axes, by name; nothing where it is none."""
+    def _of_camera(self, covariance: Array, variance: Array | None = None) -> Array | None:
+        """A covariance (6, 6) of the body in the camera's axes; None where it is none."""
         C = symmetrise(covariance)
-        C = definite_in_plane(C[None], self._still, None if variance is None else variance[None])[0]
-        return {name: symmetrise(change_body(self._T_cam_body, C))} if is_positive_definite(C) else {}
+        if not is_positive_definite(C):
+            C = definite_in_plane(C[None], self._still, None if variance is None else variance[None])[0]
+            if not is_positive_definite(C):
+                return None
+        return symmetrise(change_body(self._T_cam_body, C))
 
 
 def _pose_covariance(message: Any, T_parent_body: Array) -> Array | None:
