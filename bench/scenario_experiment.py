@@ -31,6 +31,7 @@ from gpvo.online.predictor import Predictor
 from gpvo.sim.scenario import load_scenario, points_scenario
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.twin.replicate import TwinSettings, make_twins
+from joblib import Parallel, delayed
 
 from bench.experiment_flights import Campaign, check_numbers, experiment_parser, flights, training_runs
 
@@ -71,19 +72,21 @@ class MethodScores:
         return float(predicted / actual)
 
 
-def score_flights(runs: Sequence[Run], predictor: Predictor) -> dict[str, MethodScores]:
+def score_flights(runs: Sequence[Run], predictor: Predictor, jobs: int = 1) -> dict[str, MethodScores]:
     """Every method of :data:`METHODS` that the runs and the model allow."""
-    return _tabulated([_score_flight(run, predictor) for run in runs])
+    return _tabulated(Parallel(jobs)(delayed(_score_flight)(run, predictor) for run in runs))
 
 
-def score_by_twins(runs: Sequence[Run], settings: TwinSettings) -> dict[str, MethodScores]:
+def score_by_twins(runs: Sequence[Run], settings: TwinSettings, jobs: int = 1) -> dict[str, MethodScores]:
     """Each flight by a model of its own twins alone: :data:`METHODS` as ``METHOD of twins``."""
-    rows = []
-    for run in runs:
-        with TemporaryDirectory(prefix="gpvo-twins-") as folder:
-            sets = [build_run(read_run(p)) for p in make_twins(run.path, Path(folder), settings)]
-        rows.append(_score_flight(run, train_sets(sets, TrainConfig(), judge=False).predictor()))
+    rows = Parallel(jobs)(delayed(_score_by_twins)(run, settings) for run in runs)
     return {f"{m} of twins": scores for m, scores in _tabulated(rows).items()}
+
+
+def _score_by_twins(run: Run, settings: TwinSettings) -> dict[str, list[float]]:
+    with TemporaryDirectory(prefix="gpvo-twins-") as folder:
+        sets = [build_run(read_run(p)) for p in make_twins(run.path, Path(folder), settings)]
+    return _score_flight(run, train_sets(sets, TrainConfig(), judge=False).predictor())
 
 
 def _tabulated(flights: Sequence[Mapping[str, Sequence[float]]]) -> dict[str, MethodScores]:
@@ -131,10 +134,10 @@ def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRS
     return ScenarioFlights(name, [build_run(r) for r in seen], unseen)
 
 
-def judge(flown: ScenarioFlights) -> dict[str, MethodScores]:
+def judge(flown: ScenarioFlights, jobs: int = 1) -> dict[str, MethodScores]:
     """Train on the scenario's training flights and score the unseen ones."""
     model = train_sets(flown.training, TrainConfig(), judge=False)
-    return score_flights(flown.test, model.predictor())
+    return score_flights(flown.test, model.predictor(), jobs)
 
 
 def markdown(results: Mapping[str, Mapping[str, MethodScores]]) -> str:
@@ -190,24 +193,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
             fly(name, given.out, given.train, given.test, test_seed=given.test_seed, jobs=given.jobs,
                 duration_s=given.duration, keep_tracks=given.twins > 0)
         )  # fmt: skip
-        results[name] = judge(flown[-1])
+        results[name] = judge(flown[-1], given.jobs)
         if given.twins:
             tolerance = points_scenario(load_scenario(name)).tolerance
-            results[name] |= score_by_twins(flown[-1].test, TwinSettings(given.twins, tolerance, name))
+            results[name] |= score_by_twins(flown[-1].test, TwinSettings(given.twins, tolerance, name), given.jobs)
         print(markdown({name: results[name]}), flush=True)
     if given.together:
-        results |= _together(flown)
+        results |= _together(flown, given.jobs)
     write_json(given.out / "scenarios.json", document(results))
     print(markdown(results))
 
 
-def _together(flown: Sequence[ScenarioFlights]) -> dict[str, dict[str, MethodScores]]:
+def _together(flown: Sequence[ScenarioFlights], jobs: int) -> dict[str, dict[str, MethodScores]]:
     """One model of all scenarios that share the first one's rate, judged on each."""
     step = float(np.median(flown[0].training[0].dt_s))
     alike = [f for f in flown if abs(float(np.median(f.training[0].dt_s)) / step - 1) < 0.01]
     model = train_sets([s for f in alike for s in f.training], TrainConfig(), judge=False)
     predictor = model.predictor()
-    return {f"{f.name}, model of all": score_flights(f.test, predictor) for f in alike}
+    return {f"{f.name}, model of all": score_flights(f.test, predictor, jobs) for f in alike}
 
 
 if __name__ == "__main__":

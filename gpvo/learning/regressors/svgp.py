@@ -57,46 +57,48 @@ class SvgpRegressor(OnPoints):
                 loss.backward()
                 optimiser.step()
                 schedule.step()
-        kernel = model.covar_module
-        lengths = kernel.base_kernel.lengthscale.detach().cpu().numpy().ravel()
+        lengths = model.covar_module.lengthscale.detach().cpu().numpy().ravel()
         lengthscale = np.broadcast_to(lengths, points.shape[1]).copy()
-        found = model.variational_strategy.base_variational_strategy.inducing_points.detach().cpu().numpy()
-        signal = kernel.outputscale.detach().cpu().numpy().ravel().copy()
+        found = model.variational_strategy.inducing_points.detach().cpu().numpy()
+        signal = model.signal_var().detach().cpu().numpy().copy()
         noise = np.exp(log_noise.detach().cpu().numpy())
-        return Hyperparameters(lengthscale, signal, noise), found.reshape(points.shape) / lengthscale
+        return Hyperparameters(lengthscale, signal, noise), found / lengthscale
 
 
 def _model(points: Array, start: Hyperparameters, isotropic: bool) -> Any:
-    """D outputs with their own variational distribution and signal variance; points and length scales are shared."""
+    """D outputs, each the root of its signal variance times a GP of unit variance with a variational distribution of
+    its own: the points, the kernel and all that follows from them are shared, and worked out once."""
     import gpytorch
 
     m, d = points.shape
     D = len(start.signal_var)
+    positive = gpytorch.constraints.Positive()
 
     class SharedKernelGP(gpytorch.models.ApproximateGP):
         def __init__(self) -> None:
             distribution = gpytorch.variational.CholeskyVariationalDistribution(m, batch_shape=torch.Size([D]))
-            one = gpytorch.variational.VariationalStrategy(self, torch.tensor(points)[None], distribution)
-            super().__init__(gpytorch.variational.IndependentMultitaskVariationalStrategy(one, num_tasks=D))
-            self.mean_module = gpytorch.means.ZeroMean(batch_shape=torch.Size([D]))
-            base = gpytorch.kernels.RBFKernel(ard_num_dims=None if isotropic else d)
-            self.covar_module = gpytorch.kernels.ScaleKernel(base, batch_shape=torch.Size([D]))
+            super().__init__(gpytorch.variational.VariationalStrategy(self, torch.tensor(points), distribution))
+            self.mean_module = gpytorch.means.ZeroMean()
+            self.covar_module = gpytorch.kernels.RBFKernel(ard_num_dims=None if isotropic else d)
+            self.raw_signal_var = torch.nn.Parameter(positive.inverse_transform(torch.tensor(start.signal_var)))
 
         def forward(self, x: Tensor) -> Any:
             return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
 
+        def signal_var(self) -> Tensor:
+            return positive.transform(self.raw_signal_var)
+
     model = SharedKernelGP()
     lengths = torch.tensor(start.lengthscale)[None]
-    model.covar_module.base_kernel.lengthscale = lengths.mean(1, keepdim=True) if isotropic else lengths
-    model.covar_module.outputscale = torch.tensor(start.signal_var)
+    model.covar_module.lengthscale = lengths.mean(1, keepdim=True) if isotropic else lengths
     return model.train()
 
 
 def _negative_bound(model: Any, log_noise: Tensor, X: Tensor, Y: Tensor, n_rows: int) -> Tensor:
     """Hensman et al., equation 4, per row."""
-    q = model(X)
-    misfit = (Y - q.mean) ** 2 + q.variance
-    log_lik = -0.5 * (log_noise + np.log(2 * np.pi) + misfit / log_noise.exp())
+    q, signal_var = model(X), model.signal_var()[:, None]
+    misfit = (Y.T - signal_var.sqrt() * q.mean) ** 2 + signal_var * q.variance
+    log_lik = -0.5 * (log_noise[:, None] + np.log(2 * np.pi) + misfit / log_noise.exp()[:, None])
     return -log_lik.sum() / len(X) + model.variational_strategy.kl_divergence().sum() / n_rows
 
 
