@@ -160,9 +160,9 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
         fixed = fit_fixed_transform(A, B, lever_arm=False)
     except GpvoError:  # too few motions, or a path too straight to tell
         return None
-    turned = [np.median(_errors_m(A[p], B[p], x)) for p, x in zip(parts, X[::-1])]
-    plain = [np.median(_errors_m(A[p], B[p], np.eye(4))) for p in parts]
-    changes = np.array(turned) / np.maximum(plain, 1e-12) - 1
+    turned = [np.median(_errors(A[p], B[p], x)[0]) for p, x in zip(parts, X[::-1])]
+    plain = [np.median(_errors(A[p], B[p], np.eye(4))[0]) for p in parts]
+    changes = _change(np.array(turned), np.array(plain), B)
     if changes.max() > MATTERS:
         return None
     rotvec = se3.so3_log(fixed.T_log_truth[:3, :3])
@@ -171,10 +171,14 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
 
 @dataclass(frozen=True)
 class InversePoses:
-    """``of``: odometry or truth, whose poses seem to be inverse; ``error_change``: see :class:`FixedRotation`."""
+    """``of``: "odometry", or "truth or odometry", as a log in the world of its truth cannot be told from it.
+    ``or_backwards``: the turns do not show it, so that one of the two may as well look backwards. ``error_change``: see
+    :class:`FixedRotation`.
+    """
 
     of: str
     error_change: float
+    or_backwards: bool
 
 
 _EXPLAINS = -0.5
@@ -193,13 +197,16 @@ def inverse_poses(log: VoLog, truth: TruthLog) -> InversePoses | None:
     pairs = {
         "as they are": (A, B),
         "odometry": (_between(se3.inverse(T), start, end), B),
-        "truth": (A, _between(se3.inverse(T_world), start, end)),
+        "truth or odometry": (A, _between(se3.inverse(T_world), start, end)),
     }
     error = {of: _errors_of_halves(*pair) for of, pair in pairs.items()}
-    plain = np.maximum(error.pop("as they are"), 1e-12)
+    plain = error.pop("as they are")
     best = min(error, key=lambda of: error[of].sum())
-    change = error[best] / plain - 1
-    return InversePoses(best, float(change.mean())) if change.max() < _EXPLAINS else None
+    change = _change(error[best], plain, B)
+    if change.max() > _EXPLAINS:
+        return None
+    before, after = (np.median(_errors(*pairs[of], np.eye(4))[1]) for of in ("as they are", best))
+    return InversePoses(best, float(change.mean()), bool(after > (1 + _EXPLAINS) * before))
 
 
 def late_by(log: VoLog, truth: TruthLog) -> float | None:
@@ -215,17 +222,28 @@ def late_by(log: VoLog, truth: TruthLog) -> float | None:
         if len(A) < _MIN_MOTIONS:
             return None
         found.append(_errors_of_halves(A, B))
-    change = found[1] / np.maximum(found[0], 1e-12) - 1
+    change = _change(found[1], found[0], B)
     return offset_s if change.max() < MATTERS else None
 
 
-def _errors_m(A: Array, B: Array, X: Array) -> Array:
-    return np.asarray(np.linalg.norm(_residuals(A, B, X)[0][:, :3], axis=1))
+def _errors(A: Array, B: Array, X: Array) -> Array:
+    """(2, M) sizes of the residuals, [m] and [rad]."""
+    return np.linalg.norm(_residuals(A, B, X)[0].reshape(-1, 2, 3), axis=2).T
 
 
 def _errors_of_halves(A: Array, B: Array) -> Array:
     """(2,) median error [m] in the first and the second half of the run."""
-    return np.array([np.median(half) for half in np.array_split(_errors_m(A, B, np.eye(4)), 2)])
+    return np.array([np.median(half) for half in np.array_split(_errors(A, B, np.eye(4))[0], 2)])
+
+
+_SLIGHT, _WRITTEN_M = 1e-3, 1e-6
+
+
+def _change(new: Array, old: Array, B: Array) -> Array:
+    """Relative change of errors [m] of motions B (M, 4, 4), where those below a thousandth of the usual motion, and
+    below the digits of a file, count as none: a vehicle that mostly rests errs by rounding."""
+    least = max(_SLIGHT * float(np.sqrt((B[:, :3, 3] ** 2).sum(axis=1).mean())), _WRITTEN_M)
+    return np.asarray(np.maximum(new, least) / np.maximum(old, least) - 1)
 
 
 def _start(A: Array, B: Array) -> Array:

@@ -140,6 +140,8 @@ def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[s
     for method in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "truth"):
         pairs = [(_of_sequence(method, truth), truth) for truth in truths]
         found[method.name] = {"method": method.name, **score(pairs, options)}
+    if not found:
+        raise SourceError("holds no method beside truth", where=folder, cure="a method's files are METHOD/SEQUENCE.txt")
     return dict(sorted(found.items(), key=lambda item: item[1]["pooled"]["nll_per_dim"]["mean"]))
 
 
@@ -184,15 +186,18 @@ def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 
 def on_other_axes(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
-    """Methods whose NLL and NEES are of other axes than those of the method with the most, and of which.
+    """Methods whose NLL and NEES are, in a sequence, of other axes than those of the method with the most there; and of
+    which in the sequence with the fewest.
 
     As of a robot in a plane, whose height never differs from the truth's: such numbers do not compare.
     """
-    axes = {}
-    for method, scores in found.items():
-        axes[method] = tuple(a for a in AXES if all(a in s["axes"] for s in scores["sequences"]))
-    most = max(axes.values(), key=len)
-    return {method: judged for method, judged in axes.items() if judged != most}
+    axes = {m: {s["sequence"]: tuple(s["axes"]) for s in scores["sequences"]} for m, scores in found.items()}
+    most: dict[str, tuple[str, ...]] = {}
+    for judged in axes.values():
+        for sequence, names in judged.items():
+            most[sequence] = max(most.get(sequence, ()), names, key=len)
+    other = {m: [names for s, names in judged.items() if names != most[s]] for m, judged in axes.items()}
+    return {method: min(names, key=len) for method, names in other.items() if names}
 
 
 def _mean_with(mean: float, count: int, charged: Array) -> float:

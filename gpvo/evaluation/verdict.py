@@ -220,9 +220,10 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             " over a second are smaller."
         )
     if e.inverse is not None:
+        backwards = ", unless one of the two looks backwards" if e.inverse.or_backwards else ""
         yield (
             f"The poses of the {e.inverse.of} seem to be inverse, T_cam_world: the other way round, errors over a"
-            f" second are {-100 * e.inverse.error_change:.0f} % smaller. Write them as T_world_cam."
+            f" second are {-100 * e.inverse.error_change:.0f} % smaller. Write them as T_world_cam{backwards}."
         )
     yield from _of_truth_and_path(e)
     if e.turned is not None and len(unseen) < len(AXES):

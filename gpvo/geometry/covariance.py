@@ -16,15 +16,17 @@ def symmetrise(C: Array) -> Array:
     return 0.5 * (C + np.swapaxes(C, -1, -2))
 
 
+def is_symmetric(C: Array) -> bool:
+    """Whether one (n, n) matrix is symmetric to rounding: of an element, or of those that were summed up to it."""
+    size = np.abs(C)
+    return bool((np.abs(C - C.T) <= 1e-8 * size + 1e-12 * size.max()).all())
+
+
 def is_positive_definite(C: Array) -> bool:
     """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
     C = np.asarray(C)
-    size = np.abs(C)
-    largest = size.max()
     # Comparisons with NaN are false.
-    if not (largest < LARGEST and np.diagonal(C).min() > 1 / LARGEST):
-        return False
-    if not (np.abs(C - C.T) <= 1e-8 * size + 1e-12 * largest).all():
+    if not (np.abs(C).max() < LARGEST and np.diagonal(C).min() > 1 / LARGEST and is_symmetric(C)):
         return False
     try:
         np.linalg.cholesky(C)

@@ -24,7 +24,8 @@ from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 FORMATS = ("tum", "kitti", "csv", "bag")
 # FLU body at the camera's own place, looking forward.
 T_FLU_OPTICAL: Array = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
-_GROWS = 1e-6  # of a variance: what a step adds to it, beyond rounding
+# What a step adds to a variance, beyond rounding: of the variance, and of the least that is seen.
+_GROWS, _GROWS_SEEN = 1e-6, 1e-3
 NONE_STATED = "its covariances are not positive definite and were left out"
 
 
@@ -240,10 +241,11 @@ def definite_in_plane(covariance: Array, still: NDArray[np.bool_], variance: Arr
     """
     own = np.diagonal(covariance, axis1=1, axis2=2)
     variance = own if variance is None else variance
-    empty = still & ~still.all() & (own <= _GROWS * variance)
+    empty = still & ~still.all() & (own <= np.maximum(_GROWS * variance, _GROWS_SEEN * SEEN**2))
     filled = np.where(empty[:, :, None] | empty[:, None], 0.0, covariance)
     filled += empty[:, None] * np.eye(6) * np.maximum(np.where(empty, variance, 1.0), SEEN**2)[:, None]
-    return np.where(transport.are_positive_definite(covariance)[:, None, None], covariance, filled)
+    good = np.array([transport.is_positive_definite(C) for C in transport.symmetrise(covariance)], dtype=bool)
+    return np.where(good[:, None, None], covariance, filled)
 
 
 def check_same_rows(truth: ForeignLog, log: ForeignLog) -> None:

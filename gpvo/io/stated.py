@@ -110,7 +110,9 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     name, cov, notes = _motion_covariances(log, motions)
     t = log.t_ns
     gaps = _after_gaps(t)
-    unknown = _stated_unknown(cov) - {0, *gaps} if cov is not None and name == IMPORTED else set()
+    unknown = set[int]()
+    if cov is not None and name == IMPORTED:
+        unknown = set(np.flatnonzero(is_turn_unknown(cov)).tolist()) - {0, *gaps}
     lost = {**dict.fromkeys(gaps, "gap in the log"), **dict.fromkeys(unknown, "stated as unknown")}
     if gaps:
         notes = [*notes, f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}"]
@@ -129,10 +131,12 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     return records, [*log.notes, *notes]
 
 
-def _stated_unknown(covariance: Array) -> set[int]:
-    """Rows whose rotation is stated as unknown about every axis; an odometry in the plane knows its heading."""
-    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]
-    return set(np.flatnonzero((variances > UNKNOWN_RAD**2).all(axis=1)).tolist())
+def is_turn_unknown(covariance: Array) -> NDArray[np.bool_]:
+    """(N,) which of (N, 6, 6) state a rotation that is unknown about every axis, those of no frame included: an
+    odometry in a plane knows its heading, however its camera is tilted."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    turn = np.where(known[:, None, None], covariance, 0.0)[:, 3:, 3:]
+    return np.asarray(np.linalg.eigvalsh(symmetrise(turn))[:, 0] > UNKNOWN_RAD**2)
 
 
 def _after_gaps(t_ns: NDArray[np.int64]) -> set[int]:

@@ -11,14 +11,21 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.errors import printable
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import are_positive_definite, change_body, is_positive_definite, symmetrise
+from gpvo.geometry.covariance import (
+    are_positive_definite,
+    change_body,
+    is_positive_definite,
+    is_symmetric,
+    symmetrise,
+)
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_reader import pose_of, stamp_ns
 from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, is_optical, moving_frame
-from gpvo.io.stated import UNKNOWN_RAD
+from gpvo.io.stated import is_turn_unknown
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import Arrival, Sequence, StampWatch
 from gpvo.stats.consistency import SEEN
@@ -111,7 +118,7 @@ class PoseStage:
         self._watch = StampWatch()
         self._last: tuple[int, Array, Array | None] | None = None  # stamp, T_parent_cam, covariance of the pose
         self._growth: deque[bool] = deque(maxlen=200)
-        self._still = np.ones(6, dtype=bool)  # axes of the body that have not moved
+        self._moved, self._motions = np.zeros(6), 0  # sum of the squared motions of the body by axis, and their count
 
     def take(self, arrival: Arrival) -> Iterator[Taken]:
         """One record, unless the message is late, repeated, absurd or of another clock."""
@@ -162,7 +169,7 @@ class PoseStage:
         elif rate[:3].max() > _MAX_MPS or rate[3:].max() > _MAX_RADPS:
             status, reason = Status.LOST, "impossible speed"
             self.counts["jumps"] += 1
-        elif IMPORTED in stated and (np.diagonal(stated[IMPORTED])[3:] > UNKNOWN_RAD**2).all():
+        elif IMPORTED in stated and is_turn_unknown(stated[IMPORTED][None])[0]:
             status, reason = Status.LOST, "stated as unknown"
         return VoRecord(t_ns, before[0], status, T_prev_cur, reason=reason, covariances=stated)
 
@@ -170,7 +177,7 @@ class PoseStage:
         self, message: Any, T_body_prev_cur: Array, dt_s: float, before: Array | None, now: Array | None
     ) -> dict[str, Array]:
         """What is stated of the body's motion, or else of its poses, in the camera's axes."""
-        self._still = self._still & (np.abs(se3.log(T_body_prev_cur)) < SEEN)
+        self._moved, self._motions = self._moved + se3.log(T_body_prev_cur) ** 2, self._motions + 1
         twist = _matrix(getattr(message, "twist", None))
         if twist is not None and (of_velocity := self._of_camera(twist)) is not None:
             return {IMPORTED: of_velocity * dt_s**2}
@@ -178,10 +185,16 @@ class PoseStage:
             return {}
         A = se3.adjoint(se3.inverse(T_body_prev_cur))
         name, found = IMPORTED, self._of_camera(now - A @ before @ A.T, np.diagonal(now))
-        self._growth.append(found is not None)
+        if found is not None or not self._still.all():  # before it moves, nothing tells the axes of a plane
+            self._growth.append(found is not None)
         if len(self._growth) >= _ENOUGH and np.mean(self._growth) < _GROWS:
             name, found = IMPORTED_POSE, self._of_camera(now)
         return {} if found is None else {name: found}
+
+    @property
+    def _still(self) -> NDArray[np.bool_]:
+        """(6,) axes of the body along and about which it has not moved so far: see ``still_axes``."""
+        return np.asarray(self._moved < self._motions * SEEN**2)
 
     def _of_camera(self, covariance: Array, variance: Array | None = None) -> Array | None:
         """A covariance (6, 6) of the body in the camera's axes; None where it is none."""
@@ -205,7 +218,7 @@ def _matrix(holder: Any) -> Array | None:
     if flat is None or np.size(flat) != 36:
         return None
     C = np.asarray(flat, dtype=np.float64).reshape(6, 6)
-    return C if are_positive_definite(C[None], semi=True)[0] and np.allclose(C, C.T, 1e-8, 0.0) else None
+    return C if are_positive_definite(C[None], semi=True)[0] and is_symmetric(C) else None
 
 
 def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) -> VoRecord:

@@ -63,10 +63,12 @@ def fit(ratio: Array) -> tuple[Array, Array]:
 
     The t is taken only where it explains the residuals better than the Gaussian.
     """
-    start = np.log(np.maximum(np.median(ratio, axis=0) / 0.455, 1e-300))
+    # Where most residuals are zero, as at rest, the median is no start.
+    mean = ratio.mean(axis=0)
+    start = np.log(np.maximum(np.maximum(np.median(ratio, axis=0) / 0.455, 1e-12 * mean), 1e-300))
     low, high = np.broadcast_to([[math.log(NU_MIN)], [math.log(2 * NU_GAUSSIAN)]], (2, len(start)))
     nu = np.exp(_minimum(lambda ln_nu: _loss(ratio, np.exp(ln_nu), start), low, high))
-    gaussian = np.log(np.maximum(ratio.mean(axis=0), 1e-300))
+    gaussian = np.log(np.maximum(mean, 1e-300))
     light = (nu >= NU_GAUSSIAN) | (_loss(ratio, nu, start) >= 0.5 * (gaussian + 1.0 + math.log(2 * np.pi)))
     return np.where(light, np.inf, nu), np.where(light, gaussian, _log_scale(ratio, nu, start))
 

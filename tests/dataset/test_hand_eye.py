@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
+from gpvo.dataset.hand_eye import fit_fixed_transform, fixed_rotation, inverse_poses, late_by, windowed_motions
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Status, TruthLog, VoLog, VoRecord
@@ -132,3 +132,50 @@ def test_a_truth_of_one_world_is_left_in_one():
     records = [VoRecord(int(t[k]), int(t[max(k - 1, 0)]), Status.OK, motions[k]) for k in range(600)]
     fit = fit_fixed_transform(*windowed_motions(VoLog(records), TruthLog(t, poses @ X)))
     assert fit.worlds_deg < 0.1
+
+
+def _driven(steps: np.ndarray) -> tuple[VoLog, np.ndarray]:
+    """A log of motions (n, 6), and its poses from the identity."""
+    T = [np.eye(4)]
+    records = [VoRecord(0, 0, Status.START, np.eye(4))]
+    for k, motion in enumerate(se3.exp(steps), 1):
+        T.append(T[-1] @ motion)
+        records.append(VoRecord(k * 50_000_000, (k - 1) * 50_000_000, Status.OK, motion))
+    return VoLog(records), np.array(T)
+
+
+def _truth(T: np.ndarray) -> TruthLog:
+    return TruthLog(np.arange(len(T)) * 50_000_000, T)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_a_robot_that_mostly_rests_is_accused_of_nothing(share: float):
+    """The median error is rounding, which every other reading of the poses can halve."""
+    steps = np.where((np.arange(1200) % 250 < 250 * share)[:, None], [0, 0, 0.05, 0, 0.01, 0], 0.0)
+    log, _ = _driven(steps * [1, 1, 1.02, 1, 1, 1])
+    truth = _truth(se3.exp(np.array([5.0, -3, 2, 0, 0.7, 0])) @ _driven(steps)[1])
+    assert inverse_poses(log, truth) is None
+    assert late_by(log, truth) is None
+    assert fixed_rotation(log, truth) is None
+
+
+@pytest.mark.parametrize("turning", [0.0, 0.02])
+def test_inverse_poses_and_a_camera_that_looks_backwards(turning: float):
+    """Where the path turns, the two differ; straight ahead they do not, and both are said."""
+    rng = np.random.default_rng(1)
+    steps = np.zeros((1200, 6))
+    steps[:, 2], steps[:, 4] = 0.05, turning * np.sin(np.arange(1200) / 60)
+    log, T = _driven(steps + rng.standard_normal((1200, 6)) * ([2e-3] * 3 + [5e-4] * 3))
+    _, exact = _driven(steps)
+    backwards = exact @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    inverse_log, _ = _driven(se3.log(T[:-1] @ se3.inverse(T[1:])))
+    found, turned = inverse_poses(inverse_log, _truth(exact)), inverse_poses(log, _truth(backwards))
+    assert found is not None
+    assert found.of == "odometry"
+    assert found.or_backwards == (turning == 0.0)
+    if turning:
+        assert turned is None
+        assert fixed_rotation(log, _truth(backwards)) is not None
+    else:
+        assert turned is not None
+        assert turned.or_backwards

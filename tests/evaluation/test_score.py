@@ -16,7 +16,7 @@ from gpvo.dataset.build import build_run
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.evaluate import evaluate_run
-from gpvo.evaluation.score import board, score, score_folder, score_sequence, write_statements
+from gpvo.evaluation.score import board, on_other_axes, score, score_folder, score_sequence, write_statements
 from gpvo.geometry import se3
 from gpvo.io.run import write_run
 from gpvo.io.run_read import Run, read_run
@@ -153,6 +153,22 @@ def test_a_method_that_moves_in_a_plane_is_not_compared_with_others(tmp_path: Pa
     told = _call(capsys, tmp_path)
     assert "flat: NLL and NEES are of x, z, ry alone; they do not compare with those of others." in told
     assert "free: NLL" not in told
+
+
+def test_axes_are_compared_sequence_by_sequence() -> None:
+    def of(*axes: str) -> dict[str, list[dict[str, object]]]:
+        return {"sequences": [{"sequence": str(k), "axes": tuple(a)} for k, a in enumerate(axes)]}
+
+    assert on_other_axes({"a": of("xyz", "xy"), "b": of("xyz", "xy")}) == {}
+    assert on_other_axes({"a": of("xyz", "xy"), "b": of("xy", "xy")}) == {"b": ("x", "y")}
+    assert on_other_axes({"a": of("xy", "xyz"), "b": of("xyz", "z")}) == {"a": ("x", "y"), "b": ("z",)}
+
+
+def test_a_folder_without_methods_is_refused(written, tmp_path: Path) -> None:
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "a.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n")
+    with pytest.raises(SourceError, match="holds no method beside truth"):
+        score_folder(tmp_path)
 
 
 def test_somebody_elses_csv_is_scored_in_one_command(written, tmp_path: Path, capsys) -> None:

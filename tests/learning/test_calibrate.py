@@ -30,6 +30,15 @@ def test_one_jump_does_not_set_the_scale():
     assert second_moment(square) < 1.5
 
 
+@pytest.mark.parametrize("share", [0.49, 0.51, 0.6])
+def test_residuals_at_rest_leave_one_jump_as_little_weight(share):
+    """Where most are zero, so is the median: the fit must not take the Gaussian's word, a thousand times too large."""
+    square = np.random.default_rng(1).standard_t(4, (200, 1)) ** 2
+    square[: int(200 * share)] = 0.0
+    square[-1] = 1e6
+    assert second_moment(square) < 1.0
+
+
 def test_a_new_sequence_is_covered():
     """Scales drawn per sequence: the mean NEES of new ones stays near one, where pooling would do no worse."""
     rng = np.random.default_rng(2)

@@ -60,22 +60,87 @@ def test_the_shim_equals_the_imported_run(stated: np.ndarray | None, child: str,
     assert "sigma x" in kept.reports[-1].values["driven_by"]
 
 
-@pytest.mark.parametrize("of", ["twist", "pose"])
-def test_a_robot_in_a_plane_states_three_axes_as_in_an_import(of: str, tmp_path: Path) -> None:
-    """Its driver states zero for height, roll and pitch; what it says of the others counts, message by message."""
-    motion, T, C = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.02])), np.eye(4), np.zeros((6, 6))
-    own, A = np.diag([1e-6, 4e-6, 0.0, 0.0, 0.0, 1e-6]), se3.adjoint(se3.inverse(motion))
-    maker, live, zero = BagMaker(ros1=False), PoseStage(TOPIC), np.zeros((6, 6))
+def _of_a_planar_robot(
+    of: str, tilt_rad: float, place: np.ndarray, folder: Path
+) -> tuple[list[VoRecord], list[VoRecord]]:
+    """What live and import make of 60 messages with zeros for height, roll and pitch, while the body trembles by
+    ``tilt_rad`` about the latter two; the camera at ``place``."""
+    rng, T, C = np.random.default_rng(2), np.eye(4), np.zeros((6, 6))
+    own, maker, live, zero = (
+        np.diag([1e-6, 4e-6, 0.0, 0.0, 0.0, 1e-6]),
+        BagMaker(ros1=False),
+        PoseStage(TOPIC, place),
+        np.zeros((6, 6)),
+    )
     for k in range(60):
         in_world = rotate_covariance(T[:3, :3], C) if of == "pose" else zero
         maker.odometry(TOPIC, 10**18 + k * 50_000_000, T, in_world, own if of == "twist" else zero, "base_link")
+        motion = se3.exp(np.array([0.05, 0.0, 0.0, *(tilt_rad * rng.standard_normal(2)), 0.02]))
+        A = se3.adjoint(se3.inverse(motion))
         T, C = T @ motion, A @ C @ A.T + own
-    log = read_foreign(maker.write(tmp_path / "wheels"), topic=TOPIC)
-    imported = to_records(log.seen_from(T_FLU_OPTICAL))[0]
+    log = read_foreign(maker.write(folder / "wheels"), topic=TOPIC)
     records = [taken.record for t, topic, m in maker.messages for taken in live.take(Arrival(topic, m, t))]
+    return records, to_records(log.seen_from(place))[0]
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 1e-16, 1e-9, 1e-7])
+@pytest.mark.parametrize("of", ["twist", "pose"])
+def test_a_robot_in_a_plane_states_three_axes_as_in_an_import(of: str, tilt_rad: float, tmp_path: Path) -> None:
+    """Its driver states zero for height, roll and pitch; what it says of the others counts, message by message."""
+    records, imported = _of_a_planar_robot(of, tilt_rad, T_FLU_OPTICAL, tmp_path)
     for ours, theirs in zip(records[1:], imported[1:], strict=True):
         assert set(ours.covariances) == set(theirs.covariances) == {"imported"}
-        np.testing.assert_allclose(ours.covariances["imported"], theirs.covariances["imported"], rtol=1e-5, atol=1e-12)
+        if tilt_rad == 0.0:
+            np.testing.assert_allclose(
+                ours.covariances["imported"], theirs.covariances["imported"], rtol=1e-5, atol=1e-12
+            )
+
+
+@pytest.mark.parametrize("of", ["twist", "pose"])
+def test_a_robot_in_a_plane_may_carry_a_tilted_camera(of: str, tmp_path: Path) -> None:
+    tilted = T_FLU_OPTICAL @ se3.exp(np.array([0.2, 0.0, 0.3, -0.17, 0.0, 0.0]))
+    records, _ = _of_a_planar_robot(of, 0.0, tilted, tmp_path)
+    assert all(set(r.covariances) == {"imported"} and r.status is Status.OK for r in records[1:])
+
+
+def _planar(k: int, T: np.ndarray, covariance: np.ndarray) -> Arrival:
+    maker = BagMaker(ros1=False)
+    maker.odometry(TOPIC, 10**18 + k * 50_000_000, T, np.zeros((6, 6)), covariance, "base_link")
+    ((t, topic, message),) = maker.messages
+    return Arrival(topic, message, t)
+
+
+def test_unknown_height_roll_and_pitch_do_not_lose_a_tilted_camera() -> None:
+    """In its axes they leak into the heading, which the driver does know."""
+    tilted = T_FLU_OPTICAL @ se3.exp(np.array([0, 0, 0, -0.17, 0.0, 0.0]))
+    live, T, unknown = PoseStage(TOPIC, tilted), np.eye(4), np.diag([1e-4, 2e-4, 1e6, 1e6, 2e6, 1e-4])
+    for k in range(20):
+        [taken] = live.take(_planar(k, T, unknown))
+        assert taken.record.status in (Status.START, Status.OK)
+        T = T @ se3.exp(np.array([0.05, 0, 0, 0, 0, 0.02]))
+
+
+def test_one_bump_does_not_end_what_a_planar_robot_states() -> None:
+    """Nor does rest before the first motion."""
+    live, T, own = PoseStage(TOPIC, T_FLU_OPTICAL), np.eye(4), np.diag([1e-4, 2e-4, 0, 0, 0, 1e-4])
+    stated = []
+    for k in range(400):
+        [taken] = live.take(_planar(k, T, own))
+        stated.append(set(taken.record.covariances))
+        T = T @ se3.exp(np.array([0.05, 0, 1e-5 if k == 100 else 0.0, 0, 0, 0.02]) * (k >= 40))
+    assert stated[42:] == [{"imported"}] * 358
+
+
+def test_a_covariance_is_symmetric_if_rounding_is_all_that_differs() -> None:
+    """A filter that turns an isotropic block leaves 1e-21 on one side of the diagonal and -1e-21 on the other."""
+    rng, live, T = np.random.default_rng(0), PoseStage(TOPIC, T_FLU_OPTICAL), np.eye(4)
+    for k in range(50):
+        R = se3.so3_exp(rng.standard_normal(3))
+        C = np.zeros((6, 6))
+        C[:3, :3], C[3:, 3:] = R @ (1e-4 * np.eye(3)) @ R.T, R @ (1e-6 * np.eye(3)) @ R.T
+        [taken] = live.take(_planar(k, T, C))
+        assert k == 0 or set(taken.record.covariances) == {"imported"}
+        T = T @ se3.exp(rng.standard_normal(6) * 0.02)
 
 
 def test_the_twist_is_in_the_child_frame_and_the_pose_in_its_parent() -> None:
