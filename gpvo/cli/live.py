@@ -161,6 +161,8 @@ def doctor(
     if wire is None:
         found = examine_bag(Path(source), topic)
         if truth is not None:
+            if truth_topic is None and truth.exists() and truth.samefile(source):
+                raise GpvoError("which topic of the bag is the ground truth?", cure="name it with --truth-topic")
             judged = {t: _nees_of_bag(Path(source), t, truth, truth_topic, align) for t in found if t != truth_topic}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
@@ -231,12 +233,16 @@ def _lines(found: dict[str, Any]) -> list[str]:
             each = ", ".join(f"{name} {block['nees_dof']:.3g}" for name, block in by_block.items())
             out.append(
                 f"NEES per degree of freedom of {about['count']} {what}: {joint['nees_dof']:.3g}"
-                f" [{low:.3g}, {high:.3g}], {each}: {_meaning(low, high)}"
+                f" [{low:.3g}, {high:.3g}], {each}: {_meaning(joint['nees_dof'], low, high)}"
             )
     return out
 
 
-def _meaning(low: float, high: float) -> str:
+def _meaning(mean: float, low: float, high: float) -> str:
+    """By the bounds of the verdict of ``gpvo evaluate``."""
+    from gpvo.evaluation.verdict import HONEST
+
+    slightly = "slightly " if HONEST[0] <= mean <= HONEST[1] else ""
     if low > 1.0:
-        return "overconfident"
-    return "too cautious" if high < 1.0 else "right, as far as this truth can tell"
+        return f"{slightly}overconfident"
+    return f"{slightly}too cautious" if high < 1.0 else "right, as far as this truth can tell"

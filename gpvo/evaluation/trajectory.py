@@ -110,15 +110,22 @@ def pairs_ahead(progress: Array, step: float, every: int = 1) -> tuple[NDArray[n
     return start[inside], end[inside]
 
 
-def segments(T_est: Array, T_true: Array, lengths_m: Sequence[float], every: int = 10) -> tuple[Segment, ...]:
+def segments(
+    T_est: Array,
+    T_true: Array,
+    lengths_m: Sequence[float],
+    every: int = 10,
+    frame: NDArray[np.int64] | None = None,
+) -> tuple[Segment, ...]:
     """KITTI's segment errors for given lengths of the true path, a start at every tenth frame.
 
-    NaN, and a count of 0, for a length that the path does not reach.
+    NaN, and a count of 0, for a length that the path does not reach. ``frame``: as in :func:`trajectory_errors`.
     """
     arc = se3.path_length_m(T_true[:, :3, 3])
+    frame = np.arange(len(arc)) if frame is None else frame
     out = []
     for length in lengths_m:
-        start, end = pairs_ahead(arc, length, every)
+        start, end = _unbroken(frame, *pairs_ahead(arc, length, every))
         error = rpe(T_est, T_true, start, end)
         out.append(
             Segment(
@@ -140,8 +147,8 @@ def trajectory_errors(
 ) -> TrajectoryErrors:
     """Every error of one run; ``lengths_m`` default to 10 to 100 m, for paths above 800 m to KITTI's 100 to 800 m.
 
-    ``frame`` (N,): number of each pose in the run, where poses without truth were left out. Relative errors of a frame
-    and of a second are not taken across such a gap.
+    ``frame`` (N,): number of each pose in the run, where poses without truth were left out. Relative errors are not
+    taken across such a gap, over which the path is longer than seen.
     """
     frame = np.arange(len(t_ns)) if frame is None else frame
     arc = se3.path_length_m(T_true[:, :3, 3])
@@ -159,8 +166,8 @@ def trajectory_errors(
         final_error_m=float(off[-1]),
         rpe_frame=rpe(T_est, T_true, *_unbroken(frame, each, each + 1)),
         rpe_second=rpe(T_est, T_true, *_unbroken(frame, *pairs_ahead(t_s, 1.0))),
-        rpe_10m=rpe(T_est, T_true, *pairs_ahead(arc, 10.0)),
-        segments=segments(T_est, T_true, lengths),
+        rpe_10m=rpe(T_est, T_true, *_unbroken(frame, *pairs_ahead(arc, 10.0))),
+        segments=segments(T_est, T_true, lengths, frame=frame),
     )
 
 

@@ -14,7 +14,7 @@ from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
-from gpvo.types import Array
+from gpvo.types import Array, Status
 
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import Evaluation
@@ -89,6 +89,8 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
     lines = [*_conditions(e), *(found[m].line() for m in shown)]
     if not wrong and not outside:
         where = "per motion and over distance" if told.of_motions else f"over {_listed([n for n, _ in told.spans])}"
+        if not told.spans:
+            where = "per motion; over a second or a distance, nothing can be judged"
         return Verdict("green", f"The {told.method} covariance is honest here, {where}.", tuple(lines))
     if told.method != best and not found[best].wrong():
         lines.append(f"Use {best} here: it is honest{', and has the best likelihood of all' * told.of_motions}.")
@@ -192,9 +194,15 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     """What was seen of the run, of its truth, and of the model's domain."""
     if e.in_domain is not None:
         yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
-    lost = sum(r.status.value == "lost" for r in e.run.log)
-    if lost:
+    reasons = [r.reason for r in e.run.log if r.status is Status.LOST]
+    by_model = reasons.count("prediction")
+    if lost := len(reasons) - by_model:
         yield f"{lost} of {len(e.run.log)} frames {'has' if lost == 1 else 'have'} no motion."
+    if by_model:
+        yield (
+            f"The model calls {by_model} of {len(e.run.log)} motions lost, most as slips: no vehicle moves so; if yours"
+            " does, import or run with --max-acceleration."
+        )
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
         yield (
@@ -231,7 +239,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
         yield (
             f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg"
-            f" (mounting or calibration{asked})."
+            f" (mounting, calibration, or a steady bias of the odometry{asked})."
             f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
         )
 

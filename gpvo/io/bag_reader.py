@@ -115,12 +115,13 @@ def pose_of(message: Any) -> Array:
 
 
 def read_poses(
-    path: Path, topic: str, remark: Callable[[str], None] | None = None
+    path: Path, topic: str, remark: Callable[[str], None] | None = None, *, complete: bool = False
 ) -> tuple[np.ndarray, Array, list[Any]]:
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
-    ``remark`` is told how many were dropped, or out of order. Raises SourceError where the topic has no poses, or one
-    that is not finite, and where its clock goes back by more than a second or gives many messages one stamp.
+    ``remark`` is told how many were dropped, or out of order. Messages that hold no pose, as some odometries send when
+    they are lost, are dropped, or refused where the poses must be ``complete``. Raises SourceError where the topic has
+    no poses, and where its clock goes back by more than a second or gives many messages one stamp.
     """
     stamps, rows, kept = [], [], []
     with open_bag(path) as reader:
@@ -136,11 +137,14 @@ def read_poses(
         raise SourceError(f"holds no message on '{topic}'", where=path)
     t, data = np.array(stamps, dtype=np.int64), np.stack(rows)
     order = _in_time(t, data, topic, path, remark)
+    good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
+    if bad := int((~good).sum()):
+        if complete or bad == len(order):
+            raise SourceError(f"message {order[~good][0] + 1} on '{topic}' holds no valid pose", where=path)
+        if remark is not None:
+            remark(f"{bad} of {len(t)} messages on '{topic}' hold no valid pose and were left out")
+    order = order[good]
     t, data = t[order], data[order]
-    norm = np.linalg.norm(data[:, 3:], axis=1)
-    bad = np.flatnonzero(~np.isfinite(data).all(axis=1) | ~(np.abs(norm - 1) < 0.1))
-    if len(bad):
-        raise SourceError(f"message {order[bad[0]] + 1} on '{topic}' holds no valid pose", where=path)
     return t, se3.from_quaternion(data[:, :3], data[:, 3:]), [kept[i] for i in order]
 
 

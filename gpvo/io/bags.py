@@ -128,7 +128,7 @@ class BagSource(ImageSource):
 
     def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
         try:
-            t, T, _ = read_poses(self.path, topic, self.remark)
+            t, T, _ = read_poses(self.path, topic, self.remark, complete=True)
         except SourceError as error:
             cure = "; ".join(filter(None, (error.cure, "--truth-topic none does without")))
             raise SourceError(error.what, where=error.where, cure=cure) from None

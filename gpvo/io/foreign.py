@@ -15,7 +15,7 @@ from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
-from gpvo.io.foreign_csv import Table, is_number, read_table
+from gpvo.io.foreign_csv import Table, is_number, names_other_columns, read_table
 from gpvo.io.stamps import check_interval, text_lines
 from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
 from gpvo.stats.consistency import SEEN, seen_axes
@@ -47,7 +47,7 @@ class ForeignLog:
     ``"motion"`` from the row before, ``"pose"`` since the start. ``columns``: further fields of the records, (N,).
     ``topic``: of a bag, and ``frame_id`` the name that its messages give to the frame whose poses they hold.
     ``is_counted``: its stamps are its rows' numbers at a rate that was given, so that another log's rows must be the
-    same.
+    same. ``other_topics``: of a bag, those with poses that were not read.
     """
 
     path: Path
@@ -59,6 +59,7 @@ class ForeignLog:
     topic: str | None = None
     frame_id: str | None = None
     is_counted: bool = False
+    other_topics: tuple[str, ...] = ()
 
     @property
     def frame(self) -> str:
@@ -100,9 +101,12 @@ def guess_format(path: Path) -> str:
     if path.is_dir():
         raise SourceError("is a folder, not a log", where=path, cure="name the trajectory file or the bag")
     lines = [text for _, (_, text) in zip(range(50), text_lines(path))]
-    data = next((line for line in lines if line and not line.startswith("#")), "")
+    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), 0)
+    data, above = (lines[first], lines[:first]) if lines else ("", [])
     words = data.split()
     if "," in data or ";" in data or (words and not all(is_number(w) for w in words)):
+        return "csv"
+    if above and names_other_columns(above[-1].lstrip("# ").split(), len(words)):
         return "csv"
     if len(words) in (8, 12):
         return "tum" if len(words) == 8 else "kitti"
@@ -134,7 +138,8 @@ def read_foreign(
     topic : for bags, the topic of poses; by default the only one, an Odometry first.
     times, rate_hz : for KITTI poses, which have no stamps: a file with a line of seconds each, or the rate.
     covariance_of : what covariance columns of a CSV are of, ``"pose"`` (default) or ``"motion"``.
-    complete : refuse rows of a CSV without a pose, as a ground truth must; else they are left out and counted.
+    complete : refuse rows of a CSV, or messages of a bag, without a pose, as a ground truth must; else they are left
+        out and counted.
     covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
 
     Raises
@@ -155,7 +160,7 @@ def read_foreign(
         return ForeignLog(p, trajectory, is_counted=is_counted)
     if name == "csv":
         return _from_table(p, read_table(p, mapping or {}), covariance_of or "pose", covariance_axes, complete)
-    return _read_bag(p, topic)
+    return _read_bag(p, topic, complete)
 
 
 def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complete: bool) -> ForeignLog:
@@ -179,7 +184,10 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     if cov is not None and axes == "world":
         cov = _into_body(trajectory, cov)
     if cov is not None:
-        cov = definite_in_plane(cov, still_axes(trajectory.T_world_body))
+        still = still_axes(trajectory.T_world_body)
+        stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
+        planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
+        cov = definite_in_plane(cov, still) if planar else None
     lost = int((~known).sum())
     return ForeignLog(
         path,
@@ -187,24 +195,24 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         cov,
         covariance_of,
         {n: c[n][known] for n in (*COUNT_FIELDS, *FLOAT_FIELDS) if n in c},
-        (*table.notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table)),
+        (*table.notes, *((f"{lost} rows without a pose were left out",) if lost else ()), *_unused(table, cov)),
     )
 
 
-def _unused(table: Table) -> tuple[str, ...]:
+def _unused(table: Table, covariance: Array | None) -> tuple[str, ...]:
     """A remark on columns that state an uncertainty and that nothing reads."""
     names, notes = ", ".join(table.unused), []
     if names:
         notes.append(f"columns not used: {names}; --map COLUMN=cov_00 takes a variance, see --help")
     absent = [f"cov_{i}{i}" for i in range(6) if f"cov_{i}{i}" not in table.columns]
-    if absent and any(c.startswith("cov_") for c in table.columns):
+    if covariance is None and any(c.startswith("cov_") for c in table.columns):
         notes.append(f"the covariance is not used: it has no {', '.join(absent)}; --map COLUMN=NAME names them")
     return tuple(notes)
 
 
 def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) -> Array | None:
-    """(N, 6, 6) of the covariance columns; what is not stated off the diagonal is zero."""
-    if not all(f"cov_{i}{i}" in columns for i in range(6)):
+    """(N, 6, 6) of the covariance columns; what is not stated is zero, None where nothing is."""
+    if not any(f"cov_{i}{i}" in columns for i in range(6)):
         return None
     C = np.zeros((int(known.sum()), 6, 6))
     for i in range(6):
@@ -281,7 +289,7 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
     return Trajectory(t, T), times is None
 
 
-def _read_bag(path: Path, topic: str | None) -> ForeignLog:
+def _read_bag(path: Path, topic: str | None, complete: bool) -> ForeignLog:
     with open_bag(path) as reader:
         odometry, poses = (list(topics_of(reader, kinds)) for kinds in ((ODOMETRY_TYPE,), POSE_TYPES))
     if topic is None:
@@ -290,15 +298,12 @@ def _read_bag(path: Path, topic: str | None) -> ForeignLog:
             found = ", ".join(wanted) or "none"
             raise SourceError(f"which topic? (poses on: {found})", where=path, cure="name one with --topic")
         topic = wanted[0]
-    log = _read_bag_topic(path, topic)
-    unused = [t for t in poses if t != topic]
-    note = f"poses on {', '.join(unused)} are not used: --topic takes them as the odometry, --truth-topic as truth"
-    return replace(log, notes=(*log.notes, note)) if unused else log
+    return replace(_read_bag_topic(path, topic, complete), other_topics=tuple(t for t in poses if t != topic))
 
 
-def _read_bag_topic(path: Path, topic: str) -> ForeignLog:
+def _read_bag_topic(path: Path, topic: str, complete: bool) -> ForeignLog:
     notes: list[str] = []
-    t, T, read = read_poses(path, topic, notes.append)
+    t, T, read = read_poses(path, topic, notes.append, complete=complete)
     log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
     twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
     still = still_axes(T)

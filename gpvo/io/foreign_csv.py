@@ -21,7 +21,10 @@ _STAMPS = ("t_ns", "t_us", "t_ms", "t_s")
 # Everything that a column can be mapped to.
 TARGETS = (*_STAMPS, *_POSE, *_COV, *COUNT_FIELDS, *FLOAT_FIELDS)
 
-_STAMP_NAMES = {"t", "time", "timestamp", "stamp", "sec", "secs", *(f"time_{u}" for u in UNITS_NS)}
+_STAMP_NAMES = {
+    *("t", "time", "timestamp", "stamp", "sec", "secs"),
+    *(f"{name}_{unit}" for name in ("time", "timestamp", "stamp") for unit in UNITS_NS),
+}
 _OPENVINS = {
     **{f"p{a}{b}": f"cov_{i}{j}" for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j},
     **{f"q{a}{b}": f"cov_{i + 3}{j + 3}" for i, a in enumerate("rpy") for j, b in enumerate("rpy") if i <= j},
@@ -158,6 +161,15 @@ def is_number(text: str) -> bool:
     return True
 
 
+def names_other_columns(words: list[str], count: int) -> bool:
+    """Whether the words above rows of ``count`` numbers name them, a stamp and a pose among them, and otherwise than
+    TUM has them."""
+    named = [_suggest(w) for w in words]
+    if len(words) != count or not {*named} & {*_STAMPS} or not {*named} >= {*_POSE}:
+        return False
+    return named != ["t_s", *_POSE]
+
+
 def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[str, int]:
     """Target name -> column index."""
     for column, target in mapping.items():
@@ -172,7 +184,14 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     found: dict[str, int] = {mapping[c]: header.index(c) for c in mapping}
     for index, column in enumerate(header):
         guess = None if column in mapping else _suggest(column)
-        if guess is not None and guess not in found and not (guess in _STAMPS and found.keys() & _STAMPS):
+        if guess is None or (guess in _STAMPS and found.keys() & _STAMPS):
+            continue
+        if guess not in _POSE or guess not in found:
+            found.setdefault(guess, index)
+        elif (other := header[found[guess]]) not in mapping and _is_plain(column) >= _is_plain(other):
+            if _is_plain(column) == _is_plain(other):
+                cure = f"say which with --map COLUMN={guess} and so on, in a ground truth with --truth-map"
+                raise SourceError(f"the columns '{other}' and '{column}' may both be {guess}", where=path, cure=cure)
             found[guess] = index
     absent = [p for p in _POSE if p not in found]
     if not found.keys() & _STAMPS:
@@ -186,10 +205,15 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     return found
 
 
+def _is_plain(column: str) -> bool:
+    """Whether the name of a column of poses does not say whose: ``p_x`` goes before ``gt_p_x``."""
+    return re.fullmatch(r"[a-z]*_?[xyzw]", column.strip().lower().replace(".", "_")) is not None
+
+
 def _suggest(column: str) -> str | None:
     """What a column name means to most people."""
-    unit = re.search(r"\[(.*?)\]", column)
-    name = re.sub(r"\[.*?\]", "", column).strip().lower().replace(".", "_").lstrip("#%").strip("_")
+    unit = re.search(r"[\[(](.*?)[\])]", column)
+    name = re.sub(r"[\[(].*?[\])]", "", column).strip().lower().replace(".", "_").lstrip("#%").strip("_")
     if name in TARGETS:
         return name
     if name in _STAMP_NAMES:

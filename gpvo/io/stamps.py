@@ -22,8 +22,9 @@ _MAX_CHARACTERS = 1_000_000
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 END_OF_ROS_NS = 2**31 * 10**9  # the stamps of ROS count seconds in 31 bits, from 1970 to January 2038
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-# Below which size a number is a time of the unit.
-_LIMITS = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (np.inf, "ns"))
+# Below which size a number is a time of the unit. Between the first two, seconds would be of after 2262 and
+# milliseconds of before 1973: such numbers are nanoseconds that count from zero.
+_LIMITS = ((9.2e9, "s"), (1e11, "ns"), (1e14, "ms"), (1e17, "us"), (np.inf, "ns"))
 # Usual intervals of any odometry [ns]; beyond them the stamps are in another unit.
 _SHORTEST_NS, _LONGEST_NS = 1e5, 2e10
 # The same where the stamps, read as nanoseconds, are of the size of today's microseconds: of frames 2 s apart, and no
@@ -73,7 +74,8 @@ def text_to_ns(text: str, unit: str) -> int:
 
 
 def likely_unit(text: str) -> str | None:
-    """The unit (of :data:`UNITS_NS`) that makes a number a time of 1973 to 2262; seconds for smaller ones.
+    """The unit (of :data:`UNITS_NS`) that makes a number a time of 1973 to 2262; for smaller ones seconds, or where
+    these would be too many nanoseconds.
 
     None where the text is no number.
     """

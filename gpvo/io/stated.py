@@ -103,7 +103,8 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     is positive definite for nearly all rows, as for an odometry that adds up its errors; a filter's is not, and stays
     as it is under the name ``imported_pose``, which is of the pose, not of one motion. Across a gap in the log the
     odometry was lost, whatever it says when it is there again; and of a motion whose turn it does not know to a radian
-    about any axis it knows nothing (as RTAB-Map says by a variance of 9999: introlab/rtabmap_ros, issue 80).
+    about any axis it knows nothing (as RTAB-Map says by a variance of 9999: introlab/rtabmap_ros, issue 80). Its pose
+    is a placeholder then: the last known one holds, and the motion from there to the next known one is unknown, too.
     """
     T = log.trajectory.T_world_body
     motions = se3.inverse(T[:-1]) @ T[1:]
@@ -112,7 +113,10 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     gaps = _after_gaps(t)
     unknown = set[int]()
     if cov is not None and name == IMPORTED:
-        unknown = set(np.flatnonzero(is_turn_unknown(cov)).tolist()) - {0, *gaps}
+        unstated = is_turn_unknown(cov) & (np.arange(len(T)) > 0)  # before the first row is no motion
+        known = np.maximum.accumulate(np.where(unstated, 0, np.arange(len(T))))
+        motions = se3.inverse(T[known[:-1]]) @ T[known[1:]]
+        unknown = set(np.flatnonzero(unstated | np.append(False, unstated[:-1])).tolist()) - set(gaps)
     lost = {**dict.fromkeys(gaps, "gap in the log"), **dict.fromkeys(unknown, "stated as unknown")}
     if gaps:
         notes = [*notes, f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}"]

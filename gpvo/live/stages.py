@@ -117,6 +117,7 @@ class PoseStage:
         """Begin anew with the next message."""
         self._watch = StampWatch()
         self._last: tuple[int, Array, Array | None] | None = None  # stamp, T_parent_cam, covariance of the pose
+        self._is_unknown = False
         self._growth: deque[bool] = deque(maxlen=200)
         self._moved, self._motions = np.zeros(6), 0  # sum of the squared motions of the body by axis, and their count
 
@@ -162,6 +163,12 @@ class PoseStage:
         T_prev_cur = se3.inverse(before[1]) @ T_parent_cam
         dt_s = (t_ns - before[0]) * 1e-9
         stated = self._stated(message, self.T_body_cam @ T_prev_cur @ self._T_cam_body, dt_s, before[2], pose)
+        was_unknown, self._is_unknown = (
+            self._is_unknown,
+            IMPORTED in stated and is_turn_unknown(stated[IMPORTED][None])[0],
+        )
+        if self._is_unknown:  # its pose is a placeholder, as in to_records
+            T_prev_cur, self._last = np.eye(4), (t_ns, before[1], pose)
         status, reason = Status.OK, ""
         rate = np.abs(se3.log(T_prev_cur)) / dt_s
         if seen is Sequence.GAP:
@@ -169,7 +176,7 @@ class PoseStage:
         elif rate[:3].max() > _MAX_MPS or rate[3:].max() > _MAX_RADPS:
             status, reason = Status.LOST, "impossible speed"
             self.counts["jumps"] += 1
-        elif IMPORTED in stated and is_turn_unknown(stated[IMPORTED][None])[0]:
+        elif self._is_unknown or was_unknown:
             status, reason = Status.LOST, "stated as unknown"
         return VoRecord(t_ns, before[0], status, T_prev_cur, reason=reason, covariances=stated)
 

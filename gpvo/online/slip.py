@@ -2,9 +2,10 @@
 
 The implied acceleration is compared with what the vehicle can do. Odometry's own noise, which enters with the square of
 the frame rate, raises the bound to eight times the median of what was seen, but to no more than four times the
-vehicle's. Disagreement with a gyro is compared with a high quantile of it, extrapolated from the history's
-upper tail (B. M. Hill, "A simple general approach to inference about the tail of a distribution", 1975; quantile after
-I. Weissman, 1978).
+vehicle's. Above 33 Hz the change of velocity is compared with what the vehicle can do in 30 ms: odometry that is
+propagated at 200 Hz is corrected by millimetres from frame to frame. Disagreement with a gyro is compared with a high
+quantile of it, extrapolated from the history's upper tail (B. M. Hill, "A simple general approach to inference about
+the tail of a distribution", 1975; quantile after I. Weissman, 1978).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ FALSE_FLAG_RATE = 1e-6
 
 _NOISE_MEDIANS = 8.0
 _MOST_NOISE = 4.0  # times the vehicle's bound
+_LEAST_STEP_S = 0.03
 _GYRO_TRUST_RADPS = 0.05  # Disagreement with a gyro of ordinary bias and scale error that is always believed.
 _HISTORY = 1000
 _ENOUGH = 50  # Fewer motions do not show a tail: then tail index _PRIOR_TAIL and the median stand in.
@@ -129,8 +131,8 @@ def _unflagged(record: VoRecord) -> VoRecord:
 
 
 def _rates(middle_s: float, now: Array, before: tuple[float, Array]) -> tuple[float, float]:
-    """Linear and angular acceleration implied by two velocities and the times they belong to."""
-    step_s = max(middle_s - before[0], 1e-6)
+    """Linear and angular acceleration implied by two velocities and the times they belong to, over 30 ms at least."""
+    step_s = max(middle_s - before[0], _LEAST_STEP_S)
     return lengths(((now - before[1]) / step_s).tolist())
 
 

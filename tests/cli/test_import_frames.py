@@ -87,6 +87,19 @@ def test_a_bag_holds_a_body_unless_its_frame_is_optical(make, poses, name, frame
     assert abs(turned[2, 3]) < 0.1 * AHEAD
 
 
+def test_ground_truth_in_the_same_bag_is_used_and_said_to_be(tmp_path):
+    maker, stamps = BagMaker(True), seq.stamps(N)
+    for k in range(N):
+        maker.odometry("/odom", stamps[k], BODY[k], np.zeros((6, 6)), np.eye(6) * 1e-4, "base_link")
+        maker.pose_with_covariance("/mocap", stamps[k], BODY[k], np.zeros((6, 6)), "world")
+    bag = maker.write(tmp_path / "a.bag")
+    with_truth = ("import", bag, "--topic", "/odom", "--truth", bag, "--truth-topic", "/mocap", "-o", tmp_path / "run")
+    assert "not used" not in _call(*with_truth)[0]
+    assert "poses on /mocap are not used" in _call("import", bag, "--topic", "/odom", "-o", tmp_path / "bare")[0]
+    result = CliRunner().invoke(app, ["doctor", str(bag), "--truth", str(bag)])
+    assert "which topic of the bag is the ground truth? (name it with --truth-topic)" in str(result.exception)
+
+
 def test_a_file_holds_a_camera_and_nothing_is_said(tmp_path):
     write_tum(tmp_path / "log.tum", np.array(seq.stamps(N)), CAMERA)
     assert _call("import", tmp_path / "log.tum", "-o", tmp_path / "run")[1] == ""

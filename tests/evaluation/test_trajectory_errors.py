@@ -98,6 +98,17 @@ def test_pairs_ahead_are_the_first_at_least_that_far():
     assert len(start) == len(end) == 0
 
 
+def test_over_a_gap_of_the_truth_no_segment_is_measured():
+    """It would be longer than it says, and its error with it."""
+    T = se3.exp(np.outer(np.arange(400), [0, 0, 0.1, 0, 0, 0]))
+    estimate = se3.exp(np.outer(np.arange(400), [0, 0, 0.101, 0, 0, 0]))
+    kept = np.r_[:150, 250:400]
+    e = trajectory_errors(np.arange(400)[kept] * 50_000_000, estimate[kept], T[kept], (10.0,), kept)
+    assert e.rpe_10m.translation_m.max == pytest.approx(0.1, rel=1e-6)
+    assert e.segments[0].translation_percent == pytest.approx(1.0, rel=1e-6)
+    assert e.segments[0].count == 10
+
+
 def test_an_error_at_the_end_is_the_final_error():
     T = _path()
     estimate = T.copy()

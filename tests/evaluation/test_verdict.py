@@ -45,6 +45,23 @@ def test_one_method(factor: float, colour: str, word: str) -> None:
         assert "by a factor of 3." in found.lines[0]
 
 
+def test_a_run_too_short_for_any_distance_is_judged_per_motion_alone() -> None:
+    log, truth = make_run(600)
+    short = VoLog(log.records[:12], log.camera)
+    found = verdict(evaluate_run(Run(Path("hall"), "hall", short, truth, None, Mounting(), [])))
+    assert "per motion; over a second or a distance, nothing can be judged" in found.headline
+
+
+def test_slips_that_the_model_names_are_no_lost_frames() -> None:
+    evaluation = evaluated({"triangulation": 1.0})
+    log = evaluation.run.log
+    called = [r.with_status(Status.LOST, "prediction") if k in (50, 51) else r for k, r in enumerate(log)]
+    told = " ".join(verdict(replace(evaluation, run=replace(evaluation.run, log=VoLog(called)))).lines)
+    assert f"The model calls 2 of {len(log)} motions lost, most as slips" in told
+    assert "--max-acceleration" in told
+    assert "no motion" not in told
+
+
 def test_translation_does_not_make_up_for_rotation() -> None:
     """Translation stated three times too large, rotation 1.55 times too small: as a whole that seems right."""
     sigma = np.repeat([3.0, 1 / 1.55], 3)

@@ -379,6 +379,26 @@ def test_poses_that_a_driver_publishes_twice_count_once(tmp_path):
     assert log.notes == ("20 of 40 messages on '/odom' repeat a stamp and were left out",)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_messages_without_a_pose_are_left_out_as_the_lost_odometry_sends_them(tmp_path, kind):
+    """RTAB-Map's, in ROS 1, has a quaternion of zeros; a ground truth with such messages is refused."""
+
+    def maker_of(ros1: bool) -> BagMaker:
+        maker = _odometry_bag(ros1, twist=True)
+        for k, value in ((7, 0.0), (8, 0.0), (12, float("nan"))):
+            q = maker.messages[k][2].pose.pose.orientation
+            q.x = q.y = q.z = q.w = value
+        return maker
+
+    path = _write(tmp_path, kind, maker_of)
+    log = read_foreign(path)
+    assert log.notes[0] == "3 of 20 messages on '/odom' hold no valid pose and were left out"
+    T = seq.true_poses(20)
+    np.testing.assert_allclose(to_records(log)[0][7].T_prev_cur, se3.inverse(T[6]) @ T[9], atol=1e-9)
+    with pytest.raises(SourceError, match="message 8 on '/odom' holds no valid pose"):
+        read_foreign(path, complete=True)
+
+
 def test_which_topic(tmp_path):
     maker = _odometry_bag(True, twist=True)
     maker.odometry("/other", seq.START_NS, np.eye(4), np.eye(6), np.eye(6))

@@ -11,10 +11,11 @@ from gpvo.cli.files import import_log
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL, check_same_rows, guess_format, read_foreign
+from gpvo.io.stamps import cure_of_seconds, likely_unit
 from gpvo.io.stated import to_records
 from gpvo.io.trajectory import write_tum
 from gpvo.stats.consistency import SEEN
-from gpvo.types import IMPORTED, Status
+from gpvo.types import IMPORTED, Status, VoLog
 
 N = 25
 T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
@@ -108,8 +109,12 @@ def test_a_motion_that_is_stated_as_unknown_is_lost(tmp_path):
     small, some = [1e-4] * N, [25.0 if k in (0, 8, 9, 10) else 1e-4 for k in range(N)]
     read = {"covariance_of": "motion", "covariance_axes": "body"}
     records, notes = to_records(read_foreign(_csv(tmp_path / "a.csv", header, [some] * 6), **read))
-    assert [k for k, r in enumerate(records) if r.status is Status.LOST] == [8, 9, 10]
-    assert notes[0].endswith("unknown: 3")
+    assert [k for k, r in enumerate(records) if r.status is Status.LOST] == [8, 9, 10, 11]
+    assert notes[0].endswith("unknown: 4")
+    # Whatever the poses of such rows are, the last known one holds, and the path goes on where it is known again.
+    placed = VoLog(records).trajectory()
+    np.testing.assert_allclose(placed[8:11], np.tile(placed[7], (3, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(se3.inverse(POSES[7]) @ POSES[11], records[11].T_prev_cur, atol=1e-9)
     planar = [small, small, [1e6] * N, [1e6] * N, [1e6] * N, small]
     records, notes = to_records(read_foreign(_csv(tmp_path / "b.csv", header, planar), **read))
     assert all(r.usable for r in records[1:])
@@ -174,6 +179,68 @@ def test_body_becomes_camera(tmp_path):
     np.testing.assert_allclose(xi, [0, 0, 1, 0, -0.1, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "#timestamp x y z qw qx qy qz",
+        "# timestamp(s) tx ty tz qw qx qy qz",
+        "# timestamp_s x y z qw qx qy qz id",
+        "#timestamp x y z qw qx qy qz vx vy vz id",
+    ],
+)
+def test_a_comment_that_names_the_columns_is_their_header(tmp_path, header):
+    """With w first, with more columns than TUM has, and with as many as KITTI has."""
+    further = len(header.lstrip("# ").split()) - 8
+    q = se3.rotation_to_quaternion_xyzw(POSES[:, :3, :3])
+    rows = [
+        " ".join([f"{t * 1e-9:.9f}", *(f"{v:.12g}" for v in (*T[:3, 3], r[3], *r[:3])), *["7"] * further])
+        for t, T, r in zip(T_NS, POSES, q, strict=True)
+    ]
+    (tmp_path / "a.txt").write_text("\n".join(["# made by hand", header, *rows]) + "\n")
+    np.testing.assert_allclose(read_foreign(tmp_path / "a.txt").trajectory.T_world_body, POSES, atol=1e-9)
+
+
+def test_the_comment_that_tum_has_changes_nothing(tmp_path):
+    write_tum(tmp_path / "a.tum", T_NS, POSES)
+    text = (tmp_path / "a.tum").read_text()
+    (tmp_path / "b.tum").write_text("# timestamp tx ty tz qx qy qz qw\n" + text)
+    assert guess_format(tmp_path / "b.tum") == "tum"
+    (tmp_path / "c.tum").write_text("# a b c d e f g h\n" + text)
+    assert guess_format(tmp_path / "c.tum") == "tum"
+
+
+def test_a_plain_column_goes_before_one_that_says_whose(tmp_path):
+    path = _csv(tmp_path / "a.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w,gt_p_x", [[9.0] * N])
+    np.testing.assert_allclose(read_foreign(path).trajectory.T_world_body, POSES, atol=1e-6)
+    text = path.read_text().splitlines()
+    swapped = [",".join([*line.split(",")[:1], line.split(",")[8], *line.split(",")[1:8]]) for line in text]
+    path.write_text("\n".join(swapped) + "\n")
+    np.testing.assert_allclose(read_foreign(path).trajectory.T_world_body, POSES, atol=1e-6)
+
+
+def test_a_robot_in_a_plane_may_state_its_three_axes_alone(tmp_path):
+    flat = se3.exp(np.outer(np.arange(N), [0.1, 0, 0, 0, 0, 0.05]))
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w,cov_xx,cov_yy,cov_yawyaw"
+    q = se3.rotation_to_quaternion_xyzw(flat[:, :3, :3])
+    lines = [",".join(map(str, [t, *T[:3, 3], *r, 1e-4, 2e-4, 1e-6])) for t, T, r in zip(T_NS, flat, q, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join([header, *lines]) + "\n")
+    read = {"covariance_of": "motion", "covariance_axes": "body"}
+    log = read_foreign(tmp_path / "a.csv", **read)
+    np.testing.assert_allclose(np.diagonal(log.covariance[5])[[0, 1, 5]], [1e-4, 2e-4, 1e-6])
+    assert all("imported" in r.covariances for r in to_records(log)[0][1:])
+    assert not log.notes
+    path = _csv(tmp_path / "b.csv", header, [[1e-4] * N, [2e-4] * N, [1e-6] * N])  # this one flies
+    log = read_foreign(path, **read)
+    assert log.covariance is None
+    assert "it has no cov_22, cov_33, cov_44" in log.notes[-1]
+
+
+@pytest.mark.parametrize("text", ["9300000000", "99000000000"])
+def test_nanoseconds_that_count_from_zero_are_named(text):
+    assert likely_unit(text) == "ns"
+    assert "nanoseconds" in cure_of_seconds(text)
+
+
 def test_covariance_follows_the_frame(tmp_path):
     header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
     path = _csv(tmp_path / "a.csv", header, [[1e-4 * (i + 1)] * N for i in range(6)])
@@ -196,6 +263,7 @@ def test_covariance_follows_the_frame(tmp_path):
         ("t_ns,x,y,z,qx,qy,qz,qw\n-1e999999999,0,0,0,0,0,0,1\n", "line 2: '-1e9{9}' is not a stamp in nanosec"),
         ("t_ns,x,y,z,qx,qy,qz,qw\ninf,0,0,0,0,0,0,1\n", "line 2: 'inf' is not a stamp in nanosec"),
         ("1,0,0,0,0,0,0,1\n", "no header line"),
+        ("t,gt_p_x,vo_p_x\n1,0,0\n", "'gt_p_x' and 'vo_p_x' may both be p_x .say which with --map COLUMN=p_x"),
         ("1 2 3\n", "not look like a trajectory"),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 import sequences as seq
 from bag_maker import BagMaker, stereo_bag
 from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.cli.files import import_log
 from gpvo.errors import CalibrationError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
@@ -62,7 +63,9 @@ def test_odometry_of_a_bag_that_is_not_used_is_named_with_the_option_that_takes_
     assert any("/wheels/odom" in n and "--topic /wheels/odom" in n and "--truth-topic" in n for n in notes)
     log = read_foreign(bag)
     assert log.topic == "/wheels/odom"
-    assert any("/vicon/head/head" in n and "--truth-topic" in n for n in log.notes)
+    assert log.other_topics == ("/vicon/head/head",)
+    notes = import_log(log, None, tmp_path / "run").notes
+    assert any("/vicon/head/head" in n and "--truth-topic" in n for n in notes)
 
 
 def _camera_info(path: Path, tx: float) -> None:

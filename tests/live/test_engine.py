@@ -143,6 +143,19 @@ def test_a_covariance_is_symmetric_if_rounding_is_all_that_differs() -> None:
         T = T @ se3.exp(rng.standard_normal(6) * 0.02)
 
 
+def test_a_placeholder_pose_of_a_lost_odometry_moves_nothing() -> None:
+    """RTAB-Map's, in ROS 2: the origin, with a variance of 9999. The way back from there is no motion either."""
+    live, known = PoseStage(TOPIC, T_FLU_OPTICAL), np.eye(6) * 1e-4
+    records = []
+    for k in range(12):
+        T = se3.exp(np.array([20.0 + 0.05 * k, 0, 0, 0, 0, 0]))
+        lost = k in (5, 6)
+        [taken] = live.take(_planar(k, np.eye(4) if lost else T, known * (9999e4 if lost else 1)))
+        records.append(taken.record)
+    assert [k for k, r in enumerate(records) if r.status is Status.LOST] == [5, 6, 7]
+    assert max(np.linalg.norm(r.T_prev_cur[:3, 3]) for r in records) == pytest.approx(0.15)
+
+
 def test_the_twist_is_in_the_child_frame_and_the_pose_in_its_parent() -> None:
     """A body that only drives forward, heading north: the twist is along its x, the pose moves along odom's y."""
     north = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gpvo.geometry import se3
 from gpvo.online.slip import SlipDetector, flag_slips, tail_quantile
-from gpvo.types import VEHICLES, Status, VoLog
+from gpvo.types import VEHICLES, Status, VoLog, VoRecord
 from synthetic_runs import make_run
 
 
@@ -107,3 +107,29 @@ def test_jumps_of_metres_in_real_logs(real_data: Path):
     log = VoLog([start] + [VoRecord(int(b), int(a), Status.OK, m) for a, b, m in zip(t[:-1], t[1:], motions)])
     assert _lost(flag_slips(log)) == [97, 315]
     assert _lost(flag_slips(replace(log, vehicle=VEHICLES["car"]))) == [97, 315]
+
+
+def _at_200_hz(speed_mps: float, n: int = 1500) -> list[VoRecord]:
+    """Ahead and in a gentle turn, without an error."""
+    motion = se3.exp(np.array([0, 0, speed_mps, 0, 0.1, 0]) * 0.005)
+    t = [5_000_000 * k for k in range(n)]
+    start = VoRecord(0, 0, Status.START, np.eye(4))
+    return [start, *(VoRecord(t[k], t[k - 1], Status.OK, motion) for k in range(1, n))]
+
+
+@pytest.mark.parametrize("correction_m", [0.0, 5e-3])
+def test_a_propagated_odometry_of_200_hz_makes_no_slips(correction_m):
+    """Noise of a millimetre and 0.3 mrad, which is 100 m/s^2 and more at this rate; then corrections at 20 Hz, too."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((1500, 6)) * ([1e-3] * 3 + [3e-4] * 3)
+    noise[::10, :3] += correction_m * rng.standard_normal((150, 3)) / np.sqrt(3)
+    records = [replace(r, T_prev_cur=r.T_prev_cur @ se3.exp(e)) for r, e in zip(_at_200_hz(1.0), noise, strict=True)]
+    noisy = VoLog([records[0], *records[1:]])
+    assert _lost(flag_slips(noisy)) == []
+    assert _lost(flag_slips(_with_jump(noisy, 700, metres=0.1))) == [700]
+
+
+def test_a_speed_that_was_never_driven_is_caught_at_200_hz():
+    records = _at_200_hz(10.0)
+    halted = [replace(r, T_prev_cur=np.eye(4)) if 300 <= k < 340 else r for k, r in enumerate(records)]
+    assert _lost(flag_slips(VoLog(halted)))[:10] == list(range(300, 310))
