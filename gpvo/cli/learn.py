@@ -99,6 +99,11 @@ def train(
         note(
             f"gpvo: log and truth never differ in {', '.join(axes)} (a plane?): the model states next to nothing there"
         )
+    if target == "frame" and (noisy := _noisy_truths(runs)):
+        note(
+            f"gpvo: the noise of the ground truth outweighs the odometry's errors of single motions in {noisy}: for a"
+            " motion, the model states both together; over a distance, where the noise does not add up, the odometry's"
+        )
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:
@@ -109,6 +114,15 @@ def train(
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", sampled from {given}" if given > kept else ""
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
+
+
+def _noisy_truths(paths: list[Path]) -> str:
+    """Names of the runs whose truth cannot judge single motions."""
+    from gpvo.dataset.errors import outweighed_by_truth
+    from gpvo.io.run import read_run
+
+    read = (read_run(p) for p in paths if p.is_dir())
+    return ", ".join(run.name for run in read if run.truth is not None and outweighed_by_truth(run.log, run.truth))
 
 
 def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path | None) -> None:

@@ -72,6 +72,24 @@ def steps_of_slow_truth(truth: TruthLog, t_ns: NDArray[np.int64]) -> tuple[float
     return (step_s, frame_s) if step_s > 1.2 * frame_s else None
 
 
+_STRAIGHT_M, _FEWEST_KNOTS = 5e-6, 5
+
+
+def interpolated_between(truth: TruthLog) -> int | None:
+    """Every how many poses a truth was measured, if the others lie on straight lines between, to the digits of a file:
+    somebody has interpolated it. None for any other truth."""
+    t_s = (truth.t_ns - truth.t_ns[0]) * 1e-9
+    bend_m = np.linalg.norm(
+        np.diff(np.diff(truth.T_world_cam[:, :3, 3], axis=0) / np.diff(t_s)[:, None], axis=0), axis=1
+    )
+    bends = np.flatnonzero(bend_m * np.diff(t_s)[1:] > _STRAIGHT_M)
+    if len(bends) < _FEWEST_KNOTS:
+        return None
+    apart, count = np.unique(np.diff(bends), return_counts=True)
+    usual = int(apart[count.argmax()])
+    return usual if usual > 2 and count.max() > 0.5 * count.sum() else None
+
+
 def interpolation_sigma(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array:
     """(6,) standard deviation [m, rad] of interpolated poses of a truth slower than the frames at ``t_ns``; else 0.
 
@@ -244,6 +262,12 @@ def telling_distance_m(log: VoLog, T_true: Array, known: NDArray[np.bool_], sigm
             return 0.0 if span == 1 else float(np.median(path_m[start + span] - path_m[start]))
         span *= 2
     return float("inf")
+
+
+def outweighed_by_truth(log: VoLog, truth: TruthLog) -> bool:
+    """Whether the truth's noise, estimated, outweighs the odometry's errors of single motions."""
+    sigma = estimate_truth_noise(motion_errors(log, truth), log)
+    return telling_distance_m(log, *interpolate_truth(truth, log.t_ns), sigma) > 0.0
 
 
 def velocity_path(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gpvo.dataset.errors import MAX_GAP_S, steps_of_slow_truth, turn_without_truth_deg
+from gpvo.dataset.errors import MAX_GAP_S, interpolated_between, steps_of_slow_truth, turn_without_truth_deg
 from gpvo.evaluation.consistency import Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.online.features import AXES
@@ -255,6 +255,11 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
             else f"nothing is interpolated over more than {MAX_GAP_S:g} s"
         )
         yield f"The ground truth comes every {steps_s[0]:.2g} s, the frames every {steps_s[1]:.2g} s: {between}."
+    if every := interpolated_between(e.run.truth):
+        yield (
+            f"Between every {every}th pose the ground truth runs straight: it was interpolated, and looks surer than it"
+            " is. Give the poses as they were measured."
+        )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
     if true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:

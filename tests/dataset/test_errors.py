@@ -9,7 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gpvo.dataset.errors import estimate_truth_noise, interpolate_truth, motion_errors, telling_distance_m
+from gpvo.dataset.errors import (
+    estimate_truth_noise,
+    interpolate_truth,
+    interpolated_between,
+    motion_errors,
+    outweighed_by_truth,
+    telling_distance_m,
+)
 from gpvo.dataset.hand_eye import fixed_rotation
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.verdict import verdict
@@ -188,6 +195,30 @@ def test_the_truth_tells_over_a_distance(flights):
     assert distances[:2] == [0.0, 0.0]
     assert 0.1 < distances[2] < 30.0
     assert np.isinf(distances[3])
+
+
+@pytest.mark.parametrize("every", [5, 10])
+def test_a_truth_that_was_interpolated_is_named(flights, every):
+    """On straight lines between every n-th pose, written with six digits; what was measured is not, nor is rest."""
+    for run in flights:
+        truth = run.truth
+        assert interpolated_between(truth) is None
+        t_s, p = truth.t_ns * 1e-9, truth.T_world_cam[:, :3, 3]
+        kept = slice(None, None, every)
+        T = truth.T_world_cam[: (len(p) - 1) // every * every + 1].copy()
+        lines = [np.interp(t_s[: len(T)], t_s[kept], axis[kept]) for axis in p.T]
+        T[:, :3, 3] = np.round(np.stack(lines, axis=1), 6)
+        straight = TruthLog(truth.t_ns[: len(T)], T)
+        assert interpolated_between(straight) == every
+        told = " ".join(verdict(evaluate_run(replace(run, truth=straight))).lines)
+        assert f"Between every {every}th pose" in told
+    assert interpolated_between(TruthLog(truth.t_ns, np.tile(np.eye(4), (len(p), 1, 1)))) is None
+
+
+def test_noise_of_the_truth_that_outweighs_motions_is_known_before_training(flights):
+    for k, run in enumerate(flights):
+        assert not outweighed_by_truth(run.log, run.truth)
+        assert outweighed_by_truth(run.log, noisy(run.truth, k, 0.05, 0.005))
 
 
 def test_evaluate_says_so_and_counts_it_in(flights):

@@ -91,7 +91,11 @@ def test_outside_the_domain_is_never_green() -> None:
 @pytest.mark.parametrize(("angle_deg", "asks"), [(2.0, False), (89.0, False), (120.0, True), (179.5, True)])
 def test_a_rotation_that_no_mounting_has_is_asked_about(angle_deg: float, asks: bool) -> None:
     found = verdict(replace(evaluated({"triangulation": 1.0}), turned=FixedRotation(angle_deg, (0.0, 0.0, 0.0), -0.5)))
-    [line] = [line for line in found.lines if f"fixed rotation of {angle_deg:.2f} deg (mounting or calibration" in line]
+    [line] = [
+        line
+        for line in found.lines
+        if f"fixed rotation of {angle_deg:.2f} deg (mounting, calibration, or a steady bias" in line
+    ]
     assert ("quaternion's order" in line) is asks
     assert ("--frame" in line) is asks
     assert "50 % smaller" in line
