@@ -85,7 +85,7 @@ def import_log(
     log = log.shifted(time_offset_s) if time_offset_s else log
     records, notes = to_records(log)
     notes += assumed
-    read = truth.topic if truth is not None and truth.path.samefile(log.path) else None
+    read = truth.topic if truth is not None and truth.path.resolve() == log.path.resolve() else None
     if unread := ", ".join(t for t in log.other_topics if t != read):
         notes.append(f"poses on {unread} are not used: --topic takes them as the odometry, --truth-topic as truth")
     fixed: FixedTransform | None = None

@@ -102,7 +102,7 @@ def train(
     if target == "frame" and (noisy := _noisy_truths(runs)):
         note(
             f"gpvo: the noise of the ground truth outweighs the odometry's errors of single motions in {noisy}: for a"
-            " motion, the model states both together; over a distance, where the noise does not add up, the odometry's"
+            " motion the model states both together, over a distance the odometry's alone, as the noise does not add up"
         )
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}

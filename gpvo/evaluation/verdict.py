@@ -257,7 +257,7 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
         yield f"The ground truth comes every {steps_s[0]:.2g} s, the frames every {steps_s[1]:.2g} s: {between}."
     if every := interpolated_between(e.run.truth):
         yield (
-            f"Between every {every}th pose the ground truth runs straight: it was interpolated, and looks surer than it"
+            f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks surer than it"
             " is. Give the poses as they were measured."
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))

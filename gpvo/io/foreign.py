@@ -101,8 +101,8 @@ def guess_format(path: Path) -> str:
     if path.is_dir():
         raise SourceError("is a folder, not a log", where=path, cure="name the trajectory file or the bag")
     lines = [text for _, (_, text) in zip(range(50), text_lines(path))]
-    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), 0)
-    data, above = (lines[first], lines[:first]) if lines else ("", [])
+    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    data, above = "".join(lines[first : first + 1]), lines[:first]
     words = data.split()
     if "," in data or ";" in data or (words and not all(is_number(w) for w in words)):
         return "csv"

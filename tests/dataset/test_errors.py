@@ -211,7 +211,7 @@ def test_a_truth_that_was_interpolated_is_named(flights, every):
         straight = TruthLog(truth.t_ns[: len(T)], T)
         assert interpolated_between(straight) == every
         told = " ".join(verdict(evaluate_run(replace(run, truth=straight))).lines)
-        assert f"Between every {every}th pose" in told
+        assert f"straight pieces of {every} poses" in told
     assert interpolated_between(TruthLog(truth.t_ns, np.tile(np.eye(4), (len(p), 1, 1)))) is None
 
 
