@@ -211,7 +211,7 @@ def _unused(table: Table, covariance: Array | None) -> tuple[str, ...]:
 
 
 def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) -> Array | None:
-    """(N, 6, 6) of the covariance columns; what is not stated is zero, None where nothing is."""
+    """(N, 6, 6) of the covariance columns; what is not stated is zero, what is not finite NaN. None where none is."""
     if not any(f"cov_{i}{i}" in columns for i in range(6)):
         return None
     C = np.zeros((int(known.sum()), 6, 6))
@@ -221,7 +221,7 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
                 C[:, i, j] = columns[f"cov_{i}{j}"][known]
                 if f"cov_{j}{i}" not in columns:
                     C[:, j, i] = C[:, i, j]
-    return C
+    return np.where(np.isfinite(C), C, np.nan)
 
 
 def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
@@ -326,7 +326,8 @@ def _bag_covariance(read: list[Any], name: str) -> Array | None:
     """(N, 6, 6) covariances of a field of the messages, None where their type has none."""
     if not hasattr(getattr(read[0], name, None), "covariance"):
         return None
-    return np.array([getattr(m, name).covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
+    C = np.array([getattr(m, name).covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
+    return np.where(np.isfinite(C), C, np.nan)
 
 
 def _looks_stated(covariance: Array) -> bool:

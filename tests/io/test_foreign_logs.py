@@ -235,6 +235,14 @@ def test_a_robot_in_a_plane_may_state_its_three_axes_alone(tmp_path):
     assert "it has no cov_22, cov_33, cov_44" in log.notes[-1]
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_infinite_variance_is_an_unknown_one(tmp_path):
+    header = "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w," + ",".join(f"cov_{i}{i}" for i in range(6))
+    columns = [[1e-4] * 5 + ["inf"] + [1e-4] * (N - 6), *[[1e-4] * N] * 5]
+    log = read_foreign(_csv(tmp_path / "a.csv", header, columns))
+    assert np.isfinite(log.covariance).all(axis=(1, 2)).sum() == N - 1
+
+
 @pytest.mark.parametrize("text", ["9300000000", "99000000000"])
 def test_nanoseconds_that_count_from_zero_are_named(text):
     assert likely_unit(text) == "ns"
