@@ -48,7 +48,8 @@ of a covariance: neither odometry nor truth speaks of it."""
 
 def seen_axes(error: Array) -> NDArray[np.intp]:
     """The axes (k,) of errors, or of motions, (n, d) that reach :data:`SEEN` in the root mean square."""
-    return np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
+    with np.errstate(over="ignore"):  # of a log that is absurd otherwise, too
+        return np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
 
 
 def counted_axes(axes: ArrayLike | None, d: int) -> NDArray[np.intp]:
