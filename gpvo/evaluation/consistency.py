@@ -27,6 +27,9 @@ from gpvo.stats.consistency import (
 from gpvo.stats.series import Interval, block_bootstrap
 from gpvo.types import Array, VoLog
 
+BY_MODEL = "prediction"
+"""The last reason of a motion whose status is the model's and not the odometry's."""
+
 HORIZONS_M = (1.0, 10.0, 100.0)
 _MAX_WINDOWS = 60
 # Times that are sums of a frame period must not miss the round number.

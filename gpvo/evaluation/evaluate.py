@@ -23,7 +23,7 @@ from gpvo.dataset.errors import (
 )
 from gpvo.dataset.hand_eye import FixedRotation, InversePoses, fixed_rotation, inverse_poses, late_by
 from gpvo.errors import GpvoError, SourceError
-from gpvo.evaluation.consistency import Consistency, consistency
+from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import (
     PoseConsistency,
@@ -223,7 +223,7 @@ def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
     records = []
     for r in log:
         p = predictions.get(r.t_ns)
-        records.append(r if p is None or r.status is Status.START else r.with_status(p.status, "prediction"))
+        records.append(r if p is None or r.status is Status.START else r.with_status(p.status, BY_MODEL))
     return replace(log, records=records)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gpvo.dataset.errors import MAX_GAP_S, interpolated_between, steps_of_slow_truth, turn_without_truth_deg
-from gpvo.evaluation.consistency import Consistency, Horizon
+from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
@@ -195,7 +195,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if e.in_domain is not None:
         yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
     reasons = [r.reason for r in e.run.log if r.status is Status.LOST]
-    by_model = reasons.count("prediction")
+    by_model = sum(reason.endswith(BY_MODEL) for reason in reasons)
     if lost := len(reasons) - by_model:
         yield f"{lost} of {len(e.run.log)} frames {'has' if lost == 1 else 'have'} no motion."
     if by_model:

@@ -205,12 +205,9 @@ class PoseStage:
 
     def _of_camera(self, covariance: Array, variance: Array | None = None) -> Array | None:
         """A covariance (6, 6) of the body in the camera's axes; None where it is none."""
-        C = symmetrise(covariance)
-        if not is_positive_definite(C):
-            C = definite_in_plane(C[None], self._still, None if variance is None else variance[None])[0]
-            if not is_positive_definite(C):
-                return None
-        return symmetrise(change_body(self._T_cam_body, C))
+        of_pose = None if variance is None else variance[None]
+        C = definite_in_plane(symmetrise(covariance)[None], self._still, of_pose)[0]
+        return symmetrise(change_body(self._T_cam_body, C)) if is_positive_definite(C) else None
 
 
 def _pose_covariance(message: Any, T_parent_body: Array) -> Array | None:

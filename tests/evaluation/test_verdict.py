@@ -14,6 +14,7 @@ from gpvo.dataset.build import build
 from gpvo.dataset.errors import interpolate_truth, turn_without_truth_deg
 from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.errors import GpvoError, SourceError
+from gpvo.evaluation.consistency import BY_MODEL
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.panels import _LEVELS, reliability
 from gpvo.evaluation.verdict import verdict
@@ -55,7 +56,8 @@ def test_a_run_too_short_for_any_distance_is_judged_per_motion_alone() -> None:
 def test_slips_that_the_model_names_are_no_lost_frames() -> None:
     evaluation = evaluated({"triangulation": 1.0})
     log = evaluation.run.log
-    called = [r.with_status(Status.LOST, "prediction") if k in (50, 51) else r for k, r in enumerate(log)]
+    weak = {51: replace(log.records[51], status=Status.DEGRADED, reason="few inliers")}
+    called = [weak.get(k, r).with_status(Status.LOST, BY_MODEL) if k in (50, 51) else r for k, r in enumerate(log)]
     told = " ".join(verdict(replace(evaluation, run=replace(evaluation.run, log=VoLog(called)))).lines)
     assert f"The model calls 2 of {len(log)} motions lost, most as slips" in told
     assert "--max-acceleration" in told
