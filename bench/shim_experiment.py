@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from gpvo.cli.files import import_log
 from gpvo.dataset.build import TrainingSet
+from gpvo.dataset.check import check
 from gpvo.files import write_json
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run import read_run
-from gpvo.learning.check import check
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.methods import method_arrays, score
 from gpvo.learning.train import TrainedModel, estimate_set, train_sets

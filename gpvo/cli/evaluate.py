@@ -174,7 +174,7 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
     options = judge.options()
     loaded, predictor = _loaded(runs, judge)
     if predictor is not None and judge.model is not None:
-        from gpvo.learning.check import check
+        from gpvo.dataset.check import check
 
         for run in loaded:
             for problem in check(predictor, run).problems:
@@ -187,7 +187,7 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
 
 def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
     """Say it again at the end, where it is read."""
-    from gpvo.learning.check import ENOUGH_INSIDE
+    from gpvo.dataset.check import ENOUGH_INSIDE
 
     outside = [e for e in found if e.in_domain is not None and e.in_domain < ENOUGH_INSIDE]
     if model is not None and outside:

@@ -78,8 +78,8 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
     """
     from dataclasses import asdict
 
+    from gpvo.dataset.check import check as check_model
     from gpvo.io.run import read_run
-    from gpvo.learning.check import check as check_model
     from gpvo.online.predictor import Predictor
 
     found = check_model(Predictor.load(model), read_run(run))

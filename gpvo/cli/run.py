@@ -53,8 +53,8 @@ def run(
     Example: gpvo run MH_01_easy/ -o runs/mh01
     """
     from gpvo import runner
+    from gpvo.dataset.check import ENOUGH_INSIDE, odometry_problems
     from gpvo.io import open_source
-    from gpvo.learning.check import ENOUGH_INSIDE, odometry_problems
     from gpvo.online.predictor import Predictor
 
     config = odometry.config(vehicle.bounds())

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.dataset.check import check
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
 from gpvo.evaluation.flights import constants_in, constants_of, flight_of, start_sigmas
@@ -22,7 +23,6 @@ from gpvo.filters.run import Flight, FusedRun, FuseOptions, begin
 from gpvo.filters.sanity import require_sane
 from gpvo.filters.study import Constants, Study, fit_scalars, make_policies, study
 from gpvo.io.run import Run, read_run
-from gpvo.learning.check import check
 from gpvo.online.predictor import Predictor
 from gpvo.twin.gap import simulated_truth
 from gpvo.types import IMPORTED, Array

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from gpvo.dataset.check import ENOUGH_INSIDE
 from gpvo.dataset.errors import MAX_GAP_S, interpolated_between, steps_of_slow_truth, turn_without_truth_deg
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
-from gpvo.learning.check import ENOUGH_INSIDE
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
 from gpvo.types import Array, Status

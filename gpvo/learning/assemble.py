@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.dataset.build import group_folds
 from gpvo.learning.basefit import learn_domain, learn_velocities
 from gpvo.learning.calibrate import (
     LEVELS,
@@ -19,10 +21,10 @@ from gpvo.learning.calibrate import (
     fit_scale,
 )
 from gpvo.learning.logvariance import log_ratio
-from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
+from gpvo.learning.parts import MOST_ROWS, PRIORS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
 from gpvo.learning.poses import Motions, Poses, added_factor, pose_losses, poses_of, with_added
-from gpvo.learning.rows import Rows, significant_gain
+from gpvo.learning.rows import Rows, significant_gain, simplest_sufficient
 from gpvo.learning.spans import at_most
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
 from gpvo.online.division import Division, ln_faster, of_calibration
@@ -34,6 +36,7 @@ from gpvo.types import Array
 
 _WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _LEAST_KNOWN = 0.5
+_MOST_FOLDS = 5
 
 
 def assemble(
@@ -52,7 +55,14 @@ def assemble(
     """
     error = rows.error
     scale = fit_scale(error / np.sqrt(variance), rows.group)
-    of = _Residuals(rows, error, variance * scale.factor, rows.select(columns), rows.geometry(base.method))
+    of = _Residuals(
+        rows,
+        error,
+        variance * scale.factor,
+        rows.select(columns),
+        rows.geometry(base.method),
+        group_folds(rows.group, _MOST_FOLDS),
+    )
     z = error / np.sqrt(of.variance)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z**2).mean(axis=1), rows.group)
@@ -60,14 +70,14 @@ def assemble(
     places = np.array([columns.index(n) for n in inputs or columns[:1]], dtype=np.int64)
     if gp is not None:
         high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
-    division, parts = _division_of(of)
+    divided = _divided(of)
     model = ErrorModel(
         columns=columns,
         inputs=places,
         gp=gp or ProjectedGP.constant(np.zeros(6)),
         domain=domain,
         base=base,
-        division=division,
+        division=divided.whole,
         velocities=learn_velocities(rows),
         factor=scale.factor,
         outside_power=np.array([outside_power]),
@@ -76,8 +86,8 @@ def assemble(
         nu=np.zeros(1),
         dt_s=rows.step_s,
     )
-    parts, found = _with_calibration(model, of, (parts, _most_likely(model, of)))
-    return found.model, _calibration(rows, scale, found, parts, np.abs(z) / np.sqrt(found.joint))
+    found = _with_calibration(model, of, _most_likely(model, of, divided))
+    return found.model, _calibration(rows, scale, found, np.abs(z) / np.sqrt(found.joint))
 
 
 @dataclass(frozen=True)
@@ -90,12 +100,8 @@ class _Residuals:
     variance: Array
     X: Array
     geometry: Array | None
+    fold: NDArray[np.int64]
     patterns: Patterns | None = None
-
-    def _folds(self) -> list[tuple[NDArray[np.bool_], Array]]:
-        """Rows (n,) of each fold, and the patterns learned from the other flights."""
-        assert self.patterns is not None
-        return [(self.patterns.fold == k, patterns) for k, patterns in enumerate(self.patterns.without)]
 
     def of_calibration(self) -> tuple[Array | None, Array, Array]:
         """Root (n, 6, 6) of the covariance due to a wrong calibration, by the patterns of other flights; the variance
@@ -103,123 +109,149 @@ class _Residuals:
         if self.patterns is None:
             return None, self.variance, self.error
         twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.error), 6, 6)), self.variance.copy()
-        for fold, patterns in self._folds():
-            root[fold], rest[fold] = of_calibration(self.variance[fold], patterns, twist[fold])
+        for k, patterns in enumerate(self.patterns.without):
+            of = self.fold == k
+            root[of], rest[of] = of_calibration(self.variance[of], patterns, twist[of])
         return root, rest, self.error - self.patterns.error
 
-    def divided(self, model: ErrorModel) -> tuple[Array, ...]:
-        """Covariances (n, 6, 6) of jitter and white noise, and the root (n, 6, 12) of bias and calibration, by the
-        patterns of the other flights."""
-        twist, geometry = model.twist(self.X), self.geometry
 
-        def split(of: Any, division: Division) -> tuple[Array, ...]:
-            e = division.split(self.variance[of], twist[of], None if geometry is None else geometry[of])
-            return e.jitter, e.white, e.persistent_root
+@dataclass(frozen=True)
+class _Divided:
+    """How errors add up, learned from all flights, with the ``parts`` that it rests on, and from those ``without`` each
+    fold: by the latter, poses show what is stated of a flight that nothing was learned from."""
 
-        if self.patterns is None:
-            return split(slice(None), model.division)
-        out = tuple(np.empty((len(twist), 6, k)) for k in (6, 6, 12))
-        for fold, patterns in self._folds():
-            for whole, part in zip(out, split(fold, replace(model.division, calibration_patterns=patterns))):
-                whole[fold] = part
+    whole: Division
+    parts: Parts
+    without: Sequence[Division]
+
+    def changed(self, change: Callable[[Division], Division]) -> _Divided:
+        """All of them, with the same change."""
+        return replace(self, whole=change(self.whole), without=[change(d) for d in self.without])
+
+    def split(self, of: _Residuals) -> tuple[Array, ...]:
+        """Covariances (n, 6, 6) of jitter and white noise, and the root (n, 6, 12) of bias and calibration, by what the
+        other flights show."""
+        twist, out = of.rows.select(TWIST_COLUMNS), tuple(np.empty((len(of.error), 6, k)) for k in (6, 6, 12))
+        for k, division in enumerate(self.without):
+            i = of.fold == k
+            e = division.split(of.variance[i], twist[i], None if of.geometry is None else of.geometry[i])
+            for every, part in zip(out, (e.jitter, e.white, e.persistent_root)):
+                every[i] = part
         return out
 
 
 @dataclass(frozen=True)
 class _Consistent:
-    """A model calibrated for poses and for all six axes jointly, with the factors of both, and its loss on the poses of
-    each sequence (S,)."""
+    """A model calibrated for poses and for all six axes jointly, with the factors of both, the parts that its division
+    rests on, and its loss on the poses of each sequence (S,)."""
 
     model: ErrorModel
     added: float
     joint: float
+    parts: Parts
     losses: Array
 
 
-def _most_likely(model: ErrorModel, of: _Residuals) -> _Consistent:
-    """The calibrated model, with the share of the geometry's correlations under which poses and motions are likeliest;
-    none if the geometry is mostly unknown."""
+def _most_likely(model: ErrorModel, of: _Residuals, divided: _Divided) -> _Consistent:
+    """The calibrated model, with the strongest prior of the parts' correlations, and the least share of the geometry's,
+    that no other beats by a significant gain in the poses; none if the geometry is mostly unknown."""
+    priors = [divided, *(_divided(of, divided.parts, prior) for prior in PRIORS[1:])]
+    first = [_consistent(model, of, d) for d in priors]
+    best = simplest_sufficient({k: found.losses for k, found in enumerate(first)})
     if of.geometry is None or np.isfinite(of.geometry).all(axis=(1, 2)).mean() < _LEAST_KNOWN:
-        return _consistent(model, of)
-    tried = [_consistent(_with_division(model, geometry_weight=np.array([w])), of) for w in _WEIGHTS]
-    return min(tried, key=lambda found: found.losses.mean())
+        return first[best]
+    weighted = (priors[best].changed(partial(replace, geometry_weight=np.array([w]))) for w in _WEIGHTS[1:])
+    tried = [first[best], *(_consistent(model, of, d) for d in weighted)]
+    return tried[simplest_sufficient({k: found.losses for k, found in enumerate(tried)})]
 
 
-def _consistent(model: ErrorModel, of: _Residuals) -> _Consistent:
+def _consistent(model: ErrorModel, of: _Residuals, divided: _Divided) -> _Consistent:
     """The model, calibrated for poses and for all six axes jointly."""
-    whole, joint, poses = _jointly(model, of)
-    added = added_factor(poses, model.division.share)
+    whole, joint, poses = _jointly(of, divided)
+    added = added_factor(poses, divided.whole.share)
     if added != 1.0:
-        model = _with_division(model, share=with_added(model.division.share, added))
-        whole, joint, poses = _jointly(model, of)
+        divided = divided.changed(lambda d: replace(d, share=with_added(d.share, added)))
+        whole, joint, poses = _jointly(of, divided)
     nu = student_t.fit_dof(nees(of.error, whole), of.error.shape[1], of.rows.weight)
-    typical = float(np.median(np.linalg.slogdet(whole)[1]))
+    typical, division = float(np.median(np.linalg.slogdet(whole)[1])), divided.whole
     model = replace(
         model,
+        division=replace(
+            division,
+            level=division.level + np.log(joint),
+            calibration_patterns=division.calibration_patterns * np.sqrt(joint),
+        ),
         factor=model.factor * joint,
         typical_ln_det=np.array([typical]),
         nu=np.array([0.0 if np.isinf(nu) else nu]),
     )
-    level, patterns = model.division.level + np.log(joint), model.division.calibration_patterns * np.sqrt(joint)
-    model = _with_division(model, level=level, calibration_patterns=patterns)
-    return _Consistent(model, added, joint, pose_losses(poses))
+    return _Consistent(model, added, joint, divided.parts, pose_losses(poses))
 
 
-def _jointly(model: ErrorModel, of: _Residuals) -> tuple[Array, float, list[Poses]]:
+def _jointly(of: _Residuals, divided: _Divided) -> tuple[Array, float, list[Poses]]:
     """Covariances (n, 6, 6) of motions, times the factor that makes their joint NEES right; the factor; and poses with
     such covariances."""
-    jitter, white, root = of.divided(model)
+    jitter, white, root = divided.split(of)
     whole = jitter + white + root @ np.swapaxes(root, -1, -2)
     joint = fit_joint_factor(of.error, whole, of.rows.group)
     stated = (of.rows.motions(), of.error, jitter * joint, white * joint, root * np.sqrt(joint))
     chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
     chains = [Motions(i, *(x[c] for x in stated)) for i, cs in enumerate(chosen) for c in cs]
-    phi = np.exp(-of.rows.step_s / model.division.persistent_tau_s)
+    phi = np.exp(-of.rows.step_s / divided.whole.persistent_tau_s)
     return whole * joint, joint, poses_of(chains, phi)
 
 
-def _with_division(model: ErrorModel, **changed: Array) -> ErrorModel:
-    return replace(model, division=replace(model.division, **changed))
-
-
-_Found = tuple[Parts, _Consistent]
-
-
-def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Found) -> _Found:
+def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Consistent) -> _Consistent:
     """The same with a part for a wrong calibration, if the patterns of other flights make the poses likelier by a
     significant gain."""
-    patterns = learn_patterns(of.rows, of.error, of.variance)
+    patterns = learn_patterns(of.rows, of.error, of.variance, of.fold)
     if patterns is None:
         return plain
     of = replace(of, patterns=patterns)
-    division, parts = _division_of(of)
-    found = _most_likely(replace(bare, division=division), of)
-    return (parts, found) if significant_gain(plain[1].losses - found.losses) else plain
+    found = _most_likely(bare, of, _divided(of))
+    return found if significant_gain(plain.losses - found.losses) else plain
 
 
-def _division_of(of: _Residuals) -> tuple[Division, Parts]:
-    """How errors add up, without the geometry's correlations so far."""
-    rows = of.rows
-    v_mps = rows.select(TWIST_COLUMNS[:3])
-    ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
-    faster = ln_faster(v_mps, ln_speed)
+def _divided(of: _Residuals, like: Parts | None = None, prior: float = PRIORS[0]) -> _Divided:
+    """How errors add up, without the geometry's correlations so far; ``like``: see :func:`fit_parts`."""
     root, rest, left = of.of_calibration()
-    sigma = np.sqrt(rest)
-    errors, sigmas = rows.chains(left), rows.chains(sigma)
+    usual = None if of.patterns is None else of.patterns.usual
+    whole, parts = _division(of.rows, (of.error, rest, left, root), usual, like, prior)
+    without = []
+    for k in np.unique(of.fold):
+        kept = of.fold != k
+        some = of.error[kept], rest[kept], left[kept], None if root is None else root[kept]
+        patterns = None if of.patterns is None else of.patterns.without[k]
+        without.append(_division(of.rows.only(kept), some, patterns, parts, prior)[0])
+    return _Divided(whole, parts, without)
+
+
+def _division(
+    rows: Rows,
+    of: tuple[Array, Array, Array, Array | None],
+    patterns: Array | None,
+    like: Parts | None,
+    prior: float,
+) -> tuple[Division, Parts]:
+    """From errors (n, 6), the variance without that of a wrong calibration, the errors that remain without it, and its
+    root (n, 6, 6)."""
+    error, rest, left, root = of
+    v_mps, sigma = rows.select(TWIST_COLUMNS[:3]), np.sqrt(rest)
+    ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
+    sigmas, faster = rows.chains(sigma), rows.chains(ln_faster(v_mps, ln_speed))
     lasting = None if root is None else rows.chains(root)
-    parts = fit_parts(rows.chains(of.error), sigmas, rows.chains(faster), rows.step_s, lasting)
+    parts = fit_parts(rows.chains(error), sigmas, faster, rows.step_s, lasting, like)
     division = Division(
         share=parts.share,
         growth=parts.growth,
         level=parts.level,
         ln_speed=ln_speed,
-        correlation=part_correlations(errors, sigmas, parts, rows.step_s),
+        correlation=part_correlations(rows.chains(left), sigmas, parts, rows.step_s, prior),
         geometry_weight=np.zeros(1),
         bias_tau_s=parts.tau_s,
     )
-    if of.patterns is not None:
-        usual = of.patterns.usual
-        division = replace(division, calibration_patterns=usual, calibration_tau_s=np.full(6, PERSISTENT_S))
+    if patterns is not None:
+        division = replace(division, calibration_patterns=patterns, calibration_tau_s=np.full(6, PERSISTENT_S))
     return division, parts
 
 
@@ -232,7 +264,7 @@ def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:
     return out
 
 
-def _calibration(rows: Rows, scale: Scale, found: _Consistent, parts: Parts, score: Array) -> dict[str, Any]:
+def _calibration(rows: Rows, scale: Scale, found: _Consistent, score: Array) -> dict[str, Any]:
     axes = [conformal_quantiles(score[:, j], rows.group) for j in range(6)]
     return {
         "by": rows.grouped_by,
@@ -247,5 +279,5 @@ def _calibration(rows: Rows, scale: Scale, found: _Consistent, parts: Parts, sco
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
         "interval_guaranteed": [sure for _, sure in axes],
-        "parts": {"spans_frames": parts.spans, "seen_over_stated": parts.ratio},
+        "parts": {"spans_frames": found.parts.spans, "seen_over_stated": found.parts.ratio},
     }

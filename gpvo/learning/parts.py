@@ -38,12 +38,21 @@ _MOST_RATIO = 16.0
 
 
 @dataclass(frozen=True)
+class Shape:
+    """What is chosen for a block of axes: see :class:`Parts`; ``tau`` [frames] is the same for all blocks."""
+
+    by_speed: float
+    by_noise: float
+    tau: float
+
+
+@dataclass(frozen=True)
 class Parts:
     """``share`` (3, D): of jitter, white noise and bias on each axis at the typical log variance ``level`` (D,).
 
     ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.division.divide`).
     ``tau_s`` (D,): of the bias. ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over
-    what is stated; ``doubt`` (S, D): see :class:`gpvo.learning.spans.SpanVariances`.
+    what is stated. ``shapes``: of each block of three axes.
     """
 
     share: Array
@@ -52,7 +61,7 @@ class Parts:
     tau_s: Array
     spans: NDArray[np.int64]
     ratio: Array
-    doubt: Array
+    shapes: Sequence[Shape]
 
 
 @dataclass(frozen=True)
@@ -88,15 +97,6 @@ class _Windows:
 
 
 @dataclass(frozen=True)
-class _Shape:
-    """What is chosen for a block of axes: see :class:`Parts`."""
-
-    by_speed: float
-    by_noise: float
-    tau: float
-
-
-@dataclass(frozen=True)
 class _Fit:
     """``share`` (3, d) of a shape, mean ratio of squared sums to what is stated (S, d), and the loss."""
 
@@ -105,12 +105,20 @@ class _Fit:
     ratio: Array
 
 
-def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float, lasting: Chains | None = None) -> Parts:
+def fit_parts(
+    error: Chains,
+    sigma: Chains,
+    ln_speed: Chains,
+    step_s: float,
+    lasting: Chains | None = None,
+    like: Parts | None = None,
+) -> Parts:
     """From errors, their stated standard deviations, and the logs (n_i, 1) of the speed over the typical one.
 
     ``step_s``: usual duration of a motion. ``lasting``: roots (n_i, D, P) of what else adds up, by constants of unit
-    variance; ``sigma`` is what is stated without it. All axes have one time constant, translation and rotation (each
-    three axes) a growth each; the shares are the axis' own.
+    variance; ``sigma`` is what is stated without it. ``like``: the shares alone are fitted, the rest is taken from
+    there. All axes have one time constant, translation and rotation (each three axes) a growth each; the shares are the
+    axis' own.
     """
     lasting = lasting or [[np.zeros((*c.shape, 1)) for c in chains] for chains in error]
     error, sigma, ln_speed, lasting = (at_most(x, MOST_ROWS) for x in (error, sigma, ln_speed, lasting))
@@ -122,20 +130,21 @@ def fit_parts(error: Chains, sigma: Chains, ln_speed: Chains, step_s: float, las
     blocks = [slice(start, min(start + 3, D)) for start in range(0, D, 3)]
     given = (error, ln_var, ln_speed, lasting)
     windows = [_windows(given, found.spans, block, level) for block in blocks]
-    tau, shapes = _choose(windows)
+    shapes = _choose(windows) if like is None else like.shapes
+    tau = shapes[0].tau
     widening = found.widening(tau)
     for block, seen, shape in zip(blocks, windows, shapes):
         fit = _fit_shape(seen, shape, widening[:, block])
         share[:, block], ratio[:, block] = fit.share, fit.ratio
         growth[:, block] = [[shape.by_speed], [shape.by_noise]]
-    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio, found.doubt)
+    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio, shapes)
 
 
-_Choice = tuple[_Shape, _Fit]
+_Choice = tuple[Shape, _Fit]
 
 
-def _choose(windows: Sequence[_Windows]) -> tuple[float, list[_Shape]]:
-    """The time constant [frames] of all blocks, and the shape of each. Sideways errors are correlated with the
+def _choose(windows: Sequence[_Windows]) -> list[Shape]:
+    """The shape of each block, with one time constant for all. Sideways errors are correlated with the
     rotations that undo them; with time constants of their own, the two would drift apart along the way."""
     tried: dict[float, list[_Choice]] = {}
 
@@ -145,14 +154,14 @@ def _choose(windows: Sequence[_Windows]) -> tuple[float, list[_Shape]]:
 
     found = min(_TAU_FRAMES, key=loss)
     found = min((found, found / 2.0, found * 2.0), key=loss)
-    return found, [shape for shape, _ in tried[found]]
+    return [shape for shape, _ in tried[found]]
 
 
 def _best(windows: _Windows, tau: float) -> _Choice:
     """The best shape of a block. By default the shares are constant."""
-    tried = [(s, _fit_shape(windows, s)) for s in (_Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
+    tried = [(s, _fit_shape(windows, s)) for s in (Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
     by_noise = min(tried, key=_loss)[0].by_noise
-    others = (_Shape(v, by_noise, tau) for v in _SPEED_GROWTHS)
+    others = (Shape(v, by_noise, tau) for v in _SPEED_GROWTHS)
     return min([*tried, *((s, _fit_shape(windows, s)) for s in others)], key=_loss)
 
 
@@ -193,7 +202,7 @@ def _sums(each: Array, first: NDArray[np.int64], end: NDArray[np.int64]) -> Arra
     return np.asarray(np.add.reduceat(each, np.stack([first, end], axis=1).ravel(), axis=-1)[..., ::2])
 
 
-def _fit_shape(windows: _Windows, shape: _Shape, widen: Array | None = None) -> _Fit:
+def _fit_shape(windows: _Windows, shape: Shape, widen: Array | None = None) -> _Fit:
     """Shares for one shape, by the likelihood of squared sums, times ``widen`` (S, d) if given.
 
     The standard deviation of a squared sum is its own stated variance (times root two). So the fit is reweighted by
@@ -254,8 +263,10 @@ def _solve(A: Array, square: Array, weight: Array) -> Array:
     return np.asarray(share / share.sum(axis=0))
 
 
-_PRIOR = 3.0
-_LEAST_EIGENVALUE = 1e-3
+PRIORS = (9.0, 0.3)
+"""Windows that the correlations of single motions may count for, as what to expect of each part."""
+_ROUNDS, _CONVERGED = 100, 1e-3
+_OVERLAP = 4
 
 
 def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
@@ -266,36 +277,54 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
     return np.stack([np.ones_like(m), m, bias], axis=1)
 
 
-def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
+def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float, prior: float = PRIORS[0]) -> Array:
     """(3, 6, 6) correlations of jitter, white noise and bias, from those of the errors summed over each span.
 
     Each sum is divided by its own stated deviation: the worst of the motions in it dominate it, as they dominate the
-    pose, and their axes may be more strongly correlated than those of the others. For each pair of axes three numbers
-    are sought whose mixture, weighted by what each part contributes to the sum, is the correlation observed over every
-    span; all are shrunk towards that of single motions, as few windows show little.
+    pose, and their axes may be more strongly correlated than those of the others. The covariance over a span is that
+    of its parts, by what each contributes: variance components of a Wishart likelihood, by the MM algorithm of H. Zhou
+    et al., "MM algorithms for variance components models" (2019), which keeps them positive definite. All spans hold
+    the same errors, so that they share one count of windows; the correlations of single motions are the
+    ``prior``, worth so many windows.
     """
     part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
-    whole = part.sum(axis=2).T
+    scale = np.moveaxis(np.sqrt(part / part.sum(axis=2, keepdims=True)), 0, 2)
+    D = scale[..., :, None] * scale[..., None, :]
     measured = np.array([correlation(student_t.scatter(_scaled_sums(error, sigma, m))) for m in split.spans])
-    windows = 2.0 / split.doubt
-    out = np.tile(np.eye(6), (3, 1, 1))
-    for i, j in zip(*np.triu_indices(6, 1)):
-        mixture = np.sqrt(part[i] * part[j] / (whole[:, i] * whole[:, j])[:, None])
-        weight = np.sqrt(np.minimum(windows[:, i], windows[:, j]))
-        A = np.vstack([mixture * weight[:, None], _PRIOR * np.eye(3)])
-        b = np.concatenate([measured[:, i, j] * weight, np.full(3, _PRIOR * measured[0, i, j])])
-        out[:, i, j] = out[:, j, i] = np.linalg.lstsq(A, b, rcond=None)[0]
-    return np.array([_nearest_correlation(R) for R in out])
+    count = (_independent(error, split, scale[:, 2] ** 2, step_s) / len(split.spans))[:, None, None]
+    R = np.repeat(measured[:1], 3, axis=0)
+    for _ in range(_ROUNDS):
+        inverse = np.linalg.inv((D * R).sum(axis=1))
+        own = (count[:, None] * D * inverse[:, None]).sum(axis=0) + prior * np.linalg.inv(R)
+        seen = (count[:, None] * D * (inverse @ measured @ inverse)[:, None]).sum(axis=0)
+        before, R = R, _balanced(own, R @ seen @ R + prior * measured[0])
+        if np.abs(R - before).max() < _CONVERGED:
+            break
+    return correlation(R)
+
+
+def _independent(error: Chains, split: Parts, bias: Array, step_s: float) -> Array:
+    """(S,) independent windows of each span, where ``bias`` (S, D) of the variance of a sum is that of the bias, which
+    lasts from one window to the next (M. Bartlett, "On the theoretical specification and sampling properties of
+    autocorrelated time-series" (1946)); those of different sequences always are."""
+    windows = np.array([[sum(len(c) // m for c in chains) for chains in error] for m in split.spans])
+    kept = np.exp(-2.0 * split.spans[:, None] * step_s / split.tau_s)
+    alone = (windows.sum(axis=1, keepdims=True) / (1.0 + 2.0 * bias**2 * kept / (1.0 - kept))).min(axis=1)
+    return np.asarray(np.maximum(alone, (windows > 0).sum(axis=1)))
+
+
+def _balanced(N: Array, M: Array) -> Array:
+    """(..., n, n) positive definite X that solves ``X N X = M``, all symmetric."""
+    L = np.linalg.cholesky(N)
+    values, vectors = np.linalg.eigh(np.swapaxes(L, -1, -2) @ M @ L)
+    half = np.linalg.solve(np.swapaxes(L, -1, -2), vectors)
+    return np.asarray((half * np.sqrt(values)[..., None, :]) @ np.swapaxes(half, -1, -2))
 
 
 def _scaled_sums(error: Chains, sigma: Chains, m: int) -> Array:
-    """(w, D) sums over m motions, over their stated deviation if independent; each axis has unit mean square."""
+    """(w, D) sums over m motions, over their stated deviation if independent; each axis has unit mean square. Of
+    windows that hold nearly the same motions, some are enough."""
     pairs = [(e, s) for es, ss in zip(error, sigma) for e, s in zip(es, ss) if len(e) >= m]
-    z = np.concatenate([moving_sums(e, m) / np.sqrt(moving_sums(s**2, m)) for e, s in pairs])
+    some = slice(None, None, max(m // _OVERLAP, 1))
+    z = np.concatenate([moving_sums(e, m)[some] / np.sqrt(moving_sums(s**2, m)[some]) for e, s in pairs])
     return np.asarray(z / np.sqrt((z**2).mean(axis=0)))
-
-
-def _nearest_correlation(R: Array) -> Array:
-    """Positive definite, with a unit diagonal."""
-    values, vectors = np.linalg.eigh(R)
-    return correlation((vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T)

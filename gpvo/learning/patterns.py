@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.build import group_folds
 from gpvo.learning.rows import Rows
 from gpvo.learning.spans import cut
 from gpvo.online.base import TWIST_COLUMNS
@@ -23,7 +22,7 @@ from gpvo.types import Array
 PERSISTENT_S = 3600.0
 """How long a calibration stays the same: longer than the flights to learn from, which do not show it."""
 _WINDOW = 100
-_LEAST_FLIGHTS, _MOST_FOLDS = 4, 5
+_LEAST_FLIGHTS = 4
 _CLEAR = 10.0
 _ROUNDS, _BEGIN_VAR, _DIAGONAL = 60, 1e-2, 1.0
 _D = 6
@@ -31,19 +30,18 @@ _D = 6
 
 @dataclass(frozen=True)
 class Patterns:
-    """``usual`` (6, 6, 6): see :func:`gpvo.online.division.of_calibration`. ``fold`` (n,) of each row, and ``without``
-    (F, 6, 6, 6), the patterns of all flights but those of a fold. ``error`` (n, 6): what each row's own flight shows
+    """``usual`` (6, 6, 6): see :func:`gpvo.online.division.of_calibration`. ``without`` (F, 6, 6, 6): the patterns of
+    all flights but those of each fold. ``error`` (n, 6): what each row's own flight shows
     of the error of its calibration."""
 
     usual: Array
-    fold: NDArray[np.int64]
     without: Array
     error: Array
 
 
-def learn_patterns(rows: Rows, error: Array, variance: Array) -> Patterns | None:
-    """From errors (n, 6) of a stated variance (n, 6); None from fewer than four flights, or where no velocity is clear
-    of VO's own error of it."""
+def learn_patterns(rows: Rows, error: Array, variance: Array, fold: NDArray[np.int64]) -> Patterns | None:
+    """From errors (n, 6) of a stated variance (n, 6), in folds (n,) of whole flights; None from fewer than four
+    flights, or where no velocity is clear of VO's own error of it."""
     twist = np.nan_to_num(rows.select(TWIST_COLUMNS))
     flights = [_sums(*x) for x in zip(*(rows.chains(v) for v in (error, variance, twist)))]
     flown = [f for f in flights if len(f.error)]
@@ -53,13 +51,12 @@ def learn_patterns(rows: Rows, error: Array, variance: Array) -> Patterns | None
     unit = _Unit.of(flown, clear)
     evidence = [unit.evidence(f) for f in flights]
     flight = np.repeat(np.arange(len(flights)), [len(s) for s in rows.sets])
-    folds = group_folds(np.arange(len(flights)), _MOST_FOLDS)
+    folds = fold[np.searchsorted(flight, np.arange(len(flights)))]
     every, noise = _spread(evidence)
     means = np.array([unit.of_flight(e.posterior(every, noise)[0]) for e in evidence])
     without = [_spread([e for e, k in zip(evidence, folds) if k != fold])[0] for fold in range(folds.max() + 1)]
     return Patterns(
         unit.patterns(every),
-        folds[flight],
         np.array([unit.patterns(S) for S in without]),
         np.einsum("nic,nc->ni", means[flight], twist),
     )

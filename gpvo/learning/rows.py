@@ -37,6 +37,11 @@ class Rows:
         error, dt = np.concatenate([s.Y for s in sets]), np.concatenate([s.dt_s for s in sets])
         return cls(sets, error, dt, group, by, weight / weight.mean())
 
+    def only(self, kept: NDArray[np.bool_]) -> Rows:
+        """Those of the rows (n,) that are kept."""
+        parts = zip(self.sets, np.split(kept, np.cumsum([len(s) for s in self.sets])[:-1]))
+        return Rows.stack([s.rows(of) for s, of in parts if of.any()])
+
     @property
     def step_s(self) -> float:
         """Usual duration of a motion."""

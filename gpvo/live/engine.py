@@ -16,13 +16,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gpvo.dataset.check import odometry_problems, rate_problems
 from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_positive_definite, symmetrise
 from gpvo.geometry.se3 import is_rigid, rotate_covariance
 from gpvo.io.trajectory import FARTHEST_M
-from gpvo.learning.check import odometry_problems, rate_problems
 from gpvo.live.intake import Arrival
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost

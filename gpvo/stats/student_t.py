@@ -111,7 +111,7 @@ def scatter(z: Array, nu: float = NU) -> Array:
     d = z.shape[1]
     C = np.eye(d)
     for _ in range(20):
-        w = (nu + d) / (nu + (np.linalg.solve(C, z.T).T * z).sum(1))
+        w = (nu + d) / (nu + ((z @ np.linalg.inv(C)) * z).sum(axis=1))
         C_new = (z * w[:, None]).T @ z / len(z) + 1e-9 * np.eye(d)
         done = np.abs(C_new - C).max() < 1e-6
         C = C_new

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from gpvo.accumulation import PoseError
-from gpvo.learning.parts import curves, fit_parts, part_correlations
+from gpvo.learning.parts import Parts, curves, fit_parts, part_correlations
 from gpvo.learning.spans import SpanVariances, chains, span_variances
+from gpvo.stats.consistency import nees
 from scipy.signal import lfilter
 
 from motion_errors import motion_error
@@ -104,6 +105,39 @@ def test_each_part_has_its_own_correlation():
     assert R[2, 0, 1] > 0.6
     assert np.abs(R[:2, 0, 1]).max() < 0.15
     assert np.linalg.eigvalsh(R).min() > 0.0
+
+
+def _of_sums(parts: Parts, R: np.ndarray, m: int, step_s: float) -> np.ndarray:
+    """(6, 6) covariance stated of the sum over m motions of unit variance."""
+    each = np.array([curves(np.array([m]), tau / step_s)[0] for tau in parts.tau_s]) * parts.share.T
+    return np.einsum("ip,pij,jp->ij", np.sqrt(each), R, np.sqrt(each))
+
+
+def test_of_errors_that_outlast_a_flight_few_flights_show_little():
+    """Ten trials of eight flights, each with a bias of its own in all six axes. Mean NEES of the sums over 100 motions
+    of 200 others: by the true covariance 1, by the covariance of eight draws 8 / (8 - 6 - 1) = 8."""
+    rng, mean = np.random.default_rng(10), []
+    for _ in range(10):
+        z = [[0.8 * rng.standard_normal((1000, 6)) + 0.6 * rng.standard_normal(6)] for _ in range(8)]
+        parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
+        C = _of_sums(parts, part_correlations(z, _like(z, 1.0), parts, 0.05), 100, 0.05)
+        unseen = 8.0 * rng.standard_normal((200, 6)) + 60.0 * rng.standard_normal((200, 6))
+        mean.append(nees(unseen, C).mean() / 6.0)
+    assert 0.8 <= np.mean(mean) <= 1.4, np.mean(mean)
+
+
+def test_axes_that_go_together_nearly_perfectly_are_stated_so():
+    """Ten thousand motions whose sixth axis is the first up to a hundredth: NEES of as many others."""
+    rng = np.random.default_rng(11)
+    L = np.eye(6)
+    L[5, 0], L[5, 5] = 1.0, 1e-2
+    seen, unseen = rng.standard_normal((2, 10, 1000, 6)) @ L.T
+    z = [[chain] for chain in seen]
+    parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
+    R = part_correlations(z, _like(z, 1.0), parts, 0.05)
+    for m in (1, 10, 100):
+        mean = nees(unseen.reshape(-1, m, 6).sum(axis=1), _of_sums(parts, R, m, 0.05)).mean() / 6.0
+        assert 0.92 <= mean <= 1.1, (m, mean)
 
 
 def test_what_is_known_to_add_up_besides_is_no_share():

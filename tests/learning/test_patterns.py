@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from gpvo.learning.patterns import learn_patterns
+from gpvo.learning.patterns import Patterns, learn_patterns
 from gpvo.learning.rows import Rows
 from gpvo.online.base import TWIST_COLUMNS
 from gpvo.online.division import of_calibration
@@ -42,10 +42,15 @@ def _spread(patterns: np.ndarray) -> np.ndarray:
     return np.einsum("pic,pjd->icjd", patterns, patterns)
 
 
+def _patterns(rows: Rows, error: np.ndarray | None = None) -> Patterns | None:
+    error = rows.error if error is None else error
+    return learn_patterns(rows, error, np.broadcast_to(SIGMA**2, error.shape), rows.group % 3)
+
+
 def test_the_patterns_have_the_covariance_of_the_flights():
     """Of 40 flights, each element by its usual deviation, to a tenth; and each flight's own errors are found."""
     rows, K = _flights(40, COUPLED, 0)
-    found = learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape))
+    found = _patterns(rows)
     unit = np.sqrt(np.einsum("pic,pic->ic", COUPLED, COUPLED)) + SIGMA[:, None] / 10.0
     drawn, got = (_spread(p) / unit[:, :, None, None] / unit for p in (K / np.sqrt(len(K)), found.usual))
     np.testing.assert_allclose(got, drawn, atol=0.1)
@@ -57,17 +62,15 @@ def test_the_patterns_have_the_covariance_of_the_flights():
 
 def test_of_no_wrong_calibration_there_is_next_to_nothing():
     rows, _ = _flights(12, np.zeros((1, 6, 6)), 1)
-    found = learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape))
+    found = _patterns(rows)
     stated = np.einsum("nip,nip->ni", *2 * [np.einsum("pic,nc->nip", found.usual, rows.select(TWIST_COLUMNS))])
     assert (stated.mean(axis=0) < 0.02 * SIGMA**2).all()
 
 
 def test_patterns_without_a_fold_do_not_know_its_flights():
     rows, _ = _flights(6, COUPLED, 2)
-    variance = np.broadcast_to(SIGMA**2, rows.error.shape)
-    found = learn_patterns(rows, rows.error, variance)
-    gone = found.fold == 0
-    other = learn_patterns(rows, np.where(gone[:, None], 3.0 * rows.error, rows.error), variance)
+    found = _patterns(rows)
+    other = _patterns(rows, np.where(rows.group[:, None] % 3 == 0, 3.0 * rows.error, rows.error))
     np.testing.assert_allclose(_spread(other.without[0]), _spread(found.without[0]), rtol=1e-3, atol=1e-12)
     assert not np.allclose(_spread(other.without[1]), _spread(found.without[1]), rtol=1e-2, atol=1e-12)
 
@@ -75,14 +78,14 @@ def test_patterns_without_a_fold_do_not_know_its_flights():
 def test_what_goes_with_errors_of_the_velocity_is_no_pattern():
     """Along the slow axes odometry's velocity is little but its own error."""
     rows, _ = _flights(8, COUPLED, 3, slow=(0, 5))
-    found = learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape))
+    found = _patterns(rows)
     assert not found.usual[:, :, [0, 5]].any()
     assert found.usual[:, :, [1, 2]].any()
 
 
 def test_few_flights_tell_nothing_of_how_calibrations_differ():
     rows, _ = _flights(3, COUPLED, 4)
-    assert learn_patterns(rows, rows.error, np.broadcast_to(SIGMA**2, rows.error.shape)) is None
+    assert _patterns(rows) is None
 
 
 unit = st.floats(-1.0, 1.0)

@@ -13,6 +13,7 @@ import pytest
 from gpvo.cli import app
 from gpvo.cli.learn import _print_table, _train
 from gpvo.dataset.build import build, build_run
+from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
@@ -21,7 +22,6 @@ from gpvo.io.run import read_run, write_run
 from gpvo.learning import train as training
 from gpvo.learning.basefit import rate_changes
 from gpvo.learning.card import model_card
-from gpvo.learning.check import check, odometry_problems
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
 from gpvo.learning.methods import METHODS, best_scale, score
@@ -141,6 +141,24 @@ def test_consistent_over_many_frames():
         i = np.arange(1, m)[:, None]
         stated = share[0] + share[1] * m + share[2] * (m + 2 * ((m - i) * rho**i).sum(axis=0))
         assert 0.7 <= np.mean(np.mean(ratio, axis=0) / stated) <= 1.5, m
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_poses_are_calibrated_on_flights_that_nothing_was_learned_from(shared):
+    """Eight flights, each with a bias of its own, or all with the same. Fitted to the former, a model would find that
+    less adds up than it states; and only the latter show how the axes of a bias go together."""
+    rng, flights = np.random.default_rng(8), training_sets(range(8), n=600)
+    usual, drawn = np.concatenate([s.Y for s in flights]).std(axis=0), rng.standard_normal((len(flights), 6))
+    biases = np.ones((len(flights), 6)) if shared else drawn
+    noise = rng.standard_normal((len(flights), *flights[0].Y.shape))
+    biased = [replace(s, Y=usual * (0.8 * n + 0.6 * bias)) for s, n, bias in zip(flights, noise, biases)]
+    learned = train_sets(biased, TrainConfig(features="velocity"), judge=False)
+    together = learned.predictor().model.division.correlation[2][np.triu_indices(6, 1)]
+    if shared:
+        assert together.min() > 0.8
+    else:
+        assert np.abs(together).mean() < 0.3
+        assert learned.header["calibration"]["added_factor"] >= 1.0
 
 
 def _no_change(chain: np.ndarray) -> np.ndarray:

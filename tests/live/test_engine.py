@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_maker import BagMaker
+from gpvo.dataset.check import rate_problems
 from gpvo.errors import GpvoError
 from gpvo.files import write_json
 from gpvo.geometry import se3
@@ -17,7 +18,6 @@ from gpvo.geometry.covariance import is_positive_definite
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
-from gpvo.learning.check import rate_problems
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
