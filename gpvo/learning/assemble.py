@@ -21,7 +21,7 @@ from gpvo.learning.calibrate import (
     fit_scale,
 )
 from gpvo.learning.logvariance import log_ratio
-from gpvo.learning.parts import MOST_ROWS, PRIORS, Parts, fit_parts, part_correlations
+from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
 from gpvo.learning.poses import Motions, Poses, added_factor, pose_losses, poses_of, with_added
 from gpvo.learning.rows import Rows, significant_gain, simplest_sufficient
@@ -77,7 +77,7 @@ def assemble(
         gp=gp or ProjectedGP.constant(np.zeros(6)),
         domain=domain,
         base=base,
-        division=divided.whole,
+        division=divided[0].whole,
         velocities=learn_velocities(rows),
         factor=scale.factor,
         outside_power=np.array([outside_power]),
@@ -93,7 +93,8 @@ def assemble(
 @dataclass(frozen=True)
 class _Residuals:
     """All rows, out of fold: ``error`` (n, 6), its ``variance`` (n, 6), calibrated for each axis, features ``X``
-    (n, d), the geometric covariance (n, 6, 6), and ``patterns`` if calibration has a part of its own."""
+    (n, d), the geometric covariance (n, 6, 6), the ``fold`` (n,) that is left out with each row, and ``patterns`` if
+    calibration has a part of its own."""
 
     rows: Rows
     error: Array
@@ -152,15 +153,14 @@ class _Consistent:
     losses: Array
 
 
-def _most_likely(model: ErrorModel, of: _Residuals, divided: _Divided) -> _Consistent:
+def _most_likely(model: ErrorModel, of: _Residuals, divided: Sequence[_Divided]) -> _Consistent:
     """The calibrated model, with the strongest prior of the parts' correlations, and the least share of the geometry's,
     that no other beats by a significant gain in the poses; none if the geometry is mostly unknown."""
-    priors = [divided, *(_divided(of, divided.parts, prior) for prior in PRIORS[1:])]
-    first = [_consistent(model, of, d) for d in priors]
+    first = [_consistent(model, of, d) for d in divided]
     best = simplest_sufficient({k: found.losses for k, found in enumerate(first)})
     if of.geometry is None or np.isfinite(of.geometry).all(axis=(1, 2)).mean() < _LEAST_KNOWN:
         return first[best]
-    weighted = (priors[best].changed(partial(replace, geometry_weight=np.array([w]))) for w in _WEIGHTS[1:])
+    weighted = (divided[best].changed(partial(replace, geometry_weight=np.array([w]))) for w in _WEIGHTS[1:])
     tried = [first[best], *(_consistent(model, of, d) for d in weighted)]
     return tried[simplest_sufficient({k: found.losses for k, found in enumerate(tried)})]
 
@@ -212,47 +212,44 @@ def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Consistent) -> _
     return found if significant_gain(plain.losses - found.losses) else plain
 
 
-def _divided(of: _Residuals, like: Parts | None = None, prior: float = PRIORS[0]) -> _Divided:
-    """How errors add up, without the geometry's correlations so far; ``like``: see :func:`fit_parts`."""
+def _divided(of: _Residuals) -> list[_Divided]:
+    """How errors add up, without the geometry's correlations so far: for each prior of the parts' correlations."""
     root, rest, left = of.of_calibration()
     usual = None if of.patterns is None else of.patterns.usual
-    whole, parts = _division(of.rows, (of.error, rest, left, root), usual, like, prior)
+    whole, parts = _divisions(of.rows, (of.error, rest, left, root), usual)
     without = []
     for k in np.unique(of.fold):
         kept = of.fold != k
         some = of.error[kept], rest[kept], left[kept], None if root is None else root[kept]
         patterns = None if of.patterns is None else of.patterns.without[k]
-        without.append(_division(of.rows.only(kept), some, patterns, parts, prior)[0])
-    return _Divided(whole, parts, without)
+        without.append(_divisions(of.rows.only(kept), some, patterns, parts)[0])
+    return [_Divided(of_all, parts, others) for of_all, *others in zip(whole, *without)]
 
 
-def _division(
-    rows: Rows,
-    of: tuple[Array, Array, Array, Array | None],
-    patterns: Array | None,
-    like: Parts | None,
-    prior: float,
-) -> tuple[Division, Parts]:
+def _divisions(
+    rows: Rows, of: tuple[Array, Array, Array, Array | None], patterns: Array | None, like: Parts | None = None
+) -> tuple[list[Division], Parts]:
     """From errors (n, 6), the variance without that of a wrong calibration, the errors that remain without it, and its
-    root (n, 6, 6)."""
+    root (n, 6, 6); ``like``: see :func:`fit_parts`."""
     error, rest, left, root = of
     v_mps, sigma = rows.select(TWIST_COLUMNS[:3]), np.sqrt(rest)
     ln_speed = np.log(np.maximum(np.nanmedian(np.linalg.norm(v_mps, axis=1), keepdims=True), 1e-6))
     sigmas, faster = rows.chains(sigma), rows.chains(ln_faster(v_mps, ln_speed))
     lasting = None if root is None else rows.chains(root)
     parts = fit_parts(rows.chains(error), sigmas, faster, rows.step_s, lasting, like)
+    R = part_correlations(rows.chains(left), sigmas, parts, rows.step_s)
     division = Division(
         share=parts.share,
         growth=parts.growth,
         level=parts.level,
         ln_speed=ln_speed,
-        correlation=part_correlations(rows.chains(left), sigmas, parts, rows.step_s, prior),
+        correlation=R[0],
         geometry_weight=np.zeros(1),
         bias_tau_s=parts.tau_s,
     )
     if patterns is not None:
         division = replace(division, calibration_patterns=patterns, calibration_tau_s=np.full(6, PERSISTENT_S))
-    return division, parts
+    return [replace(division, correlation=of_prior) for of_prior in R], parts
 
 
 def _distance(X: Array, noise: Array, group: NDArray[np.int64]) -> Array:

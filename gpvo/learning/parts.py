@@ -277,26 +277,27 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
     return np.stack([np.ones_like(m), m, bias], axis=1)
 
 
-def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float, prior: float = PRIORS[0]) -> Array:
-    """(3, 6, 6) correlations of jitter, white noise and bias, from those of the errors summed over each span.
+def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
+    """(P, 3, 6, 6) correlations of jitter, white noise and bias, for each of :data:`PRIORS`, from those of the errors
+    summed over each span.
 
     Each sum is divided by its own stated deviation: the worst of the motions in it dominate it, as they dominate the
     pose, and their axes may be more strongly correlated than those of the others. The covariance over a span is that
     of its parts, by what each contributes: variance components of a Wishart likelihood, by the MM algorithm of H. Zhou
     et al., "MM algorithms for variance components models" (2019), which keeps them positive definite. All spans hold
-    the same errors, so that they share one count of windows; the correlations of single motions are the
-    ``prior``, worth so many windows.
+    the same errors, so that they share one count of windows; the correlations of single motions are the prior.
     """
     part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
     scale = np.moveaxis(np.sqrt(part / part.sum(axis=2, keepdims=True)), 0, 2)
     D = scale[..., :, None] * scale[..., None, :]
     measured = np.array([correlation(student_t.scatter(_scaled_sums(error, sigma, m))) for m in split.spans])
-    count = (_independent(error, split, scale[:, 2] ** 2, step_s) / len(split.spans))[:, None, None]
-    R = np.repeat(measured[:1], 3, axis=0)
+    weighted = D * (_independent(error, split, scale[:, 2] ** 2, step_s) / len(split.spans))[:, None, None, None]
+    prior = np.array(PRIORS)[:, None, None, None]
+    R = np.tile(measured[0], (len(PRIORS), 3, 1, 1))
     for _ in range(_ROUNDS):
-        inverse = np.linalg.inv((D * R).sum(axis=1))
-        own = (count[:, None] * D * inverse[:, None]).sum(axis=0) + prior * np.linalg.inv(R)
-        seen = (count[:, None] * D * (inverse @ measured @ inverse)[:, None]).sum(axis=0)
+        inverse = np.linalg.inv((D * R[:, None]).sum(axis=2))
+        own = (weighted * inverse[:, :, None]).sum(axis=1) + prior * np.linalg.inv(R)
+        seen = (weighted * (inverse @ measured @ inverse)[:, :, None]).sum(axis=1)
         before, R = R, _balanced(own, R @ seen @ R + prior * measured[0])
         if np.abs(R - before).max() < _CONVERGED:
             break
