@@ -31,8 +31,8 @@ _D = 6
 @dataclass(frozen=True)
 class Patterns:
     """``usual`` (6, 6, 6): see :func:`gpvo.online.division.of_calibration`. ``without`` (F, 6, 6, 6): the patterns of
-    all flights but those of each fold. ``error`` (n, 6): what each row's own flight shows
-    of the error of its calibration."""
+    all flights but those of each fold. ``error`` (n, 6): what each row's own flight shows of the error of its
+    calibration."""
 
     usual: Array
     without: Array
@@ -51,10 +51,10 @@ def learn_patterns(rows: Rows, error: Array, variance: Array, fold: NDArray[np.i
     unit = _Unit.of(flown, clear)
     evidence = [unit.evidence(f) for f in flights]
     flight = np.repeat(np.arange(len(flights)), [len(s) for s in rows.sets])
-    folds = fold[np.searchsorted(flight, np.arange(len(flights)))]
+    fold_of = fold[np.unique(flight, return_index=True)[1]]
     every, noise = _spread(evidence)
     means = np.array([unit.of_flight(e.posterior(every, noise)[0]) for e in evidence])
-    without = [_spread([e for e, k in zip(evidence, folds) if k != fold])[0] for fold in range(folds.max() + 1)]
+    without = [_spread([e for e, of in zip(evidence, fold_of) if of != k])[0] for k in np.unique(fold)]
     return Patterns(
         unit.patterns(every),
         np.array([unit.patterns(S) for S in without]),

@@ -67,7 +67,7 @@ def pose_losses(poses: Sequence[Poses], factor: float = 1.0) -> Array:
 
 
 def with_added(share: Array, factor: float) -> Array:
-    """(3, D) shares with white noise and bias times the factor; jitter is the remainder."""
+    """(3, D) shares with white noise and bias times the factor; jitter, some on every axis, is the remainder."""
     added = share[1:] * factor
     added *= np.minimum(1.0, (1.0 - _LEAST_JITTER) / added.sum(axis=0))
     return np.vstack([1.0 - added.sum(axis=0), added])
