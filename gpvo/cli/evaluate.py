@@ -80,7 +80,7 @@ def evaluate(
 
     Example: gpvo evaluate runs/mh01 --plots figures
     """
-    from gpvo.evaluation.document import document
+    from gpvo.evaluation.document import document, pooled
     from gpvo.evaluation.evaluate import distinct
 
     if twins:
@@ -97,7 +97,7 @@ def evaluate(
         for about in documents:
             _print(about)
         if len(documents) > 1:
-            _print_pooled(document(found)["pooled"], len(found))
+            _print_pooled(pooled(documents), len(documents))
     _tell_misfits(judge.model, found)
 
 

@@ -92,7 +92,7 @@ def train(
     drawn = twin_options.settings(seed) if twins else None
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
-            trained = _with_origin(_train(paths, settings, update, on_fit), paths)
+            trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
     if trained.header["target"] != "position" and (axes := unseen_axes(trained.sets)):
@@ -144,14 +144,16 @@ def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[s
     note(f"gpvo: {folder} holds the covariances stated for the runs left out; to score them: gpvo score {folder}")
 
 
-def _with_origin(trained: TrainedModel, paths: list[Path]) -> TrainedModel:
-    """The header also says which sequences are twins, whose truth was simulated."""
+def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) -> TrainedModel:
+    """The header also says which sequences are twins, whose truth was simulated; those of an updated model too."""
     from dataclasses import replace
 
     from gpvo.files import read_json
+    from gpvo.online import modelfile
     from gpvo.twin.gap import simulated_truth
 
-    origin = simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
+    before = [] if update is None else modelfile.load(update)[1].get("simulated_truth") or []
+    origin = before + simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 

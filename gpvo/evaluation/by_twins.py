@@ -58,7 +58,9 @@ def by_twins(
         others = [t for j, t in enumerate(twins) if j != k]
         found.append(evaluate_run(twin, predictor, options, [_statement(twin.log, others)]))
     mean = average([document([e])["runs"][0] for e in found])
-    return {**mean, "run": run.name, "simulated_truth": {"twins": len(twins), **twins[0].meta["twin"]}}, found
+    # A verdict is in words, which have no mean: the numbers speak.
+    about = {"run": run.name, "source": run.meta.get("source"), "verdict": None}
+    return {**mean, **about, "simulated_truth": {"twins": len(twins), **twins[0].meta["twin"]}}, found
 
 
 def _statement(log: VoLog, twins: Sequence[Run]) -> Statement:

@@ -72,12 +72,14 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     ``gp_thesis`` needs a model file that holds it, as do all those written by this version.
     """
     runs = [_run_document(e) for e in evaluations]
-    return {"schema": 1, "runs": runs, "pooled": _pooled([r["methods"] for r in runs])}
+    return {"schema": 1, "runs": runs, "pooled": pooled(runs)}
 
 
-def _pooled(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the runs, with 95 % intervals by whole runs, of the methods that speak of the motions of every run."""
+def pooled(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over runs, by their documents, with 95 % intervals by whole runs, of the methods that speak of the motions
+    of every run."""
     out: dict[str, Any] = {}
+    runs = [d["methods"] for d in documents]
     for method in runs[0] if runs else ():
         scores = {
             "nll_per_dim": [r[method]["nll_per_dim"] for r in runs if method in r],

@@ -61,6 +61,8 @@ def open_bag(path: Path) -> Iterator[Any]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    if not path.exists():
+        raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
     metadata = path / "metadata.yaml"
     if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
         reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"

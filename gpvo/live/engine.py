@@ -172,16 +172,16 @@ class Engine:
         if self._truth is not None:
             self._truth.predicted(record, prediction)
         message = builder.step(record, prediction)
-        if self.settings.increment:
-            message = self._of_increment(message, record, prediction)
         message = replace(message, frame_id=taken.frame_id, child_frame_id=taken.child_frame_id)
         self._seen_ns, self.last = taken.received_ns, message
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
             self._motions.append(record)
             self._inside.append(message.in_domain is None or message.in_domain > 0.5)
-        self._deliver(lambda output: output.odometry(message))
-        return message
+        # What is kept, also in the state, is the accumulated one: the next session begins with it.
+        sent = self._of_increment(message, record, prediction) if self.settings.increment else message
+        self._deliver(lambda output: output.odometry(sent))
+        return sent
 
     def _adapt(self, truth: LateTruth, message: Any) -> None:
         if self._builder is None:  # nothing was published that it could judge

@@ -15,6 +15,8 @@ from gpvo.io.bag_reader import pose_of, stamp_ns
 from gpvo.types import Array, Prediction, TruthLog, VoRecord
 
 _MOTIONS, _POSES = 500, 5000
+_ANEW_NS = 10**9
+"""So far behind the last, a stamp does not come late."""
 _TRUTH_SHARE = 0.25
 """Of an axis' predicted variance; where truth's own variance is more, it cannot judge the axis."""
 
@@ -41,11 +43,18 @@ class LateTruth:
         if prediction is not None and record.usable and record.dt_s > 0:
             self._waiting.append((record, prediction))
 
+    def _comes_late(self, t_ns: int) -> bool:
+        """Whether a stamp repeats the last or comes late. One far behind says that the last was wrong, or that the
+        truth's clock went back: truth begins anew with it."""
+        if self._poses and t_ns <= self._poses[-1][0] - _ANEW_NS:
+            self._poses.clear()
+        return bool(self._poses) and t_ns <= self._poses[-1][0]
+
     def take(self, message: Any, T_body_cam: Array) -> Iterator[tuple[int, Array]]:
         """Stamps and errors ``xi`` (6,) of the motions that a message of truth makes known; NaN where it cannot say."""
         t_ns, row = stamp_ns(message), pose_of(message)
         norm = float(np.linalg.norm(row[3:]))
-        if not np.isfinite(row).all() or abs(norm - 1.0) > 0.1 or (self._poses and t_ns <= self._poses[-1][0]):
+        if not np.isfinite(row).all() or abs(norm - 1.0) > 0.1 or self._comes_late(t_ns):
             return
         T_world_body = se3.from_quaternion(row[None, :3], row[None, 3:])[0]
         self._poses.append((t_ns, T_world_body @ T_body_cam, *_variances(message)))

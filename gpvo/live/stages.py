@@ -284,7 +284,7 @@ class BaseFrameStage:
         self._tree = FrameTree()
         self._source: str | None = None
         self._T_base_source: Array | None = None
-        self._has_moved = False
+        self._has_moved = self._is_nameless = False
 
     @property
     def camera(self) -> StereoCamera | None:
@@ -328,6 +328,8 @@ class BaseFrameStage:
 
     def problems(self) -> list[str]:
         """What the transforms do not say, or say in two ways."""
+        if self._is_nameless:
+            return ["the poses do not name the frame that moves: --base-frame needs nav_msgs/Odometry"]
         joined = f"{printable(self.base)} to {printable(self._source or '')}"
         if self._source is not None and self._T_base_source is None:
             return [f"no transform from {joined} on /tf_static or /tf", *self.inner.problems()]
@@ -336,7 +338,13 @@ class BaseFrameStage:
 
     def _is_placed(self, message: Any) -> bool:
         if self._T_base_source is None:
-            self._source = _frame_name(getattr(message, "child_frame_id", message.header.frame_id))
+            # The header of an image names what is placed; that of a pose names the frame that it is stated in.
+            header_names_it = not isinstance(self.inner, PoseStage)
+            named = getattr(message, "child_frame_id", message.header.frame_id if header_names_it else None)
+            self._is_nameless = named is None
+            if named is None:
+                return False
+            self._source = _frame_name(named)
             self._T_base_source = self._tree.transform(self.base, self._source)
         return self._T_base_source is not None
 

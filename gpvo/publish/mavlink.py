@@ -137,7 +137,8 @@ class Sender:
         ArduPilot's EKF3 takes one velocity in 20 ms, the first: the one whose covariance it reads comes first.
         """
         out: list[bytes | None] = []
-        if self._next_beat_ns is None or odometry.t_ns >= self._next_beat_ns:
+        left_ns = None if self._next_beat_ns is None else self._next_beat_ns - odometry.t_ns
+        if left_ns is None or not 0 < left_ns <= 10**9:  # more than a second: the source's clock went back
             out.append(self.heartbeat())
             self._next_beat_ns = odometry.t_ns + 10**9
         out += [self.speed(odometry), self.odometry(odometry)]

@@ -1,3 +1,7 @@
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "missing inputs are NaN, which -ffast-math and -ffinite-math-only do away with: compile without them"
+#endif
+
 /* What the arithmetic below needs of a motion, and what it gives back. Tangent order: translation x y z [m], rotation
  * x y z [rad], in the rectified left optical frame. Matrices are row-major. */
 typedef struct {
@@ -158,7 +162,7 @@ static double gpvo_faster(const double *features) {
     int i;
     for (i = 0; i < 3; ++i) {
         double v = features[gpvo_base_column[i]];
-        v2 += gpvo_known(v) ? v * v : NAN;
+        v2 += gpvo_known(v) ? v * v : (double)NAN;
     }
     ratio = log(sqrt(v2) > 1e-9 ? sqrt(v2) : 1e-9) - GPVO_LN_SPEED;
     return isfinite(v2) ? gpvo_clip(ratio, 0.0, log(20.0)) : 0.0;

@@ -177,7 +177,8 @@ odom0_config: [{row},
 odom0_differential: false
 odom0_relative: false
 odom0_queue_size: 10
-odom0_twist_rejection_threshold: 3.0
+# against the root of the sum over all six axes, which exceeds 3 for one honest twist in six
+odom0_twist_rejection_threshold: 5.0
 """
     if ros1:
         return head + parameters

@@ -276,7 +276,7 @@ def _lens(lens: CameraModel, distortion_key: str) -> dict[str, Any]:
         "camera_model": "pinhole",
         "intrinsics": lens.intrinsics_px,
         "distortion_model": "equidistant" if fisheye else "radial-tangential",
-        distortion_key: [float(k) for k in lens.distortion[:4]],
+        distortion_key: [float(k) for k in lens.distortion[: 5 if any(lens.distortion[4:]) else 4]],
         "resolution": [lens.width, lens.height],
     }
 

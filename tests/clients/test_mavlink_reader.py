@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
-from gpvo.publish.mavlink import COMPONENT, Link, quality, write_tlog
+from gpvo.publish.mavlink import COMPONENT, Link, Sender, quality, write_tlog
 from gpvo.publish.odometry import Odometry
 
 pytest.importorskip("pymavlink")
@@ -145,3 +145,11 @@ def test_udp(odometry: list[Odometry]) -> None:
 def test_a_bad_address_is_one_line(address: str) -> None:
     with pytest.raises(GpvoError):
         Link(address)
+
+
+def test_a_heartbeat_a_second_also_after_the_clock_of_the_odometry_went_back(odometry: list[Odometry]) -> None:
+    sender, moving = Sender(), next(o for o in odometry if o.twist_body is not None)
+    stamps = [*range(10**18, 10**18 + 10 * 10**9, 10**8), *range(0, 10 * 10**9, 10**8)]
+    beats = [len(sender.due(replace(moving, t_ns=t))) == 3 for t in stamps]
+    assert sum(beats[:100]) == 10
+    assert sum(beats[100:]) == 10

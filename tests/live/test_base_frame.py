@@ -157,3 +157,16 @@ def test_a_bag_with_transforms_is_replayed(tmp_path: Path) -> None:
 def test_poses_that_do_not_name_their_frame_are_refused() -> None:
     with pytest.raises(GpvoError, match="--base-frame"):
         make_stage(LiveSettings(Path("m"), odometry="/pose", pose_type=POSE_TYPE, base_frame="base_link"))
+
+
+def test_recorded_poses_that_do_not_name_their_frame_are_told_and_not_taken_for_the_odometrys_origin() -> None:
+    live, kept, _ = based()
+    maker = BagMaker(ros1=False)
+    for k in range(30):
+        maker.pose_with_covariance(TOPIC, 10**18 + k * 10**8, np.eye(4), 1e-6 * np.eye(6))
+    live.take(tf(("odom", "chassis", T_BASE_MAST), ("map", "odom", np.eye(4))))
+    for t, _, message in maker.messages:
+        live.take(Arrival(TOPIC, message, t))
+    assert not kept.frames
+    assert live.stage.counts["unplaced"] == 30
+    assert any("do not name the frame that moves" in p for p in live.stage.problems())

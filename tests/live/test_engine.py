@@ -363,3 +363,14 @@ def test_truth_that_knows_less_than_the_odometry_teaches_nothing() -> None:
         live.take(arrival)
     assert live.counts["truth"] == 0
     np.testing.assert_array_equal(live.predictor.scale, np.ones(6))
+
+
+def test_one_truth_stamped_an_hour_ahead_costs_no_more_than_itself() -> None:
+    counts = []
+    for ahead_s in (0, 3600):
+        live, arrivals = _with_truth(1.0)
+        [a for a in arrivals if a.topic == "/mocap"][100].message.header.stamp.sec += ahead_s
+        for arrival in arrivals:
+            live.take(arrival)
+        counts.append(live.counts["truth"])
+    assert counts[0] - counts[1] <= 15  # those that waited: half a second of 20 Hz

@@ -246,8 +246,13 @@ def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> 
         "void run(const double *f, predict_estimate *a, fuse_estimate *b)"
         " { predict_predict(f, 0, 0.0, a); fuse_predict(f, 0, 0.0, b); }\n"
     )
-    flags = ["-std=c99", "-Wall", "-Werror", "-c"]
-    subprocess.run(["cc", *flags, str(source), "-o", str(tmp_path / "both.o")], check=True)
+    flags = ["-std=c99", "-Wall", "-Wdouble-promotion", "-Werror", "-c"]
+    command = ["cc", *flags, str(source), "-o", str(tmp_path / "both.o")]
+    subprocess.run(command, check=True)
+    # A missing input is NaN, which this option tells the compiler that there is none of.
+    refused = subprocess.run([*command, "-ffast-math"], capture_output=True, text=True, check=False)
+    assert refused.returncode != 0
+    assert "missing inputs are NaN" in refused.stderr
 
 
 def test_onnx_has_no_prefix(tmp_path: Path) -> None:

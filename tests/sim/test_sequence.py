@@ -5,10 +5,12 @@ import hashlib
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from gpvo.cameras.kalibr import read_camchain, read_sensor_pair
 from gpvo.cameras.rig import Tolerance
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -172,6 +174,18 @@ def test_the_camera_of_a_kitti_folder(tmp_path):
     (tmp_path / "calib.txt").write_text("fx 700")
     with pytest.raises(GpvoError, match=r"calib\.txt"):
         camera_rig(str(tmp_path / "calib.txt"))
+
+
+@pytest.mark.parametrize("k3", [0.0, -0.25])
+def test_the_written_calibration_is_that_of_the_rig(k3, tmp_path):
+    rig = camera_rig("euroc")
+    left, right = (replace(lens, distortion=(-0.3, 0.12, 1e-3, -5e-4, k3)) for lens in (rig.left, rig.right))
+    sequence._write_calibration(tmp_path, replace(rig, left=left, right=right), 20.0, 0.0)
+    pair = read_sensor_pair(*(tmp_path / "mav0" / f"cam{k}" / "sensor.yaml" for k in (0, 1)))
+    chain = read_camchain(tmp_path / "dso" / "camchain.yaml")
+    for read in (pair, chain):
+        assert tuple(read.left.distortion) == tuple(left.distortion)
+        assert tuple(read.right.distortion) == tuple(right.distortion)
 
 
 @pytest.mark.parametrize("camera", ["pinhole", "euroc", "t265"])

@@ -244,18 +244,24 @@ def test_evaluate_by_twins_with_and_without_truth(flown, blind):
     assert "simulated_truth" not in own
     by_twins = json.loads(gpvo("evaluate", blind, "--twins", "--replicates", 2, "--json").stdout)["runs"][0]
     assert by_twins["simulated_truth"]["twins"] == 2
+    assert by_twins["verdict"] is None  # words have no mean
+    assert "twin" not in str(by_twins["source"])
     for method in ("triangulation", "pointing_matching"):
         real, simulated = (d["methods"][method]["nees_dof"]["joint"] for d in (own, by_twins))
         assert simulated == pytest.approx(real, rel=0.35)
 
 
 @pytest.mark.slow
-def test_a_model_of_twins_says_so(blind, tmp_path):
+def test_a_model_of_twins_says_so(flown, blind, tmp_path):
     trained = gpvo("train", blind, "--twins", "--replicates", 3, "-o", tmp_path / "m.gpvo", "--features", "thesis")
     assert trained.exit_code == 0, trained.output
     card = next(tmp_path.glob("m*.md")).read_text()
     assert "The truth was simulated" in card
     assert "3 twins of `blind`" in card
+    again = ["--features", "thesis", "--update", tmp_path / "m.gpvo"]
+    updated = gpvo("train", flown[0] / "run", *again, "-o", tmp_path / "u.gpvo")
+    assert updated.exit_code == 0, updated.output
+    assert "3 twins of `blind`" in next(tmp_path.glob("u*.md")).read_text()
 
 
 def test_runs_without_tracks_are_refused_with_the_cure(flown, tmp_path):
