@@ -22,6 +22,7 @@ from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOu
 from gpvo.live.stages import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage, PoseStage, Stage
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.online.predictor import Predictor
+from gpvo.publish.ros import check_topic
 
 WIRES = ("zenoh", "dds", "ros2", "ros1")
 _DEPTHS = {IMU_TYPE: 400, TF_TYPE: 100}
@@ -144,6 +145,7 @@ class Live:
         self._mailbox.close()
         self.engine.sources.append(self._mailbox.dropped)
         for topic, kind in self._topics.items():
+            check_topic(topic)
             depth = _DEPTHS.get(kind, self._settings.depth)
 
             def deliver(name: str, data: bytes, n: int = depth) -> None:
@@ -165,13 +167,15 @@ class Live:
 
 
 def _outputs(settings: LiveSettings, wire: Wire | None) -> list[Output]:
+    for topic in (settings.topic, *([settings.pose_topic] if settings.pose_topic else [])):
+        check_topic(topic)
     outputs: list[Output] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
     if settings.px4:
         if wire is None or wire.ros1:
             raise GpvoError("--px4 needs DDS", cure="add --dds or --ros2")
         outputs.append(Px4Output(wire))
     outputs += [MavlinkOutput(settings.mavlink)] if settings.mavlink else []
-    outputs += [FileOutput(settings.out)] if settings.out else []
+    outputs += [FileOutput(settings.out, settings.topic)] if settings.out else []
     return outputs
 
 

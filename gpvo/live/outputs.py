@@ -124,10 +124,14 @@ class MavlinkOutput:
 
 
 class FileOutput:
-    """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end."""
+    """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    Raises GpvoError at once where the path holds something that may not be replaced.
+    """
+
+    def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
+        ros.require_replaceable(path, topic)
+        self._path, self._topic = path, topic
         self._odometry: list[Odometry] = []
 
     def odometry(self, odometry: Odometry) -> None:
@@ -142,6 +146,6 @@ class FileOutput:
         if all(o.twist_body is None for o in self._odometry):
             raise GpvoError("no frame had a motion: nothing to write", where=self._path)
         if self._path.suffix == ".bag":
-            ros.write_ros1(self._path, self._odometry)
+            ros.write_ros1(self._path, self._odometry, self._topic)
         else:
-            ros.write_ros2(self._path, self._odometry, mcap=self._path.suffix == ".mcap")
+            ros.write_ros2(self._path, self._odometry, self._topic, mcap=self._path.suffix == ".mcap")

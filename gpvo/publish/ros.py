@@ -78,8 +78,14 @@ def _flat(covariance: np.ndarray) -> np.ndarray:
 def check_topic(topic: str) -> str:
     """The topic, or GpvoError where it is no name of ROS: words of letters, digits and ``_``, ``/`` between them."""
     if not re.fullmatch(r"/?[A-Za-z]\w*(/[A-Za-z_]\w*)*", topic, re.ASCII):
-        raise GpvoError(f"--topic is {topic[:80]!r}, no name of ROS", cure="give one like /gpvo/odometry")
+        raise GpvoError(f"the topic {topic[:80]!r} is no name of ROS", cure="give one like /gpvo/odometry")
     return topic
+
+
+def require_replaceable(path: Path, topic: str) -> None:
+    """Raise GpvoError where something lies that is not a bag of nothing but ``topic``."""
+    if path.exists() and not _holds_only(path, topic):
+        raise GpvoError(f"exists, and is no bag of {topic} alone", where=path, cure="choose another -o")
 
 
 def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:
@@ -120,9 +126,8 @@ def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -
 
 
 def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
-    """Write beside the target and move it there when done; a bag of nothing but ``topic`` is replaced, nothing else."""
-    if path.exists() and not _holds_only(path, topic):
-        raise GpvoError(f"exists, and is no bag of {topic} alone", where=path, cure="choose another -o")
+    """Write beside the target and move it there when done."""
+    require_replaceable(path, topic)
     holder: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

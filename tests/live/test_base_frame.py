@@ -12,11 +12,11 @@ import pytest
 from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.io.bag_reader import POSE_TYPE
+from gpvo.io.bag_reader import POSE_TYPE, open_bag
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival
-from gpvo.live.job import LiveSettings, make_stage, run_live
+from gpvo.live.job import Live, LiveSettings, make_stage, run_live
 from gpvo.live.stages import BaseFrameStage, FrameTree, PoseStage
 from gpvo.live.stereo_stage import StereoStage
 from shim_bags import TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
@@ -170,3 +170,16 @@ def test_recorded_poses_that_do_not_name_their_frame_are_told_and_not_taken_for_
     assert not kept.frames
     assert live.stage.counts["unplaced"] == 30
     assert any("do not name the frame that moves" in p for p in live.stage.problems())
+
+
+def test_the_topic_is_also_that_of_the_bag_and_what_lies_there_is_refused_before_the_flight(tmp_path: Path) -> None:
+    bag, model = messages(*flight(n=60)).write(tmp_path / "vio"), save_model(tmp_path / "vio.gpvo")
+    out = tmp_path / "out.mcap"
+    settings = LiveSettings(model, replay=bag, fast=True, out=out, topic="/foo/odom")
+    run_live(settings)
+    with open_bag(out) as reader:
+        assert list(reader.topics) == ["/foo/odom"]
+    with pytest.raises(GpvoError, match="no bag of /bar/odom alone"):
+        Live(replace(settings, topic="/bar/odom"), None, print)
+    with pytest.raises(GpvoError, match="no name of ROS"):
+        Live(replace(settings, topic="bad topic"), None, print)

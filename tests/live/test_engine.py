@@ -188,6 +188,15 @@ def test_the_increments_covariance_neither_grows_nor_vanishes() -> None:
     assert last[True].min() > 1e-7
 
 
+def test_a_state_holds_what_adds_up_whichever_covariance_is_published(tmp_path: Path) -> None:
+    for increment in (False, True):
+        live, _, _ = engine(EngineSettings(increment=increment, state=tmp_path / f"{increment}.json"))
+        for arrival in flown(*flight()):
+            live.take(arrival)
+        live.close()
+    assert (tmp_path / "True.json").read_bytes() == (tmp_path / "False.json").read_bytes()
+
+
 def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
     stamps, T = flight(n=80)
     settings = EngineSettings(state=tmp_path / "state.json")
