@@ -164,6 +164,7 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
         chosen = replace(chosen, **overrides)  # type: ignore[arg-type]
     except TypeError as error:
         raise GpvoError(f"unknown scenario value: {error}", cure="see gpvo.sim.points.PointsScenario") from None
+    chosen = _in_step(chosen)
     # One stream per purpose: more noise must not move the path.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 77]).spawn(7)]
     scene = streams[0]
@@ -171,6 +172,16 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
         scene = np.random.default_rng(np.random.SeedSequence([chosen.world_seed, 77]).spawn(1)[0])
     path, cloud = clouds.make(chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene)
     return _fly(name, seed, chosen, path, cloud, streams)
+
+
+def _in_step(scenario: PointsScenario) -> PointsScenario:
+    """The same with the IMU's rate a whole multiple of the frames', the nearest, so that frames come as asked for."""
+    for name in ("rate_hz", "imu_rate_hz", "duration_s"):
+        value = getattr(scenario, name)
+        if not (isinstance(value, (int, float)) and 0 < value < float("inf")):
+            raise GpvoError(f"{name} is {value!r}", cure="give a positive number")
+    every = max(1, round(scenario.imu_rate_hz / scenario.rate_hz))
+    return replace(scenario, imu_rate_hz=every * scenario.rate_hz)
 
 
 def _fly(

@@ -85,3 +85,16 @@ def test_covariance_is_honest_at_the_true_noise(tmp_path):
             total += xi @ np.linalg.solve(covariance, xi)
             dof += 6
     assert 0.8 < total / dof < 1.25
+
+
+@pytest.mark.parametrize("rate_hz", [7.0, 20.0, 30.0, 60.0, 200.0])
+def test_frames_come_at_the_rate_that_was_asked_for(rate_hz):
+    flight = simulate_points("tunnel-clean", 0, duration_s=2.0, rate_hz=rate_hz, imu_rate_hz=110.0)
+    assert np.diff(flight.t_s) == pytest.approx(1 / rate_hz)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), "fast"])
+@pytest.mark.parametrize("name", ["rate_hz", "imu_rate_hz", "duration_s"])
+def test_a_rate_or_duration_that_is_none_is_refused(name, value):
+    with pytest.raises(GpvoError, match=name):
+        simulate_points("tunnel-clean", 0, **{name: value})
