@@ -142,7 +142,8 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
     from gpvo.cameras.rectify import Rectifier
 
     base = SCENARIOS.get(scenario.name, PointsScenario())
-    camera = base.camera if scenario.camera in ("pinhole", "t265") else Rectifier(camera_rig(scenario.camera)).camera
+    own = load_scenario(scenario.name).camera if scenario.name in SCENARIOS else None
+    camera = base.camera if scenario.camera == own else Rectifier(camera_rig(scenario.camera)).camera
     same = ("world", "duration_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "causes", "dark")
     values: dict[str, Any] = {
         **{name: getattr(scenario, name) for name in same},

@@ -1,9 +1,11 @@
 """Scenarios: all load, mistakes are named with their cure."""
 
 import pytest
+from gpvo.cameras.rectify import Rectifier
 from gpvo.errors import GpvoError
 from gpvo.sim import scenario as sc
 from gpvo.sim.points import SCENARIOS, simulate_points
+from gpvo.sim.rig import camera_rig
 
 
 def test_every_scenario_loads_and_explains_itself():
@@ -16,6 +18,13 @@ def test_every_scenario_loads_and_explains_itself():
 @pytest.mark.parametrize("name", sorted(SCENARIOS))
 def test_points_scenario_is_the_known_one(name):
     assert sc.points_scenario(sc.load_scenario(name)) == SCENARIOS[name]
+
+
+@pytest.mark.parametrize(("name", "camera"), [("tunnel-clean", "t265"), ("street", "t265"), ("room-t265", "euroc"),
+                                              ("room-flown", "t265"), ("tunnel", "pinhole")])  # fmt: skip
+def test_a_camera_that_was_asked_for_is_flown_without_images_too(name, camera):
+    flown = sc.points_scenario(sc.load_scenario(name, {"camera": camera}))
+    assert flown.camera == Rectifier(camera_rig(camera)).camera
 
 
 @pytest.mark.parametrize("name", ["tunnel", "tunnel-dark"])
