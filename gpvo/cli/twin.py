@@ -77,6 +77,8 @@ def twin(
     settings = options.settings(seed)
     if out is None and not against:
         raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")
+    if against:
+        _require_truth(runs)
     with nullcontext(out) if out is not None else TemporaryDirectory(prefix="gpvo-twins-") as folder:
         made = make_all(runs, Path(folder), settings, jobs)
         if against:
@@ -87,6 +89,14 @@ def twin(
         print_json({"schema": 1, "twins": [str(p) for p in made]})
     else:
         print(f"{out}: {len(made)} twins of {len(runs)} runs")
+
+
+def _require_truth(runs: Sequence[Path]) -> None:
+    """Raise GpvoError, before any work, for a run that twins cannot be compared with."""
+    from gpvo.io.run import read_run
+
+    if without := [r for r in runs if read_run(r).truth is None]:
+        raise GpvoError("has no ground truth to compare twins with", where=without[0], cure="leave out --against")
 
 
 def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: bool) -> None:

@@ -238,6 +238,12 @@ def test_the_command_makes_runs_with_exact_truth(blind, tmp_path):
     assert all(t.truth.sigma_translation_m == 0.0 for t in twins)
 
 
+def test_a_run_without_truth_is_refused_before_twins_are_made_to_compare_it_with(blind, tmp_path):
+    with pytest.raises(GpvoError, match="no ground truth to compare"):
+        gpvo("twin", blind, "-o", tmp_path / "t", "--against")
+    assert not (tmp_path / "t").exists()
+
+
 def test_evaluate_by_twins_with_and_without_truth(flown, blind):
     own = json.loads(gpvo("evaluate", flown[0] / "run", "--twins", "--replicates", 3, "--json").stdout)["runs"][0]
     assert 0.4 < own["methods"]["twin"]["nees_dof"]["joint"] < 2.5
