@@ -48,8 +48,8 @@ def by_twins(
     run: Run, twins: Sequence[Run], predictor: Predictor | None, options: EvaluateOptions
 ) -> tuple[dict[str, Any], list[Evaluation]]:
     """Document (:func:`gpvo.evaluation.document.document`) and evaluation of a run with truth, with the covariance that
-    its twins show as the method ``twin``. Of a run without: the mean over its twins, and the evaluation of each; the
-    method ``twin`` of each is that of the others."""
+    its twins show as the method ``twin``. Of a run without: the mean over its twins, without a verdict, and the
+    evaluation of each; the method ``twin`` of each is that of the others."""
     if run.truth is not None:
         own = evaluate_run(run, predictor, options, [_statement(run.log, twins)])
         return document([own])["runs"][0], [own]
