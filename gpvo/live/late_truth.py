@@ -12,11 +12,10 @@ from gpvo.dataset.errors import motion_targets
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.live.intake import Sequence, StampWatch
 from gpvo.types import Array, Prediction, TruthLog, VoRecord
 
 _MOTIONS, _POSES = 500, 5000
-_ANEW_NS = 10**9
-"""So far behind the last, a stamp does not come late."""
 _TRUTH_SHARE = 0.25
 """Of an axis' predicted variance; where truth's own variance is more, it cannot judge the axis."""
 
@@ -31,31 +30,31 @@ class LateTruth:
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self._waiting: deque[tuple[VoRecord, Prediction]] = deque(maxlen=_MOTIONS)
+        self._watch = StampWatch()
         self._poses: deque[tuple[int, Array, float, float]] = deque(maxlen=_POSES)  # with variances [m^2, rad^2]
 
     def forget(self) -> None:
         """The odometry's clock or origin is another one from here on."""
         self._waiting.clear()
         self._poses.clear()
+        self._watch = StampWatch()
 
     def predicted(self, record: VoRecord, prediction: Prediction | None) -> None:
         """A motion whose error is not known yet."""
         if prediction is not None and record.usable and record.dt_s > 0:
             self._waiting.append((record, prediction))
 
-    def _comes_late(self, t_ns: int) -> bool:
-        """Whether a stamp repeats the last or comes late. One far behind says that the last was wrong, or that the
-        truth's clock went back: truth begins anew with it."""
-        if self._poses and t_ns <= self._poses[-1][0] - _ANEW_NS:
-            self._poses.clear()
-        return bool(self._poses) and t_ns <= self._poses[-1][0]
-
     def take(self, message: Any, T_body_cam: Array) -> Iterator[tuple[int, Array]]:
         """Stamps and errors ``xi`` (6,) of the motions that a message of truth makes known; NaN where it cannot say."""
         t_ns, row = stamp_ns(message), pose_of(message)
         norm = float(np.linalg.norm(row[3:]))
-        if not np.isfinite(row).all() or abs(norm - 1.0) > 0.1 or self._comes_late(t_ns):
+        if not np.isfinite(row).all() or abs(norm - 1.0) > 0.1:
             return
+        seen = self._watch.see(t_ns)
+        if seen.dropped:
+            return
+        if seen is Sequence.RESTART:
+            self._poses.clear()
         T_world_body = se3.from_quaternion(row[None, :3], row[None, 3:])[0]
         self._poses.append((t_ns, T_world_body @ T_body_cam, *_variances(message)))
         ready = []
