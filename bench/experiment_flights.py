@@ -124,7 +124,7 @@ def _fly_points(campaign: Campaign, seed: int, accidents: bool, path: Path) -> l
     happens: dict[str, Any] = {}
     if accidents:
         happens = {"dark": (D / 3, D / 3 + _DARK_S), "frozen": (2 * D / 3, 2 * D / 3 + _FROZEN_S)}
-        happens |= {} if scenario.bursts else {"bursts": True, "causes": ("image_noise",)}
+        happens |= {} if scenario.episodes_share else {"episodes_share": 0.2, "causes": ("image_noise",)}
     flight = simulate_points(scenario, seed, **happens)
     flight.save(path)
     return [{"begin_s": e.begin_s, "end_s": e.end_s, "cause": e.cause} for e in flight.episodes]

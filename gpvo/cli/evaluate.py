@@ -85,7 +85,7 @@ def evaluate(
 
     if twins:
         options = judge.options()
-        documents, found = _with_twins(*_loaded(runs, judge), options, twin_options.settings(seed))
+        documents, found = _with_twins(*_loaded(runs, judge), judge.model, options, twin_options.settings(seed))
     else:
         found = _evaluate(runs, judge)
         documents = document(found)["runs"]
@@ -173,16 +173,20 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
 
     options = judge.options()
     loaded, predictor = _loaded(runs, judge)
-    if predictor is not None and judge.model is not None:
-        from gpvo.dataset.check import check
-
-        for run in loaded:
-            for problem in check(predictor, run).problems:
-                warnings.warn(f"{judge.model.name} does not fit {run.name}: {problem}", stacklevel=2)
+    for run in loaded:
+        _warn_of_misfits(judge.model, predictor, run)
     return [
         unjudged_run(run, predictor) if unjudged and run.truth is None else evaluate_run(run, predictor, options)
         for run in loaded
     ]
+
+
+def _warn_of_misfits(model: Path | None, predictor: Predictor | None, run: Run) -> None:
+    from gpvo.dataset.check import check
+
+    if model is not None and predictor is not None:
+        for problem in check(predictor, run).problems:
+            warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
 
 
 def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
@@ -196,7 +200,7 @@ def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
 
 
 def _with_twins(
-    runs: list[Run], predictor: Predictor | None, options: EvaluateOptions, settings: TwinSettings
+    runs: list[Run], predictor: Predictor | None, model: Path | None, options: EvaluateOptions, settings: TwinSettings
 ) -> tuple[list[dict[str, Any]], list[Evaluation]]:
     """Documents of the runs, and the evaluations behind them: a run's own if it has truth, else those of its twins."""
     from tempfile import TemporaryDirectory
@@ -209,6 +213,7 @@ def _with_twins(
     for run in runs:
         with TemporaryDirectory(prefix="gpvo-twins-") as folder:
             twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
+        _warn_of_misfits(model, predictor, run if run.truth is not None else twins[0])
         about, own = by_twins(run, twins, predictor, options)
         documents.append(about)
         found += own

@@ -69,7 +69,7 @@ def simulate(
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
     if points and preview:
         raise GpvoError("--points draws no images to preview", cure="leave out one of --points, --preview")
-    from gpvo.sim.scenario import fly_campaign, load_scenario, stated_seed
+    from gpvo.sim.scenario import fly_campaign, load_scenario, stated_seed, warn_of_unused
 
     given = {"duration_s": duration, "rate_hz": rate, "speed_mps": speed, "camera": camera,
              "trajectory": None if trajectory is None else str(trajectory)}  # fmt: skip
@@ -77,6 +77,8 @@ def simulate(
         _like(like, points) | {k: v for k, v in given.items() if v is not None} | dict(map(_assignment, set_ or []))
     )
     chosen = load_scenario(scenario, overrides)
+    if points:
+        warn_of_unused(chosen)
     if seeds is not None and seed is not None:
         raise GpvoError("--seed and --seeds are mutually exclusive", cure="leave out one of them")
     # A contact sheet alone keeps no sequence.

@@ -40,10 +40,13 @@ def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
     problems = [*camera_problems(predictor.camera, run.log.camera), *odometry_problems(predictor, run.settings)]
     problems += rate_problems(predictor, [r for r in run.log if r.usable])
+    twin, known = run.meta.get("twin") or {}, predictor.header.get("simulated_truth") or []
+    if any(s.get("of") == twin.get("of") and s.get("seed") == twin.get("seed") for s in known if twin):
+        problems.append(f"it learned from these very twins of {twin['of']}: judge it by others, with another --seed")
     records, X = observe(run.log, predictor.features, predictor.target)
     usable = np.array([r.usable for r in records], dtype=bool)
-    known = np.isfinite(X[usable]).mean(axis=0) if usable.any() else np.ones(X.shape[1])
-    missing = [n for n, share in zip(predictor.features, known) if share < 0.5]
+    present = np.isfinite(X[usable]).mean(axis=0) if usable.any() else np.ones(X.shape[1])
+    missing = [n for n, share in zip(predictor.features, present) if share < 0.5]
     if missing:
         problems.append(f"the run lacks features the model needs: {', '.join(missing)}")
     place = predictor.model.locate(X[usable], np.array([r.dt_s for r in records])[usable])

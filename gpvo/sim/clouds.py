@@ -19,7 +19,9 @@ _STEP_M = 0.5  # between the points of a centre line
 _BEYOND_M = 80.0
 
 
-def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator) -> tuple[Path3, Array]:
+def make(
+    world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float
+) -> tuple[Path3, Array]:
     """A path and the landmarks (N, 3) [m] around it.
 
     ``path``: one of :data:`PATHS`, or a recorded one, a file or run folder, which is scaled to fit the world; a street
@@ -31,35 +33,39 @@ def make(world: str, path: str, duration_s: float, speed_mps: float, rng: np.ran
     bend = 0.0 if path == "straight" else 1.0
     centre = _tunnel_line(reach, rng, bend, scale=12.0 if world == "street" else 1.0)
     if world == "street" and path not in PATHS:
-        return _street_along(_recording(path, duration_s), duration_s, rng)
+        return _street_along(_recording(path, duration_s, rest_s), duration_s, rng, rest_s)
     landmarks, low, high = _KINDS[world]
     cloud = landmarks(centre, rng)
     if path == "hover":
         flown = paths.hover((low + high) / 2, 0.0, duration_s)
     elif path == "straight":
         height, ground = (1.1, ground_height) if world == "lunar" else (0.0, None)
-        flown = paths.straight(np.array([0.0, 0.0, height]), np.array([1.0, 0, 0]), duration_s, speed_mps, ground)
+        flown = paths.straight(
+            np.array([0.0, 0.0, height]), np.array([1.0, 0, 0]), duration_s, speed_mps, ground, rest_s
+        )
     elif path == "wander" or (path == "along" and world == "room"):
-        flown = paths.wandering(low, high, duration_s, speed_mps, rng)
+        flown = paths.wandering(low, high, duration_s, speed_mps, rng, rest_s)
     elif path == "along" and world == "street":
-        flown = paths.driving(centre + [0, 0, _CAMERA_HEIGHT_M], duration_s, speed_mps, rng)
+        flown = paths.driving(centre + [0, 0, _CAMERA_HEIGHT_M], duration_s, speed_mps, rng, rest_s)
     elif path == "along":
         line = centre * [1, 1, 0] + [0, 0, 1.5] if world == "lunar" else centre
-        flown = paths.along_curve(line, duration_s, speed_mps, rng, sway_m=0.35)
+        flown = paths.along_curve(line, duration_s, speed_mps, rng, sway_m=0.35, rest_s=rest_s)
     else:
-        flown = _recording(path, duration_s).fitted(low, high, duration_s, rng)
+        flown = _recording(path, duration_s, rest_s).fitted(low, high, duration_s, rng, rest_s)
     return flown, cloud
 
 
-def _recording(path: str, duration_s: float) -> recorded.Recording:
+def _recording(path: str, duration_s: float, rest_s: float) -> recorded.Recording:
     if not Path(path).exists():
         raise GpvoError(f"'{path}' is neither a kind of path nor a file", cure=f"{', '.join(PATHS)}, or a file")
-    return recorded.read_recording(Path(path), duration_s)
+    return recorded.read_recording(Path(path), duration_s, rest_s)
 
 
-def _street_along(recording: recorded.Recording, duration_s: float, rng: np.random.Generator) -> tuple[Path3, Array]:
+def _street_along(
+    recording: recorded.Recording, duration_s: float, rng: np.random.Generator, rest_s: float
+) -> tuple[Path3, Array]:
     """The recording as it is, and a street below it that goes on straight beyond both of its ends."""
-    path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0, duration_s)
+    path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0, duration_s, rest_s)
     at = path.position(np.arange(0.0, duration_s, 0.05)) - [0, 0, _CAMERA_HEIGHT_M]
     steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
     at = at[np.concatenate([[True], steps > 1e-3])]

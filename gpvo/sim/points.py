@@ -7,86 +7,22 @@ frame, so the two motions that share a frame share its noise, as in reality.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.rig import RIG_ERRORS, Tolerance, TrueRig
+from gpvo.cameras.rig import RIG_ERRORS, TrueRig
 from gpvo.errors import GpvoError
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim import clouds, events, imu
-from gpvo.sim.events import CAUSES, Episode, draw_episodes
+from gpvo.sim.events import Episode, draw_episodes
 from gpvo.sim.paths import Path3
-from gpvo.types import Array, ImuLog, StereoCamera
-
-
-@dataclass(frozen=True)
-class PointsScenario:
-    """A kind of flight. Times in s, lengths in m, pixels of the rectified image."""
-
-    world: str = "tunnel"  # tunnel, lunar, room, street
-    world_seed: int | None = None  # of landmarks and path, in place of the flight's own
-    path: str = "along"  # along, wander, straight, hover, or a recorded one: a TUM file, or a run folder
-    duration_s: float = 60.0
-    rate_hz: float = 20.0
-    speed_mps: float = 1.2
-    camera: StereoCamera = field(default_factory=lambda: StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480))
-    imu: str = "euroc"
-    imu_rate_hz: float = 200.0
-    tracks: int = 220  # wanted per frame
-    sigma_px: float = 0.15  # of each image coordinate
-    persistent_px: float = 0.0  # of a point's disparity, the same for as long as it is followed
-    blur_px: float = 0.008  # further noise per pixel of image motion
-    spread: float = 0.15  # standard deviation of log sigma between flights
-    outliers: float = 0.03  # share of the tracks that jump
-    drop: float = 0.04  # share of the tracks that end, per frame
-    bursts: bool = False  # episodes over a fifth of the flight in which VO gets ten times worse
-    causes: tuple[str, ...] = tuple(CAUSES)  # of the episodes
-    noise_every: int = 0  # every n-th frame is noisy by noise_px
-    noise_px: float = 0.0
-    dark: tuple[float, float] | None = None  # no tracks from, to
-    frozen: tuple[float, float] | None = None  # the same image from, to
-    cars: int = 0  # that drive beside, before or towards the camera, for 5 to 20 s each
-    smoke: float = 0.0  # share of the time with a plume that drifts along
-    dust: float = 0.0  # share of the time with dust that turns about the vehicle
-    texture: float = 1.0  # share of the world's points that are there
-    reach_m: float = 40.0  # as far as points are seen
-    tolerance: Tolerance = field(default_factory=Tolerance)
-    offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
-
-
-SCENARIOS: dict[str, PointsScenario] = {
-    "tunnel-clean": PointsScenario(),
-    "tunnel-noise": PointsScenario(sigma_px=0.6, outliers=0.08, tracks=120, drop=0.10),
-    "tunnel-bursts": PointsScenario(bursts=True),
-    "lunar-straight": PointsScenario(
-        world="lunar", path="straight", speed_mps=1.0, duration_s=210.0, rate_hz=10.0, noise_every=5, noise_px=0.5
-    ),
-    "room-t265": PointsScenario(
-        world="room",
-        path="wander",
-        speed_mps=0.8,
-        camera=StereoCamera(300.0, 300.0, 319.5, 239.5, 0.064, 640, 480),
-        imu="t265",
-        sigma_px=0.25,
-        tolerance=Tolerance(baseline=0.01, focal=0.003, rotation_rad=5e-4),
-    ),
-    "street": PointsScenario(
-        world="street",
-        speed_mps=22.0,
-        rate_hz=10.0,
-        camera=StereoCamera(718.0, 718.0, 619.5, 187.5, 0.5, 1240, 376),
-        tracks=400,
-        reach_m=80.0,
-    ),
-}
-SCENARIOS["street-traffic"] = replace(SCENARIOS["street"], cars=6, texture=0.5)
-SCENARIOS["tunnel-smoke"] = PointsScenario(smoke=0.3)
-SCENARIOS["lunar-dust"] = replace(SCENARIOS["lunar-straight"], duration_s=60.0, dust=0.3)
+from gpvo.sim.points_scenario import SCENARIOS, PointsScenario, check_values
+from gpvo.types import Array, ImuLog
 
 
 @dataclass(frozen=True)
@@ -163,23 +99,22 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     try:
         chosen = replace(chosen, **overrides)  # type: ignore[arg-type]
     except TypeError as error:
-        raise GpvoError(f"unknown scenario value: {error}", cure="see gpvo.sim.points.PointsScenario") from None
+        raise GpvoError(
+            f"unknown scenario value: {error}", cure="see gpvo.sim.points_scenario.PointsScenario"
+        ) from None
+    check_values(vars(chosen))
     chosen = _in_step(chosen)
     # One stream per purpose: more noise must not move the path.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 77]).spawn(7)]
     scene = streams[0]
     if chosen.world_seed is not None:
         scene = np.random.default_rng(np.random.SeedSequence([chosen.world_seed, 77]).spawn(1)[0])
-    path, cloud = clouds.make(chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene)
+    path, cloud = clouds.make(chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene, chosen.rest_s)
     return _fly(name, seed, chosen, path, cloud, streams)
 
 
 def _in_step(scenario: PointsScenario) -> PointsScenario:
     """The same with the IMU's rate a whole multiple of the frames', the nearest, so that frames come as asked for."""
-    for name in ("rate_hz", "imu_rate_hz", "duration_s"):
-        value = getattr(scenario, name)
-        if not (isinstance(value, (int, float)) and 0 < value < float("inf")):
-            raise GpvoError(f"{name} is {value!r}", cure="give a positive number")
     every = max(1, round(scenario.imu_rate_hz / scenario.rate_hz))
     return replace(scenario, imu_rate_hz=every * scenario.rate_hz)
 
@@ -192,7 +127,9 @@ def _fly(
     at_frames = motion.thinned(every)
     T_world_cam = se3.from_rt(at_frames.R_world_body, at_frames.position_m) @ T_BODY_CAM
     log, _, _ = imu.measured_imu(motion, imu.PRESETS[scenario.imu], streams[1])
-    episodes = draw_episodes(scenario.duration_s, streams[2], causes=scenario.causes) if scenario.bursts else ()
+    episodes = draw_episodes(
+        scenario.duration_s, streams[2], scenario.episodes_share, scenario.rest_s + 1.0, scenario.causes
+    )
     if scenario.texture < 1.0:
         cloud = cloud[streams[6].random(len(cloud)) < scenario.texture]
     bodies = events.draw_movers(

@@ -4,6 +4,7 @@ and their flights, one or many, on the cores of this machine or on a dask cluste
 from __future__ import annotations
 
 import difflib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,12 +17,24 @@ from gpvo.errors import GpvoError
 from gpvo.files import read_toml
 from gpvo.geometry.se3 import path_length_m
 from gpvo.parallel import map_jobs
-from gpvo.sim.points import SCENARIOS, PointsScenario, simulate_points
+from gpvo.sim.points import simulate_points
+from gpvo.sim.points_scenario import SCENARIOS, PointsScenario, check_values
 from gpvo.sim.rig import CAMERAS, camera_rig
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
 Share = Field(0.0, ge=0.0, le=0.5)
+_SHARED = (
+    "world", "world_seed", "duration_s", "rest_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "episodes_share",
+    "causes", "dark",
+)  # fmt: skip
+"""What flights with images and without take alike."""
+_IMAGES_ALONE = {
+    "noise_sigma": "points.sigma_px", "noise_every": "points.noise_every", "frozen": "points.frozen",
+    "dropped": "points.drop", "black": "points.dark", "waypoints": "--trajectory FILE", "late": "", "imu_offset_s": "",
+    "camera_pitch_deg": "", "right_light": "", "exposure_s": "", "sway_m": "", "agility": "", "depth": "", "flow": "",
+}  # fmt: skip
+"""What only flights with images take, and what is like it without."""
 _FOLDER = Path(__file__).parent / "scenarios"
 
 
@@ -123,8 +136,8 @@ def load_scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Scen
     file = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
     table = read_toml(file)
     # A resolved scenario, as it lies beside a sequence, may be flown again.
-    table.pop("seed", None)
-    table.pop("drawn", None)
+    for beside in ("seed", "files", "drawn"):
+        table.pop(beside, None)
     table.setdefault("name", file.stem)
     for key, value in (overrides or {}).items():
         _put(table, key, value)
@@ -144,17 +157,26 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
     base = SCENARIOS.get(scenario.name, PointsScenario())
     own = load_scenario(scenario.name).camera if scenario.name in SCENARIOS else None
     camera = base.camera if scenario.camera == own else Rectifier(camera_rig(scenario.camera)).camera
-    same = ("world", "duration_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "causes", "dark")
     values: dict[str, Any] = {
-        **{name: getattr(scenario, name) for name in same},
+        **{name: getattr(scenario, name) for name in _SHARED},
         "path": scenario.trajectory or scenario.path,
         "camera": camera,
-        "bursts": scenario.episodes_share > 0,
         # A rectified pair has no distortion to be wrong.
         "tolerance": replace(scenario.tolerance, distortion=0.0),
         "offset": replace(scenario.offset, distortion=0.0),
     }
     return replace(base, **{**values, **scenario.points})
+
+
+def warn_of_unused(scenario: Scenario) -> None:
+    """Warn of values, other than the scenario's usual ones, that a flight without images does not use."""
+    usual = (
+        load_scenario(scenario.name) if scenario.name in names() else Scenario.model_validate({"name": scenario.name})
+    )
+    for name, instead in _IMAGES_ALONE.items():
+        if getattr(scenario, name) != getattr(usual, name) and instead.removeprefix("points.") not in scenario.points:
+            cure = f"; set {instead}" if instead else ""
+            warnings.warn(f"{name} is not used without images{cure}", stacklevel=2)
 
 
 def require_pictures(scenario: Scenario) -> None:
@@ -190,6 +212,7 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
     known = {f.name for f in fields(PointsScenario)}
     if unknown := sorted(set(scenario.points) - known):
         raise GpvoError(f"unknown parameter 'points.{unknown[0]}'", where=where, cure=_nearest(unknown[0], known))
+    check_values(scenario.points, "points.")
     if scenario.camera not in CAMERAS and not Path(scenario.camera).exists():
         raise GpvoError(
             f"camera is '{scenario.camera}'",

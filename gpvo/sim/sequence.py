@@ -5,6 +5,8 @@ at all; and a contact sheet of its images.
 from __future__ import annotations
 
 import errno
+import hashlib
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -29,7 +31,7 @@ from gpvo.io.images import read_grey8
 from gpvo.sim import imu, sequence_plan, vehicles
 from gpvo.sim.eye import Eye, optical_flow
 from gpvo.sim.imu import Motion
-from gpvo.sim.rig import RigError, camera_rig, mounted, true_rig
+from gpvo.sim.rig import CAMERAS, RigError, camera_rig, mounted, true_rig
 from gpvo.sim.scenario import Flight, Scenario, require_pictures
 from gpvo.sim.sequence_plan import FramePlan
 from gpvo.sim.worlds import build_world
@@ -68,7 +70,7 @@ def simulate(
     """
     require_pictures(scenario)
     target = Path(out)
-    resolved = to_toml({"seed": seed, **scenario.model_dump()})
+    resolved = to_toml({"seed": seed, **scenario.model_dump(), **_digests(scenario)})
     with _only_writer(target):
         if _is_finished(target, resolved):
             poses = np.loadtxt(
@@ -93,6 +95,19 @@ def simulate(
             shutil.rmtree(part, ignore_errors=True)
             raise
     return Flight(seed, target, frames, distance)
+
+
+def _digests(scenario: Scenario) -> dict[str, dict[str, str]]:
+    """What the files hold that a scenario names: with another content, it is another scenario."""
+    files: dict[str, str] = {}
+    if scenario.camera not in CAMERAS:
+        rig = json.dumps(camera_rig(scenario.camera).describe(), sort_keys=True)
+        files["camera"] = hashlib.sha256(rig.encode()).hexdigest()
+    path = Path(scenario.trajectory or "")
+    recorded = path / "vo_log.parquet" if path.is_dir() else path
+    if scenario.trajectory and recorded.is_file():
+        files["trajectory"] = hashlib.sha256(recorded.read_bytes()).hexdigest()
+    return {"files": files} if files else {}
 
 
 @contextmanager

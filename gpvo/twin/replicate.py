@@ -213,10 +213,15 @@ def make_twins(
     Raises
     ------
     SourceError
-        As :func:`estimate`.
+        As :func:`estimate`, and where the folder holds twins that these would not replace.
     """
+    made = range(settings.replicates)
+    others = (p for p in sorted(out.glob("*-twin*/")) if p.name.rpartition("-twin")[2] not in map(str, made))
+    if (other := next(others, None)) is not None:
+        cure = "remove it, make as many as before, or give another folder"
+        raise SourceError(f"is a twin that {settings.replicates} replicates do not replace", where=other, cure=cure)
     original = estimate(path)
-    work = [(original, settings, k, out) for k in range(settings.replicates)]
+    work = [(original, settings, k, out) for k in made]
     return map_jobs(_make_twin, work, jobs=jobs, on_done=on_twin)
 
 

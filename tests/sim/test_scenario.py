@@ -1,10 +1,14 @@
 """Scenarios: all load, mistakes are named with their cure."""
 
+import warnings
+from dataclasses import fields
+
 import pytest
 from gpvo.cameras.rectify import Rectifier
 from gpvo.errors import GpvoError
 from gpvo.sim import scenario as sc
-from gpvo.sim.points import SCENARIOS, simulate_points
+from gpvo.sim.points import simulate_points
+from gpvo.sim.points_scenario import _RULES, SCENARIOS, PointsScenario, check_values
 from gpvo.sim.rig import camera_rig
 
 
@@ -49,6 +53,53 @@ def test_mistakes_are_named(overrides, message):
     with pytest.raises(GpvoError, match=message) as caught:
         sc.load_scenario("tunnel", overrides)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [("sigma_px", "fast"), ("sigma_px", -0.1), ("drop", 1.5), ("tracks", 0), ("tracks", 10.5), ("cars", True),
+     ("frozen", [3.0, 1.0]), ("dark", 4.0), ("causes", [["dust"]]), ("causes", []), ("world_seed", -1),
+     ("episodes_share", 0.9), ("reach_m", float("nan")), ("camera", "t265"), ("tolerance", {"focal": 0.1})],
+)  # fmt: skip
+def test_a_value_of_points_that_makes_no_flight_is_refused_before_any(name, value):
+    with pytest.raises(GpvoError, match=f"^points.{name} is ") as caught:
+        sc.load_scenario("tunnel", {f"points.{name}": value})
+    assert "\n" not in str(caught.value)
+    with pytest.raises(GpvoError, match=f"^{name} is "):
+        simulate_points("tunnel-clean", 0, **{name: value})
+
+
+def test_every_value_of_points_has_a_rule_that_the_known_flights_keep():
+    ruled = [name for names, _, _ in _RULES for name in names.split()]
+    assert sorted(ruled) == sorted(f.name for f in fields(PointsScenario))
+    for known in SCENARIOS.values():
+        check_values(vars(known))
+
+
+def test_what_a_flight_has_with_images_it_has_without():
+    given = {"world_seed": 4, "rest_s": 1.0, "episodes_share": 0.4, "causes": ["dust"], "duration_s": 20.0}
+    flown = sc.points_scenario(sc.load_scenario("tunnel", given))
+    assert {name: getattr(flown, name) for name in given} == given | {"causes": ("dust",)}
+    flight = simulate_points(flown, 1)
+    assert sum(e.end_s - e.begin_s for e in flight.episodes) == pytest.approx(8.0, abs=1.5)
+    moved_m = abs(flight.T_world_cam[:, :3, 3] - flight.T_world_cam[0, :3, 3]).max(axis=1)
+    assert 1.0 <= flight.t_s[(moved_m > 1e-3).argmax()] < 1.5
+
+
+@pytest.mark.parametrize(
+    "name, overrides, told",
+    [
+        ("tunnel", {"noise_sigma": 0.02}, ["noise_sigma is not used without images; set points.sigma_px"]),
+        ("tunnel", {"noise_sigma": 0.02, "points.sigma_px": 0.4}, []),
+        ("tunnel-noise", {}, []),
+        ("lunar-straight", {"camera_pitch_deg": 0.0}, ["camera_pitch_deg is not used without images"]),
+    ],
+)
+def test_what_only_images_show_is_not_dropped_in_silence(name, overrides, told):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sc.warn_of_unused(sc.load_scenario(name, overrides))
+    assert [str(w.message) for w in caught] == told
 
 
 def test_unknown_names():

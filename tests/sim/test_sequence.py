@@ -103,6 +103,22 @@ def test_resolved_scenario_flies_the_same_again(quick, tmp_path):
         sequence.simulate(quick(calibration={"baseline": 0.01}, speed_mps=0.4), 5, tmp_path / "seq")
 
 
+def test_a_file_with_another_content_is_another_scenario(quick, tmp_path):
+    def path(climb_m):
+        t = np.arange(0.0, 8.0, 0.1)
+        lines = [f"{a} {0.01 * a} 0 {climb_m * a} 0 0 0 1" for a in t]
+        (tmp_path / "path.txt").write_text("\n".join(lines))
+
+    path(0.01)
+    scenario = quick(trajectory=str(tmp_path / "path.txt"))
+    assert sequence.simulate(scenario, 5, tmp_path / "seq").redone
+    assert not sequence.simulate(scenario, 5, tmp_path / "seq").redone
+    assert load_scenario(str(tmp_path / "seq" / "scenario.toml")) == scenario
+    path(0.02)
+    with pytest.raises(GpvoError, match=r"holds another sequence \(trajectory = "):
+        sequence.simulate(scenario, 5, tmp_path / "seq")
+
+
 def test_one_writer_at_a_time(quick, tmp_path):
     with (
         sequence._only_writer(tmp_path / "seq"),

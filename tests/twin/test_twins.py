@@ -1,6 +1,7 @@
 """Twins of simulated flights: the same conditions, other noise, exact truth; and the commands around them."""
 
 import json
+import warnings
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -238,6 +239,13 @@ def test_the_command_makes_runs_with_exact_truth(blind, tmp_path):
     assert all(t.truth.sigma_translation_m == 0.0 for t in twins)
 
 
+def test_twins_of_an_earlier_call_do_not_stay_among_those_of_this(blind, tmp_path):
+    gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 3)
+    with pytest.raises(SourceError, match="blind-twin2: is a twin that 2 replicates do not replace"):
+        gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 2)
+    assert gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 3).exit_code == 0
+
+
 def test_a_run_without_truth_is_refused_before_twins_are_made_to_compare_it_with(blind, tmp_path):
     with pytest.raises(GpvoError, match="no ground truth to compare"):
         gpvo("twin", blind, "-o", tmp_path / "t", "--against")
@@ -264,6 +272,12 @@ def test_a_model_of_twins_says_so(flown, blind, tmp_path):
     card = next(tmp_path.glob("m*.md")).read_text()
     assert "The truth was simulated" in card
     assert "3 twins of `blind`" in card
+    judged = ["evaluate", blind, "--twins", "--replicates", 2, "--model", tmp_path / "m.gpvo", "--seed"]
+    with pytest.warns(UserWarning, match="learned from these very twins of blind"):
+        gpvo(*judged, 0)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*these very twins")
+        gpvo(*judged, 1)
     again = ["--features", "thesis", "--update", tmp_path / "m.gpvo"]
     updated = gpvo("train", flown[0] / "run", *again, "-o", tmp_path / "u.gpvo")
     assert updated.exit_code == 0, updated.output

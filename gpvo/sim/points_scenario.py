@@ -1,0 +1,122 @@
+"""Flights without images: what is flown, where, and how it is seen, and the kinds of flight that come with gpvo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from gpvo.cameras.rig import Tolerance
+from gpvo.errors import GpvoError
+from gpvo.sim import imu
+from gpvo.sim.events import CAUSES
+from gpvo.types import StereoCamera
+
+
+@dataclass(frozen=True)
+class PointsScenario:
+    """A kind of flight. Times in s, lengths in m, pixels of the rectified image."""
+
+    world: str = "tunnel"  # tunnel, lunar, room, street
+    world_seed: int | None = None  # of landmarks and path, in place of the flight's own
+    path: str = "along"  # along, wander, straight, hover, or a recorded one: a TUM file, or a run folder
+    duration_s: float = 60.0
+    rest_s: float = 3.0  # at the start
+    rate_hz: float = 20.0
+    speed_mps: float = 1.2
+    camera: StereoCamera = field(default_factory=lambda: StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480))
+    imu: str = "euroc"
+    imu_rate_hz: float = 200.0
+    tracks: int = 220  # wanted per frame
+    sigma_px: float = 0.15  # of each image coordinate
+    persistent_px: float = 0.0  # of a point's disparity, the same for as long as it is followed
+    blur_px: float = 0.008  # further noise per pixel of image motion
+    spread: float = 0.15  # standard deviation of log sigma between flights
+    outliers: float = 0.03  # share of the tracks that jump
+    drop: float = 0.04  # share of the tracks that end, per frame
+    episodes_share: float = 0.0  # share of the flight in episodes in which VO gets ten times worse
+    causes: tuple[str, ...] = tuple(CAUSES)  # of the episodes
+    noise_every: int = 0  # every n-th frame is noisy by noise_px
+    noise_px: float = 0.0
+    dark: tuple[float, float] | None = None  # no tracks from, to
+    frozen: tuple[float, float] | None = None  # the same image from, to
+    cars: int = 0  # that drive beside, before or towards the camera, for 5 to 20 s each
+    smoke: float = 0.0  # share of the time with a plume that drifts along
+    dust: float = 0.0  # share of the time with dust that turns about the vehicle
+    texture: float = 1.0  # share of the world's points that are there
+    reach_m: float = 40.0  # as far as points are seen
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
+
+
+SCENARIOS: dict[str, PointsScenario] = {
+    "tunnel-clean": PointsScenario(),
+    "tunnel-noise": PointsScenario(sigma_px=0.6, outliers=0.08, tracks=120, drop=0.10),
+    "tunnel-bursts": PointsScenario(episodes_share=0.2),
+    "lunar-straight": PointsScenario(
+        world="lunar", path="straight", speed_mps=1.0, duration_s=210.0, rate_hz=10.0, noise_every=5, noise_px=0.5
+    ),
+    "room-t265": PointsScenario(
+        world="room",
+        path="wander",
+        speed_mps=0.8,
+        camera=StereoCamera(300.0, 300.0, 319.5, 239.5, 0.064, 640, 480),
+        imu="t265",
+        sigma_px=0.25,
+        tolerance=Tolerance(baseline=0.01, focal=0.003, rotation_rad=5e-4),
+    ),
+    "street": PointsScenario(
+        world="street",
+        speed_mps=22.0,
+        rate_hz=10.0,
+        camera=StereoCamera(718.0, 718.0, 619.5, 187.5, 0.5, 1240, 376),
+        tracks=400,
+        reach_m=80.0,
+    ),
+}
+SCENARIOS["street-traffic"] = replace(SCENARIOS["street"], cars=6, texture=0.5)
+SCENARIOS["tunnel-smoke"] = PointsScenario(smoke=0.3)
+SCENARIOS["lunar-dust"] = replace(SCENARIOS["lunar-straight"], duration_s=60.0, dust=0.3)
+
+
+def _within(least: float, most: float, kind: type = float) -> Callable[[Any], bool]:
+    kinds = (int,) if kind is int else (int, float)
+    return lambda v: isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= most
+
+
+_is_time = _within(0.0, 1e6)
+_RULES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
+    ("duration_s rate_hz imu_rate_hz reach_m", "a number from 0.1 to 1e6", _within(0.1, 1e6)),
+    ("rest_s speed_mps sigma_px persistent_px blur_px spread noise_px", "a number from 0 to 1e3", _within(0.0, 1e3)),
+    ("outliers drop smoke dust texture", "a share from 0 to 1", _within(0.0, 1.0)),
+    ("episodes_share", "a share from 0 to 0.5", _within(0.0, 0.5)),
+    ("tracks", "a whole number from 1 to 100000", _within(1, 1e5, int)),
+    ("cars noise_every", "a whole number from 0 to 1000", _within(0, 1e3, int)),
+    ("world_seed", "a whole number from 0 on", lambda v: v is None or _within(0, float("inf"), int)(v)),
+    (
+        "dark frozen",
+        "two times in s, the earlier one first",
+        lambda v: v is None or (isinstance(v, (list, tuple)) and [*map(_is_time, v)] == [True, True] and v[0] <= v[1]),
+    ),
+    (
+        "causes",
+        f"some of {', '.join(CAUSES)}",
+        lambda v: isinstance(v, (list, tuple)) and len(v) > 0 and all(c in tuple(CAUSES) for c in v),
+    ),
+    ("imu", f"one of {', '.join(imu.PRESETS)}", lambda v: isinstance(v, str) and v in imu.PRESETS),
+    ("world path", "text", lambda v: isinstance(v, str)),
+    ("camera", "a StereoCamera; in a file, set camera itself", lambda v: isinstance(v, StereoCamera)),
+    (
+        "tolerance offset",
+        "a Tolerance; in a file, set calibration, or calibration_offset",
+        lambda v: isinstance(v, Tolerance),
+    ),
+)
+
+
+def check_values(values: Mapping[str, object], prefix: str = "") -> None:
+    """Raise GpvoError for a value that is not of the kind or range of its field of :class:`PointsScenario`."""
+    for names, wanted, fits in _RULES:
+        for name in names.split():
+            if name in values and not fits(values[name]):
+                raise GpvoError(f"{prefix}{name} is {values[name]!r}", cure=f"give {wanted}")
