@@ -51,7 +51,7 @@ class Naive:
         m = opencv.match_mutual(before[1], bits)
         uv = left[good][m[:, 1]]
         pose = opencv.pose_from_points(before[0][m[:, 0]], uv, self._camera.K, 2.0, 200, 0)
-        return np.eye(4) if pose is None else se3.inverse(pose[0])
+        return np.eye(4) if pose is None else se3.inverse(pose)
 
 
 def _timed(step: Callable[[StereoFrame], object], frames: list[StereoFrame]) -> tuple[float, list[object]]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import symmetrise
+from gpvo.geometry.covariance import change_body, symmetrise
 from gpvo.types import Array, MotionError
 
 _E, _N = slice(0, 6), slice(6, 12)
@@ -38,8 +38,7 @@ def frame_jitter(jitter: Array) -> Array:
 
 def first_jitter(T_prev_cur: Array, jitter: Array) -> Array:
     """The same of the frame where a motion starts, if no motion before it has ended there: the motion's other half."""
-    back = se3.adjoint(T_prev_cur)
-    return np.asarray(back @ frame_jitter(jitter) @ np.swapaxes(back, -1, -2))
+    return change_body(T_prev_cur, frame_jitter(jitter))
 
 
 def from_start(error: MotionError, carried: Array) -> Array | float:

@@ -37,7 +37,7 @@ def read_bounded(path: Path, most: int) -> bytes:
     """All of a file or pipe. Raises TooLarge where it holds more than ``most`` bytes, OSError where unreadable."""
     data = bytearray()
     with path.open("rb") as file:
-        while part := file.read(_STEP_BYTES):  # one of all that is allowed would be made room for at once
+        while part := file.read(_STEP_BYTES):  # read(most) would allocate all of it at once
             data += part
             if len(data) > most:
                 raise TooLarge(f"holds more than {most} bytes")

@@ -69,7 +69,7 @@ def run(
     ``calibration_state``: what is known of the calibration's errors. ``amend`` may complete a record before it is
     written; ``meta``: further keys of ``run.json``. An interrupted run leaves a folder that can be read up to its last
     complete chunk. ``resume``: the options that the source was opened with, in words. A run of the same source, options
-    and settings that broke off in ``out`` is gone on with, to the same bytes but for times; None begins anew.
+    and settings that broke off in ``out`` is resumed, and ends with the same bytes apart from times; None begins anew.
 
     Raises
     ------

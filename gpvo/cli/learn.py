@@ -37,7 +37,7 @@ def train(
         typer.Option("--stationary", "--waits", help="Motions at rest during which the truth wanders: drop or keep."),
     ] = "drop",
     odd: Annotated[
-        str, typer.Option(help="Stretches where odometry and truth differ as nowhere else: keep or drop.")
+        str, typer.Option(help="Stretches where odometry and truth differ far more than elsewhere: keep or drop.")
     ] = "keep",
     update: Annotated[
         Path | None,
@@ -268,7 +268,7 @@ def _print_table(document: dict[str, Any]) -> None:
     differing = {f["held_out"]: n for f in document["folds"] if (n := f.get("odd"))}
     if differing:
         told = ", ".join(f"{n} of {name}" for name, n in differing.items())
-        say(f"motions in which odometry and truth differ as nowhere else: {told}")
+        say(f"motions in which odometry and truth differ far more than elsewhere: {told}")
         say("('gpvo evaluate' lists them; 'gpvo train --odd drop' trains and scores without them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):

@@ -114,7 +114,7 @@ def build(
 
     ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
     waits in which the truth moves (:func:`gpvo.dataset.doubtful.wandering_waits`); "keep" learns from them. ``odd``:
-    the same of stretches in which odometry and truth differ as nowhere else
+    the same of stretches in which odometry and truth differ far more than elsewhere
     (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
     ``where``, by default ``name``.
     """

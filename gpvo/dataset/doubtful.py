@@ -5,12 +5,12 @@ positions wander by decimetres while a car waits at a light, and odometry, which
 blamed for it. Image and IMU together decide whether the vehicle stands still: a motion to which odometry is blind does
 not escape a gyroscope.
 
-Odd stretches: where odometry and truth differ as nowhere else in the sequence, one of the two is wrong, and a model
-that learned from them would be too cautious everywhere. Two differences are looked for: the share of the true motion
-that odometry shows; and the direction of travel, as when the truth climbs while the vehicle does not. Each must be far
-from its own median in the sequence, both by its spread there (the median absolute deviation, which also holds errors
-that last) and by what white noise leaves over the same window. How noise is spread over the motions, odometry states;
-how large it is, differences between neighbours tell. Which of the two is wrong is for the user to decide.
+Odd stretches: where odometry and truth differ far more than elsewhere in the sequence, one of the two is wrong, and a
+model that learned from them would be too cautious everywhere. Two differences are looked for: the share of the true
+motion that odometry shows; and the direction of travel, as when the truth climbs while the vehicle does not. Each must
+be far from its own median in the sequence, both by its spread there (the median absolute deviation, which also holds
+errors that last) and by what white noise leaves over the same window. How noise is spread over the motions, odometry
+states; how large it is, differences between neighbours tell. Which of the two is wrong is for the user to decide.
 """
 
 from __future__ import annotations

@@ -163,17 +163,9 @@ def motion_targets(records: Sequence[VoRecord], truth: TruthLog) -> tuple[Array,
 
     Known are usable motions with truth at both ends; the rest is NaN.
     """
-    if not records:
-        return np.zeros((0, 6)), np.zeros(0, dtype=bool)
-    t_prev = np.array([r.t_prev_ns for r in records], dtype=np.int64)
-    t_cur = np.array([r.t_ns for r in records], dtype=np.int64)
-    start, has_start = interpolate_truth(truth, t_prev)
-    end, has_end = interpolate_truth(truth, t_cur)
-    known = np.array([r.usable for r in records], dtype=bool) & has_start & has_end
-    xi = np.full((len(records), 6), np.nan)
-    T_true = se3.inverse(start[known]) @ end[known]
-    T_est = np.array([r.T_prev_cur for r in records], dtype=np.float64).reshape(-1, 4, 4)[known]
-    xi[known] = se3.log(se3.inverse(T_true) @ T_est)
+    errors = motion_errors(VoLog(records), truth)
+    xi, known = np.full((len(records), 6), np.nan), np.zeros(len(records), dtype=bool)
+    xi[errors.index], known[errors.index] = errors.xi, True
     return xi, known
 
 

@@ -34,7 +34,7 @@ _ITERATIONS = 30
 
 @dataclass(frozen=True)
 class FixedTransform:
-    """``T_log_truth`` (4, 4) and the robust spread of what it leaves, per axis: ``residual_m``, ``residual_rad``.
+    """``T_log_truth`` (4, 4) and the robust spread of the translations that it leaves, per axis: ``residual_m``.
 
     ``R_position_attitude`` (3, 3): from the world of the truth's attitudes to that of its positions, the identity where
     it was not fitted.
@@ -42,8 +42,6 @@ class FixedTransform:
 
     T_log_truth: Array
     residual_m: float
-    residual_rad: float
-    motions: int
     R_position_attitude: Array = field(default_factory=lambda: np.eye(3))
 
     @property
@@ -133,7 +131,7 @@ def fit_fixed_transform(
             X[:3, 3] = 0.0
         if np.abs(step).max() < 1e-10:
             break
-    return FixedTransform(se3.orthonormalise(X), float(scale[0]), float(scale[1]), len(A), R)
+    return FixedTransform(se3.orthonormalise(X), float(scale[0]), R)
 
 
 @dataclass(frozen=True)

@@ -96,8 +96,7 @@ def truth_noise(T_true: Array, sigma: Array) -> Array:
     Each motion holds the noise of two poses: ``S + Ad(T)^-1 S Ad(T)^-T``, the MA(1) shape of a differenced position.
     """
     S = np.diag(np.asarray(sigma) ** 2)
-    A = se3.adjoint(se3.inverse(T_true))
-    return S + A @ S @ np.swapaxes(A, -1, -2)
+    return compound(T_true, S, S)
 
 
 def consistency(

@@ -34,7 +34,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
     * ``truth_moves_at_rest``: motions that are not scored, because the vehicle stands still while the truth moves; they
       count only in ATE, final error and RPE.
-    * ``odd_stretches``: motions, in words, in which odometry and truth differ as nowhere else; they are scored.
+    * ``odd_stretches``: motions, in words, in which odometry and truth differ far more than elsewhere; they are scored.
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.

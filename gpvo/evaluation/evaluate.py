@@ -54,13 +54,12 @@ class EvaluateOptions:
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands. ``odd``: stretches in which odometry and truth differ as nowhere else. ``truth_sigma`` (6,): noise of the
-    truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source states. ``tells_from_m``: length of
-    path from which odometry's errors outweigh it. ``late_s``: offset between the clocks, where it matters and none was
-    given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``: poses of one of the two seem
-    to be inverse. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a
-    model.
-    ``poses``: scores of the covariances of poses that a log states.
+    stands. ``odd``: stretches in which odometry and truth differ far more than elsewhere. ``truth_sigma`` (6,): noise
+    of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source states. ``tells_from_m``:
+    length of path from which odometry's errors outweigh it. ``late_s``: offset between the clocks, where it matters and
+    none was given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``: poses of one of the
+    two seem to be inverse. ``in_domain``: share of the predicted frames that lie in the model's training domain, None
+    without a model. ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run

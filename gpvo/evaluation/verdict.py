@@ -200,8 +200,8 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         yield f"{lost} of {len(e.run.log)} frames {'has' if lost == 1 else 'have'} no motion."
     if by_model:
         yield (
-            f"The model calls {by_model} of {len(e.run.log)} motions lost, most as slips: no vehicle moves so; if yours"
-            " does, import or run with --max-acceleration."
+            f"The model calls {by_model} of {len(e.run.log)} motions lost, most as slips: no vehicle moves like"
+            " this; if yours does, raise --max-acceleration in gpvo run or gpvo import."
         )
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
@@ -210,7 +210,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             " This is taken into account."
         )
     if not e.covered.any():
-        yield "gpvo evaluate --twins judges a run by its twins, if made with --keep-tracks."
+        yield "gpvo evaluate --twins judges a run by its twins, if it was made with --keep-tracks."
     elif (bare := int((~e.covered).sum())) > _FEW_BARE * len(e.covered):
         yield f"{bare} of {len(e.covered)} frames have no ground truth."
     if e.tells_from_m > 0:

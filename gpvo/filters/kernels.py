@@ -9,23 +9,11 @@ import math
 
 import numpy as np
 
+from gpvo.geometry.se3 import skew
 from gpvo.types import Array
 
 _EYE3 = np.eye(3)
 _SMALL_ANGLE_2 = 1e-8  # squared angle below which the series are exact to rounding
-
-
-def skew(v: Array) -> Array:
-    """(B, 3) to (B, 3, 3) with ``skew(v) @ w == cross(v, w)``."""
-    out = np.zeros((len(v), 3, 3))
-    x, y, z = v[:, 0], v[:, 1], v[:, 2]
-    out[:, 2, 1] = x
-    out[:, 1, 2] = -x
-    out[:, 0, 2] = y
-    out[:, 2, 0] = -y
-    out[:, 1, 0] = z
-    out[:, 0, 1] = -z
-    return out
 
 
 def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:

@@ -49,7 +49,7 @@ class CameraOnImu:
         """From a 4x4 pose; None means that the state is the camera's own."""
         T = np.eye(4) if T_imu_cam is None else np.asarray(T_imu_cam, dtype=np.float64)
         R, t = T[:3, :3].copy(), T[:3, 3].copy()
-        return CameraOnImu(R, t, R.T.copy(), -R.T @ kernels.skew(t[None])[0])
+        return CameraOnImu(R, t, R.T.copy(), -R.T @ se3.skew(t))
 
     def pose(self, position: Array, R_world_imu: Array) -> tuple[Array, Array]:
         """Camera rotations (B, 3, 3) and positions (B, 3) in the world."""

@@ -74,8 +74,8 @@ def imu_step(x: Nominal, F: Array, dt: float, gyro0: Array, acc0: Array, gyro1: 
     E, J = kernels.exp_and_right_jacobian((0.5 * (gyro0 + gyro1) - x.gyro_bias) * dt)
     R1 = R0 @ E
     f0, f1 = acc0 - x.acc_bias, acc1 - x.acc_bias
-    half0 = 0.5 * (R0 @ kernels.skew(f0))
-    half1 = 0.5 * (R1 @ kernels.skew(f1))
+    half0 = 0.5 * (R0 @ se3.skew(f0))
+    half1 = 0.5 * (R1 @ se3.skew(f1))
     a = 0.5 * ((R0 @ f0[:, :, None])[:, :, 0] + (R1 @ f1[:, :, None])[:, :, 0]) + g
     a_th = -(half0 + half1 @ kernels.transpose(E))
     a_ba = -0.5 * (R0 + R1)
@@ -102,8 +102,8 @@ def constant_velocity_step(x: Nominal, F: Array, dt: float) -> None:
     R1 = R0 @ E
     u = kernels.transpose(R0) @ x.velocity[:, :, None]
     v1 = R1 @ u
-    turned = kernels.skew((E @ u)[:, :, 0])
-    straight = kernels.skew(u[:, :, 0])
+    turned = se3.skew((E @ u)[:, :, 0])
+    straight = se3.skew(u[:, :, 0])
     J *= dt
 
     A = R1 @ kernels.transpose(R0)

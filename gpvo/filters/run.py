@@ -15,7 +15,7 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
 from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, ConstantVelocityNoise, Nominal, constant_velocity_noise
+from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, Nominal, constant_velocity_noise
 from gpvo.filters.start import Start, StartSigmas, StaticTest, from_rest, from_truth, heading
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
@@ -90,9 +90,7 @@ class FuseOptions:
     init: Literal["truth", "static"] = "truth"
     gate: Gate = field(default_factory=Gate)
     sigmas: StartSigmas = field(default_factory=StartSigmas)
-    motion_noise: ConstantVelocityNoise | None = None
     history_s: float = 2.0
-    score_gap_s: float = 0.0  # leave out of the NEES what comes this soon after the start
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ def make_filter(
         start.covariance,
         T_imu_cam=flight.T_imu_cam,
         imu_noise=(flight.imu.noise or DEFAULT_IMU_NOISE) if flight.imu is not None else None,
-        motion_noise=options.motion_noise or (None if with_imu else constant_velocity_noise(flight.records)),
+        motion_noise=None if with_imu else constant_velocity_noise(flight.records),
         gravity_world=gravity,
     )
 
@@ -244,7 +242,7 @@ def _member(
     counts = {**timeline.counts, "rejected": failed}
     scores = metrics.without_truth(nis, failed)
     if flight.has_truth:
-        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores, options.score_gap_s)
+        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores)
     return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, note)
 
 
@@ -255,7 +253,6 @@ def _score(
     T_cam: Array,
     covariance: Array,
     known: metrics.Scores,
-    score_gap_s: float,
 ) -> metrics.Scores:
     """What is ``known`` without truth, and what the truth tells."""
     index = {r.t_ns: i for i, r in enumerate(flight.records)}
@@ -266,7 +263,7 @@ def _score(
     est, imu, C = T_cam[valid], T_imu[valid], covariance[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
     path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
-    counted = (t_ns[valid] - t_ns[0]) > score_gap_s * 1e9
+    counted = t_ns[valid] > t_ns[0]
     finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
     position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.filters import kernels
 from gpvo.filters.plausible import usable
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V
 from gpvo.geometry import se3
@@ -118,7 +117,7 @@ def from_rest(
     up = f / np.linalg.norm(f)
     R = _leveled(up, yaw_rad)
     C = _diagonal(sigmas, with_imu=True)
-    U = kernels.skew(up[None])[0] / STANDARD_GRAVITY_MPS2
+    U = se3.skew(up) / STANDARD_GRAVITY_MPS2
     cov_acc = C[BA, BA] + np.diag(acc.var(axis=0) / len(acc))
     C[TH, TH] = U @ cov_acc @ U.T + np.outer(up, up) * sigmas.yaw_rad**2
     # A little more than the model says keeps the attitude's covariance positive definite along every axis.

@@ -117,11 +117,6 @@ class Comparison:
     gain_percent: float
     difference_m: Interval
 
-    @property
-    def better(self) -> bool:
-        """Whether the interval of the difference lies wholly below zero."""
-        return self.difference_m.high < 0.0
-
     def __str__(self) -> str:
         d = self.difference_m
         interval = f" [{d.low:+.4f}, {d.high:+.4f}]" if d.high < np.inf else ""
@@ -174,20 +169,12 @@ def study(
     for flight in flights:
         if progress:
             progress(flight.name)
-        able = {name: p for name, p in policies.items() if p is not None and has_noise(flight, p)}
-        fused = fuse_side_by_side(flight, able, options)
+        fused = fuse_side_by_side(flight, {name: p for name, p in policies.items() if p is not None}, options)
         for name in policies:
             scores[name].append(fused[name].scores if name in fused else None)
             if on_run and name in fused:
                 on_run(flight, fused[name])
     return Study(tuple(f.name for f in flights), {k: tuple(v) for k, v in scores.items()}, constants)
-
-
-def has_noise(flight: Flight, policy: Policy) -> bool:
-    """Whether the policy can speak for at least half of the run's measured motions."""
-    usable = [r for r in flight.records if r.usable]
-    known = sum(policy.noise(r, flight.predictions.get(r.t_ns)) is not None for r in usable)
-    return bool(usable) and 2 * known >= len(usable)
 
 
 def table(study: Study) -> str:
@@ -244,21 +231,24 @@ class _Stacked:
 def fuse_side_by_side(
     flight: Flight, policies: Mapping[str, Policy], options: FuseOptions | None = None
 ) -> dict[str, FusedRun]:
-    """Filter one run under each policy (of one member); results as if each had filtered alone.
+    """Filter one run under each policy (of one member) that speaks for at least half of its measured motions; results
+    as if each had filtered alone.
 
     Members see the same clock and the same records. A policy that has nothing to say about some records, or whose bias
     has other time constants, is filtered by itself.
     """
-    stated = {name: _noises(flight, policy) for name, policy in policies.items()}
+    usable = sum(r.usable for r in flight.records)
+    found = {name: _noises(flight, policy) for name, policy in policies.items()}
+    stated = {name: noises for name, noises in found.items() if usable and 2 * len(noises) >= usable}
     together = _alike(stated)
     out: dict[str, FusedRun] = {}
     if len(together) > 1:
         noises = {t: _stack([stated[name][t] for name in together]) for t in stated[together[0]]}
         fused = fuse_flight(flight, _Stacked(noises), options, batch=len(together))
         out = {name: replace(run, policy=name) for name, run in zip(together, fused, strict=True)}
-    for name, policy in policies.items():
+    for name in stated:
         if name not in out:
-            out[name] = fuse_flight(flight, policy, options)[0]
+            out[name] = fuse_flight(flight, policies[name], options)[0]
     return out
 
 

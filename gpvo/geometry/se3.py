@@ -297,7 +297,7 @@ for _R in (R_FLU_OPTICAL, R_FRD_FLU, R_NED_ENU, R_FLU_T265):
 
 
 def rotate_covariance(R_new_old: Array, covariance: Array) -> Array:
-    """6x6 covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R)."""
-    B = np.zeros((6, 6))
-    B[:3, :3] = B[3:, 3:] = R_new_old
-    return B @ covariance @ B.T
+    """(..., 6, 6) covariance (translation, rotation), expressed in rotated axes: ``B C B^T``, B = blockdiag(R, R)."""
+    B = np.zeros(covariance.shape)
+    B[..., :3, :3] = B[..., 3:, 3:] = R_new_old
+    return B @ covariance @ np.swapaxes(B, -1, -2)

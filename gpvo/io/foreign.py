@@ -173,7 +173,7 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
         raise SourceError("holds no complete pose", where=path)
     if complete and not known.all():
         line = table.lines[int(np.flatnonzero(~known)[0])]
-        cure = "remove the line: a gap is better than a lie"
+        cure = "remove the line: a gap does no harm"
         raise SourceError(f"line {line} holds NaN or infinity", where=path, cure=cure)
     lines = [n for n, k in zip(table.lines, known, strict=True) if k]
     t, pose = table.t_ns[known], pose[known]
@@ -226,11 +226,7 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
 
 def _into_body(trajectory: Trajectory, covariance: Array) -> Array:
     """Covariances of fixed axes turned into those of the moving frame."""
-    Rt = np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2)
-    B = np.zeros_like(covariance)
-    B[:, :3, :3] = B[:, 3:, 3:] = Rt
-    turned: Array = B @ covariance @ np.swapaxes(B, -1, -2)
-    return turned
+    return se3.rotate_covariance(np.swapaxes(trajectory.T_world_body[:, :3, :3], -1, -2), covariance)
 
 
 def still_axes(T_world_body: Array) -> NDArray[np.bool_]:

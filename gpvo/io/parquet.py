@@ -206,13 +206,15 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             shape = file.metadata
             if shape.num_rows > MAX_ROWS or shape.num_columns > MAX_COLUMNS:
-                raise SourceError(f"has {shape.num_rows} rows and {shape.num_columns} columns: no run's", where=path)
+                raise SourceError(
+                    f"has {shape.num_rows} rows and {shape.num_columns} columns: too large for a run", where=path
+                )
             if sum(shape.row_group(i).total_byte_size for i in range(shape.num_row_groups)) > MAX_BYTES:
                 raise SourceError("unpacks to more than 8 GB", where=path)
             # What a page's run lengths stand for is in no size that the file states.
             cells, packed = shape.num_rows * shape.num_columns, path.stat().st_size
             if 8 * cells > _PLAIN_BYTES + _MAX_RATIO * packed:
-                raise SourceError(f"unpacks {packed} bytes to {cells} numbers: no run's", where=path)
+                raise SourceError(f"unpacks {packed} bytes to {cells} numbers: too large for a run", where=path)
             table = file.read()
             metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
             return {name: _to_numpy(name, table[name]) for name in table.column_names}, metadata

@@ -59,7 +59,7 @@ class RunWriter:
     meta : further keys of ``run.json``, such as ``name``, ``source`` and ``source_format``.
     calibration : the raw rig in plain numbers, for ``rig.json``.
     chunk : records per chunk; a killed run loses at most so many.
-    resume : what decides the records beside the source; a run that broke off under the same is gone on with: ``kept``
+    resume : what decides the records beside the source; a run that broke off under the same is resumed: ``kept``
         is what it left, and its records are to be appended again, first of all. None begins anew.
 
     Raises

@@ -87,7 +87,7 @@ def put_in_place(new: Path, target: Path) -> None:
         os.replace(target, old)
         os.replace(new, target)
     except OSError as error:
-        raise SourceError(f"cannot be replaced: {error.strerror}; ask for it again", where=target) from None
+        raise SourceError(f"cannot be replaced: {error.strerror}; run the command again", where=target) from None
     shutil.rmtree(old, ignore_errors=True)
 
 

@@ -161,7 +161,7 @@ def _guarded(path: Path) -> Iterator[None]:
     except KeyError as error:
         raise SourceError(f"lacks the column {error}", where=path, cure="was it made by gpvo?") from None
     except (ValueError, TypeError, OverflowError) as error:
-        raise SourceError(f"is not what it should be: {error}", where=path) from None
+        raise SourceError(f"is malformed: {error}", where=path) from None
 
 
 def _parts(path: Path, joined: str, kind: str) -> list[Path]:

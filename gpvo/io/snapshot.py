@@ -140,7 +140,7 @@ class _Restore:
     def value(self, node: Any) -> Any:
         if not isinstance(node, dict):
             if isinstance(node, float) and LARGEST < abs(node) < math.inf:
-                raise ValueError(f"{node:g} is beyond all measure")
+                raise ValueError(f"{node:g} is too large")
             return node
         kind = next(iter(node), "")
         if kind == "number":
@@ -188,7 +188,7 @@ class _Restore:
         count = int(np.prod(shape, dtype=np.int64))
         array = np.frombuffer(self._data, np.dtype(dtype), count, offset).reshape(shape, order=order)
         if array.dtype.kind == "f" and (np.isfinite(array) & (np.abs(array) > np.float64(LARGEST))).any():
-            raise ValueError("a number is beyond all measure")
+            raise ValueError("a number is too large")
         return array.copy(order="K")
 
 

@@ -40,7 +40,7 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise SourceError("is larger than 2 GB: no log", where=path)
+            raise SourceError("is larger than 2 GB: too large for a log", where=path)
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             number = 0
             while line := file.readline(_MAX_CHARACTERS + 1):

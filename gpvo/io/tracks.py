@@ -210,7 +210,7 @@ def load_arrays(path: Path, required: tuple[str, ...], optional: tuple[str, ...]
             n_bytes = sum(entry.file_size for entry in wanted.values())
             packed = sum(entry.compress_size for entry in wanted.values())
             if n_bytes > _MAX_UNPACKED_BYTES or n_bytes > _PLAIN_BYTES + _MAX_RATIO * packed:
-                raise SourceError(f"unpacks to more than tracks do: {packed} bytes to {n_bytes}", where=path)
+                raise SourceError(f"unpacks {packed} bytes to {n_bytes}: too large for tracks", where=path)
             data = {name: _read_array(archive, entry) for name, entry in wanted.items()}
     except SourceError:
         raise

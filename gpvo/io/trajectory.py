@@ -28,7 +28,7 @@ from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
 FARTHEST_M = 1e9
-_REMOVE = "remove the line: a gap is better than a lie"
+_REMOVE = "remove the line: a gap does no harm"
 _REMOVE_OF_KITTI = "KITTI poses have no stamps: remove the line and its stamp from copies, for gpvo import --times"
 _MANY = 0.2  # of the stamps: so many repeat only where they are rounded, or every line is there twice
 

@@ -110,7 +110,7 @@ class Mailbox:
         self.dropped: Counter[str] = Counter()
 
     def close(self) -> None:
-        """What comes from here on is not for use, and not counted as dropped."""
+        """From here on, what comes is ignored, and not counted as dropped."""
         self._is_open = False
 
     def open(self, keep: Container[str] = ()) -> None:

@@ -204,7 +204,7 @@ class PoseStage:
         return np.asarray(self._moved < self._motions * SEEN**2)
 
     def _of_camera(self, covariance: Array, variance: Array | None = None) -> Array | None:
-        """A covariance (6, 6) of the body in the camera's axes; None where it is none."""
+        """A covariance (6, 6) of the body in the camera's axes; None where it is not a covariance."""
         of_pose = None if variance is None else variance[None]
         C = definite_in_plane(symmetrise(covariance)[None], self._still, of_pose)[0]
         return symmetrise(change_body(self._T_cam_body, C)) if is_positive_definite(C) else None
@@ -217,7 +217,7 @@ def _pose_covariance(message: Any, T_parent_body: Array) -> Array | None:
 
 
 def _matrix(holder: Any) -> Array | None:
-    """The (6, 6) covariance of a PoseWithCovariance or TwistWithCovariance, zeros too; None where it is none."""
+    """The (6, 6) covariance of a PoseWithCovariance or TwistWithCovariance, zeros too; None where it is not one."""
     flat = getattr(holder, "covariance", None)
     if flat is None or np.size(flat) != 36:
         return None
@@ -226,7 +226,7 @@ def _matrix(holder: Any) -> Array | None:
 
 
 def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) -> VoRecord:
-    """The unknown motion, of ``duration_s``, that leads from the last message of before to the first of anew."""
+    """The unknown motion, of ``duration_s``, from the last message before a restart to the first after it."""
     t_prev_ns = record.t_ns - max(round(duration_s * 1e9), 1)
     unknown = VoRecord(record.t_ns, t_prev_ns, Status.LOST, np.eye(4), reason="restart of the source")
     return replace(unknown, covariances={method: covariance})

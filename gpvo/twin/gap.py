@@ -68,7 +68,7 @@ def read_gap(text: str) -> Gap:
         gap = Gap((), ())
     values = np.array([*gap.ratio, *gap.spread])
     if values.shape != (12,) or not ((values > 1 / _LARGEST) & (values < _LARGEST)).all():
-        raise SourceError("holds no gap", where=path, cure="give the file of 'gpvo twin RUN... --against --json'")
+        raise SourceError("is not the output of gpvo twin --against --json", where=path, cure="give that, or drives")
     return gap
 
 

@@ -40,7 +40,6 @@ class Structure(Estimate):
     residual_px: Array
     weight: Array
     sigma_px: Array
-    iterations: int
     converged: bool
 
 
@@ -61,7 +60,7 @@ def adjust(
     chart, pieces = Chart.of(seen), Pieces.of(seen)
     now = Estimate(T_world_cam, chart.begin(seen, T_world_cam))
     weight, sigma = seen.trusted.astype(np.float64), np.ones(len(T_world_cam))
-    damping, converged, iteration = 1e-4, False, 0
+    damping, converged = 1e-4, False
     for iteration in range(1, max_iterations + 1):
         # Not at first: a landmark that begins at an outlier would call all its other views outliers.
         if robust and 1 < iteration <= _CHOOSING:
@@ -84,7 +83,7 @@ def adjust(
         if iteration > (_CHOOSING if robust else 0) and cost - after <= tolerance * cost:
             converged = True
             break
-    return Structure(now.T_world_cam, now.points_world, now.misfit_px(seen), weight, sigma, iteration, converged)
+    return Structure(now.T_world_cam, now.points_world, now.misfit_px(seen), weight, sigma, converged)
 
 
 def _robust_weights(seen: Observations, now: Estimate, sigma: Array) -> tuple[Array, Array]:

@@ -137,8 +137,8 @@ class Motion:
 
     ``T_prev_cur`` (4, 4); ``inliers`` (N,); ``scale_px``: robust standard deviation of one image coordinate;
     ``residuals`` (M, 3) of (u, v, d) [px] of the inliers; ``uvd_prev`` (M, 3) their measurements in the reference
-    frame, smoothed by those in the current one; ``information`` (6, 6) at unit pixel noise; ``converged``,
-    ``iterations``; ``noise`` as given to :func:`refine`.
+    frame, smoothed by those in the current one; ``information`` (6, 6) at unit pixel noise; ``converged``;
+    ``noise`` as given to :func:`refine`.
     """
 
     T_prev_cur: Array
@@ -148,7 +148,6 @@ class Motion:
     uvd_prev: Array
     information: Array
     converged: bool
-    iterations: int
     noise: PointNoise
 
     def __str__(self) -> str:
@@ -240,7 +239,7 @@ def refine(
         if np.abs(step).max() < 1e-9 or (iteration > _CHOOSING and np.abs(step).max() < 1e-6):
             converged = True
             break
-    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, iteration, noise)
+    return Motion(T, keep, scale, r[:, keep].T, smoothed[keep], information, converged, noise)
 
 
 def _solve_step(A: Array, z: Array, weight: Array) -> tuple[Array, Array | None]:

@@ -216,7 +216,7 @@ class StereoOdometry:
         )
         if found is None:
             return None
-        T_prev_cur, tolerance_px = se3.inverse(found[0]), 2 * config.ransac_threshold_px
+        T_prev_cur, tolerance_px = se3.inverse(found), 2 * config.ransac_threshold_px
         if (among & agrees(T_prev_cur, matches, camera, tolerance_px)).sum() < config.min_inliers:
             return None
         uvd_prev, uvd_cur = matches.uvd_prev[among], matches.uvd_cur[among]

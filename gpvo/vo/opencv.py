@@ -140,8 +140,8 @@ def pose_from_points(
     threshold_px: float,
     iterations: int,
     seed: int,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """P3P inside RANSAC: ``T_cam_points`` (4, 4) and the inlier mask (N,), or None."""
+) -> NDArray[np.float64] | None:
+    """P3P inside RANSAC: ``T_cam_points`` (4, 4), or None."""
     if len(points) < 4:
         return None
     cv2.setRNGSeed(seed)
@@ -163,9 +163,7 @@ def pose_from_points(
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(rvec)[0]
     T[:3, 3] = tvec.ravel()
-    mask = np.zeros(len(points), bool)
-    mask[inliers.ravel()] = True
-    return T, mask
+    return T
 
 
 @dataclass(frozen=True)

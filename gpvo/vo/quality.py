@@ -244,11 +244,4 @@ def motion_fields(matches: Matches, motion: Motion, camera: StereoCamera, moment
 
 def stats_fields(stats: ImageStats | None) -> dict[str, Any]:
     """Fields of a record that describe the image; empty for tracks."""
-    if stats is None:
-        return {}
-    return {
-        "brightness": stats.brightness,
-        "contrast": stats.contrast,
-        "sharpness": stats.sharpness,
-        "noise_level": stats.noise_level,
-    }
+    return {} if stats is None else dict(vars(stats))

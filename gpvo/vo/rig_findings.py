@@ -171,7 +171,7 @@ def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRi
             timeshift_cam_imu_s=float(calibration.get("timeshift_cam_imu_s", 0.0)),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(f"is not what it should be: {error}", where="rig.json") from None
+        raise CalibrationError(f"is malformed: {error}", where="rig.json") from None
 
 
 def camchain(rig: StereoRig) -> str:

@@ -1,5 +1,5 @@
 """Stretches in which the truth is in doubt, found where they are and nowhere else: a truth that moves while the vehicle
-stands, and one that differs from odometry as nowhere else.
+stands, and one that differs from odometry far more than elsewhere.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.policies import ConstantPolicy, GeometricPolicy, LearnedPolicy
 from gpvo.filters.run import FuseOptions, fuse_flight
-from gpvo.filters.study import Constants, Study, fit_scalars, fuse_side_by_side, has_noise, make_policies, study, table
+from gpvo.filters.study import Constants, Study, fit_scalars, fuse_side_by_side, make_policies, study, table
 from gpvo.geometry import se3
 from gpvo.types import Status, VoRecord
 from synthetic_flights import ErrorLaw, synthetic_flight, with_geometric
@@ -89,9 +89,9 @@ def test_study_tells_a_better_policy_and_leaves_out_what_cannot_run() -> None:
     assert all(f.name in text for f in flights)
     assert "nan" not in text
     assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith("ATE m on"))
-    assert not has_noise(flights[0], GeometricPolicy("triangulation"))
-    assert has_noise(with_geometric(flights[0], np.eye(6)), GeometricPolicy("triangulation"))
-    assert has_noise(flights[0], LearnedPolicy())
+    given = {"triangulation": GeometricPolicy("triangulation"), "learned": LearnedPolicy()}
+    assert list(fuse_side_by_side(flights[0], given)) == ["learned"]
+    assert set(fuse_side_by_side(with_geometric(flights[0], np.eye(6)), given)) == set(given)
 
 
 def test_policies_side_by_side_are_as_each_alone() -> None:

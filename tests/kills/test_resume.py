@@ -1,4 +1,4 @@
-"""A run that broke off is gone on with from its last chunk: the same bytes as of one that was left in peace."""
+"""A run that broke off is resumed from its last chunk: the same bytes as of one that was left in peace."""
 
 from __future__ import annotations
 

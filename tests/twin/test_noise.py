@@ -29,7 +29,7 @@ def flight(rng: np.random.Generator, length_px: float) -> tuple[Observations, St
     seen = Observations(CAMERA, frame, track, np.c_[at[track], np.full(len(track), 5.0)], np.ones(len(track), bool))
     T = np.tile(np.eye(4), (N_FRAMES, 1, 1))
     ones = np.ones(len(track))
-    return seen, Structure(T, np.zeros((N_TRACKS, 3)), error[track], ones, np.ones(N_FRAMES), 1, True)
+    return seen, Structure(T, np.zeros((N_TRACKS, 3)), error[track], ones, np.ones(N_FRAMES), True)
 
 
 @pytest.mark.parametrize(("length_px", "low", "high"), [(0.0, 0.0, 0.0), (6.0, 10.0, 20.0), (25.0, 40.0, 40.0)])

@@ -157,11 +157,11 @@ def test_gaps_pool_over_runs_and_bad_files_are_refused(tmp_path):
     file = tmp_path / "gap.json"
     for text in ("{}", '{"pooled": {"1 s": {"ratio": [1], "spread": [1]}}}', '{"pooled": {"1 s": null}}'):
         file.write_text(text)
-        with pytest.raises(SourceError, match="holds no gap"):
+        with pytest.raises(SourceError, match="is not the output of"):
             read_gap(str(file))
     values = {"ratio": [1.0] * 6, "spread": [1.0] * 5 + [1e9]}
     file.write_text(json.dumps({"pooled": {"1 s": values}}))
-    with pytest.raises(SourceError, match="holds no gap"):
+    with pytest.raises(SourceError, match="is not the output of"):
         read_gap(str(file))
 
 

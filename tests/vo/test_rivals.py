@@ -17,7 +17,7 @@ def moving(z_m: float, sigma_m: float = 0.003) -> Motion:
     """A motion along z that its points tell to ``sigma_m``."""
     T = se3.exp(np.array([0.0, 0.0, z_m, 0.0, 0.0, 0.0]))
     nothing = np.zeros((0, 3))
-    return Motion(T, np.ones(9, bool), 1.0, nothing, nothing, np.eye(6) / sigma_m**2, True, 3, 0.0)
+    return Motion(T, np.ones(9, bool), 1.0, nothing, nothing, np.eye(6) / sigma_m**2, True, 0.0)
 
 
 def expecting(z_m: float, odds: float) -> Expected:

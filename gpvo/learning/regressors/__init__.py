@@ -32,14 +32,11 @@ class FittedGP:
 
     ``gp``: posterior of the latent functions (NumPy, see ``gpvo.online.projected``). ``hyper``: what was learned.
     ``log_evidence``: log marginal likelihood, or its lower bound, in nats and in the units of the data.
-    ``regressor``: name. ``n_rows``: rows conditioned on.
     """
 
     gp: ProjectedGP
     hyper: Hyperparameters
     log_evidence: float
-    regressor: str
-    n_rows: int
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Mean (n, D) and latent variance (n, D) at rows X (n, d); add ``hyper.noise_var`` for an observation."""

@@ -186,7 +186,7 @@ def close(
         hyper = Hyperparameters(hyper.lengthscale, *posterior.most_likely()[:2])
     evidence = posterior.bound(hyper) - len(Xs) * np.log(scaling.y_scale).sum()
     gp = posterior.projected(hyper, scaling, points)
-    return FittedGP(gp, scaling.unscaled(hyper), float(evidence), name, len(Xs))
+    return FittedGP(gp, scaling.unscaled(hyper), float(evidence))
 
 
 class CollapsedBound:
