@@ -38,9 +38,13 @@ def estimate_time_offset(log: VoLog, truth: TruthLog, max_offset_s: float = MAX_
     if len(log) < 10 or len(truth.t_ns) < 10:
         raise GpvoError("too few poses to estimate a time offset", cure="give --time-offset in seconds")
     moving = TruthLog(log.t_ns, log.trajectory())
+    for name, t_ns in (("log", log.t_ns), ("truth", truth.t_ns)):
+        if (lasts_s := (t_ns[-1] - t_ns[0]) * 1e-9) < _MIN_OVERLAP_S + _WINDOW_S:
+            needed = f"{_MIN_OVERLAP_S + _WINDOW_S:g} s are needed to estimate a time offset"
+            raise GpvoError(f"the {name} lasts {lasts_s:.2f} s; {needed}", cure="give --time-offset in seconds")
     step_s = float(np.median(np.diff(moving.t_ns))) * 1e-9
     window = max(1, round(_WINDOW_S / step_s))
-    coarse = _coarse(moving, truth, step_s, window * step_s, max_offset_s)
+    coarse = _coarse(moving, truth, min(step_s, _WINDOW_S), window * step_s, max_offset_s)
     return _refine(moving, truth, coarse, window, 1.5 * step_s)
 
 
@@ -63,7 +67,12 @@ def _on_grid(poses: TruthLog, step_s: float, window: int) -> tuple[Array, int]:
     if not 2 * window < count < _MAX_SAMPLES:
         raise GpvoError(f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset")
     grid = first + np.rint(np.arange(count) * step_s * 1e9).astype(np.int64)
-    return _amounts(*interpolate_truth(poses, grid, MAX_GAP_S), window), first
+    return _amounts(*interpolate_truth(poses, grid, _gap_s(poses)), window), first
+
+
+def _gap_s(poses: TruthLog) -> float:
+    """The longest gap that is interpolated over: of slow poses a step and a half."""
+    return max(MAX_GAP_S, 1.5e-9 * float(np.median(np.diff(poses.t_ns))))
 
 
 def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float, max_offset_s: float) -> float:
@@ -125,7 +134,7 @@ def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius
         differences = []
         for offset in offsets:
             moved = replace(log, t_ns=log.t_ns + round(float(offset) * 1e9))
-            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns, MAX_GAP_S), window))
+            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns, _gap_s(truth)), window))
         d = np.stack(differences)
         known = np.isfinite(d).all(axis=(0, 1))
         if known.sum() < 10:
@@ -138,6 +147,8 @@ def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius
     for _ in range(3):
         offsets = np.linspace(offset_s - radius_s, offset_s + radius_s, 13)
         cost = misfits(offsets)
+        if not cost.any():
+            break  # too few samples to judge by: the coarse offset stands
         best = int(np.argmin(cost))
         offset_s = float(offsets[best])
         if 0 < best < 12:

@@ -62,7 +62,7 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
 def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
     """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope."""
     base = StartSigmas()
-    known = [(r.truth, float(np.median(np.diff(r.log.t_ns))) * 1e-9) for r in runs if r.truth]
+    known = [(r.truth, float(np.median(np.diff(r.log.t_ns))) * 1e-9) for r in runs if r.truth and len(r.log) > 1]
     position = max((truth.sigma_translation_m for truth, _ in known), default=0.0)
     velocity = max((slope_sigma(truth.sigma_translation_m, dt_s) for truth, dt_s in known), default=0.0)
     rotation = max((truth.sigma_rotation_rad for truth, _ in known), default=0.0)

@@ -47,6 +47,10 @@ class Nominal:
     acc_bias: Array
     gyro_bias: Array
 
+    def of_member(self, b: int) -> Nominal:
+        """That of one member, (1, ...)."""
+        return Nominal(*(getattr(self, name)[b : b + 1] for name in self.__dataclass_fields__))
+
     def copy(self) -> Nominal:
         """An independent copy."""
         return Nominal(*(getattr(self, name).copy() for name in self.__dataclass_fields__))

@@ -21,8 +21,8 @@ from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
 
-# Truth whose vertical is further than this from +z [rad] is taken to be in another frame, and gravity is measured.
-_LEVEL_RAD = 0.17
+# Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
+_LEVEL_SIGMAS = 3.0
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
 
@@ -130,20 +130,25 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
     t = np.array([flight.records[i].t_ns for i in valid[:5]], dtype=np.int64)
     start = from_truth(t, flight.T_world_imu[valid[:5]], options.sigmas, with_imu=flight.imu is not None)
-    return _aligned_with_gravity(flight, start, valid)
+    return _aligned_with_gravity(flight, start, valid, options.sigmas)
 
 
-def _aligned_with_gravity(flight: Flight, start: Start, valid: NDArray[np.int64]) -> tuple[Start, Array | None]:
-    """Where truth's z is not up, measure gravity in truth's world and admit what that costs in tilt."""
+def _aligned_with_gravity(
+    flight: Flight, start: Start, valid: NDArray[np.int64], sigmas: StartSigmas
+) -> tuple[Start, Array | None]:
+    """Where truth's z is not up, measure gravity in truth's world and admit what that costs in tilt: a bias of the
+    accelerometer counts as gravity."""
     if flight.imu is None:
         return start, None
     up = vertical_in_world(flight.imu, np.array([flight.records[i].t_ns for i in valid]), flight.T_world_imu[valid])
-    if np.arccos(np.clip(up[2], -1.0, 1.0)) < _LEVEL_RAD:
+    sigma_rad = float(np.hypot(sigmas.acc_bias_mps2 / STANDARD_GRAVITY_MPS2, sigmas.tilt_rad))
+    if (tilt_rad := float(np.arccos(np.clip(up[2], -1.0, 1.0)))) < _LEVEL_SIGMAS * sigma_rad:
         return start, None
+    tilt, R = sigma_rad**2 * (np.eye(3) - np.outer(up, up)), start.nominal.R_world_imu[0]
     C = start.covariance.copy()
-    C[TH, TH] += np.eye(3) * 0.01**2
-    note = start.note + "; truth's z axis is not up: gravity measured from the IMU"
-    return Start(start.nominal, C, note), -STANDARD_GRAVITY_MPS2 * up
+    C[TH, TH] += R.T @ tilt @ R
+    note = f"{start.note}; truth's z axis is {np.rad2deg(tilt_rad):.1f} deg from up: gravity measured from the IMU"
+    return Start(start.nominal, C, note, tilt), -STANDARD_GRAVITY_MPS2 * up
 
 
 def vertical_in_world(imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array) -> Array:
@@ -194,15 +199,13 @@ def fuse_flight(
         with_imu=flight.imu is not None,
         history_s=options.history_s,
     )
-    states: dict[int, tuple[Nominal, Array]] = {}
     steps: dict[int, Step] = {}
     samples = _Samples(flight.imu)
     for record in records:
         samples.feed(timeline, record.t_ns)
         for step in timeline.add_vo(record, flight.predictions.get(record.t_ns)):
             steps[step.t_ns] = step
-            states[step.t_ns] = (timeline.filter.x.copy(), timeline.filter.covariance.copy())
-    return [_member(flight, policy.name, b, states, steps, timeline, start.note, options) for b in range(batch)]
+    return [_member(flight, policy.name, b, steps, timeline, start) for b in range(batch)]
 
 
 class _Samples:
@@ -225,25 +228,23 @@ def _member(
     flight: Flight,
     policy: str,
     b: int,
-    states: Mapping[int, tuple[Nominal, Array]],
     steps: Mapping[int, Step],
     timeline: Timeline,
-    note: str,
-    options: FuseOptions,
+    start: Start,
 ) -> FusedRun:
-    t_ns = np.array(sorted(states), dtype=np.int64)
+    t_ns = np.array(sorted(steps), dtype=np.int64)
     ordered = [steps[int(t)].of_member(b) for t in t_ns]
-    nominal = [states[int(t)][0] for t in t_ns]
-    T_imu = se3.from_rt(np.array([x.R_world_imu[b] for x in nominal]), np.array([x.position[b] for x in nominal]))
+    nominal = [s.nominal for s in ordered]
+    T_imu = se3.from_rt(np.array([x.R_world_imu[0] for x in nominal]), np.array([x.position[0] for x in nominal]))
     T_cam = T_imu if flight.T_imu_cam is None else T_imu @ flight.T_imu_cam
-    covariance = np.array([states[int(t)][1][b] for t in t_ns])
+    covariance = np.array([s.covariance[0] for s in ordered])
     nis = np.array([np.nan if s.innovation is None else s.innovation.nis[0] for s in ordered])
     failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
     counts = {**timeline.counts, "rejected": failed}
     scores = metrics.without_truth(nis, failed)
     if flight.has_truth:
-        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores)
-    return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, note)
+        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores, start.world_tilt)
+    return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, start.note)
 
 
 def _score(
@@ -253,8 +254,10 @@ def _score(
     T_cam: Array,
     covariance: Array,
     known: metrics.Scores,
+    world_tilt: Array,
 ) -> metrics.Scores:
-    """What is ``known`` without truth, and what the truth tells."""
+    """What is ``known`` without truth, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns
+    all attitudes alike, and positions about the start."""
     index = {r.t_ns: i for i, r in enumerate(flight.records)}
     rows = np.array([index[int(t)] for t in t_ns])
     valid = np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]
@@ -266,6 +269,9 @@ def _score(
     counted = t_ns[valid] > t_ns[0]
     finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
+    lever, R = se3.skew(imu[finite, :3, 3] - T_imu[0, :3, 3]), imu[finite, :3, :3]
+    own[0] = own[0] + lever @ world_tilt @ np.swapaxes(lever, 1, 2)
+    own[1] = own[1] + np.swapaxes(R, 1, 2) @ world_tilt @ R
     position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])
     attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9] + own[1])
     return replace(

@@ -35,11 +35,15 @@ class StartSigmas:
 
 @dataclass(frozen=True)
 class Start:
-    """An initial estimate (one member) with its covariance (15, 15) and a line that says where it came from."""
+    """An initial estimate (one member) with its covariance (15, 15) and a line that says where it came from.
+
+    ``world_tilt`` (3, 3): covariance of the angles [rad] by which its vertical may differ from the truth's.
+    """
 
     nominal: Nominal
     covariance: Array
     note: str = ""
+    world_tilt: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True)
@@ -63,35 +67,43 @@ def from_truth(
     """Start on the true pose of the first frame.
 
     ``t_ns`` (n,), ``T_world_imu`` (n, 4, 4): true poses near the start, the first is the start. The velocity is the
-    slope of a parabola through the first poses; the biases start at zero.
+    slope of a parabola through the first poses, and as uncertain as these bend otherwise; the biases start at zero.
     """
     sigmas = sigmas or StartSigmas()
     if len(t_ns) < 2:
         raise GpvoError("a start from truth needs true poses of the first two frames", cure="use --init static")
     n = min(len(t_ns), _SLOPE_POSES)
     s = (np.asarray(t_ns[:n]) - t_ns[0]) * 1e-9
-    slope = np.linalg.lstsq(_parabola(s), T_world_imu[:n, :3, 3], rcond=None)[0][1]
+    weights = _slope_weights(s)
+    slope = weights @ T_world_imu[:n, :3, 3]
     R = T_world_imu[0, :3, :3]
     rate = np.zeros(3) if with_imu else se3.so3_log(R.T @ T_world_imu[1, :3, :3]) / s[1]
     C = _diagonal(sigmas, with_imu)
+    if n > 3:
+        # One pose less makes a difference that noise explains, or jerk on some axis, of which it shows a known share.
+        less = weights - np.append(_slope_weights(s[:-1]), 0.0)
+        share = (less @ s**3) / (weights @ s**3)
+        seen = (less @ T_world_imu[:n, :3, 3]) ** 2 - (sigmas.position_m * np.linalg.norm(less)) ** 2
+        C[V, V] += np.eye(3) * max(float(seen.max()), 0.0) / share**2
     # Tilt and yaw are about world axes; the error state's attitude is about the body's.
     world = np.diag([sigmas.tilt_rad**2, sigmas.tilt_rad**2, sigmas.yaw_rad**2])
     C[TH, TH] = R.T @ world @ R
-    note = f"truth: position {sigmas.position_m:g} m, velocity {sigmas.velocity_mps:g} m/s (1 sigma)"
+    velocity_mps = float(np.sqrt(np.diagonal(C[V, V]).max()))
+    note = f"truth: position {sigmas.position_m:g} m, velocity {velocity_mps:.2g} m/s (1 sigma)"
     return Start(_member(T_world_imu[0, :3, 3], slope, R, np.zeros(3), rate), C, note)
 
 
 def slope_sigma(position_m: float, dt_s: float) -> float:
     """Standard deviation [m/s] per axis of :func:`from_truth`'s velocity: of true poses every ``dt_s``, with white
     noise of ``position_m`` per axis each."""
-    t_s = dt_s * np.arange(_SLOPE_POSES, dtype=np.float64)
-    weights = np.linalg.lstsq(_parabola(t_s), np.eye(_SLOPE_POSES), rcond=None)[0][1]
-    return position_m * float(np.linalg.norm(weights))
+    return position_m * float(np.linalg.norm(_slope_weights(dt_s * np.arange(_SLOPE_POSES, dtype=np.float64))))
 
 
-def _parabola(t_s: Array) -> Array:
-    """Design matrix of a parabola through poses at ``t_s`` (n,) [s]; of a line through two."""
-    return np.vander(t_s, min(3, len(t_s)), increasing=True)
+def _slope_weights(t_s: Array) -> Array:
+    """(n,) what the slope [1/s] at the first of values at ``t_s`` (n,) takes of each, by the least-squares parabola; by
+    the line through two."""
+    design = np.vander(t_s, min(3, len(t_s)), increasing=True)
+    return np.asarray(np.linalg.lstsq(design, np.eye(len(t_s)), rcond=None)[0][1])
 
 
 def from_rest(
@@ -127,7 +139,8 @@ def from_rest(
     C[BG, BG] = np.diag(gyro.var(axis=0) / len(gyro) + 1e-10)
     C[V, V] = np.eye(3) * 1e-4
     origin = np.zeros(3) if position is None else position
-    note = f"static: {int(window.sum())} IMU samples at rest, tilt {np.degrees(np.sqrt(C[6, 6])):.2f} deg (1 sigma)"
+    tilt_rad = np.sqrt(np.linalg.eigvalsh(U @ cov_acc @ U.T)[-1])
+    note = f"static: {int(window.sum())} IMU samples at rest, tilt {np.degrees(tilt_rad):.2f} deg (1 sigma)"
     return Start(_member(origin, np.zeros(3), R, np.zeros(3), gyro.mean(axis=0)), C, note)
 
 

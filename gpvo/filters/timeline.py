@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate, Innovation, Wait
 from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import BG, CORE, TH, V
+from gpvo.filters.propagation import BG, CORE, TH, Nominal, V
 from gpvo.online.observer import LONGEST_STEP_S, follows
 from gpvo.stats.series import Doubt
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
@@ -30,18 +30,22 @@ _LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 @dataclass(frozen=True)
 class Step:
     """What one record did: ``outcome`` is ``used``, ``rejected``, ``lost``, ``start``, ``no_reference``,
-    ``not_finite`` or ``no_covariance``; ``innovation`` is None where there was no measurement."""
+    ``not_finite`` or ``no_covariance``; ``innovation`` is None where there was no measurement. ``nominal`` and
+    ``covariance`` (B, 15, 15): the filter's after it."""
 
     t_ns: int
     outcome: str
-    innovation: Innovation | None = None
+    innovation: Innovation | None
+    nominal: Nominal
+    covariance: Array
 
     def of_member(self, b: int) -> Step:
         """What it did to one member."""
+        nominal, covariance = self.nominal.of_member(b), self.covariance[b : b + 1]
         if self.innovation is None:
-            return self
+            return replace(self, nominal=nominal, covariance=covariance)
         innovation = self.innovation.of_member(b)
-        return Step(self.t_ns, _outcome(innovation), innovation)
+        return Step(self.t_ns, _outcome(innovation), innovation, nominal, covariance)
 
 
 @dataclass(frozen=True)
@@ -166,31 +170,30 @@ class Timeline:
             # Since it last did, not since the last record: VO's bias goes on changing while frames are lost.
             self.filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.persistent_tau_s)
             self._bias_ns = record.t_ns
-        step = self._measure(record, noise)
-        judged = step.innovation
+        outcome, judged = self._measure(record, noise)
         passed, own_fault = (True, False) if judged is None else (judged.passed, judged.own_fault)
         self._wait = self._wait.after(record.t_ns, passed, own_fault)
-        self.counts[step.outcome] += 1
+        self.counts[outcome] += 1
         if record.is_reference:
-            self.filter.clone(measured=step.innovation is not None and noise is not None and not noise.lost)
+            self.filter.clone(measured=judged is not None and noise is not None and not noise.lost)
             self._reference_ns = record.t_ns
         else:
             self.filter.forget_current()
-        return step
+        return Step(record.t_ns, outcome, judged, self.filter.x.copy(), self.filter.covariance.copy())
 
-    def _measure(self, record: VoRecord, noise: MotionError | None) -> Step:
+    def _measure(self, record: VoRecord, noise: MotionError | None) -> tuple[str, Innovation | None]:
         if record.status in (Status.START, Status.LOST):
-            return Step(record.t_ns, record.status.value)
+            return record.status.value, None
         if record.t_prev_ns != self._reference_ns:
-            return Step(record.t_ns, "no_reference")
+            return "no_reference", None
         if not np.isfinite(record.T_prev_cur).all():
-            return Step(record.t_ns, "not_finite")
+            return "not_finite", None
         if noise is None:
-            return Step(record.t_ns, "no_covariance")
+            return "no_covariance", None
         recover = self._wait.over(record.t_ns, self.gate)
         innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate, recover)
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
-        return Step(record.t_ns, _outcome(innovation), innovation)
+        return _outcome(innovation), innovation
 
     def _remember(self, record: VoRecord, noise: MotionError | None) -> None:
         if self._history_ns <= 0:

@@ -92,6 +92,19 @@ def so3_left_jacobian(phi: Array) -> Array:
     return np.eye(3) + b * W + c * WW
 
 
+def right_jacobian_inverse(xi: Array) -> Array:
+    """d log(T exp(e)) / d e at e = 0, for xi = log(T). (..., 6) -> (..., 6, 6).
+
+    The series with Bernoulli numbers, to the sixth order (T. Barfoot, "State Estimation for Robotics", 2017, section
+    7.1): to 1e-3 at 2 rad.
+    """
+    ad = np.zeros((*xi.shape[:-1], 6, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = skew(xi[..., 3:])
+    ad[..., :3, 3:] = skew(xi[..., :3])
+    square = ad @ ad
+    return np.asarray(np.eye(6) + ad / 2 + square / 12 - square @ square / 720 + square @ square @ square / 30240)
+
+
 def so3_left_jacobian_inverse(phi: Array) -> Array:
     """Inverse of :func:`so3_left_jacobian`. (..., 3) -> (..., 3, 3)."""
     phi = np.asarray(phi, dtype=np.float64)

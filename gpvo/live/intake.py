@@ -60,13 +60,15 @@ class StampWatch:
     """Judges stamps [ns] as they come.
 
     A jump of the clock, back by more than a second or ahead by more than ten, is believed when three messages in a row
-    agree on it: one corrupt stamp costs one message, a source that starts again three.
+    agree on it: one corrupt stamp costs one message, a source that starts again three. Three gaps in a row are a lower
+    rate.
     """
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._doubt: Doubt[int] = Doubt(_CONFIRM)
         self._steps: deque[int] = deque(maxlen=_WINDOW)
+        self._gaps: list[int] = []
 
     def see(self, t_ns: int) -> Sequence:
         """What the next stamp is. One that no ROS message can hold is of another clock."""
@@ -90,10 +92,16 @@ class StampWatch:
     def _advance(self, t_ns: int, step: int) -> Sequence:
         usual = median(self._steps) if len(self._steps) >= 3 else inf
         self._last = t_ns
-        if step > GAP_STEPS * usual:
-            return Sequence.GAP
-        self._steps.append(step)
-        return Sequence.NEXT
+        if step <= GAP_STEPS * usual:
+            self._gaps.clear()
+            self._steps.append(step)
+            return Sequence.NEXT
+        self._gaps.append(step)
+        if len(self._gaps) >= _CONFIRM:
+            # Not gaps: this is the rate now.
+            self._steps = deque(self._gaps, maxlen=_WINDOW)
+            self._gaps.clear()
+        return Sequence.GAP
 
 
 class Mailbox:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.errors import motion_targets
+from gpvo.dataset.errors import interpolation_sigma, motion_targets
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.io.bag_reader import pose_of, stamp_ns
@@ -16,6 +16,7 @@ from gpvo.live.intake import Sequence, StampWatch
 from gpvo.types import Array, Prediction, TruthLog, VoRecord
 
 _MOTIONS, _POSES = 500, 5000
+_KEPT = 33  # poses that tell what interpolation between them misses
 _TRUTH_SHARE = 0.25
 """Of an axis' predicted variance; where truth's own variance is more, it cannot judge the axis."""
 
@@ -24,7 +25,8 @@ class LateTruth:
     """Poses on ``topic`` of the body that the odometry describes, in any fixed frame.
 
     A motion waits until truth lies at both of its ends, for 500 motions at most. Where the message states a covariance,
-    axes that the truth knows too little of are left alone; else it counts as exact.
+    axes that the truth knows too little of are left alone; else it counts as exact, but for what interpolation misses
+    where it comes more slowly than the odometry.
     """
 
     def __init__(self, topic: str) -> None:
@@ -65,8 +67,9 @@ class LateTruth:
         truth = TruthLog(np.array([p[0] for p in self._poses], dtype=np.int64), np.array([p[1] for p in self._poses]))
         errors, known = motion_targets([record for record, _ in ready], truth)
         own = np.repeat(2.0 * np.max([p[2:] for p in self._poses], axis=0), 3)
-        begin_ns = ready[-1][0].t_ns
-        while len(self._poses) > 1 and self._poses[1][0] <= begin_ns:
+        stamps = np.array([ready[0][0].t_prev_ns, *(r.t_ns for r, _ in ready)], dtype=np.int64)
+        own += 2.0 * interpolation_sigma(truth, stamps) ** 2
+        while len(self._poses) > _KEPT and self._poses[1][0] <= stamps[-1]:
             self._poses.popleft()
         for (record, prediction), xi, is_known in zip(ready, errors, known):
             judged = own <= _TRUTH_SHARE * np.diagonal(prediction.covariance)

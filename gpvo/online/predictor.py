@@ -104,7 +104,7 @@ class Predictor:
         for problem in camera_problems(self.camera, camera):
             warnings.warn(f"this is another camera: {problem}", stacklevel=2)
         self._observer = Observer(self.features, self.target, camera or self.camera, vehicle)
-        self._adaptive = AdaptiveScale(scale=scale)
+        self._adaptive = AdaptiveScale(scale)
         self._last: tuple[VoRecord, Array] | None = None
         self._stated: dict[int, tuple[Array, Array] | None] = {}
         self._rate_var = np.zeros(6)
@@ -178,11 +178,9 @@ class Predictor:
 
         Adapts the scale of later predictions; NaN axes are left unchanged, and so are lost motions.
         """
-        if not self._stated:
-            return
-        stated = self._stated.get(next(reversed(self._stated)) if t_ns is None else t_ns)
+        stated = self._stated.get(next(reversed(self._stated), -1) if t_ns is None else t_ns)
         if stated is not None:
-            self._adaptive.observe(np.asarray(xi_true, dtype=np.float64) - stated[0], stated[1])
+            self._adaptive.observe(np.asarray(xi_true, float) - stated[0], stated[1], self.model.degrees_of_freedom)
 
     def explain(self, record: VoRecord | None = None) -> list[Influence]:
         """Which inputs drove the prediction of ``record`` (default: the last step), strongest first."""

@@ -103,12 +103,13 @@ class OdometryBuilder:
         Raises GpvoError where neither a prediction nor the chosen geometric method gives a usable covariance.
         """
         base = self._chain.get(record.t_prev_ns)
+        is_break = record.is_reference and _status(record, prediction) is Status.LOST
         if base is None:
-            self._resets += bool(self._chain)
+            self._resets += bool(self._chain) and not is_break
             base = next(reversed(self._chain.values()), None) or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
             self._last = None
         if not record.usable or _status(record, prediction) is Status.LOST:
-            return self._lost(record, prediction, base)
+            return self._lost(record, prediction, base, is_break)
         error = self._error(record, prediction)
         chain = base.extended(record, error)
         twist, twist_covariance = self._twist(record, error, chain)
@@ -150,10 +151,11 @@ class OdometryBuilder:
             xi, covariance = se3.log(T_rel), error.covariance - own + A @ noise_last @ A.T
         self._speed = xi / dt
         twist = self._Ad @ xi / dt
-        moved = self._Ad @ covariance @ self._Ad.T / dt**2
+        J = self._Ad @ se3.right_jacobian_inverse(xi)
+        moved = J @ covariance @ J.T / dt**2
         return twist, lift(moved, self.floors.velocity_m2ps2, self.floors.rate_rad2ps2)
 
-    def _lost(self, record: VoRecord, prediction: Prediction | None, base: _Chain) -> Odometry:
+    def _lost(self, record: VoRecord, prediction: Prediction | None, base: _Chain, is_break: bool) -> Odometry:
         """A frame without a motion to be believed: what VO says stands in, as uncertain as what may have happened."""
         stated = prediction.covariance if prediction is not None else record.covariances.get(self.method or "")
         if stated is None or not is_positive_definite(stated):
@@ -161,7 +163,7 @@ class OdometryBuilder:
             stated = np.diag((np.abs(self._speed) * dt) ** 2)
         chain = base.extended(record, MotionError.independent(stated, dt_s=record.dt_s, status=Status.LOST))
         self._remember(record, chain)
-        if record.is_reference and _status(record, prediction) is Status.LOST:
+        if is_break:
             # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone,
             # and its twist must not begin before it.
             self._resets += 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -83,6 +84,14 @@ def joint_nll(squared: Array, d: int, nu: float) -> Array:
         return np.asarray(0.5 * (squared + d * math.log(2.0 * math.pi)))
     constant = math.lgamma(0.5 * nu) - math.lgamma(0.5 * (nu + d)) + 0.5 * d * math.log((nu - 2.0) * math.pi)
     return np.asarray(constant + 0.5 * (nu + d) * np.log1p(squared / (nu - 2.0)))
+
+
+@cache
+def half_width(level: float, nu: float) -> float:
+    """Half of the central interval that holds a share ``level`` of a t of unit second moment: its density summed."""
+    x = np.linspace(0.0, 100.0, 100_001)
+    share = np.cumsum(np.exp(-joint_nll(x**2, 1, nu)))
+    return float(np.interp(level * share[-1], share, x))
 
 
 def fit_dof(squared: Array, d: int, count: Array) -> float:

@@ -43,6 +43,26 @@ def test_offset_is_found_to_a_fraction_of_a_frame(offset, rate):
     assert found == pytest.approx(offset, abs=4e-3)
 
 
+@pytest.mark.parametrize("rate, truth_rate", [(0.8, 20.0), (1.5, 20.0), (2.0, 20.0), (20.0, 1.0), (20.0, 2.0)])
+@pytest.mark.parametrize("offset", [0.3, -1.2])
+def test_slow_logs_and_truths(rate, truth_rate, offset):
+    jitter = np.random.default_rng(2).uniform(-0.01, 0.01, round(60 * rate))
+    s = np.arange(0, 60, 1 / rate)[: len(jitter)] + jitter
+    truth = truth_of(np.arange(-5, 70, 1 / truth_rate))
+    # Straight lines over a second of slow truth are what limits it.
+    assert estimate_time_offset(log_of(s - offset, path(s)), truth) == pytest.approx(offset, abs=0.08)
+
+
+@pytest.mark.parametrize("count, rate", [(10, 2.0), (12, 3.0)])
+def test_a_few_samples_give_the_offset_to_a_step_or_are_refused(count, rate):
+    s = np.arange(count) / rate
+    for offset in (0.3, -0.3):
+        found = estimate_time_offset(log_of(s - offset, path(s)), truth_of(np.arange(-3, 10, 0.05)))
+        assert found == pytest.approx(offset, abs=1 / rate)
+    with pytest.raises(GpvoError, match="lasts 2.90 s; 3.25 s are needed"):
+        estimate_time_offset(log_of(np.arange(30) / 10, path(np.arange(30) / 10)), truth_of(np.arange(0, 40, 0.01)))
+
+
 def test_clocks_that_share_nothing():
     s = np.arange(0, 40, 0.05)
     truth = truth_of(np.arange(-20, 60, 0.01))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.evaluation.statements import statements
-from gpvo.evaluation.trajectory import pose_consistency
+from gpvo.evaluation.trajectory import aligned, pose_consistency
 from gpvo.filters.metrics import umeyama
 from gpvo.geometry import se3
 from gpvo.stats.consistency import nees
-from gpvo.types import IMPORTED_POSE, VoLog
+from gpvo.types import IMPORTED_POSE, Status, VoLog, VoRecord
 
 N = 600
 
@@ -46,8 +46,7 @@ def test_it_is_that_of_the_published_definitions_in_either_convention() -> None:
         log, T_est, T_true = filtered(seed)
         found = pose_consistency(log, T_est, T_true, known)
         assert found is not None
-        R, t = umeyama(T_est[:, :3, 3], T_true[:, :3, 3])
-        T = se3.from_rt(R, t) @ T_est
+        T = aligned(T_est, T_true, log.covariance(IMPORTED_POSE))
         off_m = T[:, :3, 3] - T_true[:, :3, 3]
         left = se3.so3_log(T[:, :3, :3] @ np.swapaxes(T_true[:, :3, :3], -1, -2))
         right = se3.so3_log(np.swapaxes(T_true[:, :3, :3], -1, -2) @ T[:, :3, :3])
@@ -62,8 +61,37 @@ def test_it_is_that_of_the_published_definitions_in_either_convention() -> None:
         }
         for block, values in published.items():
             assert found.nees_dof[block].mean == pytest.approx(values.mean(), rel=0.01)
+        R, t = umeyama(T_est[:, :3, 3], T_true[:, :3, 3])
+        by_positions = se3.log(se3.inverse(T_true) @ se3.from_rt(R, t) @ T_est)
+        assert found.nees_dof["joint"].mean == pytest.approx((nees(by_positions, body) / 6).mean(), rel=12 / N)
         on_manifold = (nees(right, body[:, 3:, 3:]) / 3).mean()
         assert found.nees_dof["orientation"].mean == pytest.approx(on_manifold, rel=1e-6)
+
+
+@pytest.mark.parametrize("path", ["straight", "at rest", "nearly straight", "drifting"])
+def test_it_is_one_where_positions_do_not_tell_the_rotation_and_where_errors_grow(path: str) -> None:
+    s, sigma = np.linspace(0.0, 50.0, 300), np.array([0.02] * 3 + [0.005] * 3)
+    p = np.stack([s, 0.2 * np.sin(s / 5) if path == "nearly straight" else 0 * s, 0 * s], axis=1)
+    T_true = se3.from_rt(np.tile(np.eye(3), (300, 1, 1)), np.zeros_like(p) if path == "at rest" else p)
+    # Of odometry without a map: exact at its start, from where errors grow.
+    size = np.linspace(0.01, 10.0, 300)[:, None] if path == "drifting" else np.ones((300, 1))
+    C = (size * sigma)[:, :, None] ** 2 * np.eye(6)
+    by_block = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        steps = np.diff(size[:, 0] ** 2, prepend=0.0) ** 0.5 if path == "drifting" else None
+        drawn = rng.standard_normal((300, 6))
+        xi = sigma * (size * drawn if steps is None else np.cumsum(steps[:, None] * drawn, axis=0))
+        T_est = T_true @ se3.exp(xi)
+        records = [
+            VoRecord(k, max(k - 1, 0), Status.OK if k else Status.START, np.eye(4), covariances={IMPORTED_POSE: c})
+            for k, c in enumerate(C)
+        ]
+        found = pose_consistency(VoLog(records), T_est, T_true, np.ones(300, bool))
+        by_block.append([found.nees_dof[b].mean for b in ("position", "orientation", "joint")])
+    # Of errors that grow as a random walk a flight holds about three, so 60 have a standard deviation of 0.06.
+    bound = 0.2 if path == "drifting" else 0.06
+    assert np.mean(by_block, axis=0) == pytest.approx(np.ones(3), abs=bound)
 
 
 def test_it_shows_by_how_much_a_statement_is_wrong() -> None:

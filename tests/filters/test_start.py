@@ -99,6 +99,35 @@ def test_a_world_whose_z_is_not_up() -> None:
     assert run.scores.final_error_m < 1.0
 
 
+@pytest.mark.parametrize("tilt_deg", [3.0, 9.0, 45.0])
+def test_a_truth_that_is_not_level_is_judged_as_one_that_is(tilt_deg: float) -> None:
+    tilted = se3.from_rt(se3.so3_exp(np.radians([tilt_deg, 0, 0])), np.zeros(3))
+    scores = []
+    for seed in range(8):
+        flight = synthetic_flight(seed, duration_s=15, turn_on=(0.05, 5e-3))  # as the filter expects
+        assert flight.T_world_cam is not None
+        turned = replace(flight, T_world_cam=tilted @ flight.T_world_cam)
+        scores.append(fuse_flight(turned, LearnedPolicy())[0].scores)
+    # Errors of eight flights of 15 s: the position's have some ten independent ones.
+    assert 0.4 < np.mean([s.nees_position for s in scores]) < 2.0
+    assert 0.4 < np.mean([s.nees_attitude for s in scores]) < 2.0
+
+
+def test_the_velocity_of_sparse_truth_is_as_unsure_as_its_path_bends() -> None:
+    rng, squares = np.random.default_rng(4), []
+    for _ in range(200):
+        phase, amplitude = rng.uniform(0, 2 * np.pi, 3), rng.uniform(1.0, 4.0, 3)
+        t = np.arange(5) * 1.0
+        swing = 2 * np.pi * 0.1 * t[:, None] + phase
+        poses = se3.from_rt(np.tile(np.eye(3), (5, 1, 1)), amplitude * np.sin(swing))
+        start = from_truth(np.round(t * 1e9).astype(np.int64), poses)
+        error = start.nominal.velocity[0] - 2 * np.pi * 0.1 * amplitude * np.cos(phase)
+        squares.append(error**2 / np.diagonal(start.covariance)[3:6])
+    # The fourth derivative adds what jerk does not tell: cautious or bold by a factor of two in sigma at most.
+    assert 0.25 < np.mean(squares) < 4.0
+    assert np.median(squares) < 2.0
+
+
 def test_missing_inputs_are_one_line() -> None:
     flight = synthetic_flight(3, duration_s=2)
     with pytest.raises(GpvoError, match="needs ground truth"):

@@ -64,6 +64,16 @@ def test_out_of_order_records_end_in_the_same_state(flight: Flight, swap: tuple[
     assert shuffled.counts["reordered"] == 1
 
 
+def test_records_out_of_order_are_scored_as_those_in_order(flight: Flight) -> None:
+    records = list(flight.records)
+    for i in range(20, len(records) - 2, 9):
+        records[i], records[i + 1] = records[i + 1], records[i]
+    given, swapped = (fuse_flight(f, LearnedPolicy())[0] for f in (flight, replace(flight, records=records)))
+    assert swapped.counts["reordered"] > 5
+    np.testing.assert_allclose(swapped.T_world_imu, given.T_world_imu, atol=1e-9)
+    np.testing.assert_allclose(swapped.covariance, given.covariance, atol=1e-12)
+
+
 def test_a_record_far_ahead_is_left_out_until_the_next_agrees(flight: Flight) -> None:
     """Used, it would be taken back by every later one, and the time up to it gone through anew."""
     usual, hurt = _timeline(flight), _timeline(flight)

@@ -35,6 +35,17 @@ def test_log_at_half_turns_has_angle_pi():
     np.testing.assert_allclose(se3.so3_exp(phi), HALF_TURNS.as_matrix(), atol=1e-12)
 
 
+def test_right_jacobian_inverse_is_the_derivative_of_the_logarithm():
+    rng = np.random.default_rng(3)
+    xi = rng.normal(size=(40, 6)) * [1, 1, 1, 0.5, 0.5, 0.5]
+    step = 1e-6
+    columns = [
+        (se3.log(se3.exp(xi) @ se3.exp(step * axis)) - se3.log(se3.exp(xi) @ se3.exp(-step * axis))) / (2 * step)
+        for axis in np.eye(6)
+    ]
+    np.testing.assert_allclose(se3.right_jacobian_inverse(xi), np.stack(columns, axis=-1), atol=1e-3)
+
+
 def test_quaternions_of_any_length_are_normalised():
     T = se3.from_quaternion(np.zeros(3), np.array([0.0, 0.0, 2.002, 2.002]))
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-15)

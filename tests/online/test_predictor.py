@@ -241,16 +241,22 @@ def test_intervals_cover_flights_that_the_model_has_not_seen(predictor):
         predictor.interval(said[s.t_ns[0]], 0.123)
 
 
-def test_late_truth_restores_coverage():
+@pytest.mark.parametrize("nu", [np.inf, 4.0, 3.0])
+def test_late_truth_restores_scale_and_coverage_whatever_the_tails(nu):
     rng = np.random.default_rng(0)
-    adaptive, hits = AdaptiveScale(), []
-    for k in range(4000):
+    unit = 1.0 if np.isinf(nu) else np.sqrt((nu - 2.0) / nu)
+    half_width = unit * (1.644854 if np.isinf(nu) else {4.0: 2.131847, 3.0: 2.353363}[nu])  # tables of Student's t
+    adaptive, hits, scales = AdaptiveScale(), [], []
+    for k in range(6000):
         actual = 3.0 if k > 1000 else 1.0
-        error = actual * rng.standard_normal(6)
-        sigma = adaptive.scale
-        hits.append(np.abs(error) <= 1.6449 * sigma)
-        adaptive.observe(error, sigma)
+        drawn = rng.standard_normal(6) if np.isinf(nu) else rng.standard_t(nu, 6)
+        error, sigma = actual * unit * drawn, adaptive.scale
+        hits.append(np.abs(error) <= half_width * sigma)
+        scales.append(sigma)
+        adaptive.observe(error, sigma, nu)
+    # 4,000 steps of which a twentieth is forgotten each time: the spread of the mean over axes is about 0.02.
     assert np.mean(hits[2000:], axis=0) == pytest.approx(0.9, abs=0.015)
+    assert np.mean(scales[2000:]) == pytest.approx(3.0, rel=0.06)
 
 
 def test_observe_widens_the_next_prediction(predictor, flight):

@@ -37,7 +37,7 @@ def test_twist_of_a_spinning_body_has_the_lever_arm_taken_out() -> None:
     out = OdometryBuilder(MOUNT, floors=TINY).step(record, _prediction(10**8, 0 * C, C, 0 * C))
     assert out.twist_body is not None
     np.testing.assert_allclose(out.twist_body, [1, 0, 0, *rate], atol=1e-9)
-    A = se3.adjoint(MOUNT)
+    A = se3.adjoint(MOUNT) @ se3.right_jacobian_inverse(se3.log(T_cam))
     np.testing.assert_allclose(out.twist_covariance, A @ C @ A.T / 0.01, rtol=1e-9)
     np.testing.assert_allclose(out.T_odom_body, T_body, atol=1e-12)
 
@@ -103,9 +103,31 @@ def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
     builder.step(VoRecord(t, 10**8, Status.LOST, guess), wide)
     after = builder.step(VoRecord(t + 10**8, t, Status.OK, step), _prediction(t + 10**8, 0 * C, C, 0 * C))
     np.testing.assert_allclose(after.twist_body, [1, 0, 0, 0, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(np.diagonal(after.twist_covariance), 1e-4, rtol=1e-6)
+    J = se3.right_jacobian_inverse(se3.log(step))
+    np.testing.assert_allclose(
+        np.diagonal(after.twist_covariance), 1e-4 * np.diagonal(J @ J.T)[[2, 0, 1, 5, 3, 4]], rtol=1e-6
+    )
     assert after.pose_covariance[0, 0] > 0.9
     assert after.reset_counter == 1
+
+
+def test_a_restart_of_the_source_is_one_reset() -> None:
+    C, builder = 1e-6 * np.eye(6), OdometryBuilder(floors=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    # Nothing is known of what led from the last frame to a reference that follows none.
+    unknown = VoRecord(10**9, 9 * 10**8, Status.LOST, np.eye(4), covariances={"triangulation": C})
+    assert builder.step(replace(unknown, is_reference=True)).reset_counter == 1
+
+
+def test_the_twist_of_a_large_turn_is_as_wrong_as_it_says() -> None:
+    rng, T = np.random.default_rng(5), se3.exp(np.array([0.5, 0.1, 1.0, 0.3, 0.8, -0.2]))
+    C, squares = np.diag([1e-4, 1e-4, 25e-4, 1e-6, 25e-6, 1e-6]), []
+    for _ in range(400):
+        record = VoRecord(10**9, 0, Status.OK, T @ se3.exp(np.linalg.cholesky(C) @ rng.standard_normal(6)))
+        out = OdometryBuilder(MOUNT, floors=TINY).step(record, _prediction(10**9, 0 * C, C, 0 * C))
+        error = out.twist_body - se3.adjoint(MOUNT) @ se3.log(T)
+        squares.append(error @ np.linalg.solve(out.twist_covariance, error) / 6)
+    assert np.mean(squares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 6 / 400))
 
 
 def test_a_slip_that_only_the_model_sees_is_a_lost_frame() -> None:
