@@ -32,8 +32,6 @@ _EVEN_DT = 0.2
 _OUTLIER = 6.0
 _MIN_WINDOWS = 10
 _NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's extent, what it has across
-_SURE = 0.99
-"""Of a drift: few windows of errors that last make intervals of 95 % too narrow."""
 
 
 def interpolate_truth(
@@ -274,7 +272,7 @@ def velocity_path(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array | None:
 
 
 def drift_variance(contradiction: Array, error: Array) -> Array:
-    """(3,) variance of the truth's displacements over windows (W, 3) [m^2]; 0 where the 99 % interval holds zero.
+    """(3,) variance of the truth's displacements over windows (W, 3) [m^2]; 0 where the 95 % interval holds zero.
 
     GPS/INS positions drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show this,
     but a third instrument can: a truth that also measures velocities gives each displacement twice, and where the two
@@ -283,5 +281,5 @@ def drift_variance(contradiction: Array, error: Array) -> Array:
     ``contradiction``: displacements by the truth's positions less those by its velocities; ``error``: those by odometry
     less those by the positions; both in axes of the camera.
     """
-    found = [block_bootstrap(product, level=_SURE) for product in -(contradiction * error).T]
+    found = [block_bootstrap(product) for product in -(contradiction * error).T]
     return np.array([v.mean if v.low > 0 else 0.0 for v in found])

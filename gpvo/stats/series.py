@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from gpvo.stats import student_t
 from gpvo.types import Array
 
 T = TypeVar("T")
@@ -98,8 +99,9 @@ def block_bootstrap(
 ) -> Interval:
     """Interval for the mean of one autocorrelated series (n,), by circular blocks.
 
-    ``block`` defaults to ``ceil(2 n^(1/3))``, at least 10 frames, at most n / 4. With fewer than 8 values the
-    interval is (-inf, inf): nothing can be said.
+    ``block`` defaults to ``ceil(2 n^(1/3))``, at least 10 frames and three times as long as the series remembers, at
+    most n / 4. As the spread of k blocks is itself an estimate, the interval is wider than theirs by Student's t with
+    k - 1 degrees of freedom. With fewer than 8 values it is (-inf, inf): nothing can be said.
     """
     values = np.asarray(values, dtype=np.float64)
     n = len(values)
@@ -107,14 +109,28 @@ def block_bootstrap(
         return Interval(np.nan, -np.inf, np.inf)
     if n < 8:
         return Interval(float(values.mean()), -np.inf, np.inf)
-    block = block or int(min(max(np.ceil(2 * n ** (1 / 3)), 10), n // 4))
+    block = block or int(min(max(np.ceil(2 * n ** (1 / 3)), 10, np.ceil(3 * _memory(values))), n // 4))
     per_draw = int(np.ceil(n / block))
     rng = np.random.default_rng(seed)
     # Sum of each circular block from a running sum, so that a draw costs n / block look-ups.
     block_mean = moving_sums(np.concatenate([values, values[:block]]), block)[:n] / block
     means = block_mean[rng.integers(0, n, (draws, per_draw))].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(values.mean()), float(low), float(high))
+    mean, k = float(values.mean()), max(n // block, 4)
+    wider = student_t.quantile_ratio(level, k - 1) * np.sqrt(k / (k - 1))
+    low, high = mean + wider * (np.quantile(means, [(1 - level) / 2, (1 + level) / 2]) - mean)
+    return Interval(mean, float(low), float(high))
+
+
+def _memory(values: Array) -> float:
+    """Integrated autocorrelation time [rows], at least 1, over the first window of five times its length (A. Sokal,
+    "Monte Carlo methods in statistical mechanics", 1997, section 3)."""
+    x = values - values.mean()
+    power, time = max(float(x @ x), 1e-300), 1.0
+    for lag in range(1, len(x) // 2):
+        time += 2.0 * float(x[:-lag] @ x[lag:]) / power
+        if lag >= 5.0 * time:
+            break
+    return max(time, 1.0)
 
 
 def sequence_bootstrap(values: Array, *, level: float = 0.95, draws: int = 10000, seed: int = 0) -> Interval:

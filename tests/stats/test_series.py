@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.stats import student_t
 from gpvo.stats.series import Interval, allan_deviation, autocorrelation, block_bootstrap, sequence_bootstrap
 
 N = 40_000
@@ -69,12 +70,25 @@ def _share(intervals: list[Interval], value: float) -> float:
     return float(np.mean([i.contains(value) for i in intervals]))
 
 
-@pytest.mark.parametrize(("rho", "least"), [(0.0, 0.90), (0.5, 0.88), (0.8, 0.80)])
-def test_block_bootstrap_covers_an_autocorrelated_mean(rho, least):
-    """Nominal 95 %: short blocks lose some of it, the more the longer the memory."""
-    series = [3.0 + _ar1(rho, 500, seed) for seed in range(TRIALS)]
+@pytest.mark.parametrize(
+    ("rho", "n", "least"),
+    [(0.0, 500, 0.92), (0.5, 500, 0.90), (0.8, 500, 0.88), (0.98, 5000, 0.88), (0.98, 1000, 0.83), (0.0, 8, 0.92)],
+)
+def test_block_bootstrap_covers_an_autocorrelated_mean(rho, n, least):
+    """Nominal 95 %: a series that is not many times as long as its memory loses some of it."""
+    series = [3.0 + _ar1(rho, n, seed) for seed in range(TRIALS)]
     share = _share([block_bootstrap(x, draws=400) for x in series], 3.0)
-    assert least < share < 0.985
+    assert least < share < 0.995
+
+
+@pytest.mark.parametrize("nu", [3, 4, 7, 30])
+def test_quantiles_of_students_t_are_scipys(nu):
+    from scipy.stats import norm
+    from scipy.stats import t as students
+
+    for level in (0.9, 0.95):
+        wanted = students.ppf((1 + level) / 2, nu) / norm.ppf((1 + level) / 2)
+        assert student_t.quantile_ratio(level, nu) == pytest.approx(wanted, rel=2e-3)
 
 
 def test_single_frames_as_blocks_are_overconfident():
