@@ -82,7 +82,7 @@ class Engine:
 
     The pose that is published never jumps: where the source starts again, or was away, an unknown motion stands
     between, with the covariance of what may have happened. ``truth`` adapts the predictor's scale.
-    ``tell``: called with each warning, at once and then every 10 s while it holds.
+    ``tell``: called with each warning, at once and then every 10 s while it holds. ``topics``: those that should come.
     """
 
     def __init__(
@@ -93,6 +93,7 @@ class Engine:
         settings: EngineSettings | None = None,
         tell: Callable[[str], None] = print,
         truth: LateTruth | None = None,
+        topics: Iterable[str] = (),
     ) -> None:
         self.stage, self.predictor, self.outputs = stage, predictor, list(outputs)
         self.settings = settings or EngineSettings()
@@ -100,10 +101,11 @@ class Engine:
         self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
         self.last: Odometry | None = None
         self.tell = tell
-        self._truth = truth
+        self._truth, self._unheard = truth, list(topics)
         self._told_s: dict[str, float] = {}
         self._builder: OdometryBuilder | None = None
         self._seen_ns: int | None = None  # arrival of the last message that was used
+        self._now_s, self._used_s = time.monotonic(), np.nan  # of the messages' clock: a recording has its own
         self._latency_ms: deque[float] = deque(maxlen=1000)
         self._motions: deque[VoRecord] = deque(maxlen=_RECENT)
         self._inside: deque[bool] = deque(maxlen=_RECENT)
@@ -116,8 +118,15 @@ class Engine:
 
     def take(self, arrival: Arrival | None) -> list[Odometry]:
         """Everything that follows from one message; None where nothing came for a while."""
+        self._now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
+        if np.isnan(self._used_s):
+            self._used_s = self._now_s
+        if arrival is not None and arrival.topic in self._unheard:
+            self._unheard.remove(arrival.topic)
+        return self._use(arrival)
+
+    def _use(self, arrival: Arrival | None) -> list[Odometry]:
         out: list[Odometry] = []
-        now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
         start = time.perf_counter()
         try:
             if self._truth is not None and arrival is not None and arrival.topic == self._truth.topic:
@@ -127,9 +136,9 @@ class Engine:
                 self._latency_ms.append(1e3 * (time.perf_counter() - start))
         except _FROM_OUTSIDE as error:  # what follows begins anew, across an unknown motion
             self.counts["failed"] += 1
-            self._warn(f"a message on {arrival.topic if arrival else 'a topic'} could not be used: {error}", now_s)
+            self._warn(f"a message on {arrival.topic if arrival else 'a topic'} could not be used: {error}")
             self.stage.reset()
-        self._watch(now_s)
+        self._watch()
         return out
 
     def close(self) -> None:
@@ -137,7 +146,7 @@ class Engine:
 
         Raises GpvoError where an output cannot be finished, as on a full disk.
         """
-        self.take(None)
+        self._use(None)
         self._save()
         failed = []
         for output in self.outputs:
@@ -155,7 +164,7 @@ class Engine:
                 give(output)
             except _FROM_OUTSIDE as error:
                 self.counts["output_failed"] += 1
-                self._warn(f"{type(output).__name__} failed: {error}", time.monotonic())
+                self._warn(f"{type(output).__name__} failed: {error}")
 
     def _step(self, taken: Taken) -> Odometry:
         builder = self._builder
@@ -173,7 +182,7 @@ class Engine:
             self._truth.predicted(record, prediction)
         message = builder.step(record, prediction)
         message = replace(message, frame_id=taken.frame_id, child_frame_id=taken.child_frame_id)
-        self._seen_ns, self.last = taken.received_ns, message
+        self._seen_ns, self._used_s, self.last = taken.received_ns, taken.received_ns * 1e-9, message
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
             self._motions.append(record)
@@ -222,14 +231,15 @@ class Engine:
         in_odom = rotate_covariance(message.T_odom_body[:3, :3], A @ C @ A.T)
         return replace(message, pose_covariance=in_odom + 1e-12 * np.eye(6))
 
-    def _watch(self, now_s: float) -> None:
+    def _watch(self) -> None:
         """Warnings and diagnostics that are due."""
+        now_s = self._now_s
         due = now_s - self._reported[0] >= _HEALTH_S
         if due:
             self._misfit = self._misfits()
-        problems = [*self._silence(now_s), *self._misfit]
+        problems = [*self._silence(), *self._misfit]
         for text in problems:
-            self._warn(text, now_s)
+            self._warn(text)
         level = 2 if self._is_bad(problems) else 1 if problems or self._is_weak() else 0
         if due or level != self._reported[1]:
             self._reported = (now_s, level)
@@ -239,10 +249,11 @@ class Engine:
             self._saved_s = now_s
             self._save()
 
-    def _silence(self, now_s: float) -> list[str]:
-        if self._seen_ns is None or now_s - self._seen_ns * 1e-9 <= _STALE_S:
+    def _silence(self) -> list[str]:
+        if not self._now_s - self._used_s > _STALE_S:
             return []
-        return [f"no usable message for more than {_STALE_S:.0f} s"]
+        never = f": nothing has come on {', '.join(self._unheard)}" if self._unheard else ""
+        return [f"no usable message for more than {_STALE_S:.0f} s{never}"]
 
     def _misfits(self) -> list[str]:
         """What does not fit between source and model, looked at once a second."""
@@ -264,10 +275,10 @@ class Engine:
     def _is_weak(self) -> bool:
         return self.last is not None and self.last.status is Status.DEGRADED
 
-    def _warn(self, text: str, now_s: float) -> None:
+    def _warn(self, text: str) -> None:
         kind = text.split(":")[0][:40]
-        if now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
-            self._told_s[kind] = now_s
+        if self._now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
+            self._told_s[kind] = self._now_s
             self.tell(text)
 
     def _health(self, level: int, problems: list[str]) -> Health:
@@ -300,7 +311,7 @@ class Engine:
         try:
             _save_state(self.settings.state, KeptState(self.last.T_odom_body, self.last.pose_covariance, self._scale))
         except GpvoError as error:
-            self._warn(f"the state is not saved: {error}", time.monotonic())
+            self._warn(f"the state is not saved: {error}")
 
 
 def _unknown(away_s: float, twist: Array) -> Array:

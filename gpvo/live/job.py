@@ -100,9 +100,9 @@ class Live:
         stage = make_stage(settings)
         truth = None if settings.truth is None else LateTruth(settings.truth)
         predictor, outputs = Predictor.load(settings.model), _outputs(settings, wire)
-        self.engine = Engine(stage, predictor, outputs, settings.engine, tell, truth)
         self._settings, self._wire, self._tell = settings, wire, tell
         self._topics = topics_in(stage, settings)
+        self.engine = Engine(stage, predictor, outputs, settings.engine, tell, truth, self._topics)
         self._mailbox = Mailbox(settings.depth)
         self._ending, self._has_run = threading.Event(), False
         self._thread: threading.Thread | None = None

@@ -238,8 +238,7 @@ def test_a_model_of_another_camera_is_called_out_at_once_and_every_ten_seconds()
     live = Engine(stage, predictor, [], tell=told.append)
     for second in range(26):
         live.take(Arrival("/other", None, second * 10**9))
-    assert len(told) == 3
-    assert all("baseline is 0.5" in text for text in told)
+    assert sum("baseline is 0.5" in text for text in told) == 3
 
 
 def test_an_odometry_at_another_rate_or_outside_the_domain_is_called_out() -> None:
