@@ -146,6 +146,7 @@ class Engine:
 
         Raises GpvoError where an output cannot be finished, as on a full disk.
         """
+        self._reported = (-np.inf, self._reported[1])  # what a short recording had no second for is said now
         self._use(None)
         self._save()
         failed = []
