@@ -36,6 +36,7 @@ REPEAT_S = 10.0
 """How often a warning that still holds is repeated."""
 _HEALTH_S, _STALE_S, _SAVE_S = 1.0, 2.0, 10.0
 _RECENT = 100
+_FAR_SCALE = 5.0  # no model that fits its odometry is so far off, either way
 _FROM_OUTSIDE = (GpvoError, OSError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError, struct.error)
 """What a message or a link can raise; neither must end the process."""
 _POSITION_SIGMA_M, _ATTITUDE_SIGMA_RAD = 1.0, 0.1  # a source that starts again need not start where it stopped
@@ -263,6 +264,9 @@ class Engine:
             out.append("the model was trained on another odometry's poses, not on images")
         out += camera_problems(self.predictor.camera, self.stage.camera)
         out += odometry_problems(self.predictor, self.stage.odometry)
+        if np.abs(np.log(self._scale)).max() > np.log(_FAR_SCALE):
+            factors = f"{self._scale.min():.2g} to {self._scale.max():.2g}"
+            out.append(f"late truth does not fit: it scales sigma by {factors} (the same body, the same axes?)")
         if len(self._motions) >= 20:
             out += rate_problems(self.predictor, self._motions)
         if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:
@@ -290,6 +294,8 @@ class Engine:
             values["in_domain"] = "" if last.in_domain is None else f"{last.in_domain:.3f}"
             values["confidence"] = "" if last.confidence is None else f"{last.confidence:.3f}"
             values["resets"] = str(last.reset_counter)
+        if self._truth is not None:
+            values["scale"] = " ".join(f"{factor:.3g}" for factor in self._scale)
         if self._latency_ms:
             p50, p99 = np.percentile(self._latency_ms, [50, 99])
             values["latency_ms_p50_p99"] = f"{p50:.2f} {p99:.2f}"

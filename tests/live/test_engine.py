@@ -365,6 +365,21 @@ def test_late_truth_adapts_the_scale_which_a_restart_keeps(tmp_path: Path) -> No
     np.testing.assert_allclose(again.predictor.scale, scales[4.0])
 
 
+def test_truth_of_another_body_or_in_other_axes_is_called_out() -> None:
+    live, arrivals = _with_truth(1.0)
+    told, kept = [], live.outputs[0]
+    live.tell = told.append
+    for arrival in arrivals:
+        if arrival.topic == "/mocap":
+            p = arrival.message.pose.pose.position
+            p.x, p.y, p.z = p.y, p.z, p.x
+        live.take(arrival)
+    assert any("late truth does not fit" in text for text in told)
+    assert isinstance(kept, Kept)
+    assert kept.reports[-1].level == 1
+    assert max(float(x) for x in kept.reports[-1].values["scale"].split()) > 5.0
+
+
 def test_truth_that_knows_less_than_the_odometry_teaches_nothing() -> None:
     live, arrivals = _with_truth(4.0, covariance=1.0)
     for arrival in arrivals:
