@@ -115,6 +115,9 @@ class Engine:
         self._saved_s = -np.inf
         self._resume = load_state(self.settings.state)
         self._scale = np.ones(6) if self._resume is None else self._resume.scale
+        if self._resume is not None and self._resume.model not in ("", predictor.digest):
+            tell("the state is another model's: its pose is taken up, the scale that late truth taught is not")
+            self._scale = np.ones(6)
         predictor.require_motions()
 
     def take(self, arrival: Arrival | None) -> list[Odometry]:
@@ -206,7 +209,8 @@ class Engine:
         """Starts where the source says, or where the saved state stopped."""
         resume, start = self._resume, np.eye(4) if taken.T_parent_body is None else taken.T_parent_body
         T_odom_body = start if resume is None else resume.T_odom_body
-        builder = OdometryBuilder(self.stage.T_body_cam, T_odom_body, self.stage.method)
+        resets = 0 if resume is None else resume.resets
+        builder = OdometryBuilder(self.stage.T_body_cam, T_odom_body, self.stage.method, resets=resets)
         if resume is not None:
             A = se3.adjoint(se3.inverse(self.stage.T_body_cam))
             in_body = rotate_covariance(T_odom_body[:3, :3].T, resume.pose_covariance)
@@ -313,10 +317,12 @@ class Engine:
         return str(first[0]) if first else ""
 
     def _save(self) -> None:
-        if self.settings.state is None or self.last is None:
+        path, last = self.settings.state, self.last
+        if path is None or last is None:
             return
+        kept = KeptState(last.T_odom_body, last.pose_covariance, self._scale, self.predictor.digest, last.reset_counter)
         try:
-            _save_state(self.settings.state, KeptState(self.last.T_odom_body, self.last.pose_covariance, self._scale))
+            write_json(path, {"schema": 1, **vars(kept)})  # whole or not at all
         except GpvoError as error:
             self._warn(f"the state is not saved: {error}")
 
@@ -329,16 +335,14 @@ def _unknown(away_s: float, twist: Array) -> Array:
 
 @dataclass(frozen=True)
 class KeptState:
-    """Pose (4, 4) and its covariance (6, 6) in ``odom``, and the scale (6,) of sigma that late truth taught."""
+    """Pose (4, 4) and its covariance (6, 6) in ``odom``; the scale (6,) of sigma that late truth taught a ``model``,
+    by its digest (empty: unknown); how often the pose was reset."""
 
     T_odom_body: Array
     pose_covariance: Array
     scale: Array
-
-
-def _save_state(path: Path, state: KeptState) -> None:
-    """Write it, whole or not at all."""
-    write_json(path, {"schema": 1, **vars(state)})
+    model: str = ""
+    resets: int = 0
 
 
 def load_state(path: Path | None) -> KeptState | None:
@@ -354,12 +358,13 @@ def load_state(path: Path | None) -> KeptState | None:
         document = read_json(path)
         T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
         scale = np.array(document.get("scale", np.ones(6)), dtype=np.float64)
+        model, resets = str(document.get("model", "")), int(document.get("resets", 0))
         if T.shape != (4, 4) or not is_rigid(T, FARTHEST_M):
             raise ValueError("it holds no pose")
         if C.shape != (6, 6) or not are_positive_definite(C[None], semi=True).all():
             raise ValueError("its covariance is not positive semidefinite")
         if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
             raise ValueError("it holds an impossible scale")
-    except (GpvoError, ValueError, KeyError, TypeError) as error:
+    except (GpvoError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise GpvoError(f"is not a state file of gpvo live: {error}", where=path, cure="remove it") from None
-    return KeptState(T, symmetrise(C), scale)
+    return KeptState(T, symmetrise(C), scale, model, resets)
