@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,6 +112,18 @@ def test_settings_that_cannot_be_used_are_refused_at_the_start(tmp_path: Path, r
         StereoStage("/l", "/r", rig=rig, settings=StereoSettings(calibration_state=tmp_path / "state.json"))
     with pytest.raises(GpvoError, match="no images to run on"):
         run_live(LiveSettings(tmp_path / "m.gpvo", odometry="/vio", replay=tmp_path, vo=StereoSettings(size=(9, 9))))
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"stereo": ("/l", "/l")}, "same topic '/l'"), ({"odometry": "/o", "imu": "/imu"}, "--imu would be ignored"),
+    ({"odometry": "/o", "calibration": Path("c.yaml")}, "--calibration would be ignored .*--stereo"),
+    ({"odometry": "/o", "address": "tcp/h:1", "domain": 3}, "--address would be ignored .*--zenoh"),
+    ({"odometry": "/o", "domain": 3}, "--domain would be ignored"), ({"pose_topic": "/p"}, "--pose-topic would"),
+    ({"replay": None, "wire": "dds", "fast": True}, "--fast would be ignored"),
+])  # fmt: skip
+def test_options_that_nothing_would_read_are_refused(given: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match=said):
+        run_live(LiveSettings(**{"model": tmp_path / "m.gpvo", "replay": tmp_path, **given}))
 
 
 @pytest.mark.parametrize("wrong", ["swapped", "size"])
