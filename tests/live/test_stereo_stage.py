@@ -114,6 +114,12 @@ def test_settings_that_cannot_be_used_are_refused_at_the_start(tmp_path: Path, r
         run_live(LiveSettings(tmp_path / "m.gpvo", odometry="/vio", replay=tmp_path, vo=StereoSettings(size=(9, 9))))
 
 
+def test_a_folder_of_images_is_no_bag(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((9, 9), np.uint8))
+    with pytest.raises(GpvoError, match=r"is no bag \(give a \.bag, \.db3 or \.mcap file"), open_bag(tmp_path):
+        pass
+
+
 @pytest.mark.parametrize(("given", "said"), [
     ({"stereo": ("/l", "/l")}, "same topic '/l'"), ({"odometry": "/o", "imu": "/imu"}, "--imu would be ignored"),
     ({"odometry": "/o", "calibration": Path("c.yaml")}, "--calibration would be ignored .*--stereo"),
