@@ -12,6 +12,7 @@ from gpvo.cli.output import one_of, print_json, say
 from gpvo.errors import GpvoError, printable
 
 if TYPE_CHECKING:
+    from gpvo.io.foreign import ForeignLog
     from gpvo.live.stereo_stage import StereoSettings
     from gpvo.types import Vehicle
 
@@ -44,7 +45,10 @@ def live(
     px4: Annotated[
         bool, typer.Option("--px4", help="Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS.")
     ] = False,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write a bag: .bag, .mcap or a ROS 2 folder.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Write a new bag at the end: .bag, .mcap or a ROS 2 folder."),
+    ] = None,
     topic: Annotated[str, typer.Option(help="Topic on which the odometry is published.")] = "/gpvo/odometry",
     pose_topic: Annotated[str | None, typer.Option(help="Also publish PoseWithCovarianceStamped here.")] = None,
     calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the images.")] = (
@@ -148,6 +152,7 @@ def doctor(
 
     Example: gpvo doctor flight.mcap --truth mocap.tum
     """
+    from gpvo.io.foreign import read_foreign
     from gpvo.live.doctor import examine_bag, examine_topic
     from gpvo.live.job import POSE_TYPE_NAMES
 
@@ -163,7 +168,8 @@ def doctor(
         if truth is not None:
             if truth_topic is None and truth.exists() and truth.samefile(source):
                 raise GpvoError("which topic of the bag is the ground truth?", cure="name it with --truth-topic")
-            judged = {t: _nees_of_bag(Path(source), t, truth, truth_topic, align) for t in found if t != truth_topic}
+            given = read_foreign(truth, topic=truth_topic, complete=True)
+            judged = {t: _nees_of_bag(Path(source), t, given, align) for t in found if t != truth_topic}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
         found = {source: examine_topic(wire, source, kind, seconds, address, domain)}
@@ -190,13 +196,11 @@ def _one_wire(**given: bool) -> str | None:
     return chosen[0] if chosen else None
 
 
-def _nees_of_bag(
-    bag: Path, topic: str, truth: Path, truth_topic: str | None = None, align: str = "none"
-) -> dict[str, Any]:
+def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[str, Any]:
     """NEES per degree of freedom of the ``poses`` and of the ``motions`` whose covariances a topic states.
 
     Each is None, or by block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; ``problem`` is
-    the reason why nothing could be judged. ``truth``: anything that ``gpvo import --truth`` reads, of the same body.
+    the reason why nothing could be judged. ``truth``: of the same body.
     """
     from tempfile import TemporaryDirectory
 
@@ -209,9 +213,8 @@ def _nees_of_bag(
 
     try:
         with TemporaryDirectory(prefix="gpvo-") as folder:
-            given = read_foreign(truth, topic=truth_topic, complete=True)
             log = read_foreign(bag, topic=topic)
-            import_log(log, given, Path(folder) / "run", frame=log.frame, align=align)
+            import_log(log, truth, Path(folder) / "run", frame=log.frame, align=align)
             evaluation = evaluate_run(read_run(Path(folder) / "run"))
     except GpvoError as error:
         return {"poses": None, "motions": None, "problem": str(error)}

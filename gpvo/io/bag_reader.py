@@ -47,9 +47,13 @@ _ALLOWED = ("CREATE TABLE %", "CREATE INDEX %", "CREATE UNIQUE INDEX %")
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a ROS 1 bag, a ROS 2 storage file, or a ROS 2 bag folder."""
+    return _has_storage(path) and (path.is_file() or (path / "metadata.yaml").is_file())
+
+
+def _has_storage(path: Path) -> bool:
     if path.is_dir():
-        return (path / "metadata.yaml").is_file() and (any(path.glob("*.db3*")) or any(path.glob("*.mcap*")))
-    return path.is_file() and path.suffix.lower() in (".bag", ".db3", ".mcap")
+        return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
+    return path.suffix.lower() in (".bag", ".db3", ".mcap")
 
 
 @contextmanager
@@ -63,6 +67,8 @@ def open_bag(path: Path) -> Iterator[Any]:
 
     if not path.exists():
         raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
+    if not _has_storage(path):
+        raise SourceError("is no bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
     metadata = path / "metadata.yaml"
     if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
         reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"

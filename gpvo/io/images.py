@@ -36,6 +36,8 @@ _MIN_MATCHES = 25
 _MIN_RATIO = 5.0
 _FRAMES = 5
 
+SWAPPED = "left and right images are swapped: matched points have negative disparity"
+"""What is said of a sequence that an OrderCheck refuses."""
 Image8 = NDArray[np.uint8]
 
 
@@ -146,8 +148,15 @@ class ImageSource(ABC):
 
     def __iter__(self) -> Iterator[StereoFrame]:
         self.report = report = self._fresh_report()
-        frames = _not_swapped(self._frames(report), self.path)
+        frames = self._not_swapped(self._frames(report))
         return prefetched(frames) if self._prefetch else frames
+
+    def _not_swapped(self, frames: Iterable[StereoFrame]) -> Iterator[StereoFrame]:
+        order = OrderCheck()
+        for frame in frames:
+            if order.is_swapped(frame):
+                raise SourceError(SWAPPED, where=self.path, cure="exchange the two image folders or topics")
+            yield frame
 
     def remark(self, text: str) -> None:
         """Add a remark to this and every later report."""
@@ -250,22 +259,20 @@ def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
             )
 
 
-def _not_swapped(frames: Iterable[StereoFrame], where: object) -> Iterator[StereoFrame]:
-    """The frames of a sequence. Of the first, one that shows the right order settles it; SourceError at the second
-    whose points lie behind the cameras."""
-    unclear, swapped = _FRAMES, 0
-    for frame in frames:
-        if unclear:
+class OrderCheck:
+    """Whether left and right are swapped, by the first frames: one that shows the right order settles it, and so does
+    the second whose points lie behind the cameras."""
+
+    def __init__(self) -> None:
+        self._unclear, self._swapped = _FRAMES, 0
+
+    def is_swapped(self, frame: StereoFrame) -> bool:
+        """Judge the next frame; True from where it is settled that they are."""
+        if self._unclear and self._swapped < 2:
             sign = disparity_sign(frame)
-            unclear = 0 if sign > 0 else unclear - 1
-            swapped += sign < 0
-            if swapped >= 2:
-                raise SourceError(
-                    "left and right images are swapped: matched points have negative disparity",
-                    where=where,
-                    cure="exchange the two image folders or topics",
-                )
-        yield frame
+            self._unclear = 0 if sign > 0 else self._unclear - 1
+            self._swapped += sign < 0
+        return self._swapped >= 2
 
 
 def disparity_sign(frame: StereoFrame) -> int:

@@ -48,8 +48,10 @@ def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]
         raise SourceError("is not a bag", where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
     with open_bag(path) as reader:
         found = list(topics_of(reader, POSE_TYPES))
-        if not found or (topic is not None and topic not in found):
-            raise SourceError(f"has no poses on '{topic or ''}' (poses on: {', '.join(found) or 'none'})", where=path)
+        if not found:
+            raise SourceError("holds no poses to check", where=path, cure="'gpvo run' makes odometry of images")
+        if topic is not None and topic not in found:
+            raise SourceError(f"has no poses on '{topic}' (poses on: {', '.join(found)})", where=path)
         wanted = found if topic is None else [topic]
         return {t: examine(Stated.of((m for _, m in messages(reader, [t])), path)) for t in wanted}
 

@@ -36,6 +36,7 @@ REPEAT_S = 10.0
 """How often a warning that still holds is repeated."""
 _HEALTH_S, _STALE_S, _SAVE_S = 1.0, 2.0, 10.0
 _RECENT = 100
+_FAR_SCALE = 5.0  # no model that fits its odometry is so far off, either way
 _FROM_OUTSIDE = (GpvoError, OSError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError, struct.error)
 """What a message or a link can raise; neither must end the process."""
 _POSITION_SIGMA_M, _ATTITUDE_SIGMA_RAD = 1.0, 0.1  # a source that starts again need not start where it stopped
@@ -82,7 +83,7 @@ class Engine:
 
     The pose that is published never jumps: where the source starts again, or was away, an unknown motion stands
     between, with the covariance of what may have happened. ``truth`` adapts the predictor's scale.
-    ``tell``: called with each warning, at once and then every 10 s while it holds.
+    ``tell``: called with each warning, at once and then every 10 s while it holds. ``topics``: those that should come.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Engine:
         settings: EngineSettings | None = None,
         tell: Callable[[str], None] = print,
         truth: LateTruth | None = None,
+        topics: Iterable[str] = (),
     ) -> None:
         self.stage, self.predictor, self.outputs = stage, predictor, list(outputs)
         self.settings = settings or EngineSettings()
@@ -100,10 +102,11 @@ class Engine:
         self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
         self.last: Odometry | None = None
         self.tell = tell
-        self._truth = truth
+        self._truth, self._unheard = truth, list(topics)
         self._told_s: dict[str, float] = {}
         self._builder: OdometryBuilder | None = None
         self._seen_ns: int | None = None  # arrival of the last message that was used
+        self._now_s, self._used_s = time.monotonic(), np.nan  # of the messages' clock: a recording has its own
         self._latency_ms: deque[float] = deque(maxlen=1000)
         self._motions: deque[VoRecord] = deque(maxlen=_RECENT)
         self._inside: deque[bool] = deque(maxlen=_RECENT)
@@ -112,12 +115,22 @@ class Engine:
         self._saved_s = -np.inf
         self._resume = load_state(self.settings.state)
         self._scale = np.ones(6) if self._resume is None else self._resume.scale
+        if self._resume is not None and self._resume.model not in ("", predictor.digest):
+            tell("the state is another model's: its pose is taken up, the scale that late truth taught is not")
+            self._scale = np.ones(6)
         predictor.require_motions()
 
     def take(self, arrival: Arrival | None) -> list[Odometry]:
         """Everything that follows from one message; None where nothing came for a while."""
+        self._now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
+        if np.isnan(self._used_s):
+            self._used_s = self._now_s
+        if arrival is not None and arrival.topic in self._unheard:
+            self._unheard.remove(arrival.topic)
+        return self._use(arrival)
+
+    def _use(self, arrival: Arrival | None) -> list[Odometry]:
         out: list[Odometry] = []
-        now_s = time.monotonic() if arrival is None else arrival.received_ns * 1e-9
         start = time.perf_counter()
         try:
             if self._truth is not None and arrival is not None and arrival.topic == self._truth.topic:
@@ -127,9 +140,9 @@ class Engine:
                 self._latency_ms.append(1e3 * (time.perf_counter() - start))
         except _FROM_OUTSIDE as error:  # what follows begins anew, across an unknown motion
             self.counts["failed"] += 1
-            self._warn(f"a message on {arrival.topic if arrival else 'a topic'} could not be used: {error}", now_s)
+            self._warn(f"a message on {arrival.topic if arrival else 'a topic'} could not be used: {error}")
             self.stage.reset()
-        self._watch(now_s)
+        self._watch()
         return out
 
     def close(self) -> None:
@@ -137,7 +150,8 @@ class Engine:
 
         Raises GpvoError where an output cannot be finished, as on a full disk.
         """
-        self.take(None)
+        self._reported = (-np.inf, self._reported[1])  # what a short recording had no second for is said now
+        self._use(None)
         self._save()
         failed = []
         for output in self.outputs:
@@ -155,7 +169,7 @@ class Engine:
                 give(output)
             except _FROM_OUTSIDE as error:
                 self.counts["output_failed"] += 1
-                self._warn(f"{type(output).__name__} failed: {error}", time.monotonic())
+                self._warn(f"{type(output).__name__} failed: {error}")
 
     def _step(self, taken: Taken) -> Odometry:
         builder = self._builder
@@ -173,7 +187,7 @@ class Engine:
             self._truth.predicted(record, prediction)
         message = builder.step(record, prediction)
         message = replace(message, frame_id=taken.frame_id, child_frame_id=taken.child_frame_id)
-        self._seen_ns, self.last = taken.received_ns, message
+        self._seen_ns, self._used_s, self.last = taken.received_ns, taken.received_ns * 1e-9, message
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
             self._motions.append(record)
@@ -195,7 +209,8 @@ class Engine:
         """Starts where the source says, or where the saved state stopped."""
         resume, start = self._resume, np.eye(4) if taken.T_parent_body is None else taken.T_parent_body
         T_odom_body = start if resume is None else resume.T_odom_body
-        builder = OdometryBuilder(self.stage.T_body_cam, T_odom_body, self.stage.method)
+        resets = 0 if resume is None else resume.resets
+        builder = OdometryBuilder(self.stage.T_body_cam, T_odom_body, self.stage.method, resets=resets)
         if resume is not None:
             A = se3.adjoint(se3.inverse(self.stage.T_body_cam))
             in_body = rotate_covariance(T_odom_body[:3, :3].T, resume.pose_covariance)
@@ -222,14 +237,15 @@ class Engine:
         in_odom = rotate_covariance(message.T_odom_body[:3, :3], A @ C @ A.T)
         return replace(message, pose_covariance=in_odom + 1e-12 * np.eye(6))
 
-    def _watch(self, now_s: float) -> None:
+    def _watch(self) -> None:
         """Warnings and diagnostics that are due."""
+        now_s = self._now_s
         due = now_s - self._reported[0] >= _HEALTH_S
         if due:
             self._misfit = self._misfits()
-        problems = [*self._silence(now_s), *self._misfit]
+        problems = [*self._silence(), *self._misfit]
         for text in problems:
-            self._warn(text, now_s)
+            self._warn(text)
         level = 2 if self._is_bad(problems) else 1 if problems or self._is_weak() else 0
         if due or level != self._reported[1]:
             self._reported = (now_s, level)
@@ -239,10 +255,11 @@ class Engine:
             self._saved_s = now_s
             self._save()
 
-    def _silence(self, now_s: float) -> list[str]:
-        if self._seen_ns is None or now_s - self._seen_ns * 1e-9 <= _STALE_S:
+    def _silence(self) -> list[str]:
+        if not self._now_s - self._used_s > _STALE_S:
             return []
-        return [f"no usable message for more than {_STALE_S:.0f} s"]
+        never = f": nothing has come on {', '.join(self._unheard)}" if self._unheard else ""
+        return [f"no usable message for more than {_STALE_S:.0f} s{never}"]
 
     def _misfits(self) -> list[str]:
         """What does not fit between source and model, looked at once a second."""
@@ -251,6 +268,9 @@ class Engine:
             out.append("the model was trained on another odometry's poses, not on images")
         out += camera_problems(self.predictor.camera, self.stage.camera)
         out += odometry_problems(self.predictor, self.stage.odometry)
+        if np.abs(np.log(self._scale)).max() > np.log(_FAR_SCALE):
+            factors = f"{self._scale.min():.2g} to {self._scale.max():.2g}"
+            out.append(f"late truth does not fit: it scales sigma by {factors} (the same body, the same axes?)")
         if len(self._motions) >= 20:
             out += rate_problems(self.predictor, self._motions)
         if len(self._inside) >= 20 and np.mean(self._inside) < 0.5:
@@ -264,10 +284,10 @@ class Engine:
     def _is_weak(self) -> bool:
         return self.last is not None and self.last.status is Status.DEGRADED
 
-    def _warn(self, text: str, now_s: float) -> None:
+    def _warn(self, text: str) -> None:
         kind = text.split(":")[0][:40]
-        if now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
-            self._told_s[kind] = now_s
+        if self._now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
+            self._told_s[kind] = self._now_s
             self.tell(text)
 
     def _health(self, level: int, problems: list[str]) -> Health:
@@ -278,6 +298,8 @@ class Engine:
             values["in_domain"] = "" if last.in_domain is None else f"{last.in_domain:.3f}"
             values["confidence"] = "" if last.confidence is None else f"{last.confidence:.3f}"
             values["resets"] = str(last.reset_counter)
+        if self._truth is not None:
+            values["scale"] = " ".join(f"{factor:.3g}" for factor in self._scale)
         if self._latency_ms:
             p50, p99 = np.percentile(self._latency_ms, [50, 99])
             values["latency_ms_p50_p99"] = f"{p50:.2f} {p99:.2f}"
@@ -295,12 +317,14 @@ class Engine:
         return str(first[0]) if first else ""
 
     def _save(self) -> None:
-        if self.settings.state is None or self.last is None:
+        path, last = self.settings.state, self.last
+        if path is None or last is None:
             return
+        kept = KeptState(last.T_odom_body, last.pose_covariance, self._scale, self.predictor.digest, last.reset_counter)
         try:
-            _save_state(self.settings.state, KeptState(self.last.T_odom_body, self.last.pose_covariance, self._scale))
+            write_json(path, {"schema": 1, **vars(kept)})  # whole or not at all
         except GpvoError as error:
-            self._warn(f"the state is not saved: {error}", time.monotonic())
+            self._warn(f"the state is not saved: {error}")
 
 
 def _unknown(away_s: float, twist: Array) -> Array:
@@ -311,16 +335,14 @@ def _unknown(away_s: float, twist: Array) -> Array:
 
 @dataclass(frozen=True)
 class KeptState:
-    """Pose (4, 4) and its covariance (6, 6) in ``odom``, and the scale (6,) of sigma that late truth taught."""
+    """Pose (4, 4) and its covariance (6, 6) in ``odom``; the scale (6,) of sigma that late truth taught a ``model``,
+    by its digest (empty: unknown); how often the pose was reset."""
 
     T_odom_body: Array
     pose_covariance: Array
     scale: Array
-
-
-def _save_state(path: Path, state: KeptState) -> None:
-    """Write it, whole or not at all."""
-    write_json(path, {"schema": 1, **vars(state)})
+    model: str = ""
+    resets: int = 0
 
 
 def load_state(path: Path | None) -> KeptState | None:
@@ -336,12 +358,13 @@ def load_state(path: Path | None) -> KeptState | None:
         document = read_json(path)
         T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
         scale = np.array(document.get("scale", np.ones(6)), dtype=np.float64)
+        model, resets = str(document.get("model", "")), int(document.get("resets", 0))
         if T.shape != (4, 4) or not is_rigid(T, FARTHEST_M):
             raise ValueError("it holds no pose")
         if C.shape != (6, 6) or not are_positive_definite(C[None], semi=True).all():
             raise ValueError("its covariance is not positive semidefinite")
         if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
             raise ValueError("it holds an impossible scale")
-    except (GpvoError, ValueError, KeyError, TypeError) as error:
+    except (GpvoError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise GpvoError(f"is not a state file of gpvo live: {error}", where=path, cure="remove it") from None
-    return KeptState(T, symmetrise(C), scale)
+    return KeptState(T, symmetrise(C), scale, model, resets)

@@ -70,8 +70,14 @@ def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) 
     """
     if settings.wire is None and settings.replay is None:
         raise GpvoError("there is no source", cure=f"give --replay BAG, or one of --{', --'.join(WIRES)}")
-    if settings.out and settings.replay and settings.out.resolve() == settings.replay.resolve():
-        raise GpvoError("is the recording itself", where=settings.out, cure="choose another -o")
+    for is_used, names, cure in (
+        (settings.replay, ("fast",), "add --replay BAG"),
+        (settings.wire == "zenoh", ("address",), "add --zenoh"),
+        (settings.wire in ("zenoh", "dds"), ("domain",), "add --zenoh or --dds"),
+        (settings.wire, ("pose_topic",), f"add one of --{', --'.join(WIRES)}"),
+    ):
+        if not is_used:
+            _refuse_idle(settings, names, cure)
     wire = open_wire(settings.wire, settings.address, settings.domain) if settings.wire else None
     stop = threading.Event()
     try:
@@ -82,6 +88,14 @@ def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) 
     finally:
         if wire is not None:
             wire.close()
+
+
+def _refuse_idle(settings: LiveSettings, names: tuple[str, ...], cure: str) -> None:
+    """GpvoError where one of the settings was given, though nothing will read it."""
+    fresh = LiveSettings(settings.model)
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(settings, name) != getattr(fresh, name)]
+    if given:
+        raise GpvoError(f"{', '.join(given)} would be ignored", cure=cure)
 
 
 class Live:
@@ -100,9 +114,9 @@ class Live:
         stage = make_stage(settings)
         truth = None if settings.truth is None else LateTruth(settings.truth)
         predictor, outputs = Predictor.load(settings.model), _outputs(settings, wire)
-        self.engine = Engine(stage, predictor, outputs, settings.engine, tell, truth)
         self._settings, self._wire, self._tell = settings, wire, tell
         self._topics = topics_in(stage, settings)
+        self.engine = Engine(stage, predictor, outputs, settings.engine, tell, truth, self._topics)
         self._mailbox = Mailbox(settings.depth)
         self._ending, self._has_run = threading.Event(), False
         self._thread: threading.Thread | None = None
@@ -196,10 +210,13 @@ def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
     if settings.stereo is not None:
         if settings.odometry is not None:
             raise GpvoError("--stereo and --odometry are mutually exclusive", cure="choose one")
+        if settings.stereo[0] == settings.stereo[1]:
+            raise GpvoError(f"left and right are the same topic '{settings.stereo[0]}'", cure="name two topics")
         rig = None if settings.calibration is None else read_stereo_yaml(settings.calibration)
         return StereoStage(*settings.stereo, settings.imu, rig, settings.vo)
     if settings.vo != StereoSettings():
         raise GpvoError("the odometry was given settings, but no images to run on", cure="add --stereo LEFT RIGHT")
+    _refuse_idle(settings, ("imu", "calibration"), "add --stereo LEFT RIGHT")
     if settings.odometry is not None:
         return PoseStage(settings.odometry)
     if settings.replay is None:

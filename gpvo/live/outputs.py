@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -126,11 +127,12 @@ class MavlinkOutput:
 class FileOutput:
     """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end.
 
-    Raises GpvoError at once where the path holds something that may not be replaced.
+    Raises GpvoError at once where something lies there: it may be the flight before a restart.
     """
 
     def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
-        ros.require_replaceable(path, topic)
+        if path.exists():
+            raise GpvoError("exists already", where=path, cure="give another name or remove it")
         self._path, self._topic = path, topic
         self._odometry: list[Odometry] = []
 
@@ -142,10 +144,10 @@ class FileOutput:
         """A bag of odometry holds none."""
 
     def close(self) -> None:
-        """Write the bag."""
+        """Write the bag; only warn where there is nothing to write, as when the end comes before the first image."""
         if all(o.twist_body is None for o in self._odometry):
-            raise GpvoError("no frame had a motion: nothing to write", where=self._path)
-        if self._path.suffix == ".bag":
+            warnings.warn(f"{self._path}: not written, because no frame had a motion", stacklevel=2)
+        elif self._path.suffix == ".bag":
             ros.write_ros1(self._path, self._odometry, self._topic)
         else:
             ros.write_ros2(self._path, self._odometry, self._topic, mcap=self._path.suffix == ".mcap")

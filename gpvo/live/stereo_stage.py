@@ -17,7 +17,7 @@ from gpvo.io.bag_images import PairQueue, decode_message
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.bags import camera_info_of, info_topic
 from gpvo.io.foreign import T_FLU_OPTICAL
-from gpvo.io.images import Image8
+from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S
 from gpvo.live.intake import Arrival, Sequence, StampWatch
@@ -87,7 +87,7 @@ class StereoStage:
 
     def reset(self) -> None:
         """Begin anew with the next pair."""
-        self._report = SourceReport()
+        self._report, self._order, self._unfit = SourceReport(), OrderCheck(), ""
         self._pairs = PairQueue(self.left, round(PAIR_TOLERANCE_S * 1e9), self._report)
         self._watch = StampWatch()
         self._samples: deque[tuple[int, Array]] = deque(maxlen=_IMU_KEPT)
@@ -122,31 +122,40 @@ class StereoStage:
             yield from self._step(*self._waiting.popleft())
 
     def problems(self) -> list[str]:
-        """Images that nobody says the calibration of."""
-        if self.camera is not None or not self.counts["uncalibrated"]:
-            return []
-        return ["images arrive, but no calibration: there is no CameraInfo beside them"]
+        """Images that nobody says the calibration of, that it is not for, or that are swapped."""
+        if self.camera is None and self.counts["uncalibrated"]:
+            return ["images arrive, but no calibration: there is no CameraInfo beside them"]
+        return [self._unfit] if self._unfit else []
 
     def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:
         if self._rectifier is None or self.camera is None:
             self.counts["uncalibrated"] += 1
             return
-        images = [decode_message(m) for m in (left, right)]
-        if not all(_fits(i, c) for i, c in zip(images, (self._rectifier.rig.left, self._rectifier.rig.right))):
-            self.counts["unreadable"] += 1
-            return
+        images: list[Image8] = []
+        for message, lens in ((left, self._rectifier.rig.left), (right, self._rectifier.rig.right)):
+            image = decode_message(message)
+            if image is None or image.shape != (lens.height, lens.width):
+                self.counts["unreadable"] += 1
+                if image is not None:
+                    size = f"{image.shape[1]}x{image.shape[0]}"
+                    self._unfit = f"images are {size}, the calibration is for {lens.width}x{lens.height}"
+                return
+            images.append(image)
+        self._unfit = ""
         seen = self._watch.see(t_ns)
         self.counts[seen.value] += 1
         if seen.dropped:
             return
         if seen is Sequence.RESTART:
             self._restart()
+        frame = StereoFrame(t_ns, *self._rectifier.apply(*images))
+        if self._order.is_swapped(frame):
+            self.counts["swapped"] += 1
+            self._unfit = SWAPPED
+            return
         begins = self._odometry is None
         if self._odometry is None:
             self._odometry = StereoOdometry(self.camera, self.settings.config, self._rectifier.mask, self._state)
-        assert images[0] is not None
-        assert images[1] is not None
-        frame = StereoFrame(t_ns, *self._rectifier.apply(images[0], images[1]))
         record = self._odometry.step(frame, None if begins else self._imu_since(t_ns))
         self._t_last_ns = t_ns
         yield Taken(record, begins, received_ns)
@@ -192,7 +201,3 @@ class StereoStage:
             return None
         data = np.array([row for _, row in chosen])
         return ImuLog(np.array([t for t, _ in chosen], dtype=np.int64), data[:, :3], data[:, 3:])
-
-
-def _fits(image: Image8 | None, lens: Any) -> bool:
-    return image is not None and image.shape == (lens.height, lens.width)

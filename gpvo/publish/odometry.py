@@ -81,12 +81,14 @@ class OdometryBuilder:
     T_body_cam : (4, 4) mounting of the camera; None takes a forward-looking camera at the body's origin.
     T_odom_body : (4, 4) body pose of the first frame in ``odom``.
     method : geometric covariance used where there is no prediction.
+    resets : how often the pose was reset before.
     """
 
     T_body_cam: Array | None = None
     T_odom_body: Array = field(default_factory=lambda: np.eye(4))
     method: str | None = None
     floors: Floors = field(default_factory=Floors)
+    resets: int = 0
 
     def __post_init__(self) -> None:
         forward = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
@@ -95,7 +97,6 @@ class OdometryBuilder:
         self._chain: dict[int, _Chain] = {}
         self._last: tuple[int, Array, Array] | None = None  # stamp, T_first_cam, noise of the last good frame
         self._speed = np.zeros(6)
-        self._resets = 0
 
     def step(self, record: VoRecord, prediction: Prediction | None = None) -> Odometry:
         """The message of one frame.
@@ -105,7 +106,7 @@ class OdometryBuilder:
         base = self._chain.get(record.t_prev_ns)
         is_break = record.is_reference and _status(record, prediction) is Status.LOST
         if base is None:
-            self._resets += bool(self._chain) and not is_break
+            self.resets += bool(self._chain) and not is_break
             base = next(reversed(self._chain.values()), None) or _Chain(np.eye(4), PoseError(), record.t_prev_ns)
             self._last = None
         if not record.usable or _status(record, prediction) is Status.LOST:
@@ -166,7 +167,7 @@ class OdometryBuilder:
         if is_break:
             # A reference that was not reached by a measurement is a break: what follows is placed by the guess alone,
             # and its twist must not begin before it.
-            self._resets += 1
+            self.resets += 1
             self._last = None
         return self._message(record, prediction, chain, None, None)
 
@@ -191,7 +192,7 @@ class OdometryBuilder:
             tracked=status is not Status.LOST,
             confidence=None if prediction is None else float(prediction.confidence),
             in_domain=None if prediction is None else float(prediction.in_domain),
-            reset_counter=self._resets % 256,
+            reset_counter=self.resets % 256,
         )
 
     def _remember(self, record: VoRecord, chain: _Chain) -> None:

@@ -82,12 +82,6 @@ def check_topic(topic: str) -> str:
     return topic
 
 
-def require_replaceable(path: Path, topic: str) -> None:
-    """Raise GpvoError where something lies that is not a bag of nothing but ``topic``."""
-    if path.exists() and not _holds_only(path, topic):
-        raise GpvoError(f"exists, and is no bag of {topic} alone", where=path, cure="choose another -o")
-
-
 def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:
     """Write a ROS 1 bag; returns the number of messages."""
 
@@ -127,7 +121,8 @@ def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -
 
 def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
     """Write beside the target and move it there when done."""
-    require_replaceable(path, topic)
+    if path.exists() and not _holds_only(path, topic):
+        raise GpvoError(f"exists, and is no bag of {topic} alone", where=path, cure="choose another -o")
     holder: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from bag_maker import BagMaker
 from gpvo.cli import app
+from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.trajectory import write_tum
@@ -203,6 +204,18 @@ def test_what_is_no_bag_and_no_topic_is_one_line() -> None:
     result = CliRunner().invoke(app, ["doctor", "no/such.bag"])
     assert result.exit_code != 0
     assert "--zenoh" in str(result.exception)
+
+
+def test_a_truth_that_cannot_be_read_and_a_bag_without_poses_are_one_line(good: list[Odometry], tmp_path: Path) -> None:
+    maker = BagMaker(ros1=False)
+    maker.image("/left", 10**18, np.zeros((48, 64), np.uint8))
+    bag, images = bag_of(good, tmp_path / "bag"), maker.write(tmp_path / "images")
+    for words, said in (
+        ((str(bag), "--truth", str(tmp_path / "none.tum")), r"none\.tum: no such file"),
+        ((str(images),), "images: holds no poses to check .*gpvo run"),
+    ):
+        with pytest.raises(GpvoError, match=said):
+            CliRunner().invoke(app, ["doctor", *words], catch_exceptions=False)
 
 
 @pytest.mark.filterwarnings("error")

@@ -12,6 +12,7 @@ import pytest
 from gpvo.geometry import se3
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, Mailbox, Sequence, StampWatch
+from gpvo.live.stages import PoseStage
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Status, StereoCamera
 from shim_bags import TOPIC, Kept, engine, flight, flown, shim_predictor
@@ -208,6 +209,24 @@ def test_silence_is_an_error_in_the_diagnostics(recording: list[Arrival]) -> Non
     assert kept.reports[-1].level == 2
     assert "no usable message" in kept.reports[-1].text
     assert sum("no usable message" in t for t in told) == 1
+
+
+def test_silence_from_the_start_names_the_topics_that_sent_nothing() -> None:
+    kept, told = Kept(), []
+    live = Engine(PoseStage(TOPIC), shim_predictor(), [kept], tell=told.append, topics=[TOPIC, "/truth"])
+    for tenth in range(50):
+        live.take(Arrival("/truth", None, tenth * SECOND // 10))
+    assert kept.reports[-1].level == 2
+    assert told == [f"no usable message for more than 2 s: nothing has come on {TOPIC}"]
+
+
+def test_the_end_of_a_recording_is_no_silence() -> None:
+    """Its clock need not be this machine's: a published run begins at zero."""
+    live, _, told = engine()
+    for arrival in flown(*flight(n=40, t0_ns=0)):
+        live.take(arrival)
+    live.close()
+    assert told == []
 
 
 def test_one_corrupt_stamp_is_one_message_and_three_that_agree_are_another_clock() -> None:

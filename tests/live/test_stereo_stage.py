@@ -5,17 +5,22 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from bag_maker import BagMaker, stereo_bag
 from gpvo import runner
+from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.readers import read_kitti_calib
+from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError
+from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.io.bag_reader import messages, open_bag
 from gpvo.io.images import read_grey8
+from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, replay
 from gpvo.live.job import LiveSettings, run_live
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
@@ -23,6 +28,7 @@ from gpvo.types import StereoFrame, VoRecord
 from gpvo.vo.config import make_config
 from gpvo.vo.odometry import StereoOdometry
 from gpvo.vo.rig_findings import read_state
+from shim_bags import Kept, shim_predictor
 
 LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
 
@@ -106,3 +112,44 @@ def test_settings_that_cannot_be_used_are_refused_at_the_start(tmp_path: Path, r
         StereoStage("/l", "/r", rig=rig, settings=StereoSettings(calibration_state=tmp_path / "state.json"))
     with pytest.raises(GpvoError, match="no images to run on"):
         run_live(LiveSettings(tmp_path / "m.gpvo", odometry="/vio", replay=tmp_path, vo=StereoSettings(size=(9, 9))))
+
+
+def test_a_folder_of_images_is_no_bag(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((9, 9), np.uint8))
+    with pytest.raises(GpvoError, match=r"is no bag \(give a \.bag, \.db3 or \.mcap file"), open_bag(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"stereo": ("/l", "/l")}, "same topic '/l'"), ({"odometry": "/o", "imu": "/imu"}, "--imu would be ignored"),
+    ({"odometry": "/o", "calibration": Path("c.yaml")}, "--calibration would be ignored .*--stereo"),
+    ({"odometry": "/o", "address": "tcp/h:1", "domain": 3}, "--address would be ignored .*--zenoh"),
+    ({"odometry": "/o", "domain": 3}, "--domain would be ignored"), ({"pose_topic": "/p"}, "--pose-topic would"),
+    ({"replay": None, "wire": "dds", "fast": True}, "--fast would be ignored"),
+])  # fmt: skip
+def test_options_that_nothing_would_read_are_refused(given: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match=said):
+        run_live(LiveSettings(**{"model": tmp_path / "m.gpvo", "replay": tmp_path, **given}))
+
+
+@pytest.mark.parametrize("wrong", ["swapped", "size"])
+def test_images_that_the_calibration_is_not_for_are_called_out_and_publish_nothing(wrong: str) -> None:
+    rng = np.random.default_rng(3)
+    scene = cv2.GaussianBlur(rng.integers(0, 256, (240, 360), dtype=np.uint8), (5, 5), 0)
+    views = scene[:, :320], scene[:, 10:330]  # in the right image a point lies further left
+    size = (320, 240) if wrong == "swapped" else (512, 512)
+    lens = PinholeRadtan(0.625 * size[0], 0.625 * size[0], size[0] / 2, size[1] / 2, *size)
+    stage, kept = StereoStage("/l", "/r", rig=StereoRig(lens, lens, se3.exp(np.array([-0.1, 0, 0, 0, 0, 0])))), Kept()
+    maker, told = BagMaker(ros1=False), []
+    for k in range(5):
+        for topic, view in zip(("/r", "/l") if wrong == "swapped" else ("/l", "/r"), views, strict=True):
+            maker.image(topic, 10**18 + k * 10**8, view)
+    live = Engine(stage, shim_predictor(), [kept], tell=told.append)
+    for t, topic, message in maker.messages:
+        live.take(Arrival(topic, message, t))
+    live.close()
+    what = {"swapped": "images are swapped", "size": "images are 320x240, the calibration is for 512x512"}[wrong]
+    assert sum(what in text for text in told) == 1
+    assert what in kept.reports[-1].text
+    assert kept.reports[-1].level == 1
+    assert all(o.twist_body is None for o in kept.frames)
