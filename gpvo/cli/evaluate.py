@@ -59,6 +59,7 @@ class JudgeOptions:
 
 
 def evaluate(
+    ctx: typer.Context,
     runs: Runs,
     judge: JudgeOptions = JudgeOptions(),
     plots: Annotated[Path | None, typer.Option(help="Folder for plots, as PNG and PDF, one set per run.")] = None,
@@ -70,7 +71,10 @@ def evaluate(
     ] = None,
     twins: Annotated[
         bool,
-        typer.Option("--twins", help="Use twins as the truth: each run is simulated again from its own tracks."),
+        typer.Option(
+            "--twins",
+            help="Simulate each run again from its own tracks: the truth of a run without one, else the row 'twin'.",
+        ),
     ] = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
@@ -83,9 +87,9 @@ def evaluate(
     from gpvo.evaluation.document import document, pooled
     from gpvo.evaluation.evaluate import distinct
 
-    if twins:
-        options = judge.options()
-        documents, found = _with_twins(*_loaded(runs, judge), judge.model, options, twin_options.settings(seed))
+    settings = twin_options.asked(ctx, twins, seed)
+    if settings is not None:
+        documents, found = _with_twins(*_loaded(runs, judge), judge.model, judge.options(), settings)
     else:
         found = _evaluate(runs, judge)
         documents = document(found)["runs"]
