@@ -136,6 +136,8 @@ def report(
     """
     from gpvo.evaluation.report import write_report
 
+    if sequence is not None and frames is None:
+        raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
     write_report(found, out, pictures, judge.model.name if judge.model else "")
@@ -145,13 +147,13 @@ def report(
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
     from gpvo.evaluation.pictures import match_pictures
-    from gpvo.io import open_source
+    from gpvo.io import open_source, read_run
     from gpvo.runner import config_of
 
     if sequence is None or len(runs) != 1:
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
     wanted = [int(f) for f in numbers("--frames", frames, "give numbers, separated by commas")]
-    return match_pictures(open_source(sequence), config_of(runs[0]), wanted)
+    return match_pictures(open_source(sequence), config_of(runs[0]), wanted, read_run(runs[0]).log)
 
 
 def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:
