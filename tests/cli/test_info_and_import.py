@@ -77,6 +77,7 @@ def test_info_of_other_files(gpvo, tmp_path):
     write_kitti_poses(tmp_path / "b.txt", poses)
     write_euroc_csv(tmp_path / "c.csv", T_NS, poses)
     (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    seq.write_kitti(tmp_path / "s", 1)
     records = [VoRecord(0, 0, Status.START, np.eye(4)), VoRecord(10, 0, Status.OK, np.eye(4))]
     write_run(tmp_path / "run", VoLog(records))
     for name, what in (
@@ -84,11 +85,13 @@ def test_info_of_other_files(gpvo, tmp_path):
         ("b.txt", "trajectory"),
         ("c.csv", "trajectory"),
         ("camchain.yaml", "calibration"),
+        ("s/calib.txt", "calibration"),
         ("run", "run"),
     ):
         code, out, _ = gpvo("info", tmp_path / name, "--json")
         assert code == 0
         assert json.loads(out)["what"] == what
+    assert "baseline_m: P0 P1 0.1, P2 P3 0.1" in gpvo("info", tmp_path / "s" / "calib.txt")[1]
 
 
 def test_info_of_a_bag(gpvo, tmp_path):
@@ -104,6 +107,8 @@ def test_info_of_a_bag(gpvo, tmp_path):
     assert code == 0
     assert document["sequence"] is None
     assert "/imu0" in document["topics"]
+    assert "notes" not in document  # of images that no one looks for
+    assert "    /imu0: type sensor_msgs/msg/Imu, messages 1\n" in gpvo("info", tmp_path / "b")[1]
 
 
 @pytest.mark.parametrize("what", ["nothing", "empty", "rubbish.txt", "rubbish.bag", "rubbish.npz", "rubbish.yaml"])

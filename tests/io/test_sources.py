@@ -397,6 +397,8 @@ def test_nothing_there_and_nothing_known(tmp_path):
         open_source(tmp_path, kind="x")
     with pytest.raises(SourceError, match="no option 'colour'"):
         open_source(seq.write_folder(tmp_path / "s"), colour=True)
+    with pytest.raises(SourceError, match=r"no option 'tolerance_s' \(--pair-tolerance\)"):
+        open_source(seq.write_kitti(tmp_path / "k"), tolerance_s=0.1)
 
 
 @pytest.mark.parametrize(
