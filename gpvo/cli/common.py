@@ -236,6 +236,12 @@ class OdometryOptions:
         return None if self.calibration_state is None else read_state(self.calibration_state, camera)
 
 
+def is_given(ctx: typer.Context, option: str) -> bool:
+    """Whether the user gave an option, rather than leaving its default."""
+    source = ctx.get_parameter_source(option)
+    return source is not None and source.name != "DEFAULT"
+
+
 def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:
     """Options for :func:`gpvo.io.open_source` from the flags; those that were not given are left out.
 

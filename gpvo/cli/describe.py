@@ -10,6 +10,8 @@ import numpy as np
 from gpvo.errors import GpvoError, ModelError, SourceError, printable
 from gpvo.geometry.se3 import path_length_m
 
+_HEAD = 100_000
+
 
 def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
     """A document with ``what`` (run, model, sequence, trajectory, calibration or bag) and what is known about it.
@@ -31,7 +33,7 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
         if path.suffix.lower() in (".yaml", ".yml"):
             return _calibration(path)
         if path.suffix.lower() in (".txt", ".csv", ".tum"):
-            return _trajectory(path)
+            return _projections(path) or _trajectory(path)
         if is_bag(path):
             return _bag(path, options or {})
         if path.is_file() and path.suffix.lower() != ".npz" and _is_safetensors(path):
@@ -127,6 +129,23 @@ def _calibration(path: Path) -> dict[str, Any]:
     return {"what": "calibration", "baseline_m": rig.baseline_m, **rig.describe()}
 
 
+def _projections(path: Path) -> dict[str, Any] | None:
+    """KITTI's ``calib.txt``, which states no size; None for any other text."""
+    from gpvo.cameras.readers import read_projections
+
+    with path.open("rb") as file:
+        if not any(line.startswith((b"P0:", b"P_rect_00:")) for line in file.read(_HEAD).splitlines()):
+            return None
+    P = read_projections(path)
+    x_m = {name: -p[0, 3] / p[0, 0] for name, p in P.items() if p[0, 0]}
+    return {
+        "what": "calibration",
+        "format": "kitti",
+        **{name: {"fx_px": p[0, 0], "fy_px": p[1, 1], "cx_px": p[0, 2], "cy_px": p[1, 2]} for name, p in P.items()},
+        "baseline_m": {f"{a} {b}": x_m[b] - x_m[a] for a, b in (("P0", "P1"), ("P2", "P3")) if a in x_m and b in x_m},
+    }
+
+
 def _model(path: Path) -> dict[str, Any]:
     from gpvo.online import modelfile
 
@@ -158,18 +177,20 @@ def _is_safetensors(path: Path) -> bool:
 
 
 def _bag(path: Path, options: dict[str, Any]) -> dict[str, Any]:
-    from gpvo.io.bag_reader import open_bag
+    from gpvo.io.bag_reader import IMAGE_TYPES, open_bag, topics_of
 
     with open_bag(path) as reader:
         document: dict[str, Any] = {
             "what": "bag",
             "duration_s": reader.duration * 1e-9,
+            "sequence": None,
             "topics": {n: {"type": t.msgtype, "messages": t.msgcount} for n, t in sorted(reader.topics.items())},
         }
+        has_images = bool(topics_of(reader, IMAGE_TYPES))
     try:
-        document["sequence"] = _sequence(path, "rosbag", options)
+        if has_images or options:
+            document["sequence"] = _sequence(path, "rosbag", options)
     except GpvoError as error:
-        document["sequence"] = None
         document["notes"] = [str(error)]
     return document
 
@@ -180,7 +201,7 @@ def as_lines(document: dict[str, Any], indent: str = "") -> list[str]:
     for key, value in document.items():
         if value is None or value in ([], {}):
             continue
-        if isinstance(value, dict) and len(str(value)) > 90:
+        if isinstance(value, dict) and (len(str(value)) > 90 or any(isinstance(v, dict) for v in value.values())):
             lines += [f"{indent}{key}:", *as_lines(value, indent + "  ")]
         elif isinstance(value, dict):
             lines.append(f"{indent}{key}: " + ", ".join(f"{k} {_short(v)}" for k, v in value.items()))

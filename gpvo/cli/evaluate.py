@@ -59,6 +59,7 @@ class JudgeOptions:
 
 
 def evaluate(
+    ctx: typer.Context,
     runs: Runs,
     judge: JudgeOptions = JudgeOptions(),
     plots: Annotated[Path | None, typer.Option(help="Folder for plots, as PNG and PDF, one set per run.")] = None,
@@ -70,7 +71,10 @@ def evaluate(
     ] = None,
     twins: Annotated[
         bool,
-        typer.Option("--twins", help="Use twins as the truth: each run is simulated again from its own tracks."),
+        typer.Option(
+            "--twins",
+            help="Simulate each run again from its own tracks: the truth of a run without one, else the row 'twin'.",
+        ),
     ] = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
@@ -83,9 +87,9 @@ def evaluate(
     from gpvo.evaluation.document import document, pooled
     from gpvo.evaluation.evaluate import distinct
 
-    if twins:
-        options = judge.options()
-        documents, found = _with_twins(*_loaded(runs, judge), judge.model, options, twin_options.settings(seed))
+    settings = twin_options.asked(ctx, twins, seed)
+    if settings is not None:
+        documents, found = _with_twins(*_loaded(runs, judge), judge.model, judge.options(), settings)
     else:
         found = _evaluate(runs, judge)
         documents = document(found)["runs"]
@@ -132,6 +136,8 @@ def report(
     """
     from gpvo.evaluation.report import write_report
 
+    if sequence is not None and frames is None:
+        raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
     write_report(found, out, pictures, judge.model.name if judge.model else "")
@@ -141,13 +147,13 @@ def report(
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
     from gpvo.evaluation.pictures import match_pictures
-    from gpvo.io import open_source
+    from gpvo.io import open_source, read_run
     from gpvo.runner import config_of
 
     if sequence is None or len(runs) != 1:
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
     wanted = [int(f) for f in numbers("--frames", frames, "give numbers, separated by commas")]
-    return match_pictures(open_source(sequence), config_of(runs[0]), wanted)
+    return match_pictures(open_source(sequence), config_of(runs[0]), wanted, read_run(runs[0]).log)
 
 
 def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:

@@ -15,6 +15,7 @@ from gpvo.cli.twin import Seed, TwinOptions, in_place_of_runs_without_truth, say
 
 
 def fuse(
+    ctx: typer.Context,
     runs: Annotated[list[Path], typer.Argument(help="Run folders to filter.")],
     model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the runs.")] = None,
     train: Annotated[
@@ -47,6 +48,7 @@ def fuse(
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
+    judging = twin_options.asked(ctx, twins, seed)
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
     if plot is not None:
@@ -63,7 +65,6 @@ def fuse(
             gate=Gate(on_fail="inflate" if gate == "inflate" else "discard"),
         ),
     )
-    judging = twin_options.settings(seed) if twins else None
     teaching = replace(judging, seed=0) if judging else None
     with (
         in_place_of_runs_without_truth(runs, judging) as flown,

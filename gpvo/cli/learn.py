@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.common import is_given
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, in_place_of_runs_without_truth
 from gpvo.errors import GpvoError
@@ -84,12 +85,12 @@ def train(
         "max_rows": max_rows,
     }
     if update is not None:
-        settings = _settings_of(update) | {k: v for k, v in settings.items() if _is_given(ctx, k)}
+        settings = _settings_of(update) | {k: v for k, v in settings.items() if is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
     if statements is not None:
         _check_statements(runs, settings, update)
-    drawn = twin_options.settings(seed) if twins else None
+    drawn = twin_options.asked(ctx, twins, seed)
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
             trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
@@ -164,12 +165,6 @@ def _settings_of(model: Path) -> dict[str, Any]:
     from gpvo.learning.store import config_of
 
     return asdict(config_of(model))
-
-
-def _is_given(ctx: typer.Context, option: str) -> bool:
-    """Whether the user gave an option, rather than leaving its default."""
-    source = ctx.get_parameter_source(option)
-    return source is not None and source.name != "DEFAULT"
 
 
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:

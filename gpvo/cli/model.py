@@ -36,8 +36,12 @@ def predict(
     from gpvo.io.run_folder import FILES
     from gpvo.online.predictor import Predictor
 
+    if len(runs) == 1 and out.is_dir():
+        raise GpvoError("is a folder", where=out, cure="give a file that ends in .parquet")
     if len(runs) == 1 and out.suffix.lower() != ".parquet":
         raise GpvoError("does not have the suffix of a Parquet file", where=out, cure="end it in .parquet")
+    if len(runs) > 1 and out.is_file():
+        raise GpvoError("is a file", where=out, cure="give a folder for the predictions of several runs")
     predictor, documents = Predictor.load(model), []
     for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
         predictions = list(predictor.replay(read_run(path).log).values())

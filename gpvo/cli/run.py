@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gpvo.types import Prediction
 
 _MOST_NOTES = 5
+_MUCH_LEFT = 1 / 3  # of a displacement: with 0.4 left, drive 0001 of KITTI drifts twice as far
 
 
 def run(
@@ -118,24 +119,36 @@ def calibration(
 ) -> None:
     """Print the calibration errors that a run found; write a corrected calibration.
 
+    Where no error was found, the calibration is written as it was.
+
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
     from gpvo.errors import SourceError
     from gpvo.files import read_json, write_text
     from gpvo.io.run import read_run
-    from gpvo.vo.rig_findings import camchain, corrected, document, read_state, rig_of
+    from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, read_state, rig_of
 
     camera = read_run(run).log.camera
     if camera is None:
         raise SourceError("holds no camera: it was not made by gpvo run", where=run)
     state = read_state(run, camera)
-    if out is not None:
-        rig = corrected(rig_of(read_json(run / "rig.json").get("calibration"), camera), state, camera)
-        write_text(out, camchain(rig))
     found = document(state, camera)
+    found_px, left_px = explained_px(state, camera)
+    if out is not None:
+        rig = rig_of(read_json(run / "rig.json").get("calibration"), camera)
+        write_text(out, camchain(corrected(rig, state, camera) if found["findings"] else rig))
     if json_:
-        print_json({"run": str(run), **found})
+        print_json({"run": str(run), **found, "found_px": found_px, "unexplained_px": left_px})
         return
     print("\n".join(found["findings"] or ["no calibration error was found between the cameras"]))
-    if out is not None:
-        print(f"{out}: corrected calibration; distortions that neither a rotation nor a focal length explains remain")
+    if out is not None and not found["findings"]:
+        print(f"{out}: the calibration, unchanged")
+    elif out is not None:
+        print(
+            f"{out}: corrected calibration; images were displaced by {found_px:.2f} px (rms), {left_px:.2f} px remain"
+        )
+        if left_px > _MUCH_LEFT * found_px:
+            note(
+                "gpvo: neither a rotation nor a focal length explains so much of it that odometry may get worse: better"
+                f" use 'gpvo run --calibration-state {run}', which corrects all that was found"
+            )

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, new_table, print_json, progress, say, show
+from gpvo.cli.common import is_given
+from gpvo.cli.output import Json, new_table, note, print_json, progress, say, show
 from gpvo.errors import GpvoError
 
 if TYPE_CHECKING:
@@ -46,6 +47,14 @@ class TwinOptions:
 
         name, sigma = read_tolerance(self.tolerance)
         return TwinSettings(self.replicates, sigma, name, seed, None if self.gap is None else read_gap(self.gap))
+
+    def asked(self, ctx: typer.Context, twins: bool, seed: int) -> TwinSettings | None:
+        """:meth:`settings` with ``--twins``, else None. Raises GpvoError for a flag that has no effect without it."""
+        if twins:
+            return self.settings(seed)
+        if idle := [f.name for f in fields(self) if is_given(ctx, f.name)]:
+            raise GpvoError(f"--{idle[0]} has no effect without --twins", cure="add --twins")
+        return None
 
 
 Seed = Annotated[
@@ -154,6 +163,11 @@ def in_place_of_runs_without_truth(
     if settings is None:
         yield paths
         return
-    without = [p for p in paths if read_run(p).truth is None]
+    without = []
+    for path in paths:
+        if (run := read_run(path)).truth is None:
+            without.append(path)
+        else:
+            note(f"gpvo: {run.name} has ground truth: no twins are made of it")
     with TemporaryDirectory(prefix="gpvo-twins-") as folder:
         yield [p for p in paths if p not in without] + make_all(without, Path(folder), settings, jobs)

@@ -104,7 +104,11 @@ def fuse_runs(
             on_run(fused)
 
     result = study(flights, policies, options, constants=constants, progress=tell, on_run=keep)
-    failed = [f"{name} is left out: {_why_not(name, constants)}" for name, row in result.scores.items() if not any(row)]
+    failed = [
+        f"{name} is left out: {_why_not(name, constants, predictor)}"
+        for name, row in result.scores.items()
+        if not any(row)
+    ]
     if len(failed) == len(result.scores):
         raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
     diverging = _diverging(result) if any(f.imu is not None for f in flights) else []
@@ -134,8 +138,10 @@ def _findings(run: Run, flight: Flight, options: FuseOptions) -> list[str]:
     return [f"{flight.name}: {line}" for line in (*findings, *unjudged)]
 
 
-def _why_not(policy: str, constants: Constants | None) -> str:
+def _why_not(policy: str, constants: Constants | None, predictor: Predictor | None) -> str:
     """Why a policy could not run at all, and the cure."""
+    if policy == LEARNED and predictor is not None:
+        return "no frame has a prediction: the model predicts only motions that odometry found"
     if policy == LEARNED:
         return "the runs hold no predictions of single motions; give --model"
     if policy == IMPORTED:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,11 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.source import Source
 from gpvo.runner import Step, steps
-from gpvo.types import Array, MotionError, Prediction, Status, StereoCamera, StereoFrame, VoRecord
+from gpvo.types import Array, MotionError, Prediction, Status, StereoCamera, StereoFrame, VoLog, VoRecord
 from gpvo.vo.config import VoConfig
 
 _GOOD, _BAD, _PATH, _DOUBT = (40, 200, 80), (230, 60, 50), (90, 150, 240), (240, 190, 60)
+_CURE = "give the sequence that the run was made of"
 _GOOD_BGR, _BAD_BGR = (60, 200, 60), (40, 40, 230)
 
 
@@ -105,13 +106,18 @@ class MatchPicture:
     uri: str
 
 
-def match_pictures(source: Source, config: VoConfig, frames: Sequence[int]) -> list[MatchPicture]:
+def match_pictures(source: Source, config: VoConfig, frames: Sequence[int], log: VoLog) -> list[MatchPicture]:
     """Figures of the frames of these indices. A run folder holds no images, so the sequence is opened again, and
-    odometry repeated with the run's own settings. Raises GpvoError for a frame that the sequence does not have."""
+    odometry repeated with the run's own settings. Raises GpvoError for a frame that the sequence does not have, and
+    where ``log``, the run's own, is of another sequence."""
+    if log.camera is None or not np.allclose(astuple(source.camera), astuple(log.camera), rtol=1e-6):
+        raise GpvoError("its camera or calibration is not that of the run", where=source.path, cure=_CURE)
     if min(frames) < 0:
         raise GpvoError(f"there is no frame {min(frames)}", where=source.path, cure="frames are numbered from 0")
     wanted, last, found = set(frames), max(frames), []
     for k, step in enumerate(steps(source, config)):
+        if k < len(log) and step.record.t_ns != log.records[k].t_ns:
+            raise GpvoError("its stamps are not those of the run", where=source.path, cure=_CURE)
         if k in wanted:
             found.append(_picture(k, step, source))
         if k == last:

@@ -50,7 +50,7 @@ def render(evaluations: Sequence[Evaluation], pictures: Sequence[MatchPicture] =
                 "groups": _groups(evaluation),
                 "scene": _embedded(scene(evaluation)),
                 "bounds_of": evaluation.shown_method,
-                "verdict": _worded(entry["verdict"], bool(evaluation.covered.any())),
+                "verdict": _worded(entry["verdict"]),
                 "camera": _camera(evaluation),
                 "judged": bool(evaluation.covered.any()),
             }
@@ -92,10 +92,10 @@ def scene(e: Evaluation) -> dict[str, Any]:
     return {"est": _rounded(est - centre), "true": _rounded(true - centre), "ellipsoids": ellipsoids, "size": size}
 
 
-def _worded(found: dict[str, Any], judged: bool) -> dict[str, Any]:
+def _worded(found: dict[str, Any]) -> dict[str, Any]:
     words = {"green": "honest", "amber": "partly honest", "red": "not honest"}
     told = (word for word in ("overconfident", "too cautious") if word in found["headline"])
-    return {**found, "word": next(told, words[found["colour"]]) if judged else "not judged"}
+    return {**found, "word": next(told, words[found["colour"]]) if found["judged"] else "cannot be judged"}
 
 
 def _camera(e: Evaluation) -> str:

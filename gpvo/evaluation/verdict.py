@@ -30,17 +30,21 @@ Colour = Literal["green", "amber", "red"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """``colour`` and ``headline`` of the best stated covariance, and what stands behind it line by line."""
+    """``colour`` and ``headline`` of the best stated covariance, and what stands behind it line by line.
+
+    ``judged``: whether a covariance could be judged at all.
+    """
 
     colour: Colour
     headline: str
     lines: tuple[str, ...]
+    judged: bool = True
 
 
 def verdict(e: Evaluation) -> Verdict:
     """The verdict on one evaluated run."""
     if reason := _why_blind(e):
-        return Verdict("amber", reason, tuple(_conditions(e)))
+        return Verdict("amber", reason, tuple(_conditions(e)), judged=False)
     judged = {m: c for m, c in e.consistency.items() if c.nll_per_dim is not None}
     return _of_motions(e, judged) if judged else _of_others(e)
 
@@ -73,7 +77,8 @@ def _of_others(e: Evaluation) -> Verdict:
         )
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
     cure = "gpvo train learns one from such runs; give the model with --model."
-    return Verdict("red", "No covariance was stated, so nothing can be judged.", (*_conditions(e), cure))
+    headline = "No covariance was stated, so nothing can be judged."
+    return Verdict("red", headline, (*_conditions(e), cure), judged=False)
 
 
 def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
@@ -82,15 +87,16 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
     # What a vehicle would be told is judged first; others only where it is wrong.
     told = found["learned" if "learned" in judged else best]
     if not told.of_motions and not told.spans:
-        return Verdict("amber", "This truth is too noisy to judge a covariance of the run.", tuple(_conditions(e)))
+        headline = "This truth is too noisy to judge a covariance of the run."
+        return Verdict("amber", headline, tuple(_conditions(e)), judged=False)
     wrong = told.wrong()
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
     shown = dict.fromkeys((told.method, best, *(m for m in judged if m in _ALWAYS)))
     lines = [*_conditions(e), *(found[m].line() for m in shown)]
     if not wrong and not outside:
-        where = "per motion and over distance" if told.of_motions else f"over {_listed([n for n, _ in told.spans])}"
-        if not told.spans:
-            where = "per motion; over a second or a distance, nothing can be judged"
+        where = "per motion; over a second or a distance, nothing can be judged"
+        if told.spans:
+            where = "per motion and " * told.of_motions + f"over {_listed([n for n, _ in told.spans])}"
         return Verdict("green", f"The {told.method} covariance is honest here, {where}.", tuple(lines))
     if told.method != best and not found[best].wrong():
         lines.append(f"Use {best} here: it is honest{', and has the best likelihood of all' * told.of_motions}.")

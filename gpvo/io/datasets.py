@@ -194,7 +194,8 @@ class KittiSource(FileSource):
     """A sequence folder with ``image_0 image_1`` (or ``image_2 image_3``), ``calib.txt`` and ``times.txt``.
 
     Poses are read from ``poses.txt`` in the folder or ``../../poses/NN.txt``. ``colour`` chooses the colour pair;
-    by default the grey one where it is there. ``truth_noise`` replaces the default of GPS/INS.
+    by default the grey one where it is there. ``calibration``: another ``calib.txt``, or a stereo YAML.
+    ``truth_noise`` replaces the default of GPS/INS.
     """
 
     format = "kitti"
@@ -208,7 +209,8 @@ class KittiSource(FileSource):
         truth_noise: TruthNoise = GPS_INS,
         **options: Any,
     ) -> None:
-        calib = Path(calibration) if calibration is not None else path / "calib.txt"
+        own = path / "calib.txt"
+        calib = own if calibration is None else Path(calibration)
         if not calib.is_file():
             raise CalibrationError("no calibration", where=calib, cure="copy the sequence's calib.txt there")
         left, right = self._cameras(path, colour)
@@ -217,9 +219,14 @@ class KittiSource(FileSource):
         first = first_size(pairs, "left")  # the calibration does not say it
         if first is None:
             raise SourceError("not one readable left image", where=path)
-        rig = read_kitti_calib(calib, left=left, right=right, size=first[1])
+        if calib.suffix.lower() in (".yaml", ".yml"):
+            rig = read_stereo_yaml(calib, size=first[1])
+        else:
+            rig = read_kitti_calib(calib, left=left, right=right, size=first[1])
         super().__init__(path, path.name, rig, pairs, known, **options)
-        self.truth = self._read_truth(path, calib, left, truth_noise)
+        # Poses are of camera 0, whose place only KITTI's own file tells.
+        T_cam0_left = left_camera_offset(own if own.is_file() else calib, left)
+        self.truth = self._read_truth(path, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -267,7 +274,7 @@ class KittiSource(FileSource):
         ]
 
     @staticmethod
-    def _read_truth(path: Path, calib: Path, left: int, noise: TruthNoise) -> TruthLog | None:
+    def _read_truth(path: Path, T_cam0_cam: Array, noise: TruthNoise) -> TruthLog | None:
         candidates = (path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt")
         file = next((c for c in candidates if c.is_file()), None)
         if file is None:
@@ -281,4 +288,4 @@ class KittiSource(FileSource):
                 cure="KITTI poses have no stamps: both files must have one line per frame",
             )
         grows = growing(stamps)
-        return carry(Trajectory(stamps[grows], T_world_cam0[grows]), left_camera_offset(calib, left), noise)
+        return carry(Trajectory(stamps[grows], T_world_cam0[grows]), T_cam0_cam, noise)

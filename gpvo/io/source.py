@@ -190,4 +190,5 @@ def open_source(path: str | Path, kind: str | None = None, **options: Any) -> So
         if "unexpected keyword argument" not in str(error):
             raise
         option = str(error).split("'")[1]
-        raise SourceError(f"the source '{name}' has no option '{option}'", where=path) from None
+        flag = {"tolerance_s": "pair-tolerance"}.get(option, option.replace("_", "-"))
+        raise SourceError(f"the source '{name}' has no option '{option}' (--{flag})", where=path) from None

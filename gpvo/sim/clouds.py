@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +13,20 @@ from gpvo.sim import paths, recorded
 from gpvo.sim.paths import Path3
 from gpvo.types import Array
 
-PATHS = ("along", "wander", "straight", "hover")
+PATHS = ("along", "wander", "straight", "hover", "waypoints")
 _CAMERA_HEIGHT_M = 1.6  # over the road
 _STEP_M = 0.5  # between the points of a centre line
 _BEYOND_M = 80.0
 
 
 def make(
-    world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float
-) -> tuple[Path3, Array]:
+    world: str, path: str, duration_s: float, speed_mps: float, rng: np.random.Generator, rest_s: float,
+    waypoints: Sequence[Sequence[float]] = (),
+) -> tuple[Path3, Array]:  # fmt: skip
     """A path and the landmarks (N, 3) [m] around it.
 
     ``path``: one of :data:`PATHS`, or a recorded one, a file or run folder, which is scaled to fit the world; a street
-    is laid along it.
+    is laid along it. ``waypoints`` [m] are flown as they are.
     """
     if world not in _KINDS:
         raise GpvoError(f"unknown world '{world}'", cure=f"choose from {', '.join(_KINDS)}")
@@ -38,6 +39,8 @@ def make(
     cloud = landmarks(centre, rng)
     if path == "hover":
         flown = paths.hover((low + high) / 2, 0.0, duration_s)
+    elif path == "waypoints":
+        flown = paths.waypoints(np.array(waypoints), duration_s, speed_mps, rest_s)
     elif path == "straight":
         height, ground = (1.1, ground_height) if world == "lunar" else (0.0, None)
         flown = paths.straight(

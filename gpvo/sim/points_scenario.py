@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +19,8 @@ class PointsScenario:
 
     world: str = "tunnel"  # tunnel, lunar, room, street
     world_seed: int | None = None  # of landmarks and path, in place of the flight's own
-    path: str = "along"  # along, wander, straight, hover, or a recorded one: a TUM file, or a run folder
+    path: str = "along"  # along, wander, straight, hover, waypoints, or a recorded one: a TUM file, or a run folder
+    waypoints: tuple[tuple[float, float, float], ...] = ()
     duration_s: float = 60.0
     rest_s: float = 3.0  # at the start
     rate_hz: float = 20.0
@@ -85,6 +86,12 @@ def _within(least: float, most: float, kind: type = float) -> Callable[[Any], bo
 
 
 _is_time = _within(0.0, 1e6)
+
+
+def _is_place(v: Sequence[Any]) -> bool:
+    return [*map(_within(-1e6, 1e6), v)] == [True] * 3
+
+
 _RULES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     ("duration_s rate_hz imu_rate_hz reach_m", "a number from 0.1 to 1e6", _within(0.1, 1e6)),
     ("rest_s speed_mps sigma_px persistent_px blur_px spread noise_px", "a number from 0 to 1e3", _within(0.0, 1e3)),
@@ -97,6 +104,11 @@ _RULES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
         "dark frozen",
         "two times in s, the earlier one first",
         lambda v: v is None or (isinstance(v, (list, tuple)) and [*map(_is_time, v)] == [True, True] and v[0] <= v[1]),
+    ),
+    (
+        "waypoints",
+        "places, [[x, y, z], ...]",
+        lambda v: isinstance(v, (list, tuple)) and all(isinstance(p, (list, tuple)) and _is_place(p) for p in v),
     ),
     (
         "causes",

@@ -26,12 +26,12 @@ Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
 Share = Field(0.0, ge=0.0, le=0.5)
 _SHARED = (
     "world", "world_seed", "duration_s", "rest_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "episodes_share",
-    "causes", "dark",
+    "causes", "dark", "waypoints",
 )  # fmt: skip
 """What flights with images and without take alike."""
 _IMAGES_ALONE = {
     "noise_sigma": "points.sigma_px", "noise_every": "points.noise_every", "frozen": "points.frozen",
-    "dropped": "points.drop", "black": "points.dark", "waypoints": "--trajectory FILE", "late": "", "imu_offset_s": "",
+    "dropped": "points.drop", "black": "points.dark", "late": "", "imu_offset_s": "",
     "camera_pitch_deg": "", "right_light": "", "exposure_s": "", "sway_m": "", "agility": "", "depth": "", "flow": "",
 }  # fmt: skip
 """What only flights with images take, and what is like it without."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -127,15 +128,9 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
 def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRig:
     """The rig with rotation, focal length and centre of the right camera changed to explain the displacements best.
 
-    What none of them explains (lens distortion) remains.
+    What none of them explains (lens distortion) remains: :func:`explained_px`.
     """
-    v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
-    x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
-    o, z = np.ones_like(x), np.zeros_like(x)
-    phi = terms(x, y)
-    dx, dy = state.mean[:N_TERMS] @ phi, state.mean[N_TERMS:] @ phi
-    by_x, by_y = [-x * y, 1 + x * x, -y, x, o, z], [-(1 + y * y), x * y, x, y, z, o]
-    p = np.linalg.lstsq(np.hstack([by_x, by_y]).T, np.concatenate([dx, dy]), rcond=None)[0]
+    p = _explanation(state, camera)[0]
     R_rect = np.eye(3) if rig.is_rectified else rectifying_rotations(rig.T_right_left)[1]
     T = rig.T_right_left.copy()
     T[:3] = R_rect.T @ se3.so3_exp(p[:3]) @ R_rect @ T[:3]
@@ -145,6 +140,26 @@ def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRi
     distortion = [float(k) for k in r.distortion]
     right = make_lens("pinhole", kind, intrinsics, distortion, (r.width, r.height), rig.where)
     return replace(rig, right=right, T_right_left=T)
+
+
+def explained_px(state: RigState, camera: StereoCamera) -> tuple[float, float]:
+    """Displacement that was found, and what of it :func:`corrected` leaves: rms over the image [px]."""
+    _, *displacements = _explanation(state, camera)
+    found_px, left_px = (camera.fx_px * math.sqrt(2 * np.mean(d**2)) for d in displacements)
+    return found_px, left_px
+
+
+def _explanation(state: RigState, camera: StereoCamera) -> tuple[Array, Array, Array]:
+    """(6,) rotation, focal length and centre that fit best; displacements dx, then dy, over the image, and what is left
+    of them."""
+    v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
+    x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
+    o, z = np.ones_like(x), np.zeros_like(x)
+    found = (state.mean.reshape(2, N_TERMS) @ terms(x, y)).ravel()
+    by_x, by_y = [-x * y, 1 + x * x, -y, x, o, z], [-(1 + y * y), x * y, x, y, z, o]
+    by = np.hstack([by_x, by_y]).T
+    p = np.linalg.lstsq(by, found, rcond=None)[0]
+    return p, found, found - by @ p
 
 
 def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRig:

@@ -15,10 +15,13 @@ from foreign_trajectories import write_euroc_csv, write_kitti_poses
 from gpvo import cli
 from gpvo.cameras.models import PinholeRadtan
 from gpvo.errors import SourceError
+from gpvo.files import write_json
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.io.trajectory import write_tum
-from gpvo.types import Status, Vehicle, VoLog, VoRecord
+from gpvo.types import Status, StereoCamera, Vehicle, VoLog, VoRecord
+from gpvo.vo.rig_error import RigState
+from gpvo.vo.rig_findings import document
 
 N = 400
 T_NS = np.array([1_403_636_579_763_555_584 + k * 50_000_000 for k in range(N)])
@@ -74,6 +77,7 @@ def test_info_of_other_files(gpvo, tmp_path):
     write_kitti_poses(tmp_path / "b.txt", poses)
     write_euroc_csv(tmp_path / "c.csv", T_NS, poses)
     (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
+    seq.write_kitti(tmp_path / "s", 1)
     records = [VoRecord(0, 0, Status.START, np.eye(4)), VoRecord(10, 0, Status.OK, np.eye(4))]
     write_run(tmp_path / "run", VoLog(records))
     for name, what in (
@@ -81,11 +85,13 @@ def test_info_of_other_files(gpvo, tmp_path):
         ("b.txt", "trajectory"),
         ("c.csv", "trajectory"),
         ("camchain.yaml", "calibration"),
+        ("s/calib.txt", "calibration"),
         ("run", "run"),
     ):
         code, out, _ = gpvo("info", tmp_path / name, "--json")
         assert code == 0
         assert json.loads(out)["what"] == what
+    assert "baseline_m: P0 P1 0.1, P2 P3 0.1" in gpvo("info", tmp_path / "s" / "calib.txt")[1]
 
 
 def test_info_of_a_bag(gpvo, tmp_path):
@@ -101,6 +107,8 @@ def test_info_of_a_bag(gpvo, tmp_path):
     assert code == 0
     assert document["sequence"] is None
     assert "/imu0" in document["topics"]
+    assert "notes" not in document  # of images that no one looks for
+    assert "    /imu0: type sensor_msgs/msg/Imu, messages 1\n" in gpvo("info", tmp_path / "b")[1]
 
 
 @pytest.mark.parametrize("what", ["nothing", "empty", "rubbish.txt", "rubbish.bag", "rubbish.npz", "rubbish.yaml"])
@@ -334,3 +342,16 @@ def test_pair_tolerance(gpvo, tmp_path):
     assert "the nearest are 4 ms apart" in err
     code, out, _ = gpvo("info", path, "--pair-tolerance", "0.005", "--json")
     assert (code, json.loads(out)["frames"]) == (0, 12)
+
+
+@pytest.mark.parametrize(("term", "told"), [(0, "0.00 px remain"), (10, "--calibration-state")])
+def test_what_a_corrected_calibration_leaves(gpvo, tmp_path, term, told):
+    """A shift, and a bend of fourth order, which neither a rotation nor a focal length explains."""
+    camera = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
+    write_run(tmp_path / "r", VoLog([VoRecord(0, 0, Status.START, np.eye(4))], camera=camera))
+    for size, text in ((0.0, "c.yaml: the calibration, unchanged"), (0.01, told)):
+        state = RigState(size * np.eye(30)[term], 1e-6 * np.eye(30), 1.0)
+        write_json(tmp_path / "r" / "calibration_state.json", document(state, camera))
+        code, out, err = gpvo("calibration", tmp_path / "r", "-o", tmp_path / "c.yaml")
+        assert code == 0
+        assert text in out + err

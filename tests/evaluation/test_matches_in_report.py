@@ -41,3 +41,18 @@ def test_a_frame_that_is_not_there(flight: Path, frames: str, capsys: pytest.Cap
     words = ["report", flight / "run", "--frames", frames, "--sequence", flight / "flight.npz"]
     assert main(*words) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_the_sequence_of_another_run(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Told by its stamps, as by its camera; and a sequence of which no frame is asked for."""
+    simulate_points("tunnel-clean", 0, duration_s=4.0, rate_hz=20.0).save(flight / "faster.npz")
+    simulate_points("room-t265", 0, duration_s=4.0, rate_hz=10.0).save(flight / "camera.npz")
+    for name, frames, told in (
+        ("faster", ["--frames", 5], "its stamps are not those of the run"),
+        ("camera", ["--frames", 5], "its camera or calibration is not that of the run"),
+        ("flight", [], "--sequence has no effect without --frames"),
+    ):
+        page = flight / "other.html"
+        assert main("report", flight / "run", "-o", page, *frames, "--sequence", flight / f"{name}.npz") == 2
+        assert told in capsys.readouterr().err
+        assert not page.exists()

@@ -17,7 +17,7 @@ from gpvo.types import Mounting, VoLog
 
 pytestmark = pytest.mark.slow
 
-TRUE = "The triangulation covariance is honest here, per motion and over distance."
+TRUE = "The triangulation covariance is honest here, per motion and over 1 s, 1 m and 10 m."
 # Case: its verdicts.
 CASES = {
     "good fit": [TRUE],

@@ -17,6 +17,7 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
 from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.panels import _LEVELS, reliability
+from gpvo.evaluation.report import render
 from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
@@ -51,6 +52,24 @@ def test_a_run_too_short_for_any_distance_is_judged_per_motion_alone() -> None:
     short = VoLog(log.records[:12], log.camera)
     found = verdict(evaluate_run(Run(Path("hall"), "hall", short, truth, None, Mounting(), [])))
     assert "per motion; over a second or a distance, nothing can be judged" in found.headline
+
+
+def test_only_spans_that_were_judged_are_named() -> None:
+    """A hover is honest over a second, and over no distance."""
+    evaluation = evaluated({"triangulation": 1.0})
+    assert verdict(evaluation).headline.endswith("per motion and over 1 s, 1 m and 10 m.")
+    hover = replace(evaluation.consistency["triangulation"], horizons=())
+    found = verdict(replace(evaluation, consistency={"triangulation": hover}))
+    assert found.headline.endswith("is honest here, per motion and over 1 s.")
+
+
+@pytest.mark.parametrize("factors", [{"triangulation": 1.0}, {}])
+def test_the_summary_of_a_report_judges_nothing_that_its_sections_do_not(factors: dict[str, float | Array]) -> None:
+    """Neither by a truth that is too noisy, nor where nothing was stated."""
+    evaluation = replace(evaluated(factors), tells_from_m=float("inf"))
+    summary = render([evaluation, evaluation]).split("</nav>")[0]
+    assert summary.count("cannot be judged") == 2
+    assert "honest" not in summary
 
 
 def test_slips_that_the_model_names_are_no_lost_frames() -> None:

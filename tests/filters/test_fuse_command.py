@@ -16,8 +16,10 @@ from gpvo.filters.policies import POLICIES
 from gpvo.filters.run import FuseOptions
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
-from gpvo.io.run import write_run
+from gpvo.io.run import read_run, write_run
+from gpvo.online import modelfile
 from gpvo.types import ImuLog, Mounting, Status, TruthLog, VoLog, VoRecord
+from small_model import small_model
 from synthetic_flights import FORWARD_CAMERA, ErrorLaw, synthetic_flight, with_geometric
 from typer.testing import CliRunner
 
@@ -100,6 +102,16 @@ def test_table_without_model_or_training(runs: list[Path]) -> None:
     out = _run("fuse", runs[0], "--policies", "pointing_matching,learned")
     assert "pointing_matching" in out
     assert "learned less pointing_matching" in out
+
+
+def test_a_model_that_no_frame_has_a_prediction_of(runs: list[Path], tmp_path: Path) -> None:
+    """All frames are lost: a model was given, and giving one is no cure."""
+    run, trained = read_run(runs[0]), small_model()
+    modelfile.save(tmp_path / "m.gpvo", trained.arrays, trained.header)
+    records = [r.with_status(Status.LOST, "dark") if k else r for k, r in enumerate(run.log)]
+    write_run(tmp_path / "lost", VoLog(records), mounting=MOUNTING, truth=run.truth, imu=run.imu)
+    with pytest.raises(GpvoError, match="learned is left out: no frame has a prediction"):
+        fuse_runs([tmp_path / "lost"], FusionSettings(policies=("learned",), model=tmp_path / "m.gpvo"))
 
 
 def test_without_imu(runs: list[Path]) -> None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import sequences as seq
+from gpvo.cameras.readers import read_kitti_calib
+from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.source import Source, source_kinds
+from gpvo.vo.rig_findings import camchain
 
 MAKERS = {"euroc": seq.write_euroc, "kitti": seq.write_kitti, "folder": seq.write_folder}
 
@@ -167,6 +171,18 @@ def test_kitti_colour_and_poses_beside_the_sequences(tmp_path):
     offset = se3.exp(np.array([-0.05, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12) @ offset, atol=1e-5)
     assert source.truth.sigma_translation_m == 3e-3
+
+
+def test_kitti_with_a_corrected_calibration(tmp_path):
+    path = seq.write_kitti(tmp_path / "s", folders=("image_2", "image_3"))
+    T_right_left = se3.exp(np.array([-0.1, 0.0, 0.0, 0.01, 0.02, 0.03]))
+    rig = read_kitti_calib(path / "calib.txt", left=2, right=3, size=(seq.WIDTH, seq.HEIGHT))
+    (tmp_path / "kc.yaml").write_text(camchain(replace(rig, T_right_left=T_right_left)))
+    source = open_source(path, calibration=tmp_path / "kc.yaml")
+    assert len(seq.frames_of(source)) == 12
+    T_cam0_left = se3.exp(np.array([-0.05, 0, 0, 0, 0, 0]))
+    T_left_cam = se3.from_rt(rectifying_rotations(T_right_left)[0].T, np.zeros(3))
+    np.testing.assert_allclose(source.truth.T_world_cam, seq.true_poses(12) @ T_cam0_left @ T_left_cam, atol=1e-5)
 
 
 def test_euroc_truth_is_of_the_rectified_left_camera(tmp_path):
@@ -381,6 +397,8 @@ def test_nothing_there_and_nothing_known(tmp_path):
         open_source(tmp_path, kind="x")
     with pytest.raises(SourceError, match="no option 'colour'"):
         open_source(seq.write_folder(tmp_path / "s"), colour=True)
+    with pytest.raises(SourceError, match=r"no option 'tolerance_s' \(--pair-tolerance\)"):
+        open_source(seq.write_kitti(tmp_path / "k"), tolerance_s=0.1)
 
 
 @pytest.mark.parametrize(

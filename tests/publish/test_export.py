@@ -284,6 +284,15 @@ def test_predictions_go_to_parquet_alone(tmp_path: Path) -> None:
         CliRunner().invoke(app, ["predict", "m.gpvo", "run", "-o", str(tmp_path / "p.csv")], catch_exceptions=False)
 
 
+def test_predictions_where_something_else_is(tmp_path: Path) -> None:
+    (tmp_path / "d.parquet").mkdir()
+    (tmp_path / "f.parquet").touch()
+    for runs, name, message in ((["a"], "d", "is a folder .*parquet"), (["a", "b"], "f", "is a file .*give a folder")):
+        words = ["predict", "m.gpvo", *runs, "-o", str(tmp_path / f"{name}.parquet")]
+        with pytest.raises(GpvoError, match=message):
+            CliRunner().invoke(app, words, catch_exceptions=False)
+
+
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="one of: onnx, c"):
         export_model(tmp_path / "model", tmp_path / "out", "fortran")

@@ -76,6 +76,12 @@ def test_what_lies_where_it_should_be_written_is_left_alone(
     assert (tmp_path / "file").read_bytes() == b"mine"
 
 
+def test_a_suffix_that_tells_nothing_is_refused(predicted: Path, tmp_path: Path) -> None:
+    with pytest.raises(GpvoError, match=r"z\.csv: its suffix does not tell .* \.bag, \.mcap, \.tlog"):
+        publish_run(predicted, PublishSettings(out=tmp_path / "z.csv"))
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("system", [0, 256, -1])
 def test_the_system_is_a_byte(predicted: Path, tmp_path: Path, system: int) -> None:
     with pytest.raises(GpvoError, match=f"--system is {system}.*1 to 255"):

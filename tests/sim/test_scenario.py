@@ -59,7 +59,8 @@ def test_mistakes_are_named(overrides, message):
     "name, value",
     [("sigma_px", "fast"), ("sigma_px", -0.1), ("drop", 1.5), ("tracks", 0), ("tracks", 10.5), ("cars", True),
      ("frozen", [3.0, 1.0]), ("dark", 4.0), ("causes", [["dust"]]), ("causes", []), ("world_seed", -1),
-     ("episodes_share", 0.9), ("reach_m", float("nan")), ("camera", "t265"), ("tolerance", {"focal": 0.1})],
+     ("episodes_share", 0.9), ("waypoints", [[1, 2]]), ("waypoints", [1, 2, 3]),
+     ("reach_m", float("nan")), ("camera", "t265"), ("tolerance", {"focal": 0.1})],
 )  # fmt: skip
 def test_a_value_of_points_that_makes_no_flight_is_refused_before_any(name, value):
     with pytest.raises(GpvoError, match=f"^points.{name} is ") as caught:
@@ -84,6 +85,14 @@ def test_what_a_flight_has_with_images_it_has_without():
     assert sum(e.end_s - e.begin_s for e in flight.episodes) == pytest.approx(8.0, abs=1.5)
     moved_m = abs(flight.T_world_cam[:, :3, 3] - flight.T_world_cam[0, :3, 3]).max(axis=1)
     assert 1.0 <= flight.t_s[(moved_m > 1e-3).argmax()] < 1.5
+
+
+def test_waypoints_are_flown_without_images_too():
+    places = [[1.0, 0.0, 0.0], [5.0, 0.5, 0.2], [9.0, 0.0, 0.0]]
+    given = {"path": "waypoints", "waypoints": places, "duration_s": 14.0}
+    flight = simulate_points(sc.points_scenario(sc.load_scenario("tunnel", given)), 1)
+    apart_m = abs(flight.motion.position_m[:, None] - places).max(axis=2).min(axis=0)
+    assert apart_m.max() < 0.1
 
 
 @pytest.mark.parametrize(

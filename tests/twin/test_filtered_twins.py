@@ -62,6 +62,12 @@ def test_twins_foretell_the_filters_error(flown, imu):
         assert 0.15 < scores[1]["ate_rmse_m"] / scores[0]["ate_rmse_m"] < 7.0
 
 
+def test_runs_with_truth_are_filtered_as_they_are_and_that_is_told(flown):
+    done = CliRunner().invoke(app, ["fuse", str(flown[0]), "--twins", "--no-imu", *WHAT])
+    assert [r["run"] for r in json.loads(done.stdout)["runs"]] == ["seen"]
+    assert "seen has ground truth: no twins are made of it" in done.stderr
+
+
 def test_the_table_says_that_truth_is_simulated_and_fits_80_columns(flown):
     shown = fused(flown[1], "--twins", "--replicates", 2, "--policies", "pointing_matching", "--tolerance", "kitti")
     assert "blind has no ground truth: means over 2 twins, whose truth is simulated (tolerance kitti)" in shown

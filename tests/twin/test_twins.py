@@ -265,6 +265,12 @@ def test_evaluate_by_twins_with_and_without_truth(flown, blind):
         assert simulated == pytest.approx(real, rel=0.35)
 
 
+@pytest.mark.parametrize("command", ["train", "evaluate", "fuse"])
+def test_options_of_twins_without_twins_are_refused(command, flown, tmp_path):
+    with pytest.raises(GpvoError, match=r"--gap has no effect without --twins"):
+        gpvo(command, flown[0] / "run", "--gap", "drives", *(["-o", tmp_path / "m.gpvo"] * (command == "train")))
+
+
 @pytest.mark.slow
 def test_a_model_of_twins_says_so(flown, blind, tmp_path):
     trained = gpvo("train", blind, "--twins", "--replicates", 3, "-o", tmp_path / "m.gpvo", "--features", "thesis")

@@ -16,7 +16,7 @@ from gpvo.geometry.covariance import is_positive_definite
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.motion import refine, whitened
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance
-from gpvo.vo.rig_findings import camchain, corrected, document, findings, read_state, rig_of
+from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, findings, read_state, rig_of
 from gpvo.vo.sigmas import NoiseEstimator
 
 CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
@@ -180,6 +180,14 @@ def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
     w = se3.so3_log(read.T_right_left[:3, :3])
     assert w[axis] == pytest.approx(3e-3, rel=0.1)
     assert np.abs(np.delete(w, axis)).max() < 3e-4
+
+
+def test_how_much_a_corrected_calibration_explains() -> None:
+    """A turn to first order in whole, as of a bend of fourth order half."""
+    for coefficients, least, most in ((_turn(1, 3e-3), 0.0, 1e-9), (np.eye(2 * N_TERMS)[10] * 1e-2, 0.3, 0.7)):
+        found_px, left_px = explained_px(RigState(coefficients, np.eye(2 * N_TERMS), 1.0), CAMERA)
+        assert found_px > 0.5
+        assert least <= left_px / found_px < most
 
 
 def test_corrected_camera_chain_keeps_the_imu(tmp_path: Path) -> None:
