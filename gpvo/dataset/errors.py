@@ -71,7 +71,7 @@ def steps_of_slow_truth(truth: TruthLog, t_ns: NDArray[np.int64]) -> tuple[float
 
 
 _STRAIGHT_M, _FEWEST_KNOTS = 5e-6, 5
-_SURE = 0.9  # a variance is not negative: one end of the interval judges it, at 95 %
+_TOGETHER = 4  # windows of a second whose drifts may be alike
 
 
 def interpolated_between(truth: TruthLog) -> int | None:
@@ -273,7 +273,7 @@ def velocity_path(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array | None:
 
 
 def drift_variance(contradiction: Array, error: Array) -> Array:
-    """(3,) variance of the truth's displacements over windows (W, 3) [m^2]; 0 where, at 95 %, it may be zero.
+    """(3,) variance of the truth's displacements over windows (W, 3) [m^2]; 0 where the 95 % interval holds zero.
 
     GPS/INS positions drift, by decimetres within seconds, where satellites are hidden. High-passing cannot show this,
     but a third instrument can: a truth that also measures velocities gives each displacement twice, and where the two
@@ -282,5 +282,5 @@ def drift_variance(contradiction: Array, error: Array) -> Array:
     ``contradiction``: displacements by the truth's positions less those by its velocities; ``error``: those by odometry
     less those by the positions; both in axes of the camera.
     """
-    found = [block_bootstrap(product, level=_SURE) for product in -(contradiction * error).T]
+    found = [block_bootstrap(product, _TOGETHER) for product in -(contradiction * error).T]
     return np.array([v.mean if v.low > 0 else 0.0 for v in found])

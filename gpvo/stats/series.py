@@ -7,8 +7,10 @@ Moving blocks on a circle: D. Politis, J. Romano, "A circular block-resampling p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -100,8 +102,9 @@ def block_bootstrap(
     """Interval for the mean of one autocorrelated series (n,), by circular blocks.
 
     ``block`` defaults to ``ceil(2 n^(1/3))``, at least 10 frames and three times as long as the series remembers, at
-    most n / 4. As the spread of k blocks is itself an estimate, the interval is wider than theirs by Student's t with
-    k - 1 degrees of freedom. With fewer than 8 values it is (-inf, inf): nothing can be said.
+    most n / 4. As the spread of k blocks is itself an estimate, the percentiles are expanded by Student's t with k - 1
+    degrees of freedom (T. Hesterberg, "What teachers should know about the bootstrap", 2015, section 4.3). With fewer
+    than 8 values the interval is (-inf, inf): nothing can be said.
     """
     values = np.asarray(values, dtype=np.float64)
     n = len(values)
@@ -115,10 +118,10 @@ def block_bootstrap(
     # Sum of each circular block from a running sum, so that a draw costs n / block look-ups.
     block_mean = moving_sums(np.concatenate([values, values[:block]]), block)[:n] / block
     means = block_mean[rng.integers(0, n, (draws, per_draw))].mean(axis=1)
-    mean, k = float(values.mean()), max(n // block, 4)
-    wider = student_t.quantile_ratio(level, k - 1) * np.sqrt(k / (k - 1))
-    low, high = mean + wider * (np.quantile(means, [(1 - level) / 2, (1 + level) / 2]) - mean)
-    return Interval(mean, float(low), float(high))
+    k = max(n // block, 4)
+    outside = NormalDist().cdf(-student_t.quantile(level, k - 1) * math.sqrt(k / (k - 1)))
+    low, high = np.quantile(means, [outside, 1 - outside])
+    return Interval(float(values.mean()), float(low), float(high))
 
 
 def _memory(values: Array) -> float:

@@ -94,9 +94,9 @@ def half_width(level: float, nu: float) -> float:
     return float(np.interp(level * share[-1], share, x))
 
 
-def quantile_ratio(level: float, nu: int) -> float:
-    """Half of the central interval that holds a share ``level`` of Student's t, over that of the Gaussian, nu > 2."""
-    return half_width(level, nu) * math.sqrt(nu / (nu - 2.0)) / half_width(level, math.inf)
+def quantile(level: float, nu: int) -> float:
+    """Half of the central interval that holds a share ``level`` of Student's t, for nu > 2."""
+    return half_width(level, nu) * math.sqrt(nu / (nu - 2.0))
 
 
 def fit_dof(squared: Array, d: int, count: Array) -> float:

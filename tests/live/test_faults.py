@@ -229,6 +229,17 @@ def test_the_end_of_a_recording_is_no_silence() -> None:
     assert told == []
 
 
+def test_a_rate_that_falls_is_a_gap_three_times_and_then_the_rate() -> None:
+    watch, t_ns, seen = StampWatch(), 10**9, []
+    for step_s in [1 / 30] * 60 + [0.5] * 20 + [5.5] + [0.5] * 5:
+        t_ns += round(step_s * 1e9)
+        seen.append(watch.see(t_ns))
+    assert set(seen[1:60]) == {Sequence.NEXT}
+    assert seen[60:63] == [Sequence.GAP] * 3
+    assert set(seen[63:80]) == {Sequence.NEXT}
+    assert seen[80:] == [Sequence.GAP] + [Sequence.NEXT] * 5
+
+
 def test_one_corrupt_stamp_is_one_message_and_three_that_agree_are_another_clock() -> None:
     watch = StampWatch()
     usual = [watch.see(k * SECOND // 20 + 10**18) for k in range(10)]
