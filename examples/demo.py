@@ -20,7 +20,7 @@ def gpvo(*arguments: object) -> None:
     """Run one command as a user would, and show it."""
     words = [str(a) for a in arguments]
     print(f"\n$ gpvo {' '.join(words)}", flush=True)
-    subprocess.run([sys.executable, "-m", "gpvo.cli", *words], check=True)
+    subprocess.run([sys.executable, "-m", "gpvo", *words], check=True)
 
 
 def main() -> None:

@@ -132,7 +132,3 @@ def _fail(text: str) -> NoReturn:
         traceback.print_exc()
     Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"gpvo: {text}")
     sys.exit(2)
-
-
-if __name__ == "__main__":
-    main()

@@ -36,7 +36,7 @@ def run(log: VoLog, tmp_path: Path) -> Path:
 
 
 def gpvo(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    call = [sys.executable, "-m", "gpvo.cli", *map(str, words)]
+    call = [sys.executable, "-m", "gpvo", *map(str, words)]
     return subprocess.run(call, capture_output=True, text=True, cwd=cwd, timeout=120)
 
 

@@ -27,7 +27,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 KILLS = int(os.environ.get("GPVO_KILLS", "24"))
 TABLES = ("vo_log.parquet", "trajectory.tum", "rig.json", "truth.parquet", "imu.parquet", "config.toml",
           "predictions.parquet", "tracks.parquet", "calibration_state.json")  # fmt: skip
-GPVO = [sys.executable, "-m", "gpvo.cli"]
+GPVO = [sys.executable, "-m", "gpvo"]
 # A reproduction of one row, without images: smaller than the command line offers, and interrupted as it is.
 REPRODUCE = """
 import signal, sys
@@ -239,7 +239,7 @@ def test_a_full_disk_costs_one_line_and_leaves_what_was_there(name: str, short: 
     before = bytes_of(tmp_path)
     for limit_bytes in (0, 1_000, 10_000):
         limited = f"import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
-        code = f"{limited}; runpy.run_module('gpvo.cli', run_name='__main__')"
+        code = f"{limited}; runpy.run_module('gpvo', run_name='__main__')"
         call = subprocess.run(
             [sys.executable, "-c", code, *WRITERS[name], out], capture_output=True, text=True, cwd=short, timeout=300
         )

@@ -233,7 +233,7 @@ def test_a_write_that_fails_is_one_line_and_leaves_nothing(tmp_path, tmp_path_fa
     pytest.importorskip("numba")
     resource = pytest.importorskip("resource")
     done = subprocess.run(
-        [sys.executable, "-m", "gpvo.cli", "simulate", "tunnel-clean", "-o", str(tmp_path / "seq"), "--duration", "4"],
+        [sys.executable, "-m", "gpvo", "simulate", "tunnel-clean", "-o", str(tmp_path / "seq"), "--duration", "4"],
         capture_output=True,
         text=True,
         timeout=300,

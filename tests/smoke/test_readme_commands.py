@@ -24,7 +24,7 @@ def commands() -> list[str]:
 
 def call(line: str, folder: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "gpvo.cli", *line.split()[1:]], cwd=folder, capture_output=True, text=True, timeout=600
+        [sys.executable, "-m", "gpvo", *line.split()[1:]], cwd=folder, capture_output=True, text=True, timeout=600
     )
     assert done.returncode in ((0, 1) if " check " in line else (0,)), f"{line}\n{done.stdout}\n{done.stderr}"
 

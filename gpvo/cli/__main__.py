@@ -1,5 +1,0 @@
-"""``python -m gpvo.cli``."""
-
-from gpvo.__main__ import main
-
-main()
