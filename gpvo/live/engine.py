@@ -28,7 +28,7 @@ from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
-from gpvo.publish.odometry import Odometry, OdometryBuilder
+from gpvo.publish.odometry import Odometry, OdometryBuilder, lift
 from gpvo.types import VEHICLES, Array, Prediction, Status, Vehicle, VoRecord
 from gpvo.vo.quality import lost_covariance
 
@@ -39,6 +39,7 @@ _RECENT = 100
 _FAR_SCALE = 5.0  # no model that fits its odometry is so far off, either way
 _FROM_OUTSIDE = (GpvoError, OSError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError, struct.error)
 """What a message or a link can raise; neither must end the process."""
+_LEAST_VAR = 1e-9  # of an increment: robot_localization takes less for an error
 _POSITION_SIGMA_M, _ATTITUDE_SIGMA_RAD = 1.0, 0.1  # a source that starts again need not start where it stopped
 
 
@@ -230,12 +231,14 @@ class Engine:
         return np.zeros(6) if twist is None else twist
 
     def _of_increment(self, message: Odometry, record: VoRecord, prediction: Prediction | None) -> Odometry:
-        C = record.covariances.get(self.stage.method) if prediction is None else prediction.covariance
+        C = record.covariances.get(self.stage.method)
+        if prediction is not None:
+            C = prediction.covariance + np.outer(prediction.mean, prediction.mean)
         if C is None:
             return message
         A = se3.adjoint(self.stage.T_body_cam)
         in_odom = rotate_covariance(message.T_odom_body[:3, :3], A @ C @ A.T)
-        return replace(message, pose_covariance=in_odom + 1e-12 * np.eye(6))
+        return replace(message, pose_covariance=lift(in_odom, _LEAST_VAR, _LEAST_VAR))
 
     def _watch(self) -> None:
         """Warnings and diagnostics that are due."""
