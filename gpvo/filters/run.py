@@ -23,6 +23,7 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecor
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
 _LEVEL_SIGMAS = 3.0
+_STRETCH_S, _STRETCHES = 1.0, 15  # that the vertical is measured over: at least so long, at most so many
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
 
@@ -140,8 +141,9 @@ def _aligned_with_gravity(
     accelerometer counts as gravity."""
     if flight.imu is None:
         return start, None
-    up = vertical_in_world(flight.imu, np.array([flight.records[i].t_ns for i in valid]), flight.T_world_imu[valid])
-    sigma_rad = float(np.hypot(sigmas.acc_bias_mps2 / STANDARD_GRAVITY_MPS2, sigmas.tilt_rad))
+    t_ns = np.array([flight.records[i].t_ns for i in valid])
+    up, noise_rad = vertical_in_world(flight.imu, t_ns, flight.T_world_imu[valid])
+    sigma_rad = float(np.linalg.norm([sigmas.acc_bias_mps2 / STANDARD_GRAVITY_MPS2, sigmas.tilt_rad, noise_rad]))
     if (tilt_rad := float(np.arccos(np.clip(up[2], -1.0, 1.0)))) < _LEVEL_SIGMAS * sigma_rad:
         return start, None
     tilt, R = sigma_rad**2 * (np.eye(3) - np.outer(up, up)), start.nominal.R_world_imu[0]
@@ -151,17 +153,26 @@ def _aligned_with_gravity(
     return Start(start.nominal, C, note, tilt), -STANDARD_GRAVITY_MPS2 * up
 
 
-def vertical_in_world(imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array) -> Array:
-    """Unit vector (3,) of the vertical: the mean specific force turned into the world, less the mean acceleration."""
+def vertical_in_world(imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array) -> tuple[Array, float]:
+    """Unit vector (3,) of the vertical, and its standard deviation [rad] but for the accelerometer's bias.
+
+    Over a stretch, the mean specific force in the world less the mean acceleration; of many stretches the median, which
+    readings of a failing IMU do not move far.
+    """
     imu = cleaned(imu)
-    seconds = (t_ns - t_ns[0]) * 1e-9
-    force = np.stack([np.interp(seconds, (imu.t_ns - t_ns[0]) * 1e-9, imu.acc_mps2[:, i]) for i in range(3)], axis=1)
-    world = (T_world_imu[:, :3, :3] @ force[:, :, None])[:, :, 0].mean(axis=0)
-    p, m = T_world_imu[:, :3, 3], min(5, len(t_ns) - 1)
-    v_end = (p[-1] - p[-1 - m]) / (seconds[-1] - seconds[-1 - m])
-    v_start = (p[m] - p[0]) / (seconds[m] - seconds[0])
-    up = world - (v_end - v_start) / max(seconds[-1], 1e-9)
-    return up / np.linalg.norm(up)
+    t_s, imu_s = (t_ns - t_ns[0]) * 1e-9, (imu.t_ns - t_ns[0]) * 1e-9
+    force = np.stack([np.interp(t_s, imu_s, along) for along in imu.acc_mps2.T], axis=1)
+    world = (T_world_imu[:, :3, :3] @ force[:, :, None])[:, :, 0]
+    dt_s = np.diff(t_s)[:, None]
+    impulse = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (world[1:] + world[:-1]) * dt_s, axis=0)])
+    count = int(np.clip(t_s[-1] / _STRETCH_S, 1, _STRETCHES))
+    ends = np.unique(np.searchsorted(t_s, np.linspace(0.0, t_s[-1], count + 1)))
+    gained = impulse - np.gradient(T_world_imu[:, :3, 3], t_s, axis=0)
+    ups = np.diff(gained[ends], axis=0) / np.diff(t_s[ends])[:, None]
+    up = np.median(ups, axis=0)
+    # 1.48: from the median deviation to sigma; 1.25: from the mean's to the median's.
+    sigma = 1.48 * 1.25 * np.median(np.abs(ups - up), axis=0).max() / np.sqrt(len(ups))
+    return up / np.linalg.norm(up), float(sigma / np.linalg.norm(up))
 
 
 def make_filter(

@@ -102,9 +102,7 @@ def block_bootstrap(
     """Interval for the mean of one autocorrelated series (n,), by circular blocks.
 
     ``block`` defaults to ``ceil(2 n^(1/3))``, at least 10 frames and three times as long as the series remembers, at
-    most n / 4. As the spread of k blocks is itself an estimate, the percentiles are expanded by Student's t with k - 1
-    degrees of freedom (T. Hesterberg, "What teachers should know about the bootstrap", 2015, section 4.3). With fewer
-    than 8 values the interval is (-inf, inf): nothing can be said.
+    most n / 4. With fewer than 8 values the interval is (-inf, inf): nothing can be said.
     """
     values = np.asarray(values, dtype=np.float64)
     n = len(values)
@@ -118,10 +116,16 @@ def block_bootstrap(
     # Sum of each circular block from a running sum, so that a draw costs n / block look-ups.
     block_mean = moving_sums(np.concatenate([values, values[:block]]), block)[:n] / block
     means = block_mean[rng.integers(0, n, (draws, per_draw))].mean(axis=1)
-    k = max(n // block, 4)
+    return _expanded(float(values.mean()), means, level, max(n // block, 4))
+
+
+def _expanded(mean: float, means: Array, level: float, k: int) -> Interval:
+    """Interval from the ``means`` of draws of k blocks or sequences: as their spread is itself an estimate, percentiles
+    are expanded by Student's t with k - 1 degrees of freedom (T. Hesterberg, "What teachers should know about the
+    bootstrap", 2015, section 4.3)."""
     outside = NormalDist().cdf(-student_t.quantile(level, k - 1) * math.sqrt(k / (k - 1)))
     low, high = np.quantile(means, [outside, 1 - outside])
-    return Interval(float(values.mean()), float(low), float(high))
+    return Interval(mean, float(low), float(high))
 
 
 def _memory(values: Array) -> float:
@@ -147,5 +151,4 @@ def sequence_bootstrap(values: Array, *, level: float = 0.95, draws: int = 10000
         return Interval(float(values.mean()) if n else np.nan, -np.inf, np.inf)
     rng = np.random.default_rng(seed)
     means = values[rng.integers(0, n, (draws, n))].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(values.mean()), float(low), float(high))
+    return _expanded(float(values.mean()), means, level, n)

@@ -95,7 +95,9 @@ def half_width(level: float, nu: float) -> float:
 
 
 def quantile(level: float, nu: int) -> float:
-    """Half of the central interval that holds a share ``level`` of Student's t, for nu > 2."""
+    """Half of the central interval that holds a share ``level`` of Student's t, from two degrees of freedom on."""
+    if nu == 2:
+        return level * math.sqrt(2.0 / (1.0 - level**2))
     return half_width(level, nu) * math.sqrt(nu / (nu - 2.0))
 
 

@@ -108,9 +108,10 @@ def test_a_truth_that_is_not_level_is_judged_as_one_that_is(tilt_deg: float) -> 
         assert flight.T_world_cam is not None
         turned = replace(flight, T_world_cam=tilted @ flight.T_world_cam)
         scores.append(fuse_flight(turned, LearnedPolicy())[0].scores)
-    # Errors of eight flights of 15 s: the position's have some ten independent ones.
-    assert 0.4 < np.mean([s.nees_position for s in scores]) < 2.0
-    assert 0.4 < np.mean([s.nees_attitude for s in scores]) < 2.0
+    # Errors of eight flights of 15 s: the position's have some ten independent ones. At first, the tilt counts twice:
+    # in the filter's covariance, and in how far the truth's vertical may be from its own.
+    assert 0.3 < np.mean([s.nees_position for s in scores]) < 2.0
+    assert 0.3 < np.mean([s.nees_attitude for s in scores]) < 2.0
 
 
 def test_the_velocity_of_sparse_truth_is_as_unsure_as_its_path_bends() -> None:
