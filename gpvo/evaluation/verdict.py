@@ -57,7 +57,8 @@ def _why_blind(e: Evaluation) -> str:
         return "Odometry and truth are the same throughout, so nothing can be judged: was the truth made from odometry?"
     if e.run.truth and (turn_deg := turn_without_truth_deg(e.run.log, e.run.truth)):
         return (
-            f"The truth has no attitude (it never turns, odometry does by up to {turn_deg:.0f} deg): only ATE is valid."
+            f"The truth holds no attitude (it never turns, but odometry does, by up to {turn_deg:.0f} deg):"
+            " only the ATE is valid."
         )
     if len(e.errors.index) < 2 and e.run.log.methods and e.poses is None:
         return "Fewer than two motions have ground truth at both ends, so no covariance can be judged."
