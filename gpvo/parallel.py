@@ -60,7 +60,7 @@ def _on_dask(
     try:
         client = Client(scheduler, timeout="10s") if scheduler else Client(processes=True, dashboard_address=None)
     except (OSError, TimeoutError, ValueError) as problem:
-        raise GpvoError(f"no Dask scheduler answers: {problem}", where=scheduler, cure="dask scheduler") from None
+        raise GpvoError(f"no Dask scheduler answers: {problem}", where=scheduler, cure="run 'dask scheduler'") from None
     with client:
         futures = [client.submit(function, *arguments, pure=False) for arguments in jobs_arguments]
         return list(client.gather(futures))

@@ -42,7 +42,7 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
     """
     if path.suffix.lower() == ".txt":
         if size is None:
-            raise CalibrationError("states no size of the images", where=path, cure="convert it to a camchain.yaml")
+            raise CalibrationError("does not give the image size", where=path, cure="convert it to a camchain.yaml")
         return read_kitti_calib(path, left=0, right=1, size=size)
     document = read_yaml(path)
     if "cam0" in document or "cam1" in document:
@@ -141,7 +141,7 @@ def _read_camera_infos(path: Path) -> StereoRig:
             break
     else:
         cure = "name the files left.yaml and right.yaml"
-        raise CalibrationError("is of one camera, and its name does not say which", where=path, cure=cure)
+        raise CalibrationError("is for one camera, and its name does not say which", where=path, cure=cure)
     for file in pair:
         if not file.is_file():
             raise CalibrationError(f"the other camera's file {file.name} is not beside it", where=path)
@@ -154,7 +154,7 @@ def _read_camera_info(path: Path) -> CameraInfo:
     def matrix(name: str, rows: int, columns: int) -> Array:
         holder = document.get(name)
         if not isinstance(holder, dict):
-            raise CalibrationError(f"lacks '{name}'", where=path, cure="give a camera_info YAML of ROS")
+            raise CalibrationError(f"lacks '{name}'", where=path, cure="give a ROS camera_info YAML")
         return np.reshape(get_numbers(holder, "data", rows * columns, path), (rows, columns))
 
     holder = document.get("distortion_coefficients")
@@ -267,7 +267,7 @@ def _check_centre(cx: float, cy: float, size: tuple[int, int], path: Path) -> No
         raise CalibrationError(
             f"its principal point ({cx:.1f}, {cy:.1f}) is far from the middle of the {width}x{height} images",
             where=path,
-            cure="is it the calibration of another resolution? Scale its first two rows as the images",
+            cure="is it the calibration of another resolution? Scale its first two rows like the images",
         )
 
 

@@ -91,7 +91,7 @@ class Rectifier:
         if hfov_deg is not None:
             if not 5.0 <= hfov_deg <= 160.0:
                 raise CalibrationError(
-                    f"a flat image of {hfov_deg:g} degrees is not possible",
+                    f"a pinhole image of {hfov_deg:g} degrees is not possible",
                     where=self.rig.where,
                     cure="choose a field of view from 5 to 160 degrees, 90 to 115 for a fisheye",
                 )

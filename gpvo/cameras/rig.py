@@ -159,7 +159,7 @@ def _check_baseline(rig: StereoRig) -> None:
     length = rig.baseline_m
     if length < MIN_BASELINE_M:
         raise CalibrationError(
-            f"the baseline is {length * 1e3:.3g} mm: both cameras at one place",
+            f"the baseline is {length * 1e3:.3g} mm: both cameras in one place",
             where=where,
             cure="give the transform between left and right camera in metres",
         )
@@ -172,7 +172,7 @@ def _check_baseline(rig: StereoRig) -> None:
     angle = float(np.linalg.norm(se3.so3_log(T[:3, :3])))
     if angle > MAX_ROTATION_RAD:
         raise CalibrationError(
-            f"the cameras are turned apart by {np.rad2deg(angle):.0f} degrees, too far for stereo",
+            f"the cameras are rotated by {np.rad2deg(angle):.0f} degrees to each other, too far for stereo",
             where=where,
             cure="check the order and the direction of the chained transforms",
         )

@@ -138,13 +138,13 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
     return words
 
 
-Kind = Annotated[str | None, typer.Option("--source", help="Override the guessed format of the sequence.")]
+Kind = Annotated[str | None, typer.Option("--source", help="Format of the sequence; guessed by default.")]
 Calibration = Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")]
 HfovDeg = Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")]
 Size = Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")]
-MaskLeft = Annotated[Path | None, typer.Option(help="Mask image: the pixels of the left lens that may be used.")]
+MaskLeft = Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")]
 MaskRight = Annotated[Path | None, typer.Option(help="The same for the right lens.")]
-Bits = Annotated[int | None, typer.Option(help="Depth of the samples in 16-bit images, e.g. 12.")]
+Bits = Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")]
 RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")]
 PairTolerance = Annotated[
     float | None, typer.Option(help="Largest difference between the stamps of a stereo pair [s].")
@@ -192,9 +192,9 @@ class OdometryOptions:
     sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1"
     sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5"
     sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0
-    min_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is lost; at least 4.")] = 8
-    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer agreeing points is degraded.")] = 20
-    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2: each motion alone.")] = 2
+    min_inliers: Annotated[int, typer.Option(help="A motion with fewer inliers is lost; at least 4.")] = 8
+    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer inliers is degraded.")] = 20
+    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2 estimates each motion alone.")] = 2
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),

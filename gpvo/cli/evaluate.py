@@ -73,7 +73,7 @@ def evaluate(
         bool,
         typer.Option(
             "--twins",
-            help="Simulate each run again from its own tracks: the truth of a run without one, else the row 'twin'.",
+            help="Simulate each run again from its own tracks: truth for a run that has none, else a row 'twin'.",
         ),
     ] = False,
     twin_options: TwinOptions = TwinOptions(),
@@ -130,7 +130,7 @@ def report(
 ) -> None:
     """Write a report: one HTML page that opens with a verdict.
 
-    For a run without ground truth, it shows what was stated, without a judgement.
+    For a run without ground truth, it shows what was stated, without judging it.
 
     Example: gpvo report runs/mh01 -o report.html
     """
@@ -202,7 +202,7 @@ def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
     outside = [e for e in found if e.in_domain is not None and e.in_domain < ENOUGH_INSIDE]
     if model is not None and outside:
         names = ", ".join(f"{e.run.name} ({100 * (e.in_domain or 0):.0f} %)" for e in outside)
-        warnings.warn(f"{model.name} knows too few of the frames of {names}: do not fly it there", stacklevel=2)
+        warnings.warn(f"{model.name} covers too few of the frames of {names}: do not fly it there", stacklevel=2)
 
 
 def _with_twins(
@@ -281,10 +281,10 @@ def _print_methods(d: dict[str, Any]) -> None:
     show(table)
     say("NEES: per degree of freedom, for one motion; 1 is right. _vt: for the translation alone.")
     say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
-    say("NLL: nats per axis, as a Gaussian; stated: by the stated density, where it has heavier tails.")
+    say("NLL: nats per axis, as a Gaussian; stated: under the stated density, where it has heavier tails.")
     if noisy:
         noise = f"{1e3 * sigma['translation_m']:.2g} mm, {1e3 * sigma['rotation_rad']:.2g} mrad per pose and axis"
-        say(f"+truth: with the truth's own noise ({noise}) taken into account, as over 1 s.")
+        say(f"+truth: with the truth's own noise ({noise}) taken into account, as in column 1 s.")
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:

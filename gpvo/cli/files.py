@@ -40,11 +40,11 @@ class ImportSummary:
     def __str__(self) -> str:
         parts = [f"{self.frames} records", f"{self.with_truth} with truth"]
         parts += [f"covariances: {', '.join(self.methods)}"] if self.methods else []
-        parts += [f"stamps moved by {self.time_offset_s:+.4f} s"] if self.time_offset_s else []
-        parts += [f"truth turned by {self.rotation_deg:.2f} deg"] if self.rotation_deg is not None else []
+        parts += [f"stamps shifted by {self.time_offset_s:+.4f} s"] if self.time_offset_s else []
+        parts += [f"truth rotated by {self.rotation_deg:.2f} deg"] if self.rotation_deg is not None else []
         parts += [f"moved by {1e3 * self.lever_m:.0f} mm"] if self.lever_m else []
         parts += (
-            [f"its attitudes turned by {self.worlds_deg:.2f} deg relative to its positions"] if self.worlds_deg else []
+            [f"its attitudes rotated by {self.worlds_deg:.2f} deg relative to its positions"] if self.worlds_deg else []
         )
         return "\n  ".join([", ".join(parts), *self.notes])
 
@@ -128,7 +128,7 @@ def _frame(log: ForeignLog) -> str:
     if log.topic is not None:
         of, other = ("a body", "cam") if log.frame == "body" else ("a camera", "body")
         axes = "x ahead, y left, z up" if log.frame == "body" else "x right, y down, z ahead"
-        note(f"poses on {log.topic} ('{log.frame_id}') are taken as those of {of}: {axes} (else --frame {other})")
+        note(f"poses on {log.topic} ('{log.frame_id}') are taken as those of {of}: {axes} (if not, --frame {other})")
     return log.frame
 
 
@@ -141,7 +141,7 @@ def info(
     right_topic: options.RightTopic = None,
     json_: Json = False,
 ) -> None:
-    """Say what a file or folder is.
+    """Describe a file or folder.
 
     Example: gpvo info MH_01_easy/
     """
@@ -181,8 +181,8 @@ def import_(
     frame: Annotated[
         str,
         typer.Option(
-            help="Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless the name "
-            "of its frame says optical; cam for a file."
+            help="Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
+            "name contains optical; cam for a file."
         ),
     ] = "auto",
     align: Annotated[

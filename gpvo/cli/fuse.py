@@ -23,14 +23,14 @@ def fuse(
         typer.Option(metavar="<path>", help="Training run for the constants; repeatable. Default: the model's."),
     ] = None,
     policies: Annotated[str, typer.Option(help="Policies to compare, comma-separated; all by default.")] = "",
-    init: Annotated[str, typer.Option(help="Start from truth, or from rest (static).")] = "truth",
+    init: Annotated[str, typer.Option(help="Start from the truth, or at rest (static).")] = "truth",
     gate: Annotated[
         str, typer.Option(help="What to do with a measurement beyond 3 sigma: discard or inflate.")
     ] = "discard",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
     twins: Annotated[
         bool,
-        typer.Option("--twins", help="Use twins of runs without ground truth: simulated again from their tracks."),
+        typer.Option("--twins", help="For runs without ground truth, use twins: simulated again from their tracks."),
     ] = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
@@ -38,7 +38,7 @@ def fuse(
     log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
     json_: Json = False,
 ) -> None:
-    """Filter VO with an IMU under each covariance.
+    """Fuse VO with an IMU, once with each covariance.
 
     Example: gpvo fuse runs/flight7 --model models/tunnel.gpvo --plot fuse.png
     """
@@ -102,7 +102,7 @@ def publish(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="File or folder to write; the suffix .bag (ROS 1), .mcap or .tlog replaces --to."
+            "-o", "--out", help="File or folder to write; a suffix .bag (ROS 1), .mcap or .tlog stands in for --to."
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,

@@ -45,12 +45,12 @@ def train(
         typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
     ] = None,
     max_rows: Annotated[
-        int, typer.Option(min=1000, help="Rows held in memory; longer data is streamed in blocks.")
+        int, typer.Option(min=1000, help="Rows held in memory; more are streamed in blocks.")
     ] = 100_000,
     twins: Annotated[
         bool,
         typer.Option(
-            "--twins", help="Learn from twins of runs without ground truth (made with gpvo run --keep-tracks)."
+            "--twins", help="For runs without ground truth, learn from their twins (needs gpvo run --keep-tracks)."
         ),
     ] = False,
     twin_options: TwinOptions = TwinOptions(),
@@ -66,7 +66,7 @@ def train(
 ) -> None:
     """Train an error model; score it by leaving each run out.
 
-    An interrupted training resumes from its finished folds when it is started again.
+    Interrupted training resumes from its finished folds when started again.
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
@@ -97,13 +97,11 @@ def train(
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
     if trained.header["target"] != "position" and (axes := unseen_axes(trained.sets)):
-        note(
-            f"gpvo: log and truth never differ in {', '.join(axes)} (a plane?): the model states next to nothing there"
-        )
+        note(f"gpvo: log and truth never differ in {', '.join(axes)} (planar?): the model states almost no error there")
     if target == "frame" and (noisy := _noisy_truths(runs)):
         note(
-            f"gpvo: the noise of the ground truth outweighs the odometry's errors of single motions in {noisy}: for a"
-            " motion the model states both together, over a distance the odometry's alone, as the noise does not add up"
+            f"gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of {noisy}: for one"
+            " motion the model states both together, over a distance only the odometry's, as the noise does not add up"
         )
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
@@ -255,11 +253,11 @@ def _print_table(document: dict[str, Any]) -> None:
     say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
     show(table)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
-    say("stated: by the stated density, where it has heavier tails. _vt: for the translation alone.")
+    say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")
     resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
     if resting:
         told = ", ".join(f"{n} of {name}" for name, n in resting.items())
-        say(f"left out, because the truth moves while the vehicle stands: {told} (--stationary keep keeps them)")
+        say(f"left out, because the truth moves while the vehicle stands still: {told} (--stationary keep keeps them)")
     differing = {f["held_out"]: n for f in document["folds"] if (n := f.get("odd"))}
     if differing:
         told = ", ".join(f"{n} of {name}" for name, n in differing.items())

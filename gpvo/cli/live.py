@@ -28,7 +28,7 @@ def live(
         str, typer.Option(help="Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped.")
     ] = "odometry",
     truth: Annotated[
-        str | None, typer.Option(help="Topic of delayed ground truth (mocap, tags): adapts the covariance.")
+        str | None, typer.Option(help="Topic of delayed ground truth (mocap, tags); the covariance adapts to it.")
     ] = None,
     truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
     replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
@@ -131,7 +131,7 @@ def doctor(
     source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
     topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: adds the NEES of a bag.")
+        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: adds the NEES (bags only).")
     ] = None,
     truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
     align: Annotated[

@@ -47,7 +47,7 @@ def predict(
         predictions = list(predictor.replay(read_run(path).log).values())
         target = out if len(runs) == 1 else out / f"{name}.parquet"
         if target.exists() and target.name in FILES and target.name != "predictions.parquet":
-            raise GpvoError("is a part of a run, and no predictions", where=target, cure="choose another -o")
+            raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
         target.parent.mkdir(parents=True, exist_ok=True)
         write_predictions(target, predictions)
         documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
@@ -217,7 +217,7 @@ def _print_forecast(f: Forecast, path: Path) -> None:
     for row in _rows(f):
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
     show(table)
-    say("1 sigma of the position since the first pose, in the axes of the plan's world")
+    say("1 sigma of the position relative to the first pose, in the axes of the plan's world")
     if f.mean[-1].any():
         x, y, z = f.mean_error_m[-1]
         say(f"expected error at the end: {x:.3g}, {y:.3g}, {z:.3g} m")

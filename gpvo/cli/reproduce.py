@@ -13,7 +13,7 @@ from gpvo.cli.output import Json, print_json, progress
 def reproduce(
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", help="Folder of results. Finished stages are kept, and a second run continues."),
+        typer.Option("-o", "--out", help="Folder for results. Finished stages are kept, so a second run continues."),
     ],
     quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
     seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
@@ -71,6 +71,6 @@ def _print_tables(result: dict[str, Any], out: Path) -> None:
         console.print(line)
     asked = [t["met"] for t in result["targets"]]
     console.print(
-        f"targets of the full model: {asked.count(True)} met, {asked.count(False)} not, {asked.count(None)} open"
+        f"targets of the full model: {asked.count(True)} met, {asked.count(False)} missed, {asked.count(None)} open"
     )
     console.print(str(out / "report.html"))

@@ -119,7 +119,7 @@ def calibration(
 ) -> None:
     """Print the calibration errors that a run found; write a corrected calibration.
 
-    Where no error was found, the calibration is written as it was.
+    If no error was found, the calibration is written as it was.
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
@@ -149,6 +149,6 @@ def calibration(
         )
         if left_px > _MUCH_LEFT * found_px:
             note(
-                "gpvo: neither a rotation nor a focal length explains so much of it that odometry may get worse: better"
-                f" use 'gpvo run --calibration-state {run}', which corrects all that was found"
+                "gpvo: rotation and focal length leave so much unexplained that odometry may get worse; better use"
+                f" 'gpvo run --calibration-state {run}', which corrects all that was found"
             )

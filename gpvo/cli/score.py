@@ -48,7 +48,7 @@ def score(
         else:
             _print_board(board(methods))
             for method, axes in on_other_axes(methods).items():
-                say(f"{method}: NLL and NEES are of {', '.join(axes)} alone; they do not compare with those of others.")
+                say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")

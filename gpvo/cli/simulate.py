@@ -37,11 +37,13 @@ def simulate(
     ] = None,
     camera: Annotated[
         str | None,
-        typer.Option(help="pinhole, euroc, t265, a file of Kalibr, OpenCV, ROS or KITTI, or a run."),
+        typer.Option(help="pinhole, euroc, t265, a Kalibr, OpenCV, ROS or KITTI file, or a run."),
     ] = None,
     like: Annotated[
         Path | None,
-        typer.Option(help="Run folder with tracks: fly its path with its camera, rate, depths, counts and noise."),
+        typer.Option(
+            help="Run folder with tracks: fly its path, with its camera, rate, depths, track count and noise."
+        ),
     ] = None,
     points: Annotated[
         bool, typer.Option("--points", help="Landmark tracks instead of images: a thousand times faster.")

@@ -29,14 +29,14 @@ class TwinOptions:
         typer.Option(
             "--tolerance",
             help="Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
-            " with baseline and focal (fractions) and rotation_rad. Each twin draws its own.",
+            " with baseline and focal (fractions) and rotation_rad. Each twin draws its own error.",
         ),
     ] = "none"
     gap: Annotated[
         str | None,
         typer.Option(
             "--gap",
-            help="How far real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
+            help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
         ),
     ] = None
 
@@ -60,7 +60,7 @@ class TwinOptions:
 Seed = Annotated[
     int,
     typer.Option(
-        min=0, help="Random seed of the twins. Not that of 'gpvo train', so a model is judged on other twins."
+        min=0, help="Random seed of the twins; not that of 'gpvo train', so a model is judged on other twins."
     ),
 ]
 

@@ -127,11 +127,11 @@ def build(
         raise GpvoError(
             "has no ground truth to learn from",
             where=where or name,
-            cure="run a source that has it, or gpvo import --truth",
+            cure="run a sequence that has it, or gpvo import --truth",
         )
     if target != "position" and (turn_deg := turn_without_truth_deg(log, truth)):
         raise GpvoError(
-            f"the ground truth holds no attitude: it never turns, odometry by up to {turn_deg:.0f} deg",
+            f"the ground truth holds no attitude: it never turns, but odometry does, by up to {turn_deg:.0f} deg",
             where=where or name,
             cure="give one with orientations, or learn from twins",
         )

@@ -181,8 +181,8 @@ def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:
         raise SourceError("ground truth and frames do not overlap in time", where=where, cure=cure)
     if inside < 3:
         cure = "give a longer sequence"
-        raise SourceError(f"has {len(t)} frames, and three with truth are needed", where=where, cure=cure)
-    cure = f"give a truth whose poses come evenly, at most {MAX_GAP_S:g} s apart"
+        raise SourceError(f"has {len(t)} frames; three with truth are needed", where=where, cure=cure)
+    cure = f"give a truth with evenly spaced poses, at most {MAX_GAP_S:g} s apart"
     raise SourceError(f"only {known} of {len(t)} frames lie near poses of the ground truth", where=where, cure=cure)
 
 

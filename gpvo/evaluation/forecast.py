@@ -72,7 +72,7 @@ def read_plan(path: str | Path, dt_s: float, frame: str = "cam") -> Plan:
     T = given.T_world_body @ T_FLU_OPTICAL if frame == "body" else given.T_world_body
     n = 1 + int((given.t_ns[-1] - given.t_ns[0]) * 1e-9 / dt_s + 1e-6)
     if n < _MIN_MOTIONS + 1:
-        raise SourceError(f"lasts less than {_MIN_MOTIONS} motions of {dt_s:.3g} s", where=path, cure="plan further")
+        raise SourceError(f"lasts less than {_MIN_MOTIONS} motions of {dt_s:.3g} s", where=path, cure="lengthen it")
     if n > MAX_MOTIONS:
         raise SourceError(f"lasts for {n} motions of {dt_s:.3g} s, more than {MAX_MOTIONS}", where=path)
     return resample(Trajectory(given.t_ns, T), np.arange(n, dtype=np.float64) * dt_s)

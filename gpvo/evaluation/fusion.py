@@ -145,7 +145,7 @@ def _why_not(policy: str, constants: Constants | None, predictor: Predictor | No
     if policy == LEARNED:
         return "the runs hold no predictions of single motions; give --model"
     if policy == IMPORTED:
-        return "the runs hold no covariance that their odometry states itself; gpvo import makes such runs"
+        return "the runs hold no covariance stated by their own odometry; gpvo import makes such runs"
     if policy in STATED:
         return f"the runs hold too few usable covariances; run VO with --methods {policy}"
     if policy == CONSTANT_BEST:

@@ -24,7 +24,7 @@ from gpvo.types import Array, MotionError, Prediction, Status, StereoCamera, Ste
 from gpvo.vo.config import VoConfig
 
 _GOOD, _BAD, _PATH, _DOUBT = (40, 200, 80), (230, 60, 50), (90, 150, 240), (240, 190, 60)
-_CURE = "give the sequence that the run was made of"
+_CURE = "give the sequence that the run was made from"
 _GOOD_BGR, _BAD_BGR = (60, 200, 60), (40, 40, 230)
 
 

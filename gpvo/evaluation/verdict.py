@@ -54,12 +54,11 @@ def _why_blind(e: Evaluation) -> str:
     if not e.covered.any():
         return "There is no ground truth, so no covariance can be judged."
     if len(e.errors.xi) and not len(seen_axes(e.errors.xi)):
-        return (
-            "Odometry and truth are the same throughout, so nothing can be judged: is the truth made from the odometry?"
-        )
+        return "Odometry and truth are the same throughout, so nothing can be judged: was the truth made from odometry?"
     if e.run.truth and (turn_deg := turn_without_truth_deg(e.run.log, e.run.truth)):
         return (
-            f"The truth holds no attitude (it never turns, odometry by up to {turn_deg:.0f} deg): the ATE alone holds."
+            f"The truth holds no attitude (it never turns, but odometry does, by up to {turn_deg:.0f} deg):"
+            " only the ATE is valid."
         )
     if len(e.errors.index) < 2 and e.run.log.methods and e.poses is None:
         return "Fewer than two motions have ground truth at both ends, so no covariance can be judged."
@@ -73,7 +72,7 @@ def _of_others(e: Evaluation) -> Verdict:
         colour: Colour = "green" if _word(joint) == "honest" else "red" if joint > HONEST[1] else "amber"
         line = (
             f"NEES/dof {joint:.3g} over {e.poses.count} poses, median {e.poses.nees_dof_median['joint']:.3g}, after one"
-            " rigid alignment of all: it moves the first poses of an odometry that drifts by more than they state."
+            " rigid alignment of all, which moves the first poses of a drifting odometry by more than they state."
         )
         return Verdict(colour, f"The covariance of the poses is {_word(joint)}.", (*_conditions(e), line))
     cure = "gpvo train learns one from such runs; give the model with --model."
@@ -87,7 +86,7 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
     # What a vehicle would be told is judged first; others only where it is wrong.
     told = found["learned" if "learned" in judged else best]
     if not told.of_motions and not told.spans:
-        headline = "This truth is too noisy to judge a covariance of the run."
+        headline = "This truth is too noisy to judge any covariance of the run."
         return Verdict("amber", headline, tuple(_conditions(e)), judged=False)
     wrong = told.wrong()
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
@@ -206,8 +205,8 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         yield f"{lost} of {len(e.run.log)} frames {'has' if lost == 1 else 'have'} no motion."
     if by_model:
         yield (
-            f"The model calls {by_model} of {len(e.run.log)} motions lost, most as slips: no vehicle moves like"
-            " this; if yours does, raise --max-acceleration in gpvo run or gpvo import."
+            f"The model calls {by_model} of {len(e.run.log)} motions lost, most as slips: more abrupt than the"
+            " vehicle can be; if yours can, raise --max-acceleration in gpvo run or gpvo import."
         )
     if (e.truth_sigma > 1.5 * e.truth_sigma_stated).any():
         stated = _up_to(e.truth_sigma_stated) or "none"
@@ -225,7 +224,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     unseen = [a for k, a in enumerate(AXES) if len(e.errors.xi) and k not in seen_axes(e.errors.xi)]
     if 0 < len(unseen) < len(AXES):
         yield (
-            f"Odometry and truth never differ in {_listed(unseen)} of the camera (x right, y down, z ahead; a plane?):"
+            f"Odometry and truth never differ in {_listed(unseen)} of the camera (x right, y down, z ahead; planar?):"
             " those axes are not judged."
         )
     if e.late_s is not None:
@@ -263,13 +262,13 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
         yield f"The ground truth comes every {steps_s[0]:.2g} s, the frames every {steps_s[1]:.2g} s: {between}."
     if every := interpolated_between(e.run.truth):
         yield (
-            f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks surer than it"
-            " is. Give the poses as they were measured."
+            f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks more exact than"
+            " it is. Give the poses as they were measured."
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
     if true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
-        yield f"The path of odometry is {size / true_size:.2g} times as large as the truth's: are both in metres?"
+        yield f"The odometry's path is {size / true_size:.2g} times as large as the truth's: are both in metres?"
 
 
 def _up_to(sigma: Array) -> str:

@@ -125,7 +125,7 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
         yaw = heading(flight.T_world_imu[k, :3, :3], rest.T @ np.array([0.0, 0.0, 1.0]))
         return from_rest(flight.imu, t0, still, yaw_rad=yaw, position=flight.T_world_imu[k, :3, 3]), None
     if not flight.has_truth:
-        raise GpvoError("--init truth needs ground truth of the frames", where=flight.name, cure="use --init static")
+        raise GpvoError("--init truth needs ground truth for the frames", where=flight.name, cure="use --init static")
     valid = np.flatnonzero(flight.known)
     if len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")

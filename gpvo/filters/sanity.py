@@ -51,7 +51,7 @@ def check_flight(flight: Flight) -> list[Finding]:
     """Everything that looks wrong with a flight's inputs, the worst first."""
     found = list(_covariances(flight))
     if flight.T_world_cam is not None and not flight.has_truth:
-        text = "no frame that the IMU reaches has ground truth; the run is not scored"
+        text = "no frame covered by the IMU has ground truth; the run is not scored"
         found.append(Finding("truth", text, fatal=False))
     if flight.imu is not None:
         clocks = list(_clocks(flight, flight.imu))
@@ -180,7 +180,7 @@ def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
             yield Finding("acc_unit", text, f"multiply it by {to_si:.6g}")
             return
     if ratio < 0.5:
-        text = f"the accelerometer's median reading is {g:.3g} m/s^2: gravity has been taken out of it"
+        text = f"the accelerometer's median reading is {g:.3g} m/s^2: gravity has been removed from it"
         yield Finding("acc_unit", text, "give raw specific force, or use --no-imu")
         return
     yield Finding("acc_unit", f"the accelerometer's median reading is {g:.4g} m/s^2 where gravity is 9.81 m/s^2")
@@ -213,7 +213,7 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     if not turned or energy_gyro == 0:
         rms = float(np.sqrt((imu.gyro_radps**2).sum(axis=1).mean()))
         if rms > 8.0:
-            text = f"the gyroscope turns at {rms:.0f} rad/s on average: it is in degrees per second"
+            text = f"the gyroscope reads {rms:.0f} rad/s on average: it is in degrees per second"
             yield Finding("gyro_unit", text, "multiply it by pi / 180")
         return
     # Axis by axis, so that much yaw does not outvote little roll and pitch.

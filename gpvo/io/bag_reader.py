@@ -68,7 +68,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     if not path.exists():
         raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
     if not _has_storage(path):
-        raise SourceError("is no bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
+        raise SourceError("is not a bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
     metadata = path / "metadata.yaml"
     if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
         reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
@@ -87,7 +87,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     # memory errors, the last for a length that is no length.
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
-        cure = "the recording was cut off: 'rosbag reindex' or 'ros2 bag reindex' may mend it"
+        cure = "the recording was cut off: 'rosbag reindex' or 'ros2 bag reindex' may repair it"
         raise SourceError(f"unreadable bag: {reason or type(error).__name__}", where=path, cure=cure) from None
 
 
@@ -163,7 +163,7 @@ def _in_time(
     where, steps = f"on '{topic}'", np.diff(t_ns)
     if len(steps) and -steps.min() > _BACK_NS:
         text = f"the stamps {where} go back by {-steps.min() * 1e-9:.3f} s at message {int(steps.argmin()) + 2}"
-        raise SourceError(text, where=path, cure="the clock was set or started anew: cut the bag there")
+        raise SourceError(text, where=path, cure="the clock was set or restarted: split the bag there")
     order = np.argsort(t_ns, kind="stable")
     again = np.concatenate([[False], np.diff(t_ns[order]) == 0])
     # A driver may publish each pose twice; other poses at one time are no poses.
@@ -171,7 +171,7 @@ def _in_time(
     order, repeated, late = order[~again], int(again.sum()), int((steps < 0).sum())
     if other > (1 - _LEAST_LEFT) * len(t_ns):
         text = f"{other} of {len(t_ns)} messages {where} repeat a stamp with another pose"
-        cure = "header.stamp must be the time of each measurement; a clock that starts anew needs a bag of its own"
+        cure = "header.stamp must be the time of each measurement; after the clock restarts, use a new bag"
         raise SourceError(text, where=path, cure=cure)
     if remark is not None and repeated:
         remark(f"{repeated} of {len(t_ns)} messages {where} repeat a stamp and were left out")
@@ -298,6 +298,6 @@ def require_tables(path: Path) -> None:
         try:
             other = " AND ".join(["sql NOT LIKE ?"] * len(_ALLOWED))
             if database.execute(f"SELECT 1 FROM sqlite_master WHERE {other}", _ALLOWED).fetchone():
-                raise SourceError("holds more than tables: no bag", where=file, cure="record or convert it again")
+                raise SourceError("holds more than tables: not a bag", where=file, cure="record or convert it again")
         finally:
             database.close()

@@ -130,7 +130,7 @@ class BagSource(ImageSource):
         try:
             t, T, _ = read_poses(self.path, topic, self.remark, complete=True)
         except SourceError as error:
-            cure = "; ".join(filter(None, (error.cure, "--truth-topic none does without")))
+            cure = "; ".join(filter(None, (error.cure, "--truth-topic none ignores it")))
             raise SourceError(error.what, where=error.where, cure=cure) from None
         if frame == "imu" and self.mounting.T_imu_cam is None:
             raise CalibrationError("does not say where the IMU sits", where=self.path, cure="use --truth-frame cam")

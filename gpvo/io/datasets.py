@@ -152,7 +152,7 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
         raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
     in_time = sorted(out, key=lambda line: line[0])
     if in_time != out:
-        known.note(f"{path.parent.name}/{path.name} is not in order of time: sorted by stamp")
+        known.note(f"{path.parent.name}/{path.name} is not in time order: sorted by stamp")
     return in_time
 
 
@@ -218,7 +218,7 @@ class KittiSource(FileSource):
         pairs = self._list_pairs(path, left, right, known)
         first = first_size(pairs, "left")  # the calibration does not say it
         if first is None:
-            raise SourceError("not one readable left image", where=path)
+            raise SourceError("no readable left image", where=path)
         if calib.suffix.lower() in (".yaml", ".yml"):
             rig = read_stereo_yaml(calib, size=first[1])
         else:

@@ -142,7 +142,7 @@ def _implied_header(path: Path, text: str, separator: str) -> list[str]:
     if separator == "," and len(fields) in (8, 11) and unit == "ns" and all(map(is_number, fields)):
         return list(_VINS[: len(fields)])
     names = separator.join((f"t_{unit}", *_POSE))
-    cure = f"put the names of its columns on top, in their order, such as '{names}'; any other column may have any name"
+    cure = f"put the column names on top, in order, such as '{names}'; any other column may have any name"
     raise SourceError("has no header line", where=path, cure=cure)
 
 
@@ -190,7 +190,7 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
             found.setdefault(guess, index)
         elif (other := header[found[guess]]) not in mapping and _is_plain(column) >= _is_plain(other):
             if _is_plain(column) == _is_plain(other):
-                cure = f"say which with --map COLUMN={guess} and so on, in a ground truth with --truth-map"
+                cure = f"say which with --map COLUMN={guess} and so on, for ground truth with --truth-map"
                 raise SourceError(f"the columns '{other}' and '{column}' may both be {guess}", where=path, cure=cure)
             found[guess] = index
     absent = [p for p in _POSE if p not in found]
@@ -200,7 +200,7 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
         raise SourceError(
             f"no column for {', '.join(absent)} (there are: {', '.join(header)})",
             where=path,
-            cure=f"name it with --map COLUMN={absent[0]}, in a ground truth with --truth-map",
+            cure=f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map",
         )
     return found
 
@@ -243,7 +243,7 @@ def _suggest(column: str) -> str | None:
 def _unit_cure(column: str, unit: str) -> str:
     """How to say in which unit a column of stamps is, most likely ``unit``."""
     others = ", ".join(f"t_{u}" for u in UNITS_NS if u != unit)
-    return f"name the unit: --map {column}=t_{unit} (or {others}), in a ground truth with --truth-map"
+    return f"name the unit: --map {column}=t_{unit} (or {others}), for ground truth with --truth-map"
 
 
 def _stamp(text: str, unit: str, is_stated: bool) -> int:

@@ -176,7 +176,7 @@ class ImageSource(ABC):
 
     def _readable(self, report: SourceReport) -> Iterator[StereoFrame]:
         """The pairs that can be used, as they are. Raises SourceError at the end where there was none."""
-        problem = "not one readable image pair"
+        problem = "no readable image pair"
         for t_ns, left, right in self.raw_pairs(report):
             if left is None or right is None:
                 report.unreadable += 1

@@ -192,7 +192,7 @@ def check_log(log: VoLog, path: Path) -> None:
     if len(t) == 0:
         raise SourceError("holds no records", where=path)
     if (np.diff(t) <= 0).any():
-        raise SourceError("its stamps do not grow", where=path, cure="run the sequence again")
+        raise SourceError("its stamps do not increase", where=path, cure="run the sequence again")
     known = set(t.tolist())
     if any(r.t_prev_ns not in known or r.t_prev_ns > r.t_ns for r in log.records[1:]):
         raise SourceError("a record starts from a frame that is not in it", where=path, cure="run the sequence again")
@@ -271,7 +271,7 @@ def _read_imu(path: Path) -> ImuLog | None:
 def _stamps(columns: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     t = np.asarray(columns["t_ns"], dtype=np.int64)
     if (np.diff(t) <= 0).any():
-        raise ValueError("stamps do not grow")
+        raise ValueError("stamps do not increase")
     return t
 
 

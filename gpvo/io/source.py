@@ -64,7 +64,7 @@ class Depth:
 
     def __init__(self, bits: int = 16) -> None:
         if not 8 <= bits <= 16:
-            raise SourceError(f"images of {bits} bits are not possible", cure="bits is from 8 to 16")
+            raise SourceError(f"images of {bits} bits are not possible", cure="give 8 to 16")
         self.bits, self.most = bits, 0
 
     def to8(self, samples: NDArray[np.uint16]) -> NDArray[np.uint8]:
@@ -80,7 +80,7 @@ class Depth:
         if self.most >> self.bits:
             cure = self.most.bit_length()
             return (
-                f"samples reach {self.most}, more than {self.bits} bits hold: what is brighter is cut (--bits {cure})"
+                f"samples reach {self.most}, more than {self.bits} bits hold: brighter ones are clipped (--bits {cure})"
             )
         likely = next(n for n in (8, 10, 12, 16) if self.most < 1 << n)
         if self.most and likely < self.bits == 16:

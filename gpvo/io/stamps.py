@@ -205,7 +205,7 @@ def check_interval(
     # Up to a second they are too short: read as nanoseconds. Else too long: read as seconds.
     limits = ((1e3, "ms"), (1e9, "us"), (3e12, "ms"), (1e15, "us"), (np.inf, "ns"))
     unit = next(name for limit, name in limits if usual_ns < limit)
-    text = f"the stamps look like {_UNIT_NAMES[unit]}: as they were read, the usual interval is {usual_ns * 1e-9:.3g} s"
+    text = f"the stamps look like {_UNIT_NAMES[unit]}: as read, the usual interval is {usual_ns * 1e-9:.3g} s"
     raise SourceError(text, where=where, cure=cure(unit))
 
 

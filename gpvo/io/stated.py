@@ -66,7 +66,7 @@ def read_stated(path: Path) -> VoLog:
     for k in range(1, len(t_ns)):
         start = k - 1 if behind == 21 else index.get(_stamp(path, rest[k][21]), k)
         if start >= k:
-            raise SourceError(f"the motion that ends at {rest[k][21]} s starts from no frame before", where=path)
+            raise SourceError(f"the motion that ends at {rest[k][21]} s starts from no earlier frame", where=path)
         records.append(_record(path, trajectory, start, k, rest[k][:21]))
     return VoLog(records)
 

@@ -98,7 +98,7 @@ class TracksSource:
         if n == 0 or m == 0:
             raise SourceError("holds no observations", where=path)
         if frame.min() < 0 or frame.max() >= n:
-            raise SourceError(f"'frame' goes to {frame.max()}, but 't_s' has {n} stamps", where=path)
+            raise SourceError(f"'frame' goes up to {frame.max()}, but 't_s' has {n} stamps", where=path)
         self._rows = np.argsort(frame, kind="stable")
         self._starts = np.searchsorted(frame[self._rows], np.arange(n + 1))
 
@@ -154,7 +154,7 @@ class TracksSource:
         T = self._array("T_world_cam", len(self._t_ns), 4, 4, finite=False)
         keep = growing(self._t_ns) & ~np.isnan(T[:, :3]).all(axis=(1, 2))
         if not keep.any():
-            raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="leave it out: no truth")
+            raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="without truth, leave it out")
         poses = [check_pose(T[k], f"'T_world_cam' row {k}", self.path) for k in np.flatnonzero(keep)]
         stated = ("sigma_translation_m", "sigma_rotation_rad")
         if noise is None and all(k in self._data for k in stated):
@@ -192,9 +192,7 @@ class TracksSource:
             first = int(np.argwhere(~np.isfinite(np.atleast_1d(out)))[0][0])
             raise SourceError(f"'{key}' is NaN or infinite at row {first}", where=self.path, cure="drop that row")
         if (np.abs(out) > most).any():
-            raise SourceError(
-                f"'{key}' holds {np.nanmax(np.abs(out)):.3g}, and {most:.3g} is the most", where=self.path
-            )
+            raise SourceError(f"'{key}' holds {np.nanmax(np.abs(out)):.3g}, the limit is {most:.3g}", where=self.path)
         return out
 
 

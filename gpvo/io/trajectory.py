@@ -201,7 +201,7 @@ def check_growing(path: Path, t_ns: NDArray[np.int64], lines: list[int]) -> None
         repeated = len(t_ns) - len(np.unique(t_ns))
         if repeated > _MANY * len(t_ns):
             text += f", as {repeated} of {len(t_ns)} do"
-            cure = "they are rounded: write them with all digits, nanoseconds included, or drop lines there twice"
+            cure = "they are rounded: write them with all digits, nanoseconds included, or drop repeated lines"
         raise SourceError(text, where=path, cure=cure)
 
 

@@ -45,7 +45,7 @@ def check_writable(path: Path) -> None:
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ModelError("cannot be written", where=path, cure="name a file in a folder that may be written")
+        raise ModelError("cannot be written", where=path, cure="name a file in a writable folder")
 
 
 def save_model(trained: TrainedModel, path: str | Path) -> None:

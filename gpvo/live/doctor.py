@@ -155,7 +155,7 @@ def _stamps(s: Stated) -> list[Finding]:
     good = steps[steps > 0]
     if len(good) and good.max() > 10 * np.median(good):
         what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"
-        text = "what covers a gap is not a measurement: the first message after it must say so"
+        text = "motion across a gap was not measured: the first message after it must say so"
         out.append(Finding("stamp-gap", what, text))
     return out
 
@@ -171,7 +171,7 @@ def _frames(s: Stated) -> list[Finding]:
         text = "pose and twist lose their meaning"
         out.append(Finding("frame-same", f"frame_id and child_frame_id are both '{frame}'", text))
     elif "optical" in child:
-        text = "twist and rotations are of axes z forward: robot_localization needs TF to base_link"
+        text = "twist and rotations are in axes with z forward: robot_localization needs TF to base_link"
         out.append(Finding("frame-optical", f"child_frame_id is '{child}', an optical frame", text))
     return out
 
@@ -184,7 +184,7 @@ def _poses(s: Stated) -> list[Finding]:
         out.append(Finding("pose-not-finite", what, "robot_localization drops them", float(bad.mean())))
     off = np.abs(s.quaternion_norm - 1.0) > 1e-2
     if (off & ~bad).any():
-        text = "robot_localization normalises with a warning, PX4 refuses the attitude"
+        text = "robot_localization normalises with a warning, PX4 rejects the attitude"
         out.append(Finding("quaternion-norm", "quaternions are not of unit length", text, float(off.mean())))
     motion = _motions(s)
     if motion is None:
@@ -196,7 +196,7 @@ def _poses(s: Stated) -> list[Finding]:
     if jumps.any():
         size = float(np.linalg.norm(steps[jumps][:, :3], axis=1).max())
         what = f"{int(jumps.sum())} jumps of the pose, up to {size:.2g} m"
-        text = "an odometry must be continuous (REP 105): a differential pose fuses the jump as speed"
+        text = "odometry must be continuous (REP 105): a differential pose fuses the jump as speed"
         out.append(Finding("pose-jump", what, text))
     return out
 
@@ -253,7 +253,7 @@ def _twist_against_motion(s: Stated, steps: Array, dt: Array) -> list[Finding]:
         return [Finding("twist-in-parent", "the twist is in frame_id's axes, not in child_frame_id's", text)]
     ratio = float(np.linalg.norm(said[:, :3], axis=1).mean()) / size
     if not 0.5 < ratio < 2.0:
-        text = "the twist is per frame, of another unit, or of another clock"
+        text = "the twist is per frame, in another unit, or on another clock"
         return [Finding("twist-scale", f"the twist is {ratio:.3g} times the motion of the pose", text)]
     return []
 

@@ -117,7 +117,7 @@ class Engine:
         self._resume = load_state(self.settings.state)
         self._scale = np.ones(6) if self._resume is None else self._resume.scale
         if self._resume is not None and self._resume.model not in ("", predictor.digest):
-            tell("the state is another model's: its pose is taken up, the scale that late truth taught is not")
+            tell("the state is another model's: its pose is used, the scale learned from late truth is not")
             self._scale = np.ones(6)
         predictor.require_motions()
 
@@ -261,7 +261,7 @@ class Engine:
     def _silence(self) -> list[str]:
         if not self._now_s - self._used_s > _STALE_S:
             return []
-        never = f": nothing has come on {', '.join(self._unheard)}" if self._unheard else ""
+        never = f": nothing received on {', '.join(self._unheard)}" if self._unheard else ""
         return [f"no usable message for more than {_STALE_S:.0f} s{never}"]
 
     def _misfits(self) -> list[str]:
@@ -354,7 +354,7 @@ def load_state(path: Path | None) -> KeptState | None:
     if path is None:
         return None
     if not os.access(path.parent, os.W_OK):
-        raise GpvoError("cannot be written: no such folder, or no right to", where=path, cure="another --state")
+        raise GpvoError("cannot be written: no such folder, or no permission", where=path, cure="give another --state")
     if not path.exists():
         return None
     try:

@@ -132,7 +132,7 @@ class FileOutput:
 
     def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
         if path.exists():
-            raise GpvoError("exists already", where=path, cure="give another name or remove it")
+            raise GpvoError("already exists", where=path, cure="give another name or remove it")
         self._path, self._topic = path, topic
         self._odometry: list[Odometry] = []
 

@@ -124,7 +124,7 @@ class StereoStage:
     def problems(self) -> list[str]:
         """Images that nobody says the calibration of, that it is not for, or that are swapped."""
         if self.camera is None and self.counts["uncalibrated"]:
-            return ["images arrive, but no calibration: there is no CameraInfo beside them"]
+            return ["images arrive, but no calibration: no CameraInfo comes with them"]
         return [self._unfit] if self._unfit else []
 
     def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:

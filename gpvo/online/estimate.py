@@ -71,7 +71,7 @@ class ErrorModel(Stored):
         for related in (arrays, arrays_of_base(arrays)):
             check_related(related, len(columns))
         if unknown := set(model.base.columns) - set(columns):
-            raise ModelError(f"its base variance needs {min(unknown)}, which is none of its features")
+            raise ModelError(f"its base variance needs {min(unknown)}, which is not one of its features")
         if (len(model.gp.centre), len(model.gp.offset)) != (len(model.inputs), 6):
             raise ModelError("the model file's GP does not fit its inputs and the six axes")
         return model

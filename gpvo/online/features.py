@@ -245,7 +245,7 @@ class FeatureStream:
         unknown = set(self.names) - known_columns().keys()
         if unknown:
             raise GpvoError(
-                f"features are needed that are not installed: {', '.join(sorted(unknown))}",
+                f"features that are needed are not installed: {', '.join(sorted(unknown))}",
                 cure="install the package that defines them, or update gpvo",
             )
 

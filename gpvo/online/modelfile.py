@@ -154,7 +154,7 @@ def _check_header(header: Mapping[str, Any], path: Path) -> None:
             raise ModelError(f"its header's '{name}' is not {words}", where=path)
     features, units = header.get("features"), header.get("units")
     if features and units and len(features) != len(units):
-        raise ModelError(f"its header names {len(units)} units of {len(features)} features", where=path)
+        raise ModelError(f"its header names {len(units)} units for {len(features)} features", where=path)
 
 
 def _printable(value: Any) -> Any:

@@ -169,7 +169,7 @@ class Predictor:
         at = next((i for i, known in enumerate(levels) if abs(known - level) < 1e-3), None)
         if at is None:
             held = ", ".join(f"{x:g}" for x in levels) or "none"
-            raise ModelError(f"the model holds no interval of level {level:g}", cure=f"choose one of: {held}")
+            raise ModelError(f"the model holds no interval at level {level:g}", cure=f"choose one of: {held}")
         width = np.array([axis[at] for axis in calibration["interval_sigmas"]]) * prediction.sigma
         return np.stack([prediction.mean - width, prediction.mean + width], axis=1)
 
@@ -188,7 +188,7 @@ class Predictor:
         if record is not None and (seen is None or record.t_ns != seen[0].t_ns):
             seen = copy.deepcopy(self._observer).step(record)
         if seen is None:
-            raise ModelError("there is no prediction to explain yet", cure="call step with the records before")
+            raise ModelError("there is no prediction to explain yet", cure="call step with the earlier records")
         x, dt_s = seen[1], seen[0].dt_s
         typical = np.tile(x, (len(x) + 1, 1))
         typical[np.arange(1, len(x) + 1), np.arange(len(x))] = self.model.domain.centre

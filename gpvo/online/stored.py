@@ -192,7 +192,7 @@ def check_related(arrays: _Arrays, n_features: int) -> None:
     if (arrays["domain.low"] > arrays["domain.high"]).any() or (arrays["domain.least"] > arrays["domain.most"]).any():
         raise ModelError("the training domain ends before it begins")
     if arrays["inputs"].max() >= n_features:
-        raise ModelError(f"input {arrays['inputs'].max()} is none of the {n_features} features")
+        raise ModelError(f"input {arrays['inputs'].max()} is not one of the {n_features} features")
     if (arrays["share"].sum(axis=0) < 1e-6).any():
         raise ModelError("jitter, white and bias have no share of the variance")
     if (arrays["theta"].sum(axis=1) <= 0).any():

@@ -66,7 +66,7 @@ def export_model(
     """
     to = format_of(to, path)
     if prefix != PREFIX and to != "c":
-        raise GpvoError(f"{to} has no symbols for a prefix '{prefix}' to go before", cure="give it only with c")
+        raise GpvoError(f"{to} has no symbols to prefix with '{prefix}'", cure="give it only with c")
     predictor = Predictor.load(model)
     units = tuple(str(u) for u in predictor.header.get("units") or ())
     if to == "c":

@@ -76,9 +76,9 @@ def _flat(covariance: np.ndarray) -> np.ndarray:
 
 
 def check_topic(topic: str) -> str:
-    """The topic, or GpvoError where it is no name of ROS: words of letters, digits and ``_``, ``/`` between them."""
+    """The topic, or GpvoError if it is no valid ROS name: words of letters, digits and ``_``, ``/`` between them."""
     if not re.fullmatch(r"/?[A-Za-z]\w*(/[A-Za-z_]\w*)*", topic, re.ASCII):
-        raise GpvoError(f"the topic {topic[:80]!r} is no name of ROS", cure="give one like /gpvo/odometry")
+        raise GpvoError(f"the topic {topic[:80]!r} is not a valid ROS name", cure="give one like /gpvo/odometry")
     return topic
 
 
@@ -122,7 +122,7 @@ def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -
 def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
     """Write beside the target and move it there when done."""
     if path.exists() and not _holds_only(path, topic):
-        raise GpvoError(f"exists, and is no bag of {topic} alone", where=path, cure="choose another -o")
+        raise GpvoError(f"exists, and is not a bag of {topic} alone", where=path, cure="choose another -o")
     holder: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

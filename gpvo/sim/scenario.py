@@ -217,7 +217,7 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
         raise GpvoError(
             f"camera is '{scenario.camera}'",
             where=where,
-            cure=f"choose from {', '.join(CAMERAS)}, or give a file of Kalibr, OpenCV, ROS or KITTI, or a run",
+            cure=f"choose from {', '.join(CAMERAS)}, or give a Kalibr, OpenCV, ROS or KITTI file, or a run",
         )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs at least two places", where=where, cure="waypoints = [[x, y, z], ...]")

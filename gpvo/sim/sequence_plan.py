@@ -109,7 +109,7 @@ def _along(scenario: Scenario, world: World, rng: np.random.Generator) -> Path3:
     reach = scenario.speed_mps * (scenario.duration_s - scenario.rest_s)
     if reach > length:
         raise GpvoError(
-            f"the path of {reach:.0f} m leaves the world, whose line is {length:.0f} m long",
+            f"the path of {reach:.0f} m leaves the world, whose centre line is {length:.0f} m long",
             cure="a shorter duration, a lower speed, or a larger world_params.length",
         )
     state = rng.bit_generator.state
@@ -138,7 +138,7 @@ def _wander(scenario: Scenario, world: World, rng: np.random.Generator) -> Path3
         )  # fmt: skip
         if _is_clear(scenario, world, path.position(_times(scenario))):
             return path
-    raise GpvoError(f"no path of {_DRAWS} drawn keeps clear of the walls", cure="another seed, or a shorter duration")
+    raise GpvoError(f"none of {_DRAWS} paths keeps clear of the walls", cure="another seed, or a shorter duration")
 
 
 def _place_recording(scenario: Scenario, world: World, recording: Recording, rng: np.random.Generator) -> Path3:

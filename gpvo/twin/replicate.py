@@ -65,7 +65,7 @@ def estimate(path: Path) -> Original:
     t_ns = run.log.t_ns
     frame = np.searchsorted(t_ns, tracks.t_ns)
     if len(frame) == 0 or frame.max() >= len(t_ns) or not (t_ns[frame] == tracks.t_ns).all():
-        raise SourceError("its tracks are not of its frames", where=path / "tracks.parquet", cure="run it again")
+        raise SourceError("its tracks do not match its frames", where=path / "tracks.parquet", cure="run it again")
     _, begins, track = np.unique(tracks.track, return_index=True, return_inverse=True)
     first = np.isin(np.arange(len(track)), begins)
     _refuse_too_few(frame[tracks.is_inlier & ~first], len(t_ns), path)
@@ -85,7 +85,7 @@ def _refuse_too_few(frame: NDArray[np.int64], n_frames: int, path: Path) -> None
     usual = float(np.median(np.bincount(frame, minlength=n_frames)[1:])) if n_frames > 1 else 0.0
     if usual < MIN_POINTS:
         raise SourceError(
-            f"its structure cannot be estimated: {usual:.0f} points a motion, {MIN_POINTS} are needed",
+            f"its structure cannot be estimated: {usual:.0f} points per motion, {MIN_POINTS} are needed",
             where=path,
             cure="run it with more features, or train on runs with ground truth",
         )
@@ -219,7 +219,7 @@ def make_twins(
     others = (p for p in sorted(out.glob("*-twin*/")) if p.name.rpartition("-twin")[2] not in map(str, made))
     if (other := next(others, None)) is not None:
         cure = "remove it, make as many as before, or give another folder"
-        raise SourceError(f"is a twin that {settings.replicates} replicates do not replace", where=other, cure=cure)
+        raise SourceError(f"is a twin that {settings.replicates} replicates would not replace", where=other, cure=cure)
     original = estimate(path)
     work = [(original, settings, k, out) for k in made]
     return map_jobs(_make_twin, work, jobs=jobs, on_done=on_twin)

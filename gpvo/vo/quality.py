@@ -32,9 +32,9 @@ _CURES = {
     "frozen": "the right image repeats itself while the left one changes; look at the right camera's driver",
     "late": "left and right are a frame apart; pair them by time stamp, or trigger both cameras together",
     "swapped": "most points lie behind the cameras; exchange left and right",
-    "rows": "most points are in another row on the right; calibrate the pair again",
+    "rows": "most points are in a different row on the right; calibrate the pair again",
     "few": "most points are not found in the right image; look at its exposure, focus and lens",
-    "light": "the right image has other light than the left one; give both cameras the same exposure and gain",
+    "light": "left and right differ in brightness; give both cameras the same exposure and gain",
     "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
 
@@ -87,7 +87,7 @@ def judge(
     if inliers < config.weak_inliers or inliers < 0.35 * tracked:
         doubts.append(f"only {inliers} of {tracked} points agree")
     if not motion.converged:
-        doubts.append("the estimate did not settle")
+        doubts.append("the estimate did not converge")
     spread = np.std((motion.uvd_prev[:, :2] - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px], axis=0)
     # A twentieth of the image: rotation and translation can no longer be told apart.
     if spread.max() < 0.05 * camera.width / camera.fx_px:
@@ -100,8 +100,8 @@ def _no_motion(matches: Matches, config: VoConfig) -> str:
     strong = matches.strong
     near, n = int((matches.uvd_prev[strong, 2] > TELLING_PX).sum()), int(strong.sum())
     if near < config.min_inliers <= n:
-        return f"only {near} of {n} points are near enough to tell a motion (disparity over {TELLING_PX:g} px)"
-    return f"no motion fits the {matches.n_tracked} points found again"
+        return f"only {near} of {n} points are near enough to show a motion (disparity over {TELLING_PX:g} px)"
+    return f"no motion fits the {matches.n_tracked} tracked points"
 
 
 def _all_at_infinity(motion: Motion) -> bool:

@@ -197,7 +197,7 @@ def test_kitti_of_another_resolution(write, size):
         (KITTI.replace("-3.87e+02", "abc"), "line 2"),
         (KITTI.replace("-3.87e+02", ""), "11 numbers"),
         (KITTI.replace("-3.87e+02", "nan"), "finite"),
-        (KITTI.replace("-3.87e+02", "0"), "both cameras at one place"),
+        (KITTI.replace("-3.87e+02", "0"), "both cameras in one place"),
         (KITTI.replace("P1: 7.2", "P1: 7.9"), "differ in their intrinsics"),
     ],
 )

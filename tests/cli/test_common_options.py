@@ -141,7 +141,7 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     shutil.copytree(runs[0], tmp_path / "run")
     refused = call("predict", MODEL, str(tmp_path / "run"), "-o", str(tmp_path / "run" / "truth.parquet"))
     assert refused.returncode == 2
-    assert "is a part of a run" in refused.stderr
+    assert "is part of a run" in refused.stderr
     told = call("evaluate", *runs).stdout
     assert "mean of the 3 runs" in told
     two = call("evaluate", *runs[:2]).stdout

@@ -44,11 +44,11 @@ def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_p
     assert write_ros2(tmp_path / "bag", odometry[:10], mcap=True) == 9
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.jpg").write_bytes(b"")
-    with pytest.raises(GpvoError, match="no bag of /gpvo/odometry alone"):
+    with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
         write_ros2(tmp_path / "photos", odometry)
     for name, write in (("flight", write_ros2), ("flight.bag", write_ros1)):
         write(tmp_path / name, odometry, "/camera/odometry")  # a recording
-        with pytest.raises(GpvoError, match="no bag of /gpvo/odometry alone"):
+        with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
             write(tmp_path / name, odometry)
 
 

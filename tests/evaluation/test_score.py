@@ -151,7 +151,7 @@ def test_a_method_that_moves_in_a_plane_is_not_compared_with_others(tmp_path: Pa
         (tmp_path / method).mkdir()
         write_stated(tmp_path / method / "a.txt", log, log.trajectory(), np.tile(1e-4 * np.eye(6), (201, 1, 1)))
     told = _call(capsys, tmp_path)
-    assert "flat: NLL and NEES are of x, z, ry alone; they do not compare with those of others." in told
+    assert "flat: NLL and NEES are of x, z, ry alone: not comparable with those of others." in told
     assert "free: NLL" not in told
 
 

@@ -166,7 +166,7 @@ def test_a_truth_slower_than_the_frames_does_not_make_a_covariance_overconfident
 @pytest.mark.parametrize(
     "kept,told",
     [
-        (slice(0, 2), "has 2 frames, and three with truth are needed"),
+        (slice(0, 2), "has 2 frames; three with truth are needed"),
         (slice(None), "only [0-9]* of 601 frames lie near poses of the ground truth"),
     ],
 )
@@ -228,7 +228,7 @@ def test_a_copy_of_the_odometry_is_no_truth() -> None:
     run = Run(Path("hall"), "hall", log, TruthLog(log.t_ns, log.trajectory()), None, Mounting(), [])
     found = verdict(evaluate_run(run))
     assert (found.colour, found.lines) == ("amber", ())
-    assert "is the truth made from the odometry?" in found.headline
+    assert "was the truth made from odometry?" in found.headline
 
 
 def test_a_truth_that_cannot_tell_motions_judges_none() -> None:
@@ -290,6 +290,6 @@ def test_a_truth_without_attitude_is_named() -> None:
     assert "holds no attitude" in verdict(of_truth(without)).headline
     assert "honest" in verdict(of_truth(lambda truth: truth)).headline
     log, truth = make_run(200)
-    with pytest.raises(GpvoError, match=r"never turns, odometry by up to [0-9]+ deg"):
+    with pytest.raises(GpvoError, match=r"never turns, but odometry does, by up to [0-9]+ deg"):
         build(log, without(truth), name="hall")
     assert len(build(log, without(truth), name="hall", target="position")) == 200

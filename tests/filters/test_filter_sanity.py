@@ -96,7 +96,7 @@ def test_linear_acceleration_is_not_specific_force(flight: Flight) -> None:
     nearest = np.minimum(np.arange(len(flight.imu.t_ns)) // 10, len(up) - 1)
     wrong = _with_imu(flight, lambda i: replace(i, acc_mps2=i.acc_mps2 - 9.80665 * up[nearest]))
     assert [f.kind for f in check_flight(wrong)] == ["acc_unit"]
-    assert "gravity has been taken out" in check_flight(wrong)[0].text
+    assert "gravity has been removed" in check_flight(wrong)[0].text
 
 
 def test_gaps_and_bad_samples_are_said_but_not_fatal(flight: Flight) -> None:

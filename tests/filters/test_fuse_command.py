@@ -277,5 +277,5 @@ def test_truth_where_there_is_no_imu_is_no_truth(tmp_path: Path) -> None:
     assert scores.frames == 0
     assert trace.truth is None
     assert np.linalg.norm(trace.position, axis=1).max() < 1.0
-    assert "no frame that the IMU reaches has ground truth" in "".join(report.warnings)
+    assert "no frame covered by the IMU has ground truth" in "".join(report.warnings)
     assert "pointing_matching" not in "".join(report.warnings)

@@ -98,5 +98,5 @@ def test_calibration_takes_kittis_calib(tmp_path: Path) -> None:
     (tmp_path / "calib.txt").write_text(f"P0: {row.format(0)}\nP1: {row.format(-6)}\n")
     source = open_source(folder, calibration=tmp_path / "calib.txt")
     assert source.camera.baseline_m == pytest.approx(0.1)
-    with pytest.raises(CalibrationError, match="no size"):
+    with pytest.raises(CalibrationError, match="image size"):
         read_stereo_yaml(tmp_path / "calib.txt")

@@ -132,7 +132,7 @@ def _poses_with(row: np.ndarray) -> np.ndarray:
     [
         ({"frame": None}, "lacks frame"),
         ({"uv_left": np.zeros((100, 3))}, r"'uv_left' has shape \(100, 3\), expected \(100, 2\)"),
-        ({"frame": np.full(100, 7)}, "'frame' goes to 7"),
+        ({"frame": np.full(100, 7)}, "'frame' goes up to 7"),
         ({"t_s": np.array([0, 1, 2, np.nan, 4, 5])}, "'t_s' is NaN or infinite at row 3"),
         ({"T_world_cam": np.full((6, 4, 4), np.nan)}, "'T_world_cam' is NaN"),
         ({"T_world_cam": _poses_with(np.zeros((4, 4)))}, "'T_world_cam' row 2 is not a rigid transform"),

@@ -181,7 +181,7 @@ def test_the_topic_is_also_that_of_the_bag_and_what_lies_there_is_refused_before
     run_live(settings)
     with open_bag(out) as reader:
         assert list(reader.topics) == ["/foo/odom"]
-    with pytest.raises(GpvoError, match=r"out\.mcap: exists already \(give another name or remove it\)"):
+    with pytest.raises(GpvoError, match=r"out\.mcap: already exists \(give another name or remove it\)"):
         Live(settings, None, print)
-    with pytest.raises(GpvoError, match="no name of ROS"):
+    with pytest.raises(GpvoError, match="not a valid ROS name"):
         Live(replace(settings, topic="bad topic"), None, print)

@@ -262,7 +262,7 @@ def test_a_bag_replayed_by_the_command_is_the_same_in_a_bag(tmp_path: Path) -> N
     stamps, T = flight(n=60)
     bag = messages(stamps, T).write(tmp_path / "vio")
     model = save_model(tmp_path / "vio.gpvo")
-    with pytest.raises(GpvoError, match="exists already .*remove it"):
+    with pytest.raises(GpvoError, match="already exists .*remove it"):
         run_live(LiveSettings(model, replay=bag, fast=True, out=bag))
     result = run_live(LiveSettings(model, replay=bag, fast=True, out=tmp_path / "out.mcap"))
     assert result["counts"]["frames_ok"] == 60

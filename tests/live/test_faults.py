@@ -217,7 +217,7 @@ def test_silence_from_the_start_names_the_topics_that_sent_nothing() -> None:
     for tenth in range(50):
         live.take(Arrival("/truth", None, tenth * SECOND // 10))
     assert kept.reports[-1].level == 2
-    assert told == [f"no usable message for more than 2 s: nothing has come on {TOPIC}"]
+    assert told == [f"no usable message for more than 2 s: nothing received on {TOPIC}"]
 
 
 def test_the_end_of_a_recording_is_no_silence() -> None:

@@ -116,7 +116,7 @@ def test_settings_that_cannot_be_used_are_refused_at_the_start(tmp_path: Path, r
 
 def test_a_folder_of_images_is_no_bag(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((9, 9), np.uint8))
-    with pytest.raises(GpvoError, match=r"is no bag \(give a \.bag, \.db3 or \.mcap file"), open_bag(tmp_path):
+    with pytest.raises(GpvoError, match=r"is not a bag \(give a \.bag, \.db3 or \.mcap file"), open_bag(tmp_path):
         pass
 
 

@@ -237,7 +237,7 @@ def test_intervals_cover_flights_that_the_model_has_not_seen(predictor):
     # Of five flights the model has seen four, and the fifth counts as if it covered nothing.
     for level, hits in inside.items():
         assert level - 0.05 < np.mean(hits) < min(1.25 * level, 1.0) + 0.05
-    with pytest.raises(ModelError, match="no interval of level 0.123"):
+    with pytest.raises(ModelError, match="no interval at level 0.123"):
         predictor.interval(said[s.t_ns[0]], 0.123)
 
 

@@ -91,7 +91,7 @@ def test_the_system_is_a_byte(predicted: Path, tmp_path: Path, system: int) -> N
 @pytest.mark.parametrize("topic", ["", "/", "vo\nodom1: /imu", "/a//b", "/3d", "/odom: x", "/odomé"])
 def test_a_topic_that_is_no_name_of_ros_is_refused(tmp_path: Path, topic: str) -> None:
     """It goes into a parameter file."""
-    with pytest.raises(GpvoError, match="no name of ROS"):
+    with pytest.raises(GpvoError, match="not a valid ROS name"):
         publish_run(tmp_path, PublishSettings(topic=topic))
 
 

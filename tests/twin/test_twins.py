@@ -241,7 +241,7 @@ def test_the_command_makes_runs_with_exact_truth(blind, tmp_path):
 
 def test_twins_of_an_earlier_call_do_not_stay_among_those_of_this(blind, tmp_path):
     gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 3)
-    with pytest.raises(SourceError, match="blind-twin2: is a twin that 2 replicates do not replace"):
+    with pytest.raises(SourceError, match="blind-twin2: is a twin that 2 replicates would not replace"):
         gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 2)
     assert gpvo("twin", blind, "-o", tmp_path / "t", "--replicates", 3).exit_code == 0
 
@@ -299,7 +299,7 @@ def test_runs_without_tracks_are_refused_with_the_cure(flown, tmp_path):
         estimate(tmp_path / "log")
     few = simulate_points("tunnel-clean", seed=1, duration_s=2.0, tracks=10)
     run(open_source(few.save(tmp_path / "few.npz")), tmp_path / "few", keep_tracks=True)
-    with pytest.raises(SourceError, match="points a motion"):
+    with pytest.raises(SourceError, match="points per motion"):
         estimate(tmp_path / "few")
 
 

@@ -179,7 +179,7 @@ def test_points_too_far_away_are_named() -> None:
         for k, uvd in enumerate((before, after))
     ]
     assert records[1].status is Status.LOST
-    assert re.fullmatch(r"only \d of \d+ points are near enough to tell .* \(disparity over 1 px\)", records[1].reason)
+    assert re.fullmatch(r"only \d of \d+ points are near enough to show .* \(disparity over 1 px\)", records[1].reason)
 
 
 def test_refuses_what_it_cannot_mean(clip: Clip) -> None:

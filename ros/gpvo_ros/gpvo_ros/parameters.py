@@ -40,12 +40,12 @@ PARAMETERS = {
     "calibration_state": Parameter("", "Start from the calibration errors of an earlier run: its folder."),
     "hfov_deg": Parameter(0.0, "Field of view of the rectified images [deg]; 0: the lens's own.", (0.0, 179.0)),
     "size": Parameter("", "Size of the rectified images, WIDTHxHEIGHT; default: that of the raw ones."),
-    "mask_left": Parameter("", "Mask image: the pixels of the left lens that may be used."),
+    "mask_left": Parameter("", "Mask image for the left lens: which pixels may be used."),
     "mask_right": Parameter("", "The same for the right lens."),
     "base_frame": Parameter(
         "", "Publish the odometry of this frame, located through /tf_static and /tf; default: the source's own."
     ),
-    "truth": Parameter("", "Topic of ground truth that arrives late: adapts the covariance."),
+    "truth": Parameter("", "Topic of ground truth that arrives late; the covariance adapts to it."),
     "truth_type": Parameter("pose", "Type of that topic.", choices=tuple(POSE_TYPE_NAMES)),
     "topic": Parameter("/gpvo/odometry", "Topic on which the odometry is published."),
     "pose_topic": Parameter("", "Also publish PoseWithCovarianceStamped here."),
