@@ -128,13 +128,13 @@ def _correlation(x: Array, y: Array, min_overlap: int) -> Array:
 def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius_s: float) -> float:
     """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: three nested grids and a parabola."""
     T = log.T_world_cam
-    mine = _amounts(T, np.ones(len(T), dtype=bool), window)
+    mine, gap_s = _amounts(T, np.ones(len(T), dtype=bool), window), _gap_s(truth)
 
     def misfits(offsets: Array) -> Array:
         differences = []
         for offset in offsets:
             moved = replace(log, t_ns=log.t_ns + round(float(offset) * 1e9))
-            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns, _gap_s(truth)), window))
+            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns, gap_s), window))
         d = np.stack(differences)
         known = np.isfinite(d).all(axis=(0, 1))
         if known.sum() < 10:

@@ -232,8 +232,7 @@ def aligned(T_est: Array, T_true: Array, covariance: Array) -> Array:
 
     Gauss-Newton, from the better of two starts: by positions alone, and by orientations with the mean position.
     """
-    U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", T_true[:, :3, :3], T_est[:, :3, :3]))
-    turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    turn = se3.orthonormalise((T_true @ se3.inverse(T_est)).mean(axis=0))[:3, :3]
     p_est, p_true = T_est[:, :3, 3], T_true[:, :3, 3]
     starts = (umeyama(p_est, p_true), (turn, p_true.mean(axis=0) - turn @ p_est.mean(axis=0)))
     moved = [se3.from_rt(R, t) @ T_est for R, t in starts]
@@ -244,15 +243,15 @@ def aligned(T_est: Array, T_true: Array, covariance: Array) -> Array:
         xi = se3.log(se3.inverse(T_true) @ T)[:, axes]
         return float(np.einsum("ni,nij,nj", xi, information, xi))
 
-    best = min(moved, key=cost)
+    best, least = min(((T, cost(T)) for T in moved), key=lambda one: one[1])
     for _ in range(_ALIGNING):
         xi, J = se3.log(se3.inverse(T_true) @ best)[:, axes], se3.adjoint(se3.inverse(best))[:, axes]
         WJ = information @ J
         step = np.linalg.lstsq(np.einsum("nij,nik->jk", J, WJ), -np.einsum("nij,ni->j", WJ, xi), rcond=1e-12)[0]
         candidate = se3.exp(step) @ best
-        if not cost(candidate) < cost(best):
+        if not (now := cost(candidate)) < least:
             break
-        best = candidate
+        best, least = candidate, now
     return best
 
 
