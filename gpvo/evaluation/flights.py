@@ -111,7 +111,7 @@ def on_smooth_path(twin: Flight, seed: Sequence[int]) -> Flight:
     assert twin.T_world_cam is not None
     T_world_imu, t_s = twin.T_world_imu, (t_ns - t_ns[0]) * 1e-9
     if imu is not None:
-        up, _ = vertical_in_world(imu, t_ns, T_world_imu)
+        up, _ = vertical_in_world(imu, t_ns, T_world_imu, StartSigmas().acc_bias_mps2)
         tilt = np.cross(up, [0.0, 0.0, 1.0])
         turn = np.arctan2(np.linalg.norm(tilt), up[2]) * tilt / max(float(np.linalg.norm(tilt)), 1e-12)
         T_world_imu = se3.exp(np.append(np.zeros(3), turn)) @ T_world_imu

@@ -58,7 +58,7 @@ def test_real_imu_passes_the_checks_and_wrong_ones_do_not(flight: Flight) -> Non
 def test_vertical_of_the_truth(flight: Flight) -> None:
     assert flight.imu is not None
     t_ns = np.array([r.t_ns for r in flight.records])
-    assert np.arccos(vertical_in_world(flight.imu, t_ns, flight.T_world_imu)[0][2]) < np.radians(0.5)
+    assert np.arccos(vertical_in_world(flight.imu, t_ns, flight.T_world_imu, 0.05)[0][2]) < np.radians(0.5)
 
 
 def test_the_filter_follows(flight: Flight) -> None:

@@ -11,7 +11,7 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
-from gpvo.filters.run import FuseOptions, begin, fuse_flight
+from gpvo.filters.run import FuseOptions, begin, fuse_flight, vertical_in_world
 from gpvo.filters.start import StartSigmas, StaticTest, from_rest, from_truth, heading
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
@@ -99,7 +99,22 @@ def test_a_world_whose_z_is_not_up() -> None:
     assert run.scores.final_error_m < 1.0
 
 
-@pytest.mark.parametrize("tilt_deg", [3.0, 9.0, 45.0])
+def test_the_vertical_is_as_unsure_as_stated() -> None:
+    """Turning tells an accelerometer's bias from gravity; squared error over stated variance, over 24 flights."""
+    squares, sigmas_rad = [], []
+    for seed in range(24):
+        flight = synthetic_flight(seed, duration_s=15, turn_on=(0.05, 5e-3))
+        assert flight.imu is not None
+        t_ns = np.array([r.t_ns for r in flight.records])
+        up, C = vertical_in_world(flight.imu, t_ns, flight.T_world_imu, 0.05)
+        off = np.cross([0.0, 0.0, 1.0], up)[:2]
+        squares.append(off @ np.linalg.solve(C[:2, :2], off) / 2)
+        sigmas_rad.append(np.sqrt(np.trace(C[:2, :2]) / 2))
+    assert 0.4 < np.mean(squares) < 1.6
+    assert np.median(sigmas_rad) < 0.4 * 0.05 / 9.80665  # what the bias alone would leave of a straight flight
+
+
+@pytest.mark.parametrize("tilt_deg", [0.8, 3.0, 45.0])
 def test_a_truth_that_is_not_level_is_judged_as_one_that_is(tilt_deg: float) -> None:
     tilted = se3.from_rt(se3.so3_exp(np.radians([tilt_deg, 0, 0])), np.zeros(3))
     scores = []
