@@ -23,7 +23,7 @@ from gpvo.learning.calibrate import (
 from gpvo.learning.logvariance import log_ratio
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
-from gpvo.learning.poses import Motions, Poses, added_factor, pose_losses, poses_of, with_added
+from gpvo.learning.poses import Poses, Windows, added_factor, pose_losses, windows_of, with_added
 from gpvo.learning.rows import Rows, significant_gain, simplest_sufficient
 from gpvo.learning.spans import at_most
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
@@ -62,6 +62,8 @@ def assemble(
         rows.select(columns),
         rows.geometry(base.method),
         group_folds(rows.group, _MOST_FOLDS),
+        windows_of(at_most(rows.chains(np.arange(len(error))), MOST_ROWS)),
+        rows.motions(),
     )
     z = error / np.sqrt(of.variance)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
@@ -93,8 +95,8 @@ def assemble(
 @dataclass(frozen=True)
 class _Residuals:
     """All rows, out of fold: ``error`` (n, 6), its ``variance`` (n, 6), calibrated for each axis, features ``X``
-    (n, d), the geometric covariance (n, 6, 6), the ``fold`` (n,) that is left out with each row, and ``patterns`` if
-    calibration has a part of its own."""
+    (n, d), the geometric covariance (n, 6, 6), the ``fold`` (n,) that is left out with each row, the ``windows`` whose
+    poses are looked at, the motions ``T_prev_cur`` (n, 4, 4), and ``patterns`` if calibration has a part of its own."""
 
     rows: Rows
     error: Array
@@ -102,6 +104,8 @@ class _Residuals:
     X: Array
     geometry: Array | None
     fold: NDArray[np.int64]
+    windows: Sequence[Windows]
+    T_prev_cur: Array
     patterns: Patterns | None = None
 
     def of_calibration(self) -> tuple[Array | None, Array, Array]:
@@ -194,11 +198,9 @@ def _jointly(of: _Residuals, divided: _Divided) -> tuple[Array, float, list[Pose
     jitter, white, root = divided.split(of)
     whole = jitter + white + root @ np.swapaxes(root, -1, -2)
     joint = fit_joint_factor(of.error, whole, of.rows.group)
-    stated = (of.rows.motions(), of.error, jitter * joint, white * joint, root * np.sqrt(joint))
-    chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
-    chains = [Motions(i, *(x[c] for x in stated)) for i, cs in enumerate(chosen) for c in cs]
     phi = np.exp(-of.rows.step_s / divided.whole.persistent_tau_s)
-    return whole * joint, joint, poses_of(chains, phi)
+    motions = of.T_prev_cur, of.error, jitter * joint, white * joint, root * np.sqrt(joint)
+    return whole * joint, joint, [Poses.over(w, *motions, phi) for w in of.windows]
 
 
 def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Consistent) -> _Consistent:
@@ -237,7 +239,7 @@ def _divisions(
     sigmas, faster = rows.chains(sigma), rows.chains(ln_faster(v_mps, ln_speed))
     lasting = None if root is None else rows.chains(root)
     parts = fit_parts(rows.chains(error), sigmas, faster, rows.step_s, lasting, like)
-    R = part_correlations(rows.chains(left), sigmas, parts, rows.step_s)
+    R = part_correlations(rows.chains(left), sigmas, parts)
     division = Division(
         share=parts.share,
         growth=parts.growth,
