@@ -49,6 +49,11 @@ class PointsScenario:
     tolerance: Tolerance = field(default_factory=Tolerance)
     offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
 
+    @property
+    def imu_samples_per_frame(self) -> int:
+        """The IMU's rate over that of the frames, nearest whole number."""
+        return max(1, round(self.imu_rate_hz / self.rate_hz))
+
 
 SCENARIOS: dict[str, PointsScenario] = {
     "tunnel-clean": PointsScenario(),

@@ -22,25 +22,14 @@ class StereoRenderer:
 
     Parameters
     ----------
-    world
-        As from ``build_world``.
-    left, right
-        Lens models of the two cameras; they may differ.
-    T_right_left
-        (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
-    threads
-        Number of threads; the images are the same to the bit for any number.
-    head_lamp
-        Radiant intensity of a lamp at each camera; by default that of the world.
-    max_angle_rad
-        Half the field of view; pixels beyond it are black, as behind the rim of a fisheye.
-    far_m
-        Nothing beyond this distance is drawn.
+    left, right : lens models of the two cameras; they may differ.
+    T_right_left : (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
+    threads : how many; the images are the same to the bit for any number.
+    head_lamp : radiant intensity of a lamp at each camera; by default that of the world.
+    max_angle_rad : half the field of view; pixels beyond it are black, as behind the rim of a fisheye.
+    far_m : nothing beyond this distance is drawn.
 
-    Raises
-    ------
-    MissingExtraError
-        Where numba is not installed.
+    Raises MissingExtraError where numba is not installed.
     """
 
     def __init__(
