@@ -39,21 +39,28 @@ _LEAST_KNOWN = 0.5
 _MOST_FOLDS = 5
 
 
-def assemble(
-    rows: Rows,
-    base: BaseVariance,
-    columns: tuple[str, ...],
-    inputs: Sequence[str],
-    gp: ProjectedGP | None,
-    variance: Array,
-) -> tuple[ErrorModel, dict[str, Any]]:
-    """The finished error model: parts, correlations and scale fitted to the errors, given their ``variance``
-    (n, 6).
+@dataclass(frozen=True)
+class VarianceModel:
+    """The variance of a motion: ``base``, times the exponential of ``gp`` on ``inputs`` where it has any.
 
-    ``base``, and ``gp`` on ``inputs`` if there is one: what will state the variance of a new sequence. Errors of the
-    camera's calibration get a part of their own if that makes the poses of left-out flights likelier.
+    ``oof`` (n, 6): the variance of each training row by a fit without its group. ``means``: coefficients (6, 5) of the
+    base fitted without a GP, to all rows and to those outside of each fold.
     """
-    error = rows.error
+
+    inputs: tuple[str, ...]
+    base: BaseVariance
+    gp: ProjectedGP | None
+    oof: Array
+    means: Sequence[Array]
+
+
+def assemble(rows: Rows, columns: tuple[str, ...], learned: VarianceModel) -> tuple[ErrorModel, dict[str, Any]]:
+    """The finished error model on ``columns``: parts, correlations and scale fitted to the errors, given their variance
+    out of fold.
+
+    Errors of the camera's calibration get a part of their own if that makes the poses of left-out flights likelier.
+    """
+    error, variance, base, gp = rows.error, learned.oof, learned.base, learned.gp
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     of = _Residuals(
         rows,
@@ -69,7 +76,7 @@ def assemble(
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
     outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z**2).mean(axis=1), rows.group)
     domain, high = learn_domain(of.X), np.zeros(6)
-    places = np.array([columns.index(n) for n in inputs or columns[:1]], dtype=np.int64)
+    places = np.array([columns.index(n) for n in learned.inputs or columns[:1]], dtype=np.int64)
     if gp is not None:
         high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
     divided = _divided(of)
