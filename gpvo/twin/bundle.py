@@ -47,8 +47,8 @@ class Observations:
         """A hundred thousand at a time: matrices of each observation would need a gigabyte for a million."""
         for i in range(0, len(self.frame), _PART):
             rows = slice(i, i + _PART)
-            own = (x[rows] for x in (self.frame, self.track, self.uvd, self.trusted))
-            yield rows, Observations(self.camera, *own)
+            part = Observations(self.camera, self.frame[rows], self.track[rows], self.uvd[rows], self.trusted[rows])
+            yield rows, part
 
 
 @dataclass(frozen=True)

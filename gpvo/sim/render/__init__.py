@@ -67,15 +67,15 @@ class StereoRenderer:
         always that of ``T_world_left``. Depth runs along the optical axis [m], NaN where there is nothing; that of the
         right camera is kept in ``depth_right`` until the next call.
         """
-        poses = [T_world_left] if motion is None or len(motion) < 2 else [*motion, T_world_left]
+        poses = [T_world_left] if motion is None or len(motion) < 2 else motion
         left, right = (np.zeros_like(drawer.radiance) for drawer in (self._left, self._right))
-        for k, T in enumerate(poses):
+        for T in poses:
             self._draw(np.asarray(T, dtype=np.float64))
-            # With motion, the last pose is for depth alone.
-            if k == 0 or k < len(poses) - 1:
-                left += self._left.radiance
-                right += self._right.radiance
-        count = np.float32(max(len(poses) - 1, 1))
+            left += self._left.radiance
+            right += self._right.radiance
+        if len(poses) > 1:  # for the depth alone
+            self._draw(np.asarray(T_world_left, dtype=np.float64))
+        count = np.float32(len(poses))
         return left / count, right / count, self._left.depth.copy()
 
     @property
