@@ -203,7 +203,7 @@ class KltFrontend:
         :meth:`_find_right`, the known points first."""
         new_uv, new_disparity, detected = self._new_corners(view, uv)
         found = self._find_right(view, np.concatenate([uv, new_uv]), np.concatenate([disparity, new_disparity]))
-        new_uvd, good = (a[len(uv) :] for a in found[:2])
+        new_uvd, good = found[0][len(uv) :], found[1][len(uv) :]
         self._new = _New(detected, new_uv[good], new_uvd[good], int(good[:detected].sum()))
         return found
 
