@@ -170,7 +170,8 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
 
 def warn_of_unused(scenario: Scenario) -> None:
     """Warn of values, other than the scenario's usual ones, that a flight without images does not use."""
-    usual = load_scenario(scenario.name) if scenario.name in names() else Scenario(name=scenario.name)
+    own = scenario.name
+    usual = load_scenario(own) if own in names() else Scenario.model_validate({"name": own})
     for name, instead in _IMAGES_ALONE.items():
         if getattr(scenario, name) != getattr(usual, name) and instead.removeprefix("points.") not in scenario.points:
             cure = f"; set {instead}" if instead else ""
