@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import group_folds
 from gpvo.learning.basefit import learn_domain, learn_velocities
-from gpvo.learning.calibrate import (
-    LEVELS,
-    Scale,
-    conformal_quantiles,
-    fit_joint_factor,
-    fit_outside_power,
-    fit_scale,
-)
+from gpvo.learning.calibrate import LEVELS, Scale, conformal_quantiles, fit_joint_factor, fit_outside_power, fit_scale
 from gpvo.learning.logvariance import log_ratio
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns

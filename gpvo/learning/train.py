@@ -22,15 +22,7 @@ from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
-from gpvo.learning.methods import (
-    METHODS,
-    average,
-    empty,
-    method_arrays,
-    score,
-    simple_covariances,
-    stated_and_actual,
-)
+from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.thesis import fit_thesis
@@ -82,11 +74,7 @@ def train(
 # On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.
 @fixed_threads(1)
 def train_sets(
-    sets: Sequence[TrainingSet],
-    config: TrainConfig,
-    *,
-    judge: bool = True,
-    on_fit: OnFit = lambda done, total: None,
+    sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out."""
     sets = _checked(sets, config.target)

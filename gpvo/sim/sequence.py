@@ -55,12 +55,7 @@ _TRUTH_HEAD = (
 
 
 def simulate(
-    scenario: Scenario,
-    seed: int,
-    out: str | Path,
-    *,
-    threads: int = 2,
-    on_frame: Callable[[], None] | None = None,
+    scenario: Scenario, seed: int, out: str | Path, *, threads: int = 2, on_frame: Callable[[], None] | None = None
 ) -> Flight:
     """Write a sequence folder; a finished one with the same scenario and seed is left as it is.
 
