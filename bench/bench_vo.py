@@ -98,11 +98,11 @@ def _covariances() -> dict[str, object]:
     uvd = np.column_stack([rng.uniform(0, 640, 500), rng.uniform(0, 480, 500), rng.uniform(3, 60, 500)])
     T = se3.exp(np.array([0.02, 0, 0.06, 0.01, 0.02, 0]))
     cur = transfer(T, uvd, camera).uvd.T
-    methods = ("triangulation", "pointing_matching")
+    config = make_config()
     times = []
     for _ in range(300):
         start = time.perf_counter()
-        covariances_by_method(methods, T, uvd, cur, camera, sigma_px=1.0, sigma_p_px=0.1, sigma_m_px=0.5)
+        covariances_by_method(config, (0.1, 0.5), T, uvd, cur, camera)
         times.append(time.perf_counter() - start)
     value = 1e3 * float(np.median(times))
     return {"value": value, "unit": "ms", "peer": "bound", "peer_value": 0.5, "ratio": 0.5 / value}

@@ -12,18 +12,11 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.build import group_folds
 from gpvo.learning.basefit import learn_domain, learn_velocities
-from gpvo.learning.calibrate import (
-    LEVELS,
-    Scale,
-    conformal_quantiles,
-    fit_joint_factor,
-    fit_outside_power,
-    fit_scale,
-)
+from gpvo.learning.calibrate import LEVELS, Scale, conformal_quantiles, fit_joint_factor, fit_outside_power, fit_scale
 from gpvo.learning.logvariance import log_ratio
 from gpvo.learning.parts import MOST_ROWS, Parts, fit_parts, part_correlations
 from gpvo.learning.patterns import PERSISTENT_S, Patterns, learn_patterns
-from gpvo.learning.poses import Motions, Poses, added_factor, pose_losses, poses_of, with_added
+from gpvo.learning.poses import Poses, Windows, added_factor, pose_losses, windows_of, with_added
 from gpvo.learning.rows import Rows, significant_gain, simplest_sufficient
 from gpvo.learning.spans import at_most
 from gpvo.online.base import TWIST_COLUMNS, BaseVariance, feature_noise, motion_noise
@@ -39,37 +32,45 @@ _LEAST_KNOWN = 0.5
 _MOST_FOLDS = 5
 
 
-def assemble(
-    rows: Rows,
-    base: BaseVariance,
-    columns: tuple[str, ...],
-    inputs: Sequence[str],
-    gp: ProjectedGP | None,
-    variance: Array,
-) -> tuple[ErrorModel, dict[str, Any]]:
-    """The finished error model: parts, correlations and scale fitted to the errors, given their ``variance``
-    (n, 6).
+@dataclass(frozen=True)
+class VarianceModel:
+    """The variance of a motion: ``base``, times the exponential of ``gp`` on ``inputs`` where it has any.
 
-    ``base``, and ``gp`` on ``inputs`` if there is one: what will state the variance of a new sequence. Errors of the
-    camera's calibration get a part of their own if that makes the poses of left-out flights likelier.
+    ``oof`` (n, 6): the variance of each training row by a fit without its group. ``means``: coefficients (6, 5) of the
+    base fitted without a GP, to all rows and to those outside of each fold.
     """
-    error = rows.error
+
+    inputs: tuple[str, ...]
+    base: BaseVariance
+    gp: ProjectedGP | None
+    oof: Array
+    means: Sequence[Array]
+
+
+def assemble(rows: Rows, columns: tuple[str, ...], learned: VarianceModel) -> tuple[ErrorModel, dict[str, Any]]:
+    """The finished error model on ``columns``: parts, correlations and scale fitted to the errors, given their variance
+    out of fold.
+
+    Errors of the camera's calibration get a part of their own if that makes the poses of left-out flights likelier.
+    """
+    error, variance, base, gp = rows.error, learned.oof, learned.base, learned.gp
     scale = fit_scale(error / np.sqrt(variance), rows.group)
     of = _Residuals(
         rows,
-        error,
         variance * scale.factor,
-        rows.select(columns),
         rows.geometry(base.method),
         group_folds(rows.group, _MOST_FOLDS),
+        windows_of(at_most(rows.chains(np.arange(len(error))), MOST_ROWS)),
+        rows.motions(),
     )
+    X = rows.select(columns)
     z = error / np.sqrt(of.variance)
     noise = feature_noise(motion_noise(columns), variance, rows.dt_s)
-    outside_power = fit_outside_power(_distance(of.X, noise, rows.group), (z**2).mean(axis=1), rows.group)
-    domain, high = learn_domain(of.X), np.zeros(6)
-    places = np.array([columns.index(n) for n in inputs or columns[:1]], dtype=np.int64)
+    outside_power = fit_outside_power(_distance(X, noise, rows.group), (z**2).mean(axis=1), rows.group)
+    domain, high = learn_domain(X), np.zeros(6)
+    places = np.array([columns.index(n) for n in learned.inputs or columns[:1]], dtype=np.int64)
     if gp is not None:
-        high = np.quantile(log_ratio(gp, domain.locate(of.X).inside[:, places]), 0.95, axis=0)
+        high = np.quantile(log_ratio(gp, domain.locate(X).inside[:, places]), 0.95, axis=0)
     divided = _divided(of)
     model = ErrorModel(
         columns=columns,
@@ -92,28 +93,28 @@ def assemble(
 
 @dataclass(frozen=True)
 class _Residuals:
-    """All rows, out of fold: ``error`` (n, 6), its ``variance`` (n, 6), calibrated for each axis, features ``X``
-    (n, d), the geometric covariance (n, 6, 6), the ``fold`` (n,) that is left out with each row, and ``patterns`` if
-    calibration has a part of its own."""
+    """All rows, the ``variance`` (n, 6) of their errors out of fold, calibrated for each axis, the geometric covariance
+    (n, 6, 6), the ``fold`` (n,) that is left out with each row, the ``windows`` whose poses are looked at, the motions
+    ``T_prev_cur`` (n, 4, 4), and ``patterns`` if calibration has a part of its own."""
 
     rows: Rows
-    error: Array
     variance: Array
-    X: Array
     geometry: Array | None
     fold: NDArray[np.int64]
+    windows: Sequence[Windows]
+    T_prev_cur: Array
     patterns: Patterns | None = None
 
     def of_calibration(self) -> tuple[Array | None, Array, Array]:
         """Root (n, 6, 6) of the covariance due to a wrong calibration, by the patterns of other flights; the variance
         and the errors that remain without it."""
         if self.patterns is None:
-            return None, self.variance, self.error
-        twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.error), 6, 6)), self.variance.copy()
+            return None, self.variance, self.rows.error
+        twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.fold), 6, 6)), self.variance.copy()
         for k, patterns in enumerate(self.patterns.without):
             of = self.fold == k
             root[of], rest[of] = of_calibration(self.variance[of], patterns, twist[of])
-        return root, rest, self.error - self.patterns.error
+        return root, rest, self.rows.error - self.patterns.error
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class _Divided:
     def split(self, of: _Residuals) -> tuple[Array, ...]:
         """Covariances (n, 6, 6) of jitter and white noise, and the root (n, 6, 12) of bias and calibration, by what the
         other flights show."""
-        twist, out = of.rows.select(TWIST_COLUMNS), tuple(np.empty((len(of.error), 6, k)) for k in (6, 6, 12))
+        twist, out = of.rows.select(TWIST_COLUMNS), tuple(np.empty((len(of.fold), 6, k)) for k in (6, 6, 12))
         for k, division in enumerate(self.without):
             i = of.fold == k
             e = division.split(of.variance[i], twist[i], None if of.geometry is None else of.geometry[i])
@@ -172,7 +173,7 @@ def _consistent(model: ErrorModel, of: _Residuals, divided: _Divided) -> _Consis
     if added != 1.0:
         divided = divided.changed(lambda d: replace(d, share=with_added(d.share, added)))
         whole, joint, poses = _jointly(of, divided)
-    nu = student_t.fit_dof(nees(of.error, whole), of.error.shape[1], of.rows.weight)
+    nu = student_t.fit_dof(nees(of.rows.error, whole), of.rows.error.shape[1], of.rows.weight)
     typical, division = float(np.median(np.linalg.slogdet(whole)[1])), divided.whole
     model = replace(
         model,
@@ -193,18 +194,16 @@ def _jointly(of: _Residuals, divided: _Divided) -> tuple[Array, float, list[Pose
     such covariances."""
     jitter, white, root = divided.split(of)
     whole = jitter + white + root @ np.swapaxes(root, -1, -2)
-    joint = fit_joint_factor(of.error, whole, of.rows.group)
-    stated = (of.rows.motions(), of.error, jitter * joint, white * joint, root * np.sqrt(joint))
-    chosen = at_most(of.rows.chains(np.arange(len(of.error))), MOST_ROWS)
-    chains = [Motions(i, *(x[c] for x in stated)) for i, cs in enumerate(chosen) for c in cs]
+    joint = fit_joint_factor(of.rows.error, whole, of.rows.group)
     phi = np.exp(-of.rows.step_s / divided.whole.persistent_tau_s)
-    return whole * joint, joint, poses_of(chains, phi)
+    motions = of.T_prev_cur, of.rows.error, jitter * joint, white * joint, root * np.sqrt(joint)
+    return whole * joint, joint, [Poses.over(w, *motions, phi) for w in of.windows]
 
 
 def _with_calibration(bare: ErrorModel, of: _Residuals, plain: _Consistent) -> _Consistent:
     """The same with a part for a wrong calibration, if the patterns of other flights make the poses likelier by a
     significant gain."""
-    patterns = learn_patterns(of.rows, of.error, of.variance, of.fold)
+    patterns = learn_patterns(of.rows, of.rows.error, of.variance, of.fold)
     if patterns is None:
         return plain
     of = replace(of, patterns=patterns)
@@ -216,11 +215,11 @@ def _divided(of: _Residuals) -> list[_Divided]:
     """How errors add up, without the geometry's correlations so far: for each prior of the parts' correlations."""
     root, rest, left = of.of_calibration()
     usual = None if of.patterns is None else of.patterns.usual
-    whole, parts = _divisions(of.rows, (of.error, rest, left, root), usual)
+    whole, parts = _divisions(of.rows, (of.rows.error, rest, left, root), usual)
     without = []
     for k in np.unique(of.fold):
         kept = of.fold != k
-        some = of.error[kept], rest[kept], left[kept], None if root is None else root[kept]
+        some = of.rows.error[kept], rest[kept], left[kept], None if root is None else root[kept]
         patterns = None if of.patterns is None else of.patterns.without[k]
         without.append(_divisions(of.rows.only(kept), some, patterns, parts)[0])
     return [_Divided(of_all, parts, others) for of_all, *others in zip(whole, *without)]
@@ -237,7 +236,7 @@ def _divisions(
     sigmas, faster = rows.chains(sigma), rows.chains(ln_faster(v_mps, ln_speed))
     lasting = None if root is None else rows.chains(root)
     parts = fit_parts(rows.chains(error), sigmas, faster, rows.step_s, lasting, like)
-    R = part_correlations(rows.chains(left), sigmas, parts, rows.step_s)
+    R = part_correlations(rows.chains(left), sigmas, parts)
     division = Division(
         share=parts.share,
         growth=parts.growth,

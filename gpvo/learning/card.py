@@ -29,13 +29,17 @@ def model_card(header: Mapping[str, Any], table: Mapping[str, Any], name: str) -
     sections = [
         _intro(header, name),
         _unfit(header, table),
-        _data(header),
+        f"{_sequences(header)}{_simulated(header)}\n\nDigest of the rows: `{header['training_digest']}`",
         _scores(table, name),
         _calibration(header),
         _domain(header),
         _limits(header),
     ]
     return "\n\n".join(s for s in sections if s) + "\n"
+
+
+def _section(title: str, *lines: str) -> str:
+    return "\n".join([f"## {title}", "", *lines])
 
 
 def _intro(h: Mapping[str, Any], name: str) -> str:
@@ -89,11 +93,7 @@ def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
             lines.append(f"* On flights like `{fold['held_out']}`: only {100 * inside:.0f} % of it was in domain.")
     if h.get("simulated_truth"):
         lines.append("* As evidence that a vehicle is safe: the ground truth was simulated.")
-    return "\n".join(["## Where not to use it", "", *lines, "", "`gpvo check MODEL RUN` checks this before a flight."])
-
-
-def _data(h: Mapping[str, Any]) -> str:
-    return _sequences(h) + _simulated(h) + f"\n\nDigest of the rows: `{h['training_digest']}`"
+    return _section("Where not to use it", *lines, "", "`gpvo check MODEL RUN` checks this before a flight.")
 
 
 def _simulated(h: Mapping[str, Any]) -> str:
@@ -116,7 +116,7 @@ def _sequences(h: Mapping[str, Any]) -> str:
         seen = f"focal length {_camera(camera)}, {camera['width']}x{camera['height']}"
     rows = [[str(s.get(key, 0)) for key in keys] for s in h["sequences"]]
     head = ("sequence", "rows", "lost", "without truth", "truth moves at rest")
-    return "\n".join(["## Training data", "", f"Camera: {seen}.", "", *markdown_table(head, rows)])
+    return _section("Training data", f"Camera: {seen}.", "", *markdown_table(head, rows))
 
 
 def _camera(camera: Mapping[str, Any]) -> str:
@@ -136,17 +136,14 @@ def _table(scores: Iterable[tuple[str, Mapping[str, Any]]]) -> list[str]:
 
 def _scores(table: Mapping[str, Any], name: str) -> str:
     if not table.get("folds"):
-        return "## Scores\n\nOne short sequence: none could be left out, so nothing is known about others."
+        return _section("Scores", "One short sequence: none could be left out, so nothing is known about others.")
     blocks = table.get("folds_are") == "time blocks"
-    lines = [
-        "## Scores on sequences left out" if not blocks else "## Scores on parts of the one sequence, left out in turn",
-        "",
-        *(["They say nothing about another flight.", ""] if blocks else []),
-        *_table(table["mean"].items()),
-    ]
+    title = "Scores on parts of the one sequence, left out in turn" if blocks else "Scores on sequences left out"
+    lines = ["They say nothing about another flight.", ""] if blocks else []
     c = table["comparison"]
     d = c["nll_per_dim_difference"]
     lines += [
+        *_table(table["mean"].items()),
         "",
         f"Best row by NLL: `{c['best_row']}`. `learned` minus `{c['rival']}`: {_difference(d)}.",
         _gain_of_gp(c["learned_less_base"]),
@@ -163,7 +160,7 @@ def _scores(table: Mapping[str, Any], name: str) -> str:
             "Actual error against stated sigma of each axis, for ten groups of motions sorted by it. On the diagonal",
             "sigma is right; above it sigma is too small. In the green band it is right within a factor of 1.4.",
         ]
-    return "\n".join(lines)
+    return _section(title, *lines)
 
 
 def _difference(d: Mapping[str, float | None]) -> str:
@@ -192,33 +189,27 @@ def _calibration(h: Mapping[str, Any]) -> str:
         f"{100 * level:.0f} %: {w:.2f}" for level, w in zip(c["interval_levels"], c["interval_sigmas"][0])
     )
     apart = bool(c.get("calibration_part"))
-    return "\n".join(
-        [
-            "## Calibration",
-            "",
-            f"Calibrated by {c['by']} ({c['groups']} left out in turn).{marked}",
-            f"The error of one motion is stated as {shape}; the covariance is its second moment.",
-            f"Half widths, in sigma, of the intervals that covered left-out data on the first axis: {widths}.",
-            *(["The camera's calibration differs between these sequences; a part of the model is for that."] * apart),
-        ]
+    return _section(
+        "Calibration",
+        f"Calibrated by {c['by']} ({c['groups']} left out in turn).{marked}",
+        f"The error of one motion is stated as {shape}; the covariance is its second moment.",
+        f"Half widths, in sigma, of the intervals that covered left-out data on the first axis: {widths}.",
+        *(["The camera's calibration differs between these sequences; a part of the model is for that."] * apart),
     )
 
 
 def _domain(h: Mapping[str, Any]) -> str:
     ranges = zip(h["training_domain"].items(), h["units"])
     rows = [[f"`{name}`", unit, f"{low:.4g}", f"{high:.4g}"] for (name, (low, high)), unit in ranges]
-    return "\n".join(["## Range of the training data", "", *markdown_table(("feature", "unit", "from", "to"), rows)])
+    return _section("Range of the training data", *markdown_table(("feature", "unit", "from", "to"), rows))
 
 
 def _limits(h: Mapping[str, Any]) -> str:
-    return "\n".join(
-        [
-            "## Limits",
-            "",
-            "* Outside the ranges above the covariance grows, `in_domain` falls, and the numbers are a guess.",
-            "* The noise of the ground truth is part of the error that was learned.",
-            f"* Versions: {', '.join(f'{name} {number}' for name, number in h['versions'].items())}.",
-        ]
+    return _section(
+        "Limits",
+        "* Outside the ranges above the covariance grows, `in_domain` falls, and the numbers are a guess.",
+        "* The noise of the ground truth is part of the error that was learned.",
+        f"* Versions: {', '.join(f'{name} {number}' for name, number in h['versions'].items())}.",
     )
 
 

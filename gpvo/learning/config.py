@@ -79,11 +79,10 @@ def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tup
 
 def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tuple[str, ...]]:
     """Named sets of inputs to try, each without what the logs lack. Raises GpvoError if nothing is left."""
-    names = FAMILIES if config.features == "auto" else {config.features: (config.features,)}
+    asked = FAMILIES if config.features == "auto" else {config.features: config.features}
     out: dict[str, tuple[str, ...]] = {}
-    for name, selection in names.items():
-        wanted = resolve(config.features) if name == config.features else resolve(selection)
-        columns = supported_columns(sets, wanted)
+    for name, selection in asked.items():
+        columns = supported_columns(sets, resolve(selection))
         if columns and columns not in out.values():
             out[name] = columns
     if not out:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet, group_folds
-from gpvo.learning.assemble import assemble
+from gpvo.learning.assemble import VarianceModel, assemble
 from gpvo.learning.basefit import fit_coefficients, learn_domain
 from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
 from gpvo.learning.logvariance import fit_log_variance, log_ratio
@@ -44,21 +44,6 @@ class BaseChoice:
 
 
 @dataclass(frozen=True)
-class VarianceModel:
-    """The variance of a motion: ``base``, times the exponential of ``gp`` on ``inputs`` where it has any.
-
-    ``oof`` (n, 6): the variance of each training row by a fit without its group. ``means``: coefficients (6, 5) of the
-    base fitted without a GP, to all rows and to those outside of each fold.
-    """
-
-    inputs: tuple[str, ...]
-    base: BaseVariance
-    gp: ProjectedGP | None
-    oof: Array
-    means: Sequence[Array]
-
-
-@dataclass(frozen=True)
 class Learned:
     """A fitted model in memory. ``model``: the one that predicts; ``base``: the same with the GP at its mean function.
 
@@ -78,10 +63,10 @@ def fit_model(sets: Sequence[TrainingSet], config: TrainConfig) -> Learned:
     choice, alone = choose_base(rows)
     name, variance, losses = choose_inputs(rows, choice, alone, config)
     columns = tuple(dict.fromkeys((*variance.inputs, *alone.base.columns, *guarded(rows.sets, config))))
-    model, calibration = assemble(rows, variance.base, columns, variance.inputs, variance.gp, variance.oof)
+    model, calibration = assemble(rows, columns, variance)
     base, arrays = model, dict(model.to_arrays())
     if variance.gp is not None:
-        base, _ = assemble(rows, alone.base, columns, (), None, alone.oof)
+        base, _ = assemble(rows, columns, alone)
         own = base.to_arrays().items()
         arrays |= {BASE + n: a for n, a in own if n not in arrays or not np.array_equal(a, arrays[n])}
     choices = {"base": str(choice), "inputs": name, "inputs_nll": losses, "grouped_by": rows.grouped_by}

@@ -109,10 +109,7 @@ def _mode(prior: ProjectedGP, Z: Array, ratio: Array, weight: Array, group: NDAr
             break
     explained = _PRIOR_VAR - 1.0 / precision
     return replace(
-        prior,
-        projection=V.T @ prior.projection,
-        weights=A.T.copy(),
-        reduction=(explained @ _ROTATION**2).T.copy(),
+        prior, projection=V.T @ prior.projection, weights=A.T.copy(), reduction=(explained @ _ROTATION**2).T.copy()
     )
 
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,18 +52,27 @@ class Shape:
 class Parts:
     """``share`` (3, D): of jitter, white noise and bias on each axis at the typical log variance ``level`` (D,).
 
-    ``growth`` (2, D): how the shares change with the speed and the variance (see :func:`gpvo.online.division.divide`).
-    ``tau_s`` (D,): of the bias. ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over
-    what is stated. ``shapes``: of each block of three axes.
+    ``spans`` (S,) frames; ``ratio`` (S, D): mean square of sums over so many frames, over what is stated. ``shapes``:
+    of each block of three axes. ``step_s``: usual duration of a motion.
     """
 
     share: Array
-    growth: Array
     level: Array
-    tau_s: Array
     spans: NDArray[np.int64]
     ratio: Array
     shapes: Sequence[Shape]
+    step_s: float
+
+    @property
+    def growth(self) -> Array:
+        """(2, D) how the shares change with the speed and the variance (see :func:`gpvo.online.division.divide`)."""
+        by_block = np.array([[s.by_speed, s.by_noise] for s in self.shapes]).T
+        return by_block.repeat(3, axis=1)[:, : len(self.level)]
+
+    @property
+    def tau_s(self) -> Array:
+        """(D,) time constant of the bias."""
+        return np.full(len(self.level), self.shapes[0].tau * self.step_s)
 
 
 @dataclass(frozen=True)
@@ -98,8 +109,10 @@ class _Windows:
 
 @dataclass(frozen=True)
 class _Fit:
-    """``share`` (3, d) of a shape, mean ratio of squared sums to what is stated (S, d), and the loss."""
+    """``share`` (3, d) of a shape, mean ratio of squared sums to what is stated (S, d), and the loss, with what the
+    shape must be worth."""
 
+    shape: Shape
     loss: float
     share: Array
     ratio: Array
@@ -125,49 +138,39 @@ def fit_parts(
     found = span_variances([[e / s for e, s in zip(*pair)] for pair in zip(error, sigma)])
     ln_var = [[2.0 * np.log(s) for s in chains] for chains in sigma]
     level = np.median(np.concatenate([c for chains in ln_var for c in chains]), axis=0)
-    D = len(level)
-    share, growth, ratio = np.empty((3, D)), np.empty((2, D)), np.empty((len(found.spans), D))
-    blocks = [slice(start, min(start + 3, D)) for start in range(0, D, 3)]
+    blocks = [slice(start, start + 3) for start in range(0, len(level), 3)]
     given = (error, ln_var, ln_speed, lasting)
     windows = [_windows(given, found.spans, block, level) for block in blocks]
     shapes = _choose(windows) if like is None else like.shapes
-    tau = shapes[0].tau
-    widening = found.widening(tau)
-    for block, seen, shape in zip(blocks, windows, shapes):
-        fit = _fit_shape(seen, shape, widening[:, block])
-        share[:, block], ratio[:, block] = fit.share, fit.ratio
-        growth[:, block] = [[shape.by_speed], [shape.by_noise]]
-    return Parts(share, growth, level, np.full(D, tau * step_s), found.spans, ratio, shapes)
-
-
-_Choice = tuple[Shape, _Fit]
+    widening = found.widening(shapes[0].tau)
+    fits = [_fit_shape(w, shape, widening[:, block]) for w, shape, block in zip(windows, shapes, blocks)]
+    share, ratio = (np.concatenate(of, axis=1) for of in zip(*((fit.share, fit.ratio) for fit in fits)))
+    return Parts(share, level, found.spans, ratio, shapes, step_s)
 
 
 def _choose(windows: Sequence[_Windows]) -> list[Shape]:
     """The shape of each block, with one time constant for all. Sideways errors are correlated with the
     rotations that undo them; with time constants of their own, the two would drift apart along the way."""
-    tried: dict[float, list[_Choice]] = {}
+
+    @cache
+    def best(tau: float) -> list[_Fit]:
+        return [_best(block, tau) for block in windows]
 
     def loss(tau: float) -> float:
-        tried.setdefault(tau, [_best(block, tau) for block in windows])
-        return sum(_loss(choice) for choice in tried[tau])
+        return sum(fit.loss for fit in best(tau))
 
     found = min(_TAU_FRAMES, key=loss)
     found = min((found, found / 2.0, found * 2.0), key=loss)
-    return [shape for shape, _ in tried[found]]
+    return [fit.shape for fit in best(found)]
 
 
-def _best(windows: _Windows, tau: float) -> _Choice:
+def _best(windows: _Windows, tau: float) -> _Fit:
     """The best shape of a block. By default the shares are constant."""
-    tried = [(s, _fit_shape(windows, s)) for s in (Shape(0.0, g, tau) for g in _NOISE_GROWTHS)]
-    by_noise = min(tried, key=_loss)[0].by_noise
-    others = (Shape(v, by_noise, tau) for v in _SPEED_GROWTHS)
-    return min([*tried, *((s, _fit_shape(windows, s)) for s in others)], key=_loss)
-
-
-def _loss(choice: _Choice) -> float:
-    shape, fit = choice
-    return fit.loss + _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
+    loss = attrgetter("loss")
+    tried = [_fit_shape(windows, Shape(0.0, by_noise, tau)) for by_noise in _NOISE_GROWTHS]
+    by_noise = min(tried, key=loss).shape.by_noise
+    tried += [_fit_shape(windows, Shape(by_speed, by_noise, tau)) for by_speed in _SPEED_GROWTHS]
+    return min(tried, key=loss)
 
 
 def _windows(given: Sequence[Chains], spans: NDArray[np.int64], block: slice, level: Array) -> _Windows:
@@ -225,8 +228,9 @@ def _fit_shape(windows: _Windows, shape: Shape, widen: Array | None = None) -> _
     stated = known + (A * share[:, :, None]).sum(axis=0)
     ratio = np.minimum(square / stated, _MOST_RATIO)
     loss = float((windows.count * (np.log(stated) + ratio)).sum())
+    loss += _WORTH * ((shape.by_speed > 0) + (shape.by_noise > 0))
     means = np.array([r.mean(axis=1) for r in np.split(ratio, np.cumsum(sizes)[:-1], axis=1)])
-    return _Fit(loss, share, means / widen)
+    return _Fit(shape, loss, share, means / widen)
 
 
 def _terms(w: _Windows, gains: tuple[Array, Array] | None, tau: float, share: Array) -> Array:
@@ -277,7 +281,7 @@ def curves(spans: NDArray[np.int64], tau_frames: float) -> Array:
     return np.stack([np.ones_like(m), m, bias], axis=1)
 
 
-def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float) -> Array:
+def part_correlations(error: Chains, sigma: Chains, split: Parts) -> Array:
     """(P, 3, 6, 6) correlations of jitter, white noise and bias, for each of :data:`PRIORS`, from those of the errors
     summed over each span.
 
@@ -287,11 +291,11 @@ def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float)
     et al., "MM algorithms for variance components models" (2019), which keeps them positive definite. All spans hold
     the same errors, so that they share one count of windows; the correlations of single motions are the prior.
     """
-    part = np.stack([curves(split.spans, tau / step_s) for tau in split.tau_s]) * split.share.T[:, None, :]
+    part = curves(split.spans, split.shapes[0].tau) * split.share.T[:, None, :]
     scale = np.moveaxis(np.sqrt(part / part.sum(axis=2, keepdims=True)), 0, 2)
     D = scale[..., :, None] * scale[..., None, :]
     measured = np.array([correlation(student_t.scatter(_scaled_sums(error, sigma, m))) for m in split.spans])
-    weighted = D * (_independent(error, split, scale[:, 2] ** 2, step_s) / len(split.spans))[:, None, None, None]
+    weighted = D * (_independent(error, split, scale[:, 2] ** 2) / len(split.spans))[:, None, None, None]
     prior = np.array(PRIORS)[:, None, None, None]
     R = np.tile(measured[0], (len(PRIORS), 3, 1, 1))
     for _ in range(_ROUNDS):
@@ -304,12 +308,12 @@ def part_correlations(error: Chains, sigma: Chains, split: Parts, step_s: float)
     return correlation(R)
 
 
-def _independent(error: Chains, split: Parts, bias: Array, step_s: float) -> Array:
+def _independent(error: Chains, split: Parts, bias: Array) -> Array:
     """(S,) independent windows of each span, where ``bias`` (S, D) of the variance of a sum is that of the bias, which
     lasts from one window to the next (M. Bartlett, "On the theoretical specification and sampling properties of
     autocorrelated time-series" (1946)); those of different sequences always are."""
     windows = np.array([[sum(len(c) // m for c in chains) for chains in error] for m in split.spans])
-    kept = np.exp(-2.0 * split.spans[:, None] * step_s / split.tau_s)
+    kept = np.exp(-2.0 * split.spans[:, None] * split.step_s / split.tau_s)
     alone = (windows.sum(axis=1, keepdims=True) / (1.0 + 2.0 * bias**2 * kept / (1.0 - kept))).min(axis=1)
     return np.asarray(np.maximum(alone, (windows > 0).sum(axis=1)))
 

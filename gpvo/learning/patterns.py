@@ -129,10 +129,7 @@ class _Unit:
     @classmethod
     def of(cls, flights: Sequence[_Sums], clear: NDArray[np.bool_]) -> _Unit:
         """By all windows."""
-        error, twist = (
-            _rms(np.concatenate([f.sigma for f in flights])),
-            _rms(np.concatenate([f.twist for f in flights])),
-        )
+        error, twist = (_rms(np.concatenate(x)) for x in ([f.sigma for f in flights], [f.twist for f in flights]))
         return cls(error, twist[clear], clear)
 
     def evidence(self, f: _Sums) -> _Evidence:
@@ -151,11 +148,9 @@ class _Unit:
     def patterns(self, S: Array) -> Array:
         """(6, 6, 6) from the covariance of ``vec K``: its longest principal axes."""
         values, vectors = np.linalg.eigh(S)
+        axes = vectors * np.sqrt(np.maximum(values, 0.0))
         longest = np.argsort(values)[::-1][:_D]
-        out = np.zeros((_D, _D, _D))
-        for p, i in enumerate(longest):
-            out[p] = self.of_flight(vectors[:, i] * np.sqrt(max(values[i], 0.0)))
-        return out
+        return np.array([self.of_flight(axes[:, i]) for i in longest])
 
 
 def _spread(evidence: Sequence[_Evidence]) -> tuple[Array, Array]:

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gpvo.accumulation import adjoints_to_end, persistent_sum
 from gpvo.learning.rows import significant_gain
-from gpvo.learning.spans import SPANS, cut
+from gpvo.learning.spans import SPANS, Chains, cut
 from gpvo.stats.consistency import nees
 from gpvo.types import Array
 
@@ -27,17 +28,26 @@ _MOST_NEES = 16.0
 
 
 @dataclass(frozen=True)
-class Motions:
-    """One unbroken chain of n motions of a sequence: ``T_prev_cur`` (n, 4, 4), ``error`` (n, 6), and of what is stated
-    the covariances ``jitter`` and ``white`` (n, 6, 6), and ``root`` (n, 6, 12) of the bias and of what a wrong
-    calibration adds."""
+class Windows:
+    """Separate windows of m motions each, of unbroken chains: the ``rows`` (w, m) of their motions. ``belongs`` (w, S):
+    to which sequence, its columns summing to one: a sequence counts as one, however many windows it has, as its errors
+    go together."""
 
-    sequence: int
-    T_prev_cur: Array
-    error: Array
-    jitter: Array
-    white: Array
-    root: Array
+    rows: NDArray[np.int64]
+    belongs: Array
+
+    @classmethod
+    def of(cls, chains: Chains, m: int) -> Windows:
+        """Of ``chains`` of rows."""
+        rows = np.concatenate([cut(chain, m) for some in chains for chain in some])
+        counts = [sum(len(chain) // m for chain in some) for some in chains]
+        return cls(rows, np.repeat(np.eye(len(chains)) / np.maximum(counts, 1.0), counts, axis=0))
+
+
+def windows_of(chains: Chains) -> list[Windows]:
+    """Single motions, and windows of ten and more of them as far as there are enough; ``chains`` of rows."""
+    counts = {m: sum(len(chain) // m for some in chains for chain in some) for m in SPANS if m == 1 or m >= _LONG}
+    return [Windows.of(chains, m) for m, count in counts.items() if count >= _LEAST_WINDOWS]
 
 
 def added_factor(poses: Sequence[Poses], share: Array) -> float:
@@ -46,7 +56,7 @@ def added_factor(poses: Sequence[Poses], share: Array) -> float:
     ``share`` (3, D) of the parts. Spans of ten and more motions count alike, as they contain the same errors, and so do
     sequences. The factor is shrunk towards 1, and is 1 unless its gain is significant. Every axis keeps some jitter.
     """
-    poses = [p for p in poses if p.span >= _LONG]
+    poses = [p for p in poses if p.windows.rows.shape[1] >= _LONG]
     if not poses:
         return 1.0
     most = max((1.0 - _LEAST_JITTER) / float((share[1] + share[2]).max()), 1.0)
@@ -75,61 +85,46 @@ def with_added(share: Array, factor: float) -> Array:
 
 @dataclass(frozen=True)
 class Poses:
-    """Errors (w, 6) of the poses after ``span`` motions each, in the axes of the last camera, and covariances
-    (w, 6, 6): that of ``jitter`` and calibration, of what has ``added`` up, and of the first and last motion's part of
-    that, were it jitter too (``at_ends``). ``belongs`` (w, S): to which sequence, its columns summing to one: a
-    sequence counts as one, however many windows it has, as its errors go together."""
+    """Errors (w, 6) of the poses after windows of motions, in the axes of the last camera, and covariances (w, 6, 6):
+    that of ``jitter`` and calibration, of what has ``added`` up, and of the first and last motion's part of that, were
+    it jitter too (``at_ends``)."""
 
-    span: int
+    windows: Windows
     error: Array
     jitter: Array
     added: Array
     at_ends: Array
-    belongs: Array
 
     @classmethod
-    def over(cls, chains: Sequence[Motions], m: int, phi: Array) -> Poses:
-        """Of the separate windows of all chains; ``phi`` (12,): correlation of bias and calibration from one motion to
-        the next."""
-        long = [c for c in chains if len(c.error) >= m]
-        every = zip(*((c.T_prev_cur, c.error, c.jitter, c.white, c.root) for c in long))
-        error, jitter, added, at_ends = _sums(phi, *(np.concatenate([cut(v, m) for v in of]) for of in every))
-        sequence = np.concatenate([np.full(len(c.error) // m, c.sequence) for c in long])
-        belongs = (sequence[:, None] == np.unique([c.sequence for c in chains])).astype(np.float64)
-        return cls(m, error, jitter, added, at_ends, belongs / np.maximum(belongs.sum(axis=0), 1.0))
+    def over(
+        cls, windows: Windows, T_prev_cur: Array, error: Array, jitter: Array, white: Array, root: Array, phi: Array
+    ) -> Poses:
+        """As :class:`gpvo.accumulation.PoseError` adds up, for all windows at once and with one time step.
+
+        Of all motions (n, 4, 4) the errors (n, 6), the covariances ``jitter`` and ``white`` (n, 6, 6), and the ``root``
+        (n, 6, 12) of the bias and of what a wrong calibration adds; ``phi`` (12,): correlation of the latter two from
+        one motion to the next.
+        """
+        rows, ends = windows.rows, [0, -1]
+        to_end = adjoints_to_end(T_prev_cur[rows])
+        at_both = _carried(to_end[:, ends], jitter[rows[:, ends]])
+        whites, roots = _carried(to_end, white[rows]), to_end @ root[rows]
+        bias, calibration = roots[..., :6], roots[..., 6:]
+        phis = np.broadcast_to(phi, (*rows.shape, len(phi)))
+        added = whites.sum(axis=1) + persistent_sum(bias, phis[..., :6])
+        lasting = persistent_sum(calibration, phis[..., 6:]) if calibration.any() else np.zeros_like(added)
+        at_ends = whites[:, ends] + bias[:, ends] @ np.swapaxes(bias[:, ends], -1, -2)
+        summed = (to_end @ error[rows][..., None]).sum(axis=1)[..., 0]
+        return cls(windows, summed, 0.5 * at_both.sum(axis=1) + lasting, added, 0.5 * at_ends.sum(axis=1))
 
     def losses(self, factor: float) -> Array:
         """(S,) negative log-likelihood of each sequence, without its constant; 0 for one without a window. Gross errors
         count as four sigma."""
         C = self.jitter + self.at_ends + factor * (self.added - self.at_ends)
         squared = np.minimum(nees(self.error, C), _MOST_NEES * 6.0)
-        return np.asarray((0.5 * (np.linalg.slogdet(C)[1] + squared)) @ self.belongs)
+        return np.asarray((0.5 * (np.linalg.slogdet(C)[1] + squared)) @ self.windows.belongs)
 
 
-def poses_of(chains: Sequence[Motions], phi: Array) -> list[Poses]:
-    """Single motions, and the poses after ten and more of them as far as a span has enough windows."""
-    counts = {m: sum(len(c.error) // m for c in chains) for m in SPANS if m == 1 or m >= _LONG}
-    return [Poses.over(chains, m, phi) for m, count in counts.items() if count >= _LEAST_WINDOWS]
-
-
-def _sums(
-    phi: Array, T_prev_cur: Array, error: Array, jitter: Array, white: Array, root: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Error, jitter, added and at_ends of :class:`Poses`, of windows (w, m, ...) of motions: as
-    :class:`gpvo.accumulation.PoseError` adds up, for all at once and with one time step."""
-    to_end, ends = adjoints_to_end(T_prev_cur), [0, -1]
-    jitter, white, root = _carried(jitter[:, ends], to_end[:, ends]), _carried(white, to_end), to_end @ root
-    bias, calibration = root[..., :6], root[..., 6:]
-    phi = np.broadcast_to(phi, (*root.shape[:2], len(phi)))
-    added = white.sum(axis=1) + persistent_sum(bias, phi[..., :6])
-    lasting = persistent_sum(calibration, phi[..., 6:]) if calibration.any() else np.zeros_like(added)
-    return (
-        (to_end @ error[..., None]).sum(axis=1)[..., 0],
-        0.5 * jitter.sum(axis=1) + lasting,
-        added,
-        0.5 * (white[:, ends] + bias[:, ends] @ np.swapaxes(bias[:, ends], -1, -2)).sum(axis=1),
-    )
-
-
-def _carried(C: Array, adjoint: Array) -> Array:
+def _carried(adjoint: Array, C: Array) -> Array:
+    """Covariances (..., 6, 6), carried by adjoints (..., 6, 6)."""
     return np.asarray(adjoint @ C @ np.swapaxes(adjoint, -1, -2))

@@ -12,7 +12,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.methods import METHODS, average, empty, score
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.learning.train import TrainedModel, header_of_sets
-from gpvo.online.features import THESIS, known_columns, resolve
+from gpvo.online.features import THESIS, resolve
 
 
 def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
@@ -26,18 +26,15 @@ def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: b
         folds.append(
             {"held_out": held_out.name, "rows": len(held_out), "lost": held_out.counts["lost"], "methods": methods}
         )
-    names, (low, high) = model.columns, _reach(sets, model)
+    X = np.concatenate([s.select(model.columns) for s in sets])
+    X = X[np.isfinite(X).all(axis=1)]
     header = {
-        **header_of_sets(sets, config),
+        **header_of_sets(sets, config, model.columns, (X.min(axis=0), X.max(axis=0)), folds),
         "horizon": "from the first frame",
         "frame": "first camera",
-        "features": list(names),
-        "units": [known_columns()[name] for name in names],
-        "training_domain": {n: [lo, hi] for n, lo, hi in zip(names, low, high)},
-        "scores": {f["held_out"]: f["methods"] for f in folds},
     }
     mean = {m: average([f["methods"][m] for f in folds]) if folds else empty() for m in METHODS}
-    table = {"schema": 1, "model": None, "features": list(names), "folds": folds, "mean": mean}
+    table = {"schema": 1, "model": None, "features": header["features"], "folds": folds, "mean": mean}
     return TrainedModel(model.to_arrays(), header, {**table, "comparison": None}, sets)
 
 
@@ -45,9 +42,3 @@ def _fit(sets: Sequence[TrainingSet], config: TrainConfig) -> ThesisModel:
     columns = THESIS if config.features == "auto" else resolve(config.features)
     regressor = "sparse" if config.regressor == "auto" else config.regressor
     return fit_thesis(sets, columns, regressor, shared=True, seed=config.seed, inducing=config.inducing)
-
-
-def _reach(sets: Sequence[TrainingSet], model: ThesisModel) -> tuple[list[float], list[float]]:
-    X = np.concatenate([s.select(model.columns) for s in sets])
-    X = X[np.isfinite(X).all(axis=1)]
-    return X.min(axis=0).tolist(), X.max(axis=0).tolist()

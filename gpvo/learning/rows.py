@@ -3,7 +3,7 @@ by which training replaces a simpler model by another: held-out gain above its s
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -39,8 +39,7 @@ class Rows:
 
     def only(self, kept: NDArray[np.bool_]) -> Rows:
         """Those of the rows (n,) that are kept."""
-        parts = zip(self.sets, np.split(kept, np.cumsum([len(s) for s in self.sets])[:-1]))
-        return Rows.stack([s.rows(of) for s, of in parts if of.any()])
+        return Rows.stack([s.rows(of) for s, of in self._by_set(kept) if of.any()])
 
     @property
     def step_s(self) -> float:
@@ -66,12 +65,10 @@ class Rows:
 
     def chains(self, values: NDArray[Any]) -> list[list[NDArray[Any]]]:
         """Rows of (n, ...) of each sequence, in unbroken chains of motions."""
-        out, start = [], 0
-        for s in self.sets:
-            mine = values[start : start + len(s)]
-            out.append([mine[rows] for rows in chains(s.t_ns, s.dt_s)])
-            start += len(s)
-        return out
+        return [[own[rows] for rows in chains(s.t_ns, s.dt_s)] for s, own in self._by_set(values)]
+
+    def _by_set(self, values: NDArray[Any]) -> Iterator[tuple[TrainingSet, NDArray[Any]]]:
+        return zip(self.sets, np.split(values, np.cumsum([len(s) for s in self.sets])[:-1]))
 
 
 Candidate = TypeVar("Candidate", bound=Hashable)

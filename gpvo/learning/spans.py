@@ -52,7 +52,7 @@ def at_most(values: Chains, limit: int) -> Chains:
     return out
 
 
-def cut(values: Array, m: int) -> Array:
+def cut(values: NDArray[Any], m: int) -> NDArray[Any]:
     """(w, m, ...) separate windows of m rows; what is left over is dropped."""
     return values[: len(values) // m * m].reshape(-1, m, *values.shape[1:])
 

@@ -22,15 +22,7 @@ from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
-from gpvo.learning.methods import (
-    METHODS,
-    average,
-    empty,
-    method_arrays,
-    score,
-    simple_covariances,
-    stated_and_actual,
-)
+from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.thesis import fit_thesis
@@ -82,11 +74,7 @@ def train(
 # On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.
 @fixed_threads(1)
 def train_sets(
-    sets: Sequence[TrainingSet],
-    config: TrainConfig,
-    *,
-    judge: bool = True,
-    on_fit: OnFit = lambda done, total: None,
+    sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out."""
     sets = _checked(sets, config.target)
@@ -95,9 +83,8 @@ def train_sets(
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays(), **thesis.to_arrays()}
     header = _header(sets, config, learned, table)
-    return TrainedModel(
-        arrays, header, {"schema": 1, "model": None, "features": list(learned.model.columns), **table}, sets
-    )
+    document = {"schema": 1, "model": None, "features": header["features"], **table}
+    return TrainedModel(arrays, header, document, sets)
 
 
 def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
@@ -292,8 +279,13 @@ def training_digest(sets: Sequence[TrainingSet]) -> str:
     return hashlib.sha256("".join(sorted(s.digest() for s in sets)).encode()).hexdigest()
 
 
-def header_of_sets(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, Any]:
-    """What the header of every kind of model says about its training."""
+def header_of_sets(
+    sets: Sequence[TrainingSet], config: TrainConfig, columns: Sequence[str], reach: tuple[Array, Array],
+    folds: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:  # fmt: skip
+    """What the header of every kind of model says about its training; ``reach``: least and largest value (d,) of each
+    feature."""
+    low, high = reach
     cameras = [s.camera for s in sets if s.camera is not None]
     return {
         "model_schema": 1,
@@ -304,6 +296,10 @@ def header_of_sets(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str
         "versions": versions(),
         "training_digest": training_digest(sets),
         "config": config.settings(),
+        "features": list(columns),
+        "units": [known_columns()[name] for name in columns],
+        "training_domain": {n: [lo, hi] for n, lo, hi in zip(columns, low.tolist(), high.tolist())},
+        "scores": {f["held_out"]: f["methods"] for f in folds},
     }
 
 
@@ -311,23 +307,17 @@ def _header(
     sets: Sequence[TrainingSet], config: TrainConfig, learned: Learned, table: Mapping[str, Any]
 ) -> dict[str, Any]:
     model = learned.model
-    low, high = model.domain.reach
-    step = model.dt_s
     return {
-        **header_of_sets(sets, config),
+        **header_of_sets(sets, config, model.columns, model.domain.reach, table.get("folds", [])),
         "frame": "cam",
         "tangent": "translation then rotation, right perturbation, m and rad",
         "horizon": "one motion" if config.target == "frame" else config.target,
-        "features": list(model.columns),
-        "units": [known_columns()[name] for name in model.columns],
         "inputs": [] if learned.choices["inputs"] == NONE else [model.columns[i] for i in model.inputs],
         "base_method": model.base.method,
-        "training_domain": {n: [lo, hi] for n, lo, hi in zip(model.columns, low.tolist(), high.tolist())},
-        "dt_s": step,
-        "rate_hz": 1.0 / step,
+        "dt_s": model.dt_s,
+        "rate_hz": 1.0 / model.dt_s,
         "choices": learned.choices,
         "calibration": learned.calibration,
         "by_few_sequences": len(sets) < MIN_SEQUENCES,
-        "scores": {f["held_out"]: f["methods"] for f in table.get("folds", [])},
         "comparison": table.get("comparison"),
     }

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
+from gpvo.sim.paths import level_axes
 from gpvo.types import Array
 
 LANE_M = 3.5
@@ -132,9 +133,8 @@ class _Way:
         arc, place, turn = self.arc_m[moving], self.position[moving], self.heading[moving]
         heading = np.interp(arc_m, arc, turn)
         at = np.stack([np.interp(arc_m, arc, place[:, i]) for i in range(3)], 1)
-        ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], 1)
+        ahead, left = level_axes(heading)
         over = np.maximum(arc_m - arc[-1], 0.0) + np.minimum(arc_m - arc[0], 0.0)
-        left = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros_like(heading)], 1)
         return at + over[:, None] * ahead + left_m * left, heading
 
     def poses(self, position: Array, heading: Array, begin_s: float, end_s: float) -> Array:
@@ -171,7 +171,7 @@ def _smoke(way: _Way, begin_s: float, end_s: float, rng: np.random.Generator) ->
     """A plume ahead that drifts at about the camera's speed, turning slowly."""
     since_s, middle = way.t_s - begin_s, np.searchsorted(way.t_s, 0.5 * (begin_s + end_s))
     pace = rng.uniform(0.5, 1.1) * np.gradient(way.position, way.t_s, axis=0)[middle] + rng.normal(0, 0.2, 3)
-    ahead = np.array([np.cos(way.heading[middle]), np.sin(way.heading[middle]), 0.0])
+    ahead = level_axes(way.heading)[0][middle]
     centre = way.position[middle] + rng.uniform(2.5, 5.0) * ahead
     position = centre + (way.t_s - way.t_s[middle])[:, None] * pace
     points = rng.normal(0.0, [1.2, 1.2, 0.8], (int(rng.uniform(100, 600)), 3))

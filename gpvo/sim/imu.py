@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, ImuNoise
 
 
@@ -83,8 +84,7 @@ def measured_imu(
     t_ns = t_start_ns + np.rint(motion.t_s * 1e9).astype(np.int64)
     if model.exact:
         return ImuLog(t_ns, gyro, force, noise), np.zeros((n, 3)), np.zeros((n, 3))
-    tilt = model.misalignment_rad * rng.standard_normal(3)
-    turn = np.eye(3) + np.array([[0, -tilt[2], tilt[1]], [tilt[2], 0, -tilt[0]], [-tilt[1], tilt[0], 0]])
+    turn = np.eye(3) + se3.skew(model.misalignment_rad * rng.standard_normal(3))
 
     def walk(start: float, density: float) -> Array:
         steps = density * np.sqrt(dt) * rng.standard_normal((n, 3))

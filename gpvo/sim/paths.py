@@ -71,10 +71,9 @@ def along_curve(
     s = room * np.tanh(s / room * 1.0) if s[-1] > 0.8 * room else s
     start = _smoothstep(pace / 4.0)
     heading = _heading(curve.derivative(1)(s))
-    left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], 1)
     offset = sway_m * (np.sin(2 * w[1] * pace + ph[1]) - np.sin(ph[1])) * start
     rise = 0.5 * sway_m * (np.sin(2 * w[2] * pace + ph[2]) - np.sin(ph[2])) * start
-    position = curve(s) + left * offset[:, None]
+    position = curve(s) + level_axes(heading)[1] * offset[:, None]
     position[:, 2] += rise
     yaw = heading + 0.25 * (np.sin(1.6 * w[3] * pace + ph[3]) - np.sin(ph[3])) * start
     return _flat(t, position, yaw, duration_s)
@@ -192,6 +191,17 @@ def _heading(tangent: Array) -> Array:
     return np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
 
 
+def level_axes(heading: Array) -> tuple[Array, Array]:
+    """Unit vectors (N, 3) ahead and to the left, level, of headings (N,) [rad]."""
+    c, s, zero = np.cos(heading), np.sin(heading), np.zeros_like(heading)
+    return np.stack([c, s, zero], 1), np.stack([-s, c, zero], 1)
+
+
+def rotations(q_xyzw: Array) -> Array:
+    """Rotations (N, 3, 3) of quaternions (N, 4) of any length."""
+    return se3.from_quaternion(np.zeros((len(q_xyzw), 3)), q_xyzw)[:, :3, :3]
+
+
 def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float = 1.0) -> Path3:
     """Attitude of a multirotor: its thrust points along acceleration plus gravity (D. Mellinger, V. Kumar, "Minimum
     snap trajectory generation and control for quadrotors", 2011, section III). ``lean`` scales the tilt; 0 stays
@@ -202,9 +212,7 @@ def _flat(t: Array, position: Array, yaw: Array, duration_s: float, lean: float 
     def attitude(u: Array) -> Array:
         z = lean * pull(u) + np.array([0, 0, STANDARD_GRAVITY_MPS2])
         z = z / np.linalg.norm(z, axis=1, keepdims=True)
-        psi = turn(u)
-        x = np.stack([np.cos(psi), np.sin(psi), np.zeros_like(psi)], 1)
-        y = np.cross(z, x)
+        y = np.cross(z, level_axes(turn(u))[0])
         y = y / np.linalg.norm(y, axis=1, keepdims=True)
         return np.stack([np.cross(y, z), y, z], axis=2)
 

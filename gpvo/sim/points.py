@@ -20,7 +20,6 @@ from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.sim import clouds, events, imu
 from gpvo.sim.events import Episode, draw_episodes
-from gpvo.sim.paths import Path3
 from gpvo.sim.points_scenario import SCENARIOS, PointsScenario, check_values
 from gpvo.types import Array, ImuLog
 
@@ -51,7 +50,7 @@ class PointsFlight:
         """Write the stereo tracks, truth, IMU and episodes as ``.npz``; equal flights give equal bytes."""
         target = Path(path)
         c, noise = self.scenario.camera, self.imu.noise
-        every = round(self.scenario.imu_rate_hz / self.scenario.rate_hz)
+        at_frames = self.motion.thinned(self.scenario.imu_samples_per_frame)
         assert noise is not None
         arrays = {
             "t_s": self.t_s, "frame": self.frame, "track": self.track,
@@ -60,10 +59,8 @@ class PointsFlight:
             "width": c.width, "height": c.height,
             "T_world_cam": self.T_world_cam, "sigma_translation_m": 0.0, "sigma_rotation_rad": 0.0,
             "R_cam_body": T_BODY_CAM[:3, :3].T, "p_body_cam_in_body_m": T_BODY_CAM[:3, 3],
-            "gyro_body_radps": self.imu.gyro_radps[::every],
-            "vel_body_mps": np.einsum(
-                "nji,nj->ni", self.motion.R_world_body[::every], self.motion.velocity_mps[::every]
-            ),
+            "gyro_body_radps": self.imu.gyro_radps[:: self.scenario.imu_samples_per_frame],
+            "vel_body_mps": np.einsum("nji,nj->ni", at_frames.R_world_body, at_frames.velocity_mps),
             "imu_t_ns": self.imu.t_ns, "imu_gyro_radps": self.imu.gyro_radps, "imu_acc_mps2": self.imu.acc_mps2,
             "imu_noise": np.array([noise.gyro_density_radps_sqrthz, noise.acc_density_mps2_sqrthz,
                                    noise.gyro_walk_radps2_sqrthz, noise.acc_walk_mps3_sqrthz]),
@@ -78,17 +75,9 @@ T_BODY_CAM = se3.from_rt(R_FLU_OPTICAL, np.array([0.12, 0.0, 0.02]))
 
 
 def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: object) -> PointsFlight:
-    """Fly a scenario once.
+    """Fly a scenario, or that of a name of :data:`SCENARIOS`, once; ``overrides``: single values of it.
 
-    Parameters
-    ----------
-    scenario : a name of :data:`SCENARIOS`, or a scenario.
-    overrides : single values of :class:`PointsScenario`.
-
-    Raises
-    ------
-    GpvoError
-        For an unknown scenario or value.
+    Raises GpvoError for an unknown scenario or value.
     """
     if isinstance(scenario, str):
         if scenario not in SCENARIOS:
@@ -99,11 +88,11 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     try:
         chosen = replace(chosen, **overrides)  # type: ignore[arg-type]
     except TypeError as error:
-        raise GpvoError(
-            f"unknown scenario value: {error}", cure="see gpvo.sim.points_scenario.PointsScenario"
-        ) from None
+        cure = "see gpvo.sim.points_scenario.PointsScenario"
+        raise GpvoError(f"unknown scenario value: {error}", cure=cure) from None
     check_values(vars(chosen))
-    chosen = _in_step(chosen)
+    # The IMU's rate is a whole multiple of the frames', the nearest, so that frames come as asked for.
+    chosen = replace(chosen, imu_rate_hz=chosen.imu_samples_per_frame * chosen.rate_hz)
     # One stream per purpose: more noise must not move the path.
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 77]).spawn(7)]
     scene = streams[0]
@@ -112,21 +101,13 @@ def simulate_points(scenario: str | PointsScenario, seed: int = 0, **overrides: 
     path, cloud = clouds.make(
         chosen.world, chosen.path, chosen.duration_s, chosen.speed_mps, scene, chosen.rest_s, chosen.waypoints
     )
-    return _fly(name, seed, chosen, path, cloud, streams)
-
-
-def _in_step(scenario: PointsScenario) -> PointsScenario:
-    """The same with the IMU's rate a whole multiple of the frames', the nearest, so that frames come as asked for."""
-    every = max(1, round(scenario.imu_rate_hz / scenario.rate_hz))
-    return replace(scenario, imu_rate_hz=every * scenario.rate_hz)
+    return _fly(name, seed, chosen, path.motion(chosen.imu_rate_hz), cloud, streams)
 
 
 def _fly(
-    name: str, seed: int, scenario: PointsScenario, path: Path3, cloud: Array, streams: list[np.random.Generator]
+    name: str, seed: int, scenario: PointsScenario, motion: imu.Motion, cloud: Array, streams: list[np.random.Generator]
 ) -> PointsFlight:
-    motion = path.motion(scenario.imu_rate_hz)
-    every = round(scenario.imu_rate_hz / scenario.rate_hz)
-    at_frames = motion.thinned(every)
+    at_frames = motion.thinned(scenario.imu_samples_per_frame)
     T_world_cam = se3.from_rt(at_frames.R_world_body, at_frames.position_m) @ T_BODY_CAM
     log, _, _ = imu.measured_imu(motion, imu.PRESETS[scenario.imu], streams[1])
     episodes = draw_episodes(
@@ -137,21 +118,21 @@ def _fly(
     bodies = events.draw_movers(
         at_frames.t_s, T_world_cam, streams[6], cars=scenario.cars, smoke=scenario.smoke, dust=scenario.dust
     )
-    frames = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams, bodies)
-    counts = [len(f[0]) for f in frames]
+    seen = observe(scenario, at_frames.t_s, T_world_cam, cloud, episodes, streams, bodies)
+    track, uv_left, uv_right = (np.concatenate(of_frames) for of_frames in zip(*seen))
     return PointsFlight(
         name=name,
         seed=seed,
         scenario=scenario,
-        frame=np.repeat(np.arange(len(frames)), counts).astype(np.int32),
-        track=np.concatenate([f[0] for f in frames]).astype(np.int32),
-        uv_left=np.concatenate([f[1] for f in frames]).astype(np.float32),
-        uv_right=np.concatenate([f[2] for f in frames]).astype(np.float32),
+        frame=np.repeat(np.arange(len(seen)), [len(of_frame[0]) for of_frame in seen]).astype(np.int32),
+        track=track.astype(np.int32),
+        uv_left=uv_left.astype(np.float32),
+        uv_right=uv_right.astype(np.float32),
         t_s=at_frames.t_s,
         T_world_cam=T_world_cam,
         motion=motion,
         imu=log,
-        episodes=tuple(episodes),
+        episodes=episodes,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -49,6 +49,11 @@ class PointsScenario:
     tolerance: Tolerance = field(default_factory=Tolerance)
     offset: Tolerance = field(default_factory=Tolerance)  # fixed part of the difference
 
+    @property
+    def imu_samples_per_frame(self) -> int:
+        """The IMU's rate over that of the frames, nearest whole number."""
+        return max(1, round(self.imu_rate_hz / self.rate_hz))
+
 
 SCENARIOS: dict[str, PointsScenario] = {
     "tunnel-clean": PointsScenario(),
@@ -85,11 +90,13 @@ def _within(least: float, most: float, kind: type = float) -> Callable[[Any], bo
     return lambda v: isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= most
 
 
-_is_time = _within(0.0, 1e6)
+def _list_of(fits: Callable[[Any], bool], count: int | None = None) -> Callable[[Any], bool]:
+    """Of so many, any number by default."""
+    return lambda v: isinstance(v, (list, tuple)) and count in (None, len(v)) and all(map(fits, v))
 
 
-def _is_place(v: Sequence[Any]) -> bool:
-    return [*map(_within(-1e6, 1e6), v)] == [True] * 3
+_are_times, _is_place = _list_of(_within(0.0, 1e6), 2), _list_of(_within(-1e6, 1e6), 3)
+_are_causes = _list_of(lambda c: c in tuple(CAUSES))
 
 
 _RULES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
@@ -103,18 +110,10 @@ _RULES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     (
         "dark frozen",
         "two times in s, the earlier one first",
-        lambda v: v is None or (isinstance(v, (list, tuple)) and [*map(_is_time, v)] == [True, True] and v[0] <= v[1]),
+        lambda v: v is None or (_are_times(v) and v[0] <= v[1]),
     ),
-    (
-        "waypoints",
-        "places, [[x, y, z], ...]",
-        lambda v: isinstance(v, (list, tuple)) and all(isinstance(p, (list, tuple)) and _is_place(p) for p in v),
-    ),
-    (
-        "causes",
-        f"some of {', '.join(CAUSES)}",
-        lambda v: isinstance(v, (list, tuple)) and len(v) > 0 and all(c in tuple(CAUSES) for c in v),
-    ),
+    ("waypoints", "places, [[x, y, z], ...]", _list_of(_is_place)),
+    ("causes", f"some of {', '.join(CAUSES)}", lambda v: _are_causes(v) and len(v) > 0),
     ("imu", f"one of {', '.join(imu.PRESETS)}", lambda v: isinstance(v, str) and v in imu.PRESETS),
     ("world path", "text", lambda v: isinstance(v, str)),
     ("camera", "a StereoCamera; in a file, set camera itself", lambda v: isinstance(v, StereoCamera)),

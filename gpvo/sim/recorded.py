@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
-from gpvo.sim.paths import RAMP_S, Path3, knots, smooth_start
+from gpvo.sim.paths import RAMP_S, Path3, knots, rotations, smooth_start
 from gpvo.types import Array
 
 _STEP_S = 0.02
@@ -49,8 +49,7 @@ class Recording:
         t = knots(duration_s)
 
         def attitude(u: Array) -> Array:
-            turned = se3.from_quaternion(np.zeros((len(u), 3)), pose(smooth_start(u, rest_s)))[:, :3, :3]
-            return turn @ turned @ turn.T @ _about_z(heading_rad)
+            return turn @ rotations(pose(smooth_start(u, rest_s))) @ turn.T @ _about_z(heading_rad)
 
         return Path3(make_interp_spline(t, place(smooth_start(t, rest_s)), k=5), attitude, duration_s)
 
@@ -103,7 +102,7 @@ def smooth_path(t_s: Array, T_world_body: Array) -> Path3:
     grid = np.arange(0.0, t_s[-1] + 0.3, _STEP_S)
     poses = _resample(t_s, T_world_body, np.minimum(grid, t_s[-1]))
     place, turn = (make_interp_spline(grid, v, k=5) for v in _smoothed(poses[:, :3, 3], poses[:, :3, :3]))
-    return Path3(place, lambda u: se3.from_quaternion(np.zeros((len(u), 3)), turn(u))[:, :3, :3], float(t_s[-1]))
+    return Path3(place, lambda u: rotations(turn(u)), float(t_s[-1]))
 
 
 def longest_flight_s(length_s: float, rest_s: float = 3.0) -> float:

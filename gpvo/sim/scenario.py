@@ -170,9 +170,8 @@ def points_scenario(scenario: Scenario) -> PointsScenario:
 
 def warn_of_unused(scenario: Scenario) -> None:
     """Warn of values, other than the scenario's usual ones, that a flight without images does not use."""
-    usual = (
-        load_scenario(scenario.name) if scenario.name in names() else Scenario.model_validate({"name": scenario.name})
-    )
+    own = scenario.name
+    usual = load_scenario(own) if own in names() else Scenario.model_validate({"name": own})
     for name, instead in _IMAGES_ALONE.items():
         if getattr(scenario, name) != getattr(usual, name) and instead.removeprefix("points.") not in scenario.points:
             cure = f"; set {instead}" if instead else ""
@@ -266,16 +265,12 @@ def fly(
     scenario: Scenario, seed: int, out: Path, points: bool = False, threads: int = 1,
     on_frame: Callable[[], None] | None = None,
 ) -> Flight:  # fmt: skip
-    """One flight with images, a folder, or without, an ``.npz``. Raises GpvoError where it goes wrong."""
+    """One flight with images, a folder that stays if it is this very flight, or without, an ``.npz``, always written
+    anew. Raises GpvoError where it goes wrong."""
     if points:
-        return fly_points(scenario, seed, out)
+        flight = simulate_points(points_scenario(scenario), seed)
+        flight.save(out)
+        return Flight(seed, out, len(flight.t_s), float(path_length_m(flight.motion.position_m)[-1]))
     from gpvo.sim.sequence import simulate
 
     return simulate(scenario, seed, out, threads=threads, on_frame=on_frame)
-
-
-def fly_points(scenario: Scenario, seed: int, out: Path) -> Flight:
-    """One flight without images, written as ``.npz``; an existing file of that name is written anew."""
-    flight = simulate_points(points_scenario(scenario), seed)
-    flight.save(out)
-    return Flight(seed, out, len(flight.t_s), float(path_length_m(flight.motion.position_m)[-1]))

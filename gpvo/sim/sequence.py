@@ -55,12 +55,7 @@ _TRUTH_HEAD = (
 
 
 def simulate(
-    scenario: Scenario,
-    seed: int,
-    out: str | Path,
-    *,
-    threads: int = 2,
-    on_frame: Callable[[], None] | None = None,
+    scenario: Scenario, seed: int, out: str | Path, *, threads: int = 2, on_frame: Callable[[], None] | None = None
 ) -> Flight:
     """Write a sequence folder; a finished one with the same scenario and seed is left as it is.
 
@@ -73,11 +68,10 @@ def simulate(
     resolved = to_toml({"seed": seed, **scenario.model_dump(), **_digests(scenario)})
     with _only_writer(target):
         if _is_finished(target, resolved):
-            poses = np.loadtxt(
-                target / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",", usecols=(1, 2, 3), ndmin=2
-            )
+            states = target / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+            position_m = np.loadtxt(states, delimiter=",", usecols=(1, 2, 3), ndmin=2)
             frames = sum(1 for _ in (target / "mav0" / "cam0" / "data.csv").open()) - 1
-            return Flight(seed, target, frames, float(path_length_m(poses)[-1]), redone=False)
+            return Flight(seed, target, frames, float(path_length_m(position_m)[-1]), redone=False)
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
         try:
@@ -88,12 +82,10 @@ def simulate(
                 target.rmdir()
             os.replace(part, target)
         except OSError as error:
-            shutil.rmtree(part, ignore_errors=True)
             cure = "free some space and run again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else None
             raise GpvoError(f"cannot be written: {error.strerror}", where=target, cure=cure) from None
-        except BaseException:
+        finally:
             shutil.rmtree(part, ignore_errors=True)
-            raise
     return Flight(seed, target, frames, distance)
 
 
@@ -193,8 +185,9 @@ def _write_images(
     on_frame: Callable[[], None],
 ) -> int:  # fmt: skip
     mav = folder / "mav0"
-    for camera in ("cam0", "cam1"):
-        (mav / camera / "data").mkdir(parents=True, exist_ok=True)
+    cameras = mav / "cam0", mav / "cam1"
+    for camera in cameras:
+        (camera / "data").mkdir(parents=True, exist_ok=True)
     stamps: list[int] = []
     shown = seen_before = None
     pending: list[Future[None]] = []
@@ -216,14 +209,15 @@ def _write_images(
                     flow_px = optical_flow(eye.model, depth_m, eye.depth_m, T_world_cam, eye.T_world_cam)
                     pending.append(pool.submit(_save_array, mav / "flow0" / f"{before}.npy", flow_px))
                 seen_before = (stamp, eye.depth_m, eye.T_world_cam)
-            for camera, image in zip(("cam0", "cam1"), shown):
-                pending.append(pool.submit(_save, mav / camera / "data" / f"{stamp}.png", image))
+            for camera, image in zip(cameras, shown):
+                pending.append(pool.submit(_save, camera / "data" / f"{stamp}.png", image))
             while len(pending) > _AHEAD:
                 pending.pop(0).result()
         for job in pending:
             job.result()
-    for camera in ("cam0", "cam1"):
-        _write_image_list(folder, camera, stamps)
+    for camera in cameras:
+        lines = [_CAMERA_HEAD, *(f"{t},{t}.png" for t in stamps)]
+        (camera / "data.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return len(stamps)
 
 
@@ -279,12 +273,6 @@ def _write_truth(folder: Path, t_ns: NDArray[np.int64], motion: Motion, bias_gyr
     _csv(base / "data.csv", _TRUTH_HEAD, t_ns, rows)
 
 
-def _write_image_list(folder: Path, camera: str, stamps: list[int]) -> None:
-    """``data.csv`` of one camera."""
-    lines = [_CAMERA_HEAD, *(f"{t},{t}.png" for t in stamps)]
-    (folder / "mav0" / camera / "data.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def _lens(lens: CameraModel, distortion_key: str) -> dict[str, Any]:
     fisheye = lens.kind == "kannala-brandt"
     return {
@@ -331,7 +319,6 @@ def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns:
         tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
     sheet = np.vstack([np.hstack(tiles[r * columns : (r + 1) * columns]) for r in range(rows)])
     target = Path(out)
-    data = cv2.imencode(".png", sheet)[1].tobytes()
     target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_bytes(data)
+    target.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
     return target

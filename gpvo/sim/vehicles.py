@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from gpvo.errors import GpvoError, MissingExtraError
 from gpvo.geometry import se3
 from gpvo.sim.imu import Motion
-from gpvo.sim.paths import Path3
+from gpvo.sim.paths import Path3, rotations
 from gpvo.sim.worlds import HeightGrid
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array
 
@@ -79,7 +79,7 @@ def fly(path: Path3) -> Motion:
             data.ctrl[:] = np.clip(unmix @ wrench, 0.0, model.actuator_ctrlrange[0, 1])
         data.xfrc_applied[1, :3] = -_DRAG * data.qvel[:3]
         mujoco.mj_step(model, data)
-    return differentiate(states[:, :3], se3.from_quaternion(states[:, :3], np.roll(states[:, 3:], -1, 1))[:, :3, :3])
+    return differentiate(states[:, :3], rotations(np.roll(states[:, 3:], -1, 1)))
 
 
 def _thrust_and_torque(
@@ -105,7 +105,7 @@ def _thrust_and_torque(
 
 
 def _attitude(data: Any) -> Array:
-    return se3.from_quaternion(np.zeros((1, 3)), np.roll(data.qpos[3:7], -1)[None])[0, :3, :3]
+    return rotations(np.roll(data.qpos[3:7], -1)[None])[0]
 
 
 def differentiate(position: Array, R_world_body: Array) -> Motion:
@@ -146,8 +146,7 @@ def drive(path: Path3, ground: HeightGrid) -> Motion:
         mujoco.mj_step(model, data)
     width = _SMOOTH_S * RATE_HZ
     smooth = gaussian_filter1d(states, width, axis=0, mode="nearest")[settle : settle + steps]
-    position, turned = smooth[:, :3], smooth[:, 3:]
-    return differentiate(position, se3.from_quaternion(position, np.roll(turned, -1, 1))[:, :3, :3])
+    return differentiate(smooth[:, :3], rotations(np.roll(smooth[:, 3:], -1, 1)))
 
 
 def _on_ground(ground: HeightGrid, target: Array, heading: float) -> tuple[Any, Any, Any]:

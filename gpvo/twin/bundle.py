@@ -43,19 +43,12 @@ class Observations:
     uvd: Array
     trusted: NDArray[np.bool_]
 
-    def sums(self, index: NDArray[np.int64], count: int) -> sparse.csr_matrix:
-        """(count, M) matrix that adds the rows of equal index."""
-        m = len(index)
-        return sparse.csr_matrix((np.ones(m), (index, np.arange(m))), shape=(count, m))
-
     def parts(self) -> Iterator[tuple[slice, Observations]]:
         """A hundred thousand at a time: matrices of each observation would need a gigabyte for a million."""
         for i in range(0, len(self.frame), _PART):
             rows = slice(i, i + _PART)
-            yield (
-                rows,
-                Observations(self.camera, self.frame[rows], self.track[rows], self.uvd[rows], self.trusted[rows]),
-            )
+            part = Observations(self.camera, self.frame[rows], self.track[rows], self.uvd[rows], self.trusted[rows])
+            yield rows, part
 
 
 @dataclass(frozen=True)
@@ -119,10 +112,11 @@ def _projection_jacobian(P: Array, camera: StereoCamera) -> Array:
     return J
 
 
-def summed(sums: sparse.csr_matrix, blocks: Array) -> Array:
-    """Blocks (M, ...) added by rows of equal index."""
-    total = sums @ blocks.reshape(len(blocks), -1)
-    return np.asarray(total).reshape(-1, *blocks.shape[1:])
+def summed(blocks: Array, index: NDArray[np.int64], count: int) -> Array:
+    """(count, ...) blocks (M, ...), those of equal ``index`` (M,) added."""
+    m = len(index)
+    adding = sparse.csr_matrix((np.ones(m), (index, np.arange(m))), shape=(count, m))
+    return np.asarray(adding @ blocks.reshape(m, -1)).reshape(-1, *blocks.shape[1:])
 
 
 def transform(T: Array, points: Array) -> Array:
@@ -183,11 +177,10 @@ class NormalEquations:
             A[part.frame == 0] = 0.0  # the first pose stays
             D = slope @ np.swapaxes(R[part.frame], 1, 2) @ lift[part.track]
             At, Dt = np.swapaxes(A, 1, 2), np.swapaxes(D, 1, 2)
-            by_frame = part.sums(part.frame, n_frames)
-            B += summed(by_frame, At @ A)
-            by_pose += summed(by_frame, (At @ r)[:, :, 0])
-            C += summed(part.sums(pieces.piece[rows], len(C)), Dt @ D)
-            by_point += summed(part.sums(part.track, n_tracks), (Dt @ r)[:, :, 0])
+            B += summed(At @ A, part.frame, n_frames)
+            by_pose += summed((At @ r)[:, :, 0], part.frame, n_frames)
+            C += summed(Dt @ D, pieces.piece[rows], len(C))
+            by_point += summed((Dt @ r)[:, :, 0], part.track, n_tracks)
             blocks[rows] = At @ D
         starts = np.searchsorted(seen.frame, np.arange(n_frames + 1))
         E = sparse.bsr_matrix((blocks, seen.track, starts), shape=(6 * n_frames, 3 * n_tracks))
@@ -195,11 +188,8 @@ class NormalEquations:
 
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Steps (F, 6) and (N, 3) of the damped equations."""
-        whole = sparse.csr_matrix((np.ones(len(self.C)), (self.pieces.track, np.arange(len(self.C)))))
-        B = damped(self.B, damping)
-        C_inverse, of_pieces = (
-            np.asarray(np.linalg.inv(damped(C, damping)), np.float64) for C in (summed(whole, self.C), self.C)
-        )
+        B, whole = damped(self.B, damping), summed(self.C, self.pieces.track, len(self.point_gradient))
+        C_inverse, of_pieces = (np.asarray(np.linalg.inv(damped(C, damping)), np.float64) for C in (whole, self.C))
         E_rows, E_columns = self.E, self.E.T
         eliminated = (C_inverse @ self.point_gradient[:, :, None])[:, :, 0]
         right = self.pose_gradient - (E_rows @ eliminated.ravel()).reshape(-1, 6)
@@ -231,8 +221,7 @@ class NormalEquations:
                 taken = self.E.data[b] @ C_inverse[piece[a]] @ np.swapaxes(self.E.data[a], 1, 2)
                 near, far = self.seen.frame[a], self.seen.frame[b]
                 places, place = np.unique((far - near) * n + near, return_inverse=True)
-                sums = sparse.csr_matrix((np.ones(len(place)), (place, np.arange(len(place)))))
-                blocks[places] -= summed(sums, taken)
+                blocks[places] -= summed(taken, place, len(places))
         band = np.zeros((6 * REACH, 6 * n))
         by_distance = blocks.reshape(REACH, n, 6, 6)
         for d in range(REACH):

@@ -24,9 +24,8 @@ from scipy.spatial import cKDTree
 from gpvo.geometry import se3
 from gpvo.twin.bundle import WHITEN, Chart, Estimate, NormalEquations, Observations, Pieces
 from gpvo.types import Array
+from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, huber
 
-_CHI2_3_MEDIAN, _CHI2_3_999 = 2.366, 16.266
-_HUBER_SIGMAS = 3.2
 _MIN_SIGMA_PX = 0.02
 # Iterations in which weights may change; then they stand, so that the cost has one minimum.
 _CHOOSING = 6
@@ -44,12 +43,7 @@ class Structure(Estimate):
 
 
 def adjust(
-    seen: Observations,
-    T_world_cam: Array,
-    *,
-    robust: bool = True,
-    tolerance: float = 1e-4,
-    max_iterations: int = 30,
+    seen: Observations, T_world_cam: Array, *, robust: bool = True, tolerance: float = 1e-4, max_iterations: int = 30
 ) -> Structure:
     """Fit path and landmarks, from the path (F, 4, 4) that odometry found; the first pose stays.
 
@@ -96,10 +90,9 @@ def _robust_weights(seen: Observations, now: Estimate, sigma: Array) -> tuple[Ar
         own = m2[i:j][seen.trusted[i:j]]
         if len(own) >= 5:
             variance[k] = np.median(own)
-    sigma = np.maximum(np.sqrt(variance / _CHI2_3_MEDIAN), _MIN_SIGMA_PX)
+    sigma = np.maximum(np.sqrt(variance / CHI2_3_MEDIAN), _MIN_SIGMA_PX)
     ratio = m2 / sigma[seen.frame] ** 2
-    huber = np.minimum(1.0, _HUBER_SIGMAS / np.sqrt(np.maximum(ratio, 1e-12)))
-    return np.where(seen.trusted & (ratio < _CHI2_3_999), huber, 0.0), sigma
+    return np.where(seen.trusted & (ratio < CHI2_3_999), huber(ratio), 0.0), sigma
 
 
 def _cost(seen: Observations, now: Estimate, root_weight: Array) -> float:

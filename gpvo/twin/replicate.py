@@ -53,10 +53,8 @@ class Original:
 def estimate(path: Path) -> Original:
     """The structure of a run.
 
-    Raises
-    ------
-    SourceError
-        Where the run holds no tracks, no camera, or too few points to tell path, landmarks and noise apart.
+    Raises SourceError where the run holds no tracks, no camera, or too few points to tell path, landmarks and noise
+    apart.
     """
     run = read_run(path)
     tracks = read_tracks(path)
@@ -210,10 +208,7 @@ def make_twins(
 ) -> list[Path]:
     """Twins of one run as run folders ``out/NAME-twinK``, by the odometry and the settings of the run.
 
-    Raises
-    ------
-    SourceError
-        As :func:`estimate`, and where the folder holds twins that these would not replace.
+    Raises SourceError as :func:`estimate`, and where the folder holds twins that these would not replace.
     """
     made = range(settings.replicates)
     others = (p for p in sorted(out.glob("*-twin*/")) if p.name.rpartition("-twin")[2] not in map(str, made))

@@ -106,10 +106,7 @@ _SWITCH = {"on": True, "true": True, "off": False, "false": False}
 def make_config(preset: str = "fast", **overrides: object) -> VoConfig:
     """A preset with single values replaced.
 
-    Raises
-    ------
-    GpvoError
-        For an unknown preset, setting or covariance method, or a value out of its range.
+    Raises GpvoError for an unknown preset, setting or covariance method, or a value out of its range.
     """
     if preset not in PRESETS:
         raise GpvoError(f"unknown preset '{preset}'", cure=f"choose one of {', '.join(PRESETS)}")
@@ -130,10 +127,7 @@ def make_config(preset: str = "fast", **overrides: object) -> VoConfig:
 def read_settings(texts: Sequence[str]) -> dict[str, Any]:
     """Values of :class:`VoConfig` from texts such as ``klt_window_px=21``; ``auto`` is None, commas part lists.
 
-    Raises
-    ------
-    GpvoError
-        For an unknown name, or a value of the wrong type.
+    Raises GpvoError for an unknown name, or a value of the wrong type.
     """
     kinds = get_type_hints(VoConfig)
     names = [f.name for f in fields(VoConfig) if f.name not in ("preset", "sigma_pairs_px")]

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpvo.geometry import se3
 from gpvo.geometry.covariance import symmetrise
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.config import KNOWN_DEPTH_PX, pair_method
+from gpvo.vo.config import KNOWN_DEPTH_PX, VoConfig, pair_method
 from gpvo.vo.motion import Transfer, apply_whitener, residual_covariance, transfer, whitener
 from gpvo.vo.points import (
     no_farther_than,
@@ -52,10 +53,7 @@ def motion_covariance(
     exact_points : treat the reference points as exact, as PnP does: 2 to 4 times overconfident in NEES.
     moved : the transfer of the same points by the same motion, if already computed.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the points do not determine the motion.
+    Raises numpy.linalg.LinAlgError if the points do not determine the motion.
     """
     moved = moved or transfer(T_prev_cur, uvd_prev, camera)
     C = residual_covariance(moved.G, np.zeros((3, 3)) if exact_points else S_uvd, S_uvd)
@@ -70,19 +68,13 @@ def spherical_covariance(
 
     Depth is by far the worst axis, so a sphere wastes the accuracy that the image has sideways.
     """
-    R = T_prev_cur[:3, :3]
     P = triangulate(uvd_cur, camera)
-    U = point_covariance(uvd_cur, camera, S_uvd)
-    V = point_covariance(uvd_prev, camera, S_uvd)
+    U, V = (point_covariance(uvd, camera, S_uvd) for uvd in (uvd_cur, uvd_prev))
     weight = 3.0 / (np.trace(U, axis1=1, axis2=2) + np.trace(V, axis1=1, axis2=2))
     # R drops out of H^T W H for a scalar W.
-    H = np.zeros((len(P), 3, 6))
-    H[:, :, :3] = np.eye(3)
-    H[:, 0, 4], H[:, 0, 5] = P[:, 2], -P[:, 1]
-    H[:, 1, 3], H[:, 1, 5] = -P[:, 2], P[:, 0]
-    H[:, 2, 3], H[:, 2, 4] = P[:, 1], -P[:, 0]
+    H = np.concatenate([np.broadcast_to(np.eye(3), (len(P), 3, 3)), -se3.skew(P)], axis=2)
     A = (H * np.sqrt(weight)[:, None, None]).reshape(-1, 6)
-    return _from_information(A.T @ A, R)
+    return _from_information(A.T @ A, T_prev_cur[:3, :3])
 
 
 def _from_information(information: Array, R_prev_cur: Array) -> MotionCovariance:
@@ -98,43 +90,34 @@ def _from_information(information: Array, R_prev_cur: Array) -> MotionCovariance
 
 
 def covariances_by_method(
-    methods: tuple[str, ...],
+    config: VoConfig,
+    sigmas_px: tuple[float, float],
     T_prev_cur: Array,
     uvd_prev: Array,
     uvd_cur: Array,
     camera: StereoCamera,
     *,
-    sigma_px: float,
-    sigma_p_px: float,
-    sigma_m_px: float,
-    sigma_pairs_px: tuple[tuple[float, float], ...] = (),
     moved: Transfer | None = None,
     information: Callable[[Array], Array] | None = None,
 ) -> dict[str, MotionCovariance]:
-    """Every requested method and pair of sigmas over the same inliers, sharing the derivatives.
+    """Every method and pair of sigmas of ``config`` over the same inliers, sharing the derivatives.
 
-    ``moved``: the transfer of the same points by the same motion, if at hand. ``information``: (6, 6) of the motion for
-    a (3, 3) covariance of a measurement, where it is known from more than two frames; a sphere knows two.
+    ``sigmas_px``: pointing and matching as they are now. ``moved``: the transfer of the same points by the same motion,
+    if at hand. ``information``: (6, 6) of the motion for a (3, 3) covariance of a measurement, where it is known from
+    more than two frames; a sphere knows two.
     """
-
-    def stated(S_uvd: Array) -> MotionCovariance:
-        if information is not None:
-            return _from_information(information(S_uvd), T_prev_cur[:3, :3])
-        return motion_covariance(T_prev_cur, uvd_prev, camera, S_uvd, moved=moved)
-
     moved = moved or transfer(T_prev_cur, uvd_prev, camera)
-    S = {
-        "triangulation": triangulation_pixel_covariance(sigma_px),
-        "pointing_matching": pointing_matching_pixel_covariance(sigma_p_px, sigma_m_px),
-    }
+    triangulation = triangulation_pixel_covariance(config.sigma_px)
+    S = {"triangulation": triangulation, "pointing_matching": pointing_matching_pixel_covariance(*sigmas_px)}
+    S |= {pair_method(*pair): pointing_matching_pixel_covariance(*pair) for pair in config.sigma_pairs_px}
     out: dict[str, MotionCovariance] = {}
-    for method in methods:
+    for method in config.stated:
         if method == "spherical":
             # A sphere has a place: those of far points are put where depth begins to be known.
             prev, cur = (no_farther_than(a, KNOWN_DEPTH_PX) for a in (uvd_prev, uvd_cur))
-            out[method] = spherical_covariance(T_prev_cur, prev, cur, camera, S["triangulation"])
+            out[method] = spherical_covariance(T_prev_cur, prev, cur, camera, triangulation)
+        elif information is not None:
+            out[method] = _from_information(information(S[method]), T_prev_cur[:3, :3])
         else:
-            out[method] = stated(S[method])
-    for p, m in sigma_pairs_px:
-        out[pair_method(p, m)] = stated(pointing_matching_pixel_covariance(p, m))
+            out[method] = motion_covariance(T_prev_cur, uvd_prev, camera, S[method], moved=moved)
     return out

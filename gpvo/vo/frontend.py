@@ -6,9 +6,10 @@ brute-force matching left to right and to the previous frame). That of Lucas and
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from gpvo.types import Array, StereoCamera, StereoFrame, StereoTracks, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import VoConfig
-from gpvo.vo.opencv import ImageStats, image_stats
+from gpvo.vo.opencv import ImageStats, Light, Points, image_stats
 from gpvo.vo.rig_error import RigError
 
 
@@ -106,72 +107,85 @@ class Frontend(Protocol):
         """
 
 
-class TrackFrontend:
-    """For stereo tracks: points are matched by their identity."""
+def stereo_uvd(left: Points, right: Points) -> tuple[Array, Array]:
+    """(u, v, d) (N, 3) of pixels (N, 2) in the left and the right image, and by how much the right row lies below the
+    left one (N,)."""
+    left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
+    uvd = np.column_stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), left[:, 0] - right[:, 0]])
+    return uvd, right[:, 1] - left[:, 1]
 
-    def __init__(self, rig_error: RigError, config: VoConfig) -> None:
-        self._rig_error = rig_error
-        self._min_disparity_px = config.min_disparity_px
-        self._max_row_error_px = config.max_row_error_px
-        self._previous: tuple[NDArray[np.int64], Array] | None = None
-        self._current: tuple[NDArray[np.int64], Array] | None = None
-        self._row_error: Array = np.empty(0)
-        self._detected = 0
 
-    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
-        """Take in a :class:`TrackFrame`; a non-finite pixel or an impossible disparity drops its point."""
-        assert isinstance(frame, TrackFrame)
-        left, right = np.asarray(frame.uv_left, np.float64), np.asarray(frame.uv_right, np.float64)
-        uvd = np.stack([left[:, 0], 0.5 * (left[:, 1] + right[:, 1]), left[:, 0] - right[:, 0]], 1)
-        row_error = right[:, 1] - left[:, 1]
-        good = self._rig_error.allows(uvd, row_error, self._min_disparity_px, np.inf, max(self._max_row_error_px, 3.0))
-        self._detected = len(left)
-        track, first = np.unique(frame.track[good], return_index=True)
-        before, self._current = self._current, (track, uvd[good][first])
-        self._row_error = row_error[good][first]
-        repeated = before is not None and len(track) > 0 and np.array_equal(before[1], self._current[1])
-        return Observation(None, repeated)
+@dataclass(frozen=True)
+class _Measured:
+    """Stereo points of one frame: ``uvd`` (N, 3), ``row_error`` (N,), and the ``mark`` (N, ...) by which they are known
+    again. ``detected``: points of the left image, with or without a right one."""
+
+    uvd: Array
+    row_error: Array
+    mark: NDArray[Any]
+    detected: int
+
+
+class _AfreshFrontend(ABC):
+    """Measures every frame for itself, and finds the points of the reference by their marks."""
+
+    _reference: _Measured | None = None
+    _current: _Measured | None = None
+
+    @abstractmethod
+    def _pairs(self, before: NDArray[Any], now: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Places of equal marks."""
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
-        """Pair the points of equal identity."""
-        if self._previous is None or self._current is None:
+        """Pair the points of equal marks; the guess is not used."""
+        if self._reference is None or self._current is None:
             return EMPTY
-        _, i, j = np.intersect1d(self._previous[0], self._current[0], assume_unique=True, return_indices=True)
-        sought = self._previous[1]
-        return Matches(sought[i], self._current[1][j], self._row_error[j], len(i), sought_uvd=sought)
+        i, j = self._pairs(self._reference.mark, self._current.mark)
+        return Matches(self._reference.uvd[i], self._current.uvd[j], self._current.row_error[j], len(i))
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """See :class:`Frontend`."""
         assert self._current is not None
-        if len(self._current[0]) >= at_least:
-            self._previous = self._current
-        return self._detected, len(self._current[0])
+        if len(self._current.uvd) >= at_least:
+            self._reference = self._current
+        return self._current.detected, len(self._current.uvd)
 
 
-@dataclass(frozen=True)
-class _Features:
-    """Stereo-matched corners of one frame: ``uvd`` (N, 3), ``row_error`` (N,), ``bits`` (N, 61) of the left
-    descriptors."""
+class TrackFrontend(_AfreshFrontend):
+    """For stereo tracks: points are matched by their identity."""
 
-    uvd: Array
-    row_error: Array
-    bits: NDArray[np.uint8]
+    def __init__(self, rig_error: RigError, config: VoConfig) -> None:
+        self._rig_error, self._config = rig_error, config
+
+    def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
+        """Take in a :class:`TrackFrame`; a non-finite pixel or an impossible disparity drops its point."""
+        assert isinstance(frame, TrackFrame)
+        uvd, row_error = stereo_uvd(frame.uv_left, frame.uv_right)
+        limit = max(self._config.max_row_error_px, 3.0)
+        good = self._rig_error.allows(uvd, row_error, self._config.min_disparity_px, np.inf, limit)
+        track, first = np.unique(frame.track[good], return_index=True)
+        before, self._current = self._current, _Measured(uvd[good][first], row_error[good][first], track, len(uvd))
+        repeated = before is not None and len(track) > 0 and np.array_equal(before.uvd, self._current.uvd)
+        return Observation(None, repeated)
+
+    def _pairs(self, before: NDArray[Any], now: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return np.intersect1d(before, now, assume_unique=True, return_indices=True)[1:]
+
+    def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
+        """Pair the points of equal identity; all of the reference's were sought."""
+        found = super().match(T_prev_cur_guess)
+        return found if self._reference is None else replace(found, sought_uvd=self._reference.uvd)
 
 
-class DescriptorFrontend:
+class DescriptorFrontend(_AfreshFrontend):
     """Every frame is detected, described and matched afresh (D. Ross, thesis, chapter 2)."""
 
     def __init__(
         self, camera: StereoCamera, rig_error: RigError, config: VoConfig, mask: NDArray[np.bool_] | None = None
     ) -> None:
-        self._camera = camera
-        self._rig_error = rig_error
-        self._config = config
+        self._camera, self._rig_error, self._config = camera, rig_error, config
         self._mask = opencv.as_mask(mask)
-        self._reference: _Features | None = None
-        self._current: _Features | None = None
         self._images: tuple[opencv.Image, opencv.Image] | None = None
-        self._detected = 0
         self._pool = ThreadPoolExecutor(1)
 
     def observe(self, frame: StereoFrame | TrackFrame) -> Observation:
@@ -179,38 +193,23 @@ class DescriptorFrontend:
         assert isinstance(frame, StereoFrame)
         before, self._images = self._images, (frame.left, frame.right)
         right = self._pool.submit(self._features, frame.right)
-        uv_left, bits_left = self._features(frame.left)
+        uv_left, bits = self._features(frame.left)
         uv_right, bits_right = right.result()
-        pairs = opencv.match_mutual(bits_left, bits_right)
-        left, bits = uv_left[pairs[:, 0]].astype(np.float64), bits_left[pairs[:, 0]]
-        matched = uv_right[pairs[:, 1]].astype(np.float64)
-        row_error = matched[:, 1] - left[:, 1]
-        uvd = np.column_stack([left[:, 0], 0.5 * (left[:, 1] + matched[:, 1]), left[:, 0] - matched[:, 0]])
+        i, j = self._pairs(bits, bits_right)
+        uvd, row_error = stereo_uvd(uv_left[i], uv_right[j])
         config = self._config
         limit = config.max_disparity_share * self._camera.width
         good = self._rig_error.allows(uvd, row_error, config.min_disparity_px, limit, 2 * config.max_row_error_px)
-        self._current = _Features(uvd[good], row_error[good], bits[good])
-        self._detected = len(uv_left)
+        self._current = _Measured(uvd[good], row_error[good], bits[i][good], len(uv_left))
         left_same, right_same = (before is not None and np.array_equal(before[k], self._images[k]) for k in range(2))
-        stats = image_stats(frame.left, opencv.halve(frame.left))
+        stats = image_stats(frame.left, Light.of(opencv.halve(frame.left)))
         return Observation(stats, left_same and right_same, right_same and not left_same)
 
-    def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
-        """Match descriptors to the frame before; the guess is not used."""
-        if self._reference is None or self._current is None:
-            return EMPTY
-        pairs = opencv.match_mutual(self._reference.bits, self._current.bits)
-        i, j = pairs.T
-        return Matches(self._reference.uvd[i], self._current.uvd[j], self._current.row_error[j], len(pairs))
+    def _pairs(self, before: NDArray[Any], now: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        i, j = opencv.match_mutual(before, now).T
+        return i, j
 
-    def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
-        """See :class:`Frontend`."""
-        assert self._current is not None
-        if len(self._current.uvd) >= at_least:
-            self._reference = self._current
-        return self._detected, len(self._current.uvd)
-
-    def _features(self, image: opencv.Image) -> tuple[opencv.Points, NDArray[np.uint8]]:
+    def _features(self, image: opencv.Image) -> tuple[Points, NDArray[np.uint8]]:
         config = self._config
         uv = opencv.corners(image, config.max_features, config.corner_quality, config.min_distance_px, self._mask)
         return opencv.describe(image, uv)

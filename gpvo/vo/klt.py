@@ -55,11 +55,6 @@ class _New:
     uvd: Array
     strong: int = 0
 
-    @classmethod
-    def of(cls, detected: int, uv: Points, uvd: Array, good: NDArray[np.bool_]) -> _New:
-        """From corners (M, 2), the first ``detected`` of them strong, and which have a measurement."""
-        return cls(detected, uv[good], uvd[good], int(good[:detected].sum()))
-
 
 _NO_POINTS: Points = np.empty((0, 2), np.float32)
 _NONE_NEW = _New(0, _NO_POINTS, np.empty((0, 3)))
@@ -104,7 +99,7 @@ class KltFrontend:
         same_left = before is not None and _equal(before.half_left, half_left, before.left, frame.left)
         same_right = before is not None and _equal(before.half_right, half_right, before.right, frame.right)
         return Observation(
-            image_stats(frame.left, half_left),
+            image_stats(frame.left, light_left),
             same_right and same_left,
             same_right and not same_left,
             light_left.ratio(light_right),
@@ -208,8 +203,8 @@ class KltFrontend:
         :meth:`_find_right`, the known points first."""
         new_uv, new_disparity, detected = self._new_corners(view, uv)
         found = self._find_right(view, np.concatenate([uv, new_uv]), np.concatenate([disparity, new_disparity]))
-        n = len(uv)
-        self._new = _New.of(detected, new_uv, found[0][n:], found[1][n:])
+        new_uvd, good = found[0][len(uv) :], found[1][len(uv) :]
+        self._new = _New(detected, new_uv[good], new_uvd[good], int(good[:detected].sum()))
         return found
 
     def _find_right(self, view: _View, uv_left: Points, disparity: Array) -> tuple[Array, NDArray[np.bool_], Array]:

@@ -278,6 +278,11 @@ def within(r: Array, tolerance_px: float) -> NDArray[np.bool_]:
     return (np.hypot(r[0], r[1]) < tolerance_px) & (np.abs(r[2]) < 1.5 * tolerance_px)
 
 
+def huber(ratio: Array) -> Array:
+    """Huber's weights for squared distances over the variance of the noise."""
+    return np.minimum(1.0, 3.2 / np.sqrt(np.maximum(ratio, 1e-12)))
+
+
 def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float, Array]:
     """Inliers among the ``close`` points (N,), noise scale [px] and Huber weights from squared Mahalanobis distances at
     unit noise."""
@@ -286,6 +291,4 @@ def _robust_weights(m2: Array, close: NDArray[np.bool_]) -> tuple[NDArray[np.boo
     freedom = max(1.0 - 2.0 / max(int(close.sum()), 1), 1 / 3)
     scale2 = max(float(np.median(m2[close])) / CHI2_3_MEDIAN / freedom if close.any() else 1.0, 0.02**2)
     ratio = m2 / scale2
-    keep = close & (ratio < CHI2_3_999)
-    distance = np.sqrt(np.maximum(ratio, 1e-12))
-    return keep, float(np.sqrt(scale2)), np.minimum(1.0, 3.2 / distance)
+    return close & (ratio < CHI2_3_999), float(np.sqrt(scale2)), huber(ratio)

@@ -80,12 +80,8 @@ class StereoOdometry:
         """Process one frame: how the camera moved since the reference frame.
 
         ``imu`` holds the samples since the last frame, if any. The record gets the mean and spread of all samples since
-        the reference, so that they cover the same interval as its motion.
-
-        Raises
-        ------
-        SourceError
-            If the frame is not later than the last one, or not of the camera's size.
+        the reference, so that they cover the same interval as its motion. Raises SourceError if the frame is not later
+        than the last one, or not of the camera's size.
         """
         clock = Stopwatch()
         check_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
@@ -253,19 +249,15 @@ class StereoOdometry:
         self._sigmas.update(moments)
         if self._sigmas.estimates:
             self._sigmas.design.update(motion, white, self.camera)
-        sigma_p_px, sigma_m_px = self._sigmas.values
         adjusted = self._window.adjust(self._raw, motion)
         T_prev_cur = motion.T_prev_cur if adjusted is None else adjusted.T_ref[-1]
         by_method = covariances_by_method(
-            config.methods,
+            config,
+            self._sigmas.values,
             T_prev_cur,
             motion.uvd_prev,
             matches.uvd_cur[motion.inliers],
             self.camera,
-            sigma_px=config.sigma_px,
-            sigma_p_px=sigma_p_px,
-            sigma_m_px=sigma_m_px,
-            sigma_pairs_px=config.sigma_pairs_px,
             moved=white.moved,
             information=None if adjusted is None else adjusted.information,
         )

@@ -167,34 +167,6 @@ def pose_from_points(
 
 
 @dataclass(frozen=True)
-class ImageStats:
-    """Grey values run from 0 to 1; ``sharpness`` is log10 of the variance of the Laplacian over 0..255."""
-
-    brightness: float
-    contrast: float
-    sharpness: float
-    noise_level: float
-
-
-def image_stats(image: NDArray[np.uint8], half: NDArray[np.uint8]) -> ImageStats:
-    """Statistics of one grey image (H, W) and its half-size version.
-
-    Noise is taken from every third strip of rows at full resolution: averaging to half size would hide it.
-    """
-    mean, std = cv2.meanStdDev(half)
-    _, laplacian_std = cv2.meanStdDev(cv2.Laplacian(half, cv2.CV_16S))
-    rows = image.shape[0] // 3
-    response = cv2.filter2D(image[rows : 2 * rows], cv2.CV_16S, _IMMERKAER)
-    noise = math.sqrt(math.pi / 2) / 6.0 * float(cv2.norm(response, cv2.NORM_L1)) / max(response.size, 1)
-    return ImageStats(
-        float(mean[0, 0]) / 255,
-        float(std[0, 0]) / 255,
-        math.log10(max(float(laplacian_std[0, 0]) ** 2, 1e-3)),
-        noise / 255,
-    )
-
-
-@dataclass(frozen=True)
 class Light:
     """Mean and standard deviation of an image's grey values, 0..255, and where they come from: the half-size image."""
 
@@ -231,3 +203,26 @@ def in_light_of(image: NDArray[np.uint8], own: Light, other: Light) -> NDArray[n
     share, wanted = (np.cumsum(np.bincount(a.half[::2, ::2].ravel(), minlength=256)) for a in (own, other))
     grey = np.interp(share / share[-1], wanted / wanted[-1], np.arange(256.0))
     return np.asarray(cv2.LUT(image, np.rint(grey).astype(np.uint8)), np.uint8)
+
+
+@dataclass(frozen=True)
+class ImageStats:
+    """Grey values run from 0 to 1; ``sharpness`` is log10 of the variance of the Laplacian over 0..255."""
+
+    brightness: float
+    contrast: float
+    sharpness: float
+    noise_level: float
+
+
+def image_stats(image: NDArray[np.uint8], light: Light) -> ImageStats:
+    """Statistics of one grey image (H, W) of this light.
+
+    Noise is taken from every third strip of rows at full resolution: averaging to half size would hide it.
+    """
+    _, laplacian_std = cv2.meanStdDev(cv2.Laplacian(light.half, cv2.CV_16S))
+    rows = image.shape[0] // 3
+    response = cv2.filter2D(image[rows : 2 * rows], cv2.CV_16S, _IMMERKAER)
+    noise = math.sqrt(math.pi / 2) / 6.0 * float(cv2.norm(response, cv2.NORM_L1)) / max(response.size, 1)
+    sharpness = math.log10(max(float(laplacian_std[0, 0]) ** 2, 1e-3))
+    return ImageStats(light.mean / 255, light.std / 255, sharpness, noise / 255)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.cameras.kalibr import make_lens
+from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import CalibrationError, SourceError
@@ -30,9 +32,8 @@ def _power(name: str, n: int) -> str:
 _TERMS = [_power("x", i) + _power("y", j) or "1" for i, j in POWERS.tolist()]
 
 
-def _names() -> list[str]:
-    """Of the coefficients in a file, in the order of a state."""
-    return [f"{d}:{t}" for d in ("dx", "dy") for t in _TERMS]
+_NAMES = [f"{d}:{t}" for d in ("dx", "dy") for t in _TERMS]
+"""Of the coefficients in a file, in the order of a state."""
 
 
 def findings(state: RigState, camera: StereoCamera) -> list[str]:
@@ -78,7 +79,7 @@ def document(state: RigState, camera: StereoCamera) -> dict[str, Any]:
     """The state in plain numbers, for the file beside a run."""
     return {
         "schema": 1,
-        "terms": _names(),
+        "terms": _NAMES,
         "mean": state.mean,
         "covariance": state.covariance,
         "probability": state.probability,
@@ -92,17 +93,11 @@ def _camera_px(camera: StereoCamera) -> list[float]:
 
 
 def read_state(path: Path, camera: StereoCamera) -> RigState:
-    """The state of a file, or of a run folder.
-
-    Raises
-    ------
-    SourceError
-        Where the file is damaged, or of another camera.
-    """
+    """The state of a file, or of a run folder. Raises SourceError where it is damaged, or of another camera."""
     path = path / STATE_FILE if path.is_dir() else path
     read = read_json(path)
     try:
-        place = np.array([_names().index(name) for name in read["terms"]])
+        place = np.array([_NAMES.index(name) for name in read["terms"]])
         read_mean, read_covariance = np.array(read["mean"], np.float64), np.array(read["covariance"], np.float64)
         probability, of = float(read["probability"]), np.array(read["camera_px"], np.float64)
     except (KeyError, TypeError, ValueError):
@@ -135,11 +130,18 @@ def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRi
     T = rig.T_right_left.copy()
     T[:3] = R_rect.T @ se3.so3_exp(p[:3]) @ R_rect @ T[:3]
     r, scale = rig.right, 1.0 + p[3]
-    kind = "radtan" if "radtan" in r.kind else "equidistant"
     intrinsics = [r.fx_px * scale, r.fy_px * scale, r.cx_px + p[4] * r.fx_px, r.cy_px + p[5] * r.fy_px]
-    distortion = [float(k) for k in r.distortion]
-    right = make_lens("pinhole", kind, intrinsics, distortion, (r.width, r.height), rig.where)
+    right = _lens(r.kind, intrinsics, [float(k) for k in r.distortion], (r.width, r.height), rig.where)
     return replace(rig, right=right, T_right_left=T)
+
+
+def _lens(
+    kind: str, intrinsics_px: list[float], distortion: list[float], size: Sequence[int], where: str | None
+) -> CameraModel:
+    """Of a kind as :attr:`CameraModel.kind` names it."""
+    width, height = size
+    model = "radtan" if "radtan" in kind else "equidistant"
+    return make_lens("pinhole", model, intrinsics_px, distortion, (width, height), where)
 
 
 def explained_px(state: RigState, camera: StereoCamera) -> tuple[float, float]:
@@ -165,22 +167,17 @@ def _explanation(state: RigState, camera: StereoCamera) -> tuple[Array, Array, A
 def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRig:
     """The rig that a run folder describes; a rectified pair where it describes none."""
     if calibration is None:
-        K = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
-        size = [camera.width, camera.height]
-        lens = {"model": "pinhole-radtan", "intrinsics_px": K, "distortion": [], "resolution_px": size}
-        T = se3.from_rt(np.eye(3), np.array([-camera.baseline_m, 0.0, 0.0]))
-        calibration = {"left": lens, "right": lens, "T_right_left": T}
+        lens = _lens("radtan", _camera_px(camera)[:4], [], (camera.width, camera.height), "rig.json")
+        return StereoRig(lens, lens, se3.from_rt(np.eye(3), np.array([-camera.baseline_m, 0.0, 0.0])))
     try:
-        lenses = []
-        for side in ("left", "right"):
-            c = calibration[side]
-            kind = "radtan" if "radtan" in c["model"] else "equidistant"
-            width, height = c["resolution_px"]
-            lenses.append(make_lens("pinhole", kind, c["intrinsics_px"], c["distortion"], (width, height), "rig.json"))
+        left, right = (
+            _lens(c["model"], c["intrinsics_px"], c["distortion"], c["resolution_px"], "rig.json")
+            for c in (calibration["left"], calibration["right"])
+        )
         T_imu_left = calibration.get("T_imu_left")
         return StereoRig(
-            lenses[0],
-            lenses[1],
+            left,
+            right,
             np.array(calibration["T_right_left"], np.float64),
             T_imu_left=None if T_imu_left is None else check_pose(T_imu_left, "T_imu_left", "rig.json"),
             timeshift_cam_imu_s=float(calibration.get("timeshift_cam_imu_s", 0.0)),

@@ -7,14 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.motion import (
-    Motion,
-    Whitened,
-    apply_whitener,
-    persistent_direction,
-    residual_covariance,
-    whitener,
-)
+from gpvo.vo.motion import Motion, Whitened, apply_whitener, persistent_direction, residual_covariance, whitener
 from gpvo.vo.points import PointNoise
 
 _MEMORY = 0.97  # of the running mean: about thirty frames

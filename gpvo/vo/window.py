@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.frontend import Matches, keys
-from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, Motion, transfer
+from gpvo.vo.motion import CHI2_3_999, CHI2_3_MEDIAN, Motion, huber, transfer
 from gpvo.vo.points import PointNoise
 from gpvo.vo.rig_error import RigError
 
@@ -134,7 +134,7 @@ def adjust(
         if robust and 1 < iteration <= _CHOOSING:
             m2 = ((r @ whiten.T) ** 2).sum(axis=2)
             ratio = m2 * CHI2_3_MEDIAN / max(float(np.median(m2[seen])), 0.02**2)
-            weight = np.where(seen & (ratio < CHI2_3_999), 3.2 / np.sqrt(np.maximum(ratio, 3.2**2)), 0.0)
+            weight = np.where(seen & (ratio < CHI2_3_999), huber(ratio), 0.0)
         weight[1:] *= in_front
         weight[0] = np.maximum(weight[0], 1e-6)  # no place is without any hold
         try:

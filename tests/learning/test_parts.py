@@ -101,7 +101,7 @@ def test_each_part_has_its_own_correlation():
         bias = np.repeat(rng.standard_normal((20, 1)), 100, axis=0) * np.array([0.2, 0.2, 0, 0, 0, 0])
         z.append([bias + rng.standard_normal((2000, 6))])
     parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
-    R = part_correlations(z, _like(z, 1.0), parts, 0.05)[0]
+    R = part_correlations(z, _like(z, 1.0), parts)[0]
     assert R[2, 0, 1] > 0.6
     assert np.abs(R[:2, 0, 1]).max() < 0.15
     assert np.linalg.eigvalsh(R).min() > 0.0
@@ -120,7 +120,7 @@ def test_of_errors_that_outlast_a_flight_few_flights_show_little():
     for _ in range(10):
         z = [[0.8 * rng.standard_normal((1000, 6)) + 0.6 * rng.standard_normal(6)] for _ in range(8)]
         parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
-        C = _of_sums(parts, part_correlations(z, _like(z, 1.0), parts, 0.05)[0], 100, 0.05)
+        C = _of_sums(parts, part_correlations(z, _like(z, 1.0), parts)[0], 100, 0.05)
         unseen = 8.0 * rng.standard_normal((200, 6)) + 60.0 * rng.standard_normal((200, 6))
         mean.append(nees(unseen, C).mean() / 6.0)
     assert 0.8 <= np.mean(mean) <= 1.4, np.mean(mean)
@@ -134,7 +134,7 @@ def test_axes_that_go_together_nearly_perfectly_are_stated_so():
     seen, unseen = rng.standard_normal((2, 10, 1000, 6)) @ L.T
     z = [[chain] for chain in seen]
     parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
-    R = part_correlations(z, _like(z, 1.0), parts, 0.05)[0]
+    R = part_correlations(z, _like(z, 1.0), parts)[0]
     for m in (1, 10, 100):
         mean = nees(unseen.reshape(-1, m, 6).sum(axis=1), _of_sums(parts, R, m, 0.05)).mean() / 6.0
         assert 0.92 <= mean <= 1.1, (m, mean)
@@ -180,7 +180,7 @@ def test_what_is_stated_along_a_path_is_what_was_fitted():
         bias = np.array([lfilter([np.sqrt(1.0 - r**2)], [1.0, -r], column) for r, column in zip(rho, steps.T)]).T
         z.append([0.5 * bias + rng.standard_normal((4000, 6))])
     parts = fit_parts(z, _like(z, 1.0), _same_speed(z), 0.05)
-    R = part_correlations(z, _like(z, 1.0), parts, 0.05)[0]
+    R = part_correlations(z, _like(z, 1.0), parts)[0]
     of_parts = np.sqrt(parts.share) * sigma
     jitter, white, bias = R[:3] * of_parts[:, :, None] * of_parts[:, None, :]
     error = PoseError()
@@ -201,7 +201,7 @@ def test_the_worst_motions_decide_how_the_axes_of_a_sum_go_together():
         error.append([e * s])
         sigma.append([s])
     parts = fit_parts(error, sigma, _same_speed(error), 0.05)
-    white = part_correlations(error, sigma, parts, 0.05)[0, 1]
+    white = part_correlations(error, sigma, parts)[0, 1]
     np.testing.assert_allclose(white[0, 1], 0.9 * 25.0 / (25.0 + 4.0), atol=0.1)
 
 

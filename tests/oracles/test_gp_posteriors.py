@@ -80,7 +80,7 @@ def test_the_collapsed_posterior_tends_to_the_exact_one() -> None:
     exact = get_regressor("exact", hyper=short).fit(X, Y)
     scaling = Scaling.of(X, Y)
     hyper, Xs = scaling.scaled(short), scaling.inputs(X)
-    collapsed = close(Xs, scaling.outputs(Y), scaling, hyper, Xs[::-1] / hyper.lengthscale, "sparse", relearn=False)
+    collapsed = close(Xs, scaling.outputs(Y), scaling, hyper, Xs[::-1] / hyper.lengthscale, relearn=False)
     for a, b in zip(exact.predict(Xq), collapsed.predict(Xq), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
     assert collapsed.log_evidence == pytest.approx(exact.log_evidence, abs=1e-4)

@@ -31,7 +31,7 @@ def small_world(size: int = 256) -> World:
     mesh = Mesh.of(V, N, uv, np.full(len(V), 0.5), np.ones(len(V)), F, np.zeros(len(F), int))
     line = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
     bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    return World("test", 0, {}, mesh, (texture,), Lighting(0.05, 0.5), line, np.eye(4), bounds)
+    return World(mesh, (texture,), Lighting(0.05, 0.5), line, np.eye(4), bounds)
 
 
 def pose(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:

@@ -34,12 +34,12 @@ def test_a_dask_cluster_of_two_workers_makes_the_same_bytes(tmp_path):
 
 
 def test_one_failure_does_not_stop_the_others(tmp_path, monkeypatch):
-    def flaky(scenario, seed, out):
+    def flaky(scenario, seed, out, points):
         if seed == 1:
             raise GpvoError("the quadrotor crashes")
         return sc.Flight(seed, out, 10)
 
-    monkeypatch.setattr(sc, "fly_points", flaky)
+    monkeypatch.setattr(sc, "fly", flaky)
     flights = sc.fly_campaign(sc.load_scenario("tunnel"), [0, 1, 2], tmp_path, points=True)
     assert [bool(f.error) for f in flights] == [False, True, False]
 

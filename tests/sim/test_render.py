@@ -35,7 +35,7 @@ def wall(distance: float = 3.0, texture: np.ndarray | None = None) -> World:
         ones, ones, faces, np.zeros(len(faces), np.uint8),
     )  # fmt: skip
     line = np.zeros((2, 3))
-    return World("room", 0, {}, mesh, (grey,), Lighting(0.5, 0.0), line, np.eye(4), np.array([[-9.0] * 3, [9.0] * 3]))
+    return World(mesh, (grey,), Lighting(0.5, 0.0), line, np.eye(4), np.array([[-9.0] * 3, [9.0] * 3]))
 
 
 def checks() -> np.ndarray:

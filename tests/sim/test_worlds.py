@@ -69,7 +69,7 @@ def test_the_cache_gives_back_what_was_built(kind: str) -> None:
         np.testing.assert_array_equal(getattr(world.mesh, name), getattr(again.mesh, name))
     np.testing.assert_array_equal(world.textures, again.textures)
     np.testing.assert_array_equal(world.centreline, again.centreline)
-    assert (again.kind, again.seed, again.lighting) == (world.kind, world.seed, world.lighting)
+    assert again.lighting == world.lighting
 
 
 def test_a_damaged_cache_file_is_built_anew() -> None:
@@ -84,7 +84,7 @@ def test_a_cache_that_cannot_be_written_is_no_hindrance(tmp_path: Path, monkeypa
     blocked = tmp_path / "file"
     blocked.write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
-    assert build_world("room", 7, **SMALL["room"]).kind == "room"
+    assert len(build_world("room", 7, **SMALL["room"]).mesh.faces) > 0
 
 
 def test_seeds_differ() -> None:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from gpvo.geometry import se3
-from gpvo.vo.config import pair_method
+from gpvo.vo.config import VoConfig, pair_method
 from gpvo.vo.covariance import covariances_by_method, motion_covariance, spherical_covariance
 from gpvo.vo.points import (
     point_covariance,
@@ -79,7 +79,7 @@ def test_covariance_scales_with_noise_and_count() -> None:
 
 def test_every_method_is_symmetric_positive_definite() -> None:
     methods = ("triangulation", "pointing_matching", "spherical")
-    found = covariances_by_method(methods, T, BEFORE, AFTER, CAMERA, sigma_px=1.0, sigma_p_px=0.1, sigma_m_px=0.5)
+    found = covariances_by_method(VoConfig(methods=methods), (0.1, 0.5), T, BEFORE, AFTER, CAMERA)
     assert tuple(found) == methods
     for c in found.values():
         np.testing.assert_array_equal(c.full, c.full.T)
@@ -94,10 +94,8 @@ def test_points_in_one_place_do_not_determine_the_motion() -> None:
 
 def test_further_pairs_of_sigmas_are_stated_beside_the_methods() -> None:
     pairs = ((0.1, 0.5), (0.1, 1.0))
-    found = covariances_by_method(
-        ("pointing_matching",), T, BEFORE, AFTER, CAMERA,
-        sigma_px=1.0, sigma_p_px=0.1, sigma_m_px=0.5, sigma_pairs_px=pairs,
-    )  # fmt: skip
+    config = VoConfig(methods=("pointing_matching",), sigma_pairs_px=pairs)
+    found = covariances_by_method(config, (0.1, 0.5), T, BEFORE, AFTER, CAMERA)
     same, wider = (found[pair_method(*p)].full for p in pairs)
     np.testing.assert_array_equal(same, found["pointing_matching"].full)
     assert np.trace(wider) > 1.5 * np.trace(same)

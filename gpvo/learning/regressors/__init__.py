@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
 import numpy as np
@@ -126,8 +126,11 @@ def regressor_names() -> tuple[str, ...]:
     follows :class:`Regressor`, takes options as keywords, and is chosen by ``gpvo train --regressor name``. A built-in
     name cannot be overridden.
     """
-    outside = {entry.name for entry in entry_points(group="gpvo.regressors")}
-    return (*_BUILT_IN, *sorted(outside - set(_BUILT_IN)))
+    return (*_BUILT_IN, *sorted(_outside().keys() - _BUILT_IN.keys()))
+
+
+def _outside() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group="gpvo.regressors")}
 
 
 def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Regressor:
@@ -143,7 +146,7 @@ def get_regressor(name: str, *, n_rows: int | None = None, **options: Any) -> Re
         module, _, attribute = _BUILT_IN[name].partition(":")
         found = getattr(import_module(module), attribute)
     else:
-        outside = {entry.name: entry for entry in entry_points(group="gpvo.regressors")}
+        outside = _outside()
         if name not in outside:
             raise GpvoError(f"unknown regressor '{name}'", cure=f"one of: auto, {', '.join(regressor_names())}")
         found = outside[name].load()

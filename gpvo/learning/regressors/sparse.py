@@ -69,18 +69,15 @@ class OnPoints(ABC):
         scaling = Scaling.of(X, Y)
         Xs, Ys = scaling.inputs(X), scaling.outputs(Y)
         with fixed_threads(self.threads):
-            if self.hyper is not None:
-                hyper, points = scaling.scaled(self.hyper), None
-            else:
-                hyper, points = self._learn(Xs, Ys, seed)
-            return self._closed(Xs, Ys, scaling, hyper, points, seed)
+            learned = self._learn(Xs, Ys, seed) if self.hyper is None else (scaling.scaled(self.hyper), None)
+            return self._closed(Xs, Ys, scaling, *learned, seed)
 
     def _closed(
         self, Xs: Array, Ys: Array, scaling: Scaling, hyper: Hyperparameters, points: Array | None, seed: int
     ) -> FittedGP:
         if points is None:
             points = greedy_points(Xs / hyper.lengthscale, self.inducing or len(Xs), seed=seed)
-        return close(Xs, Ys, scaling, hyper, points, self.name, relearn=self.relearns and self.hyper is None)
+        return close(Xs, Ys, scaling, hyper, points, relearn=self.relearns and self.hyper is None)
 
     @abstractmethod
     def _learn(self, Xs: Array, Ys: Array, seed: int) -> tuple[Hyperparameters, Array | None]:
@@ -174,9 +171,7 @@ def start(Xs: Array, Ys: Array, seed: int) -> Hyperparameters:
     return OneLength(Xs[rows], Ys[rows], None).hyper(slice(None))
 
 
-def close(
-    Xs: Array, Ys: Array, scaling: Scaling, hyper: Hyperparameters, points: Array, name: str, *, relearn: bool
-) -> FittedGP:
+def close(Xs: Array, Ys: Array, scaling: Scaling, hyper: Hyperparameters, points: Array, *, relearn: bool) -> FittedGP:
     """One pass over all rows: with ``relearn`` the signal and noise variances too, then the optimal posterior.
 
     ``hyper`` and ``points`` (m, d) (over the length scales) belong to the standardised data.

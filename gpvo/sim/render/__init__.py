@@ -22,25 +22,14 @@ class StereoRenderer:
 
     Parameters
     ----------
-    world
-        As from ``build_world``.
-    left, right
-        Lens models of the two cameras; they may differ.
-    T_right_left
-        (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
-    threads
-        Number of threads; the images are the same to the bit for any number.
-    head_lamp
-        Radiant intensity of a lamp at each camera; by default that of the world.
-    max_angle_rad
-        Half the field of view; pixels beyond it are black, as behind the rim of a fisheye.
-    far_m
-        Nothing beyond this distance is drawn.
+    left, right : lens models of the two cameras; they may differ.
+    T_right_left : (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
+    threads : how many; the images are the same to the bit for any number.
+    head_lamp : radiant intensity of a lamp at each camera; by default that of the world.
+    max_angle_rad : half the field of view; pixels beyond it are black, as behind the rim of a fisheye.
+    far_m : nothing beyond this distance is drawn.
 
-    Raises
-    ------
-    MissingExtraError
-        Where numba is not installed.
+    Raises MissingExtraError where numba is not installed.
     """
 
     def __init__(
@@ -78,15 +67,15 @@ class StereoRenderer:
         always that of ``T_world_left``. Depth runs along the optical axis [m], NaN where there is nothing; that of the
         right camera is kept in ``depth_right`` until the next call.
         """
-        poses = [T_world_left] if motion is None or len(motion) < 2 else [*motion, T_world_left]
+        poses = [T_world_left] if motion is None or len(motion) < 2 else motion
         left, right = (np.zeros_like(drawer.radiance) for drawer in (self._left, self._right))
-        for k, T in enumerate(poses):
+        for T in poses:
             self._draw(np.asarray(T, dtype=np.float64))
-            # With motion, the last pose is for depth alone.
-            if k == 0 or k < len(poses) - 1:
-                left += self._left.radiance
-                right += self._right.radiance
-        count = np.float32(max(len(poses) - 1, 1))
+            left += self._left.radiance
+            right += self._right.radiance
+        if len(poses) > 1:  # for the depth alone
+            self._draw(np.asarray(T_world_left, dtype=np.float64))
+        count = np.float32(len(poses))
         return left / count, right / count, self._left.depth.copy()
 
     @property

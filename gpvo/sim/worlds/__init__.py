@@ -10,13 +10,11 @@ import inspect
 import json
 import os
 import zipfile
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,9 +99,6 @@ class World:
     None where there is none.
     """
 
-    kind: str
-    seed: int
-    params: Mapping[str, Any]
     mesh: Mesh
     textures: tuple[NDArray[np.uint8], ...]
     lighting: Lighting
@@ -134,10 +129,7 @@ class HeightGrid:
     def __call__(self, x: Array, y: Array) -> Array:
         """Height on the two triangles of each cell, split from (0, 1) to (1, 0) as the mesh is.
 
-        Raises
-        ------
-        GpvoError
-            Outside the grid.
+        Raises GpvoError outside the grid.
         """
         rows, columns = self.z.shape
         u, v = (np.asarray(x) - self.x0) / self.cell, (np.asarray(y) - self.y0) / self.cell
@@ -235,14 +227,9 @@ def world_parameters(kind: str) -> dict[str, object]:
 def build_world(kind: str, seed: int, **params: object) -> World:
     """The world of a kind (``tunnel``, ``lunar``, ``room``) and a seed; the second time it comes from the cache.
 
-    The cache lies in ``$XDG_CACHE_HOME/gpvo``; it may be deleted at any time.
-
-    Raises
-    ------
-    GpvoError
-        For an unknown kind or parameter, or a value a world cannot be built with.
-    MissingExtraError
-        Where Embree or numba are not installed (extra ``gpvo[sim]``).
+    The cache lies in ``$XDG_CACHE_HOME/gpvo``; it may be deleted at any time. Raises GpvoError for an unknown kind or
+    parameter, or a value a world cannot be built with; MissingExtraError where Embree or numba are not installed (extra
+    ``gpvo[sim]``).
     """
     known = world_parameters(kind)
     if unknown := sorted(set(params) - set(known)):
@@ -265,18 +252,9 @@ def cache_folder() -> Path:
 
 
 def _save_world(world: World, path: Path) -> None:
-    """Write a world atomically.
-
-    Raises
-    ------
-    OSError
-        Where the folder cannot be written.
-    """
+    """Write a world atomically. Raises OSError or SourceError where the folder cannot be written."""
     ground, shadows = world.ground, world.light_map
     header = {
-        "kind": world.kind,
-        "seed": world.seed,
-        "params": dict(world.params),
         "lighting": asdict(world.lighting),
         "textures": len(world.textures),
         "ground": None if ground is None else (ground.x0, ground.y0, ground.cell),
@@ -296,13 +274,8 @@ def _save_world(world: World, path: Path) -> None:
 
 
 def load_world(path: Path) -> World:
-    """Read a world.
-
-    Raises
-    ------
-    OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile
-        Where the file is absent or damaged.
-    """
+    """Read a world. Raises OSError, ValueError, KeyError, TypeError or zipfile.BadZipFile where the file is absent or
+    damaged."""
     with zipfile.ZipFile(path) as archive:
         if sum(info.file_size for info in archive.infolist()) > _LARGEST_BYTES:
             raise ValueError(f"{path} is too large for a world")
@@ -313,9 +286,6 @@ def load_world(path: Path) -> World:
             (u, v), texel, material = header["light_map"]
             light_map = LightMap(data["light_map"], (u, v), texel, material)
         return World(
-            kind=header["kind"],
-            seed=header["seed"],
-            params=header["params"],
             mesh=Mesh(**{f.name: data[f"mesh_{f.name}"] for f in fields(Mesh)}),
             textures=tuple(data[f"texture_{k}"] for k in range(header["textures"])),
             lighting=Lighting(**header["lighting"]),

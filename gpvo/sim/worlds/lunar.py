@@ -39,10 +39,7 @@ def build(
 ) -> World:
     """Ground with a free lane of ``length`` [m] from the origin along +x; the sun stands in direction azimuth from +x.
 
-    Raises
-    ------
-    GpvoError
-        For values out of range.
+    Raises GpvoError for values out of range.
     """
     check_ranges(
         length=(length, 20, 1000), boulders=(boulders, 0, 20000), craters=(craters, 0, 20000),
@@ -67,9 +64,6 @@ def build(
     pose[:3, 3] = line[4]
     deepest, highest = float(grid.z.min()), float(grid.z.max())
     return World(
-        kind="lunar",
-        seed=seed,
-        params={"length": length, "sun_elevation_deg": sun_elevation_deg, "sun_azimuth_deg": sun_azimuth_deg},
         mesh=mesh,
         textures=(soil.result(), stone.result()),
         lighting=Lighting(ambient=_AMBIENT, head_lamp=0.0),

@@ -46,12 +46,7 @@ def build(
     """A hall of ``width`` (x) by ``depth`` (y) by ``height`` [m] about the origin, floor at z = 0.
 
     ``blank_walls`` of its four walls are plaster, the others masonry; ``boxes`` stand along them and ``posters``
-    hang on them.
-
-    Raises
-    ------
-    GpvoError
-        For values out of range.
+    hang on them. Raises GpvoError for values out of range.
     """
     check_ranges(
         width=(width, 6, 60), depth=(depth, 6, 60), height=(height, 2.5, 15),
@@ -71,9 +66,6 @@ def build(
     inner = np.array([width / 2 - 0.6, depth / 2 - 0.6])
     images = [plaster, blocks, planks, cardboard, *[poster] * _POSTERS]
     return World(
-        kind="room",
-        seed=seed,
-        params={"width": width, "depth": depth, "height": height},
         mesh=_lit(parts, size, rng),
         textures=tuple(image(_TEXTURE_PX, rng) for image in images),
         lighting=Lighting(ambient=0.25, head_lamp=0.0),

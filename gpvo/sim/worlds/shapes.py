@@ -108,12 +108,8 @@ def add_stone(parts: Parts, stone: Array, faces: Faces, place: Array, material: 
 
 class Baker:
     """Light that does not move, per vertex of finished parts, by rays of Embree: lamps and sun with shadows, ambient
-    occlusion. ``vertices``, ``normals`` (V, 3), ``glow`` (V,); ``smooth`` may improve the normals.
-
-    Raises
-    ------
-    MissingExtraError
-        Where Embree is not installed.
+    occlusion. ``vertices``, ``normals`` (V, 3), ``glow`` (V,); ``smooth`` may improve the normals. Raises
+    MissingExtraError where Embree is not installed.
     """
 
     def __init__(self, parts: Parts, smooth: Callable[[Array], Array] = lambda normals: normals) -> None:
@@ -175,8 +171,7 @@ class Baker:
 
     def openness(self, samples: int, reach_m: float, rng: np.random.Generator) -> Array:
         """How free each vertex is (V,), 0..1: mean distance along rays about the normal, cut at ``reach_m``."""
-        everywhere = np.arange(len(self._origins))
-        out = np.zeros(len(self._origins))
+        everywhere, out = np.arange(len(self._origins)), np.zeros(len(self._origins))
         for _ in range(samples):
             ray = rng.standard_normal((len(everywhere), 3))
             ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) + self.normals

@@ -35,12 +35,7 @@ def build(
     """A tunnel of ``length`` [m] with a lamp every ``lamps`` [m] (0: none) and ``smooth_stretches`` of bare concrete.
 
     ``curve``: straight, curved or branching; ``roughness``: height of the rock's relief [m]; ``step``: edge of the
-    triangles [m].
-
-    Raises
-    ------
-    GpvoError
-        For values out of range.
+    triangles [m]. Raises GpvoError for values out of range.
     """
     if curve not in _CURVES:
         raise GpvoError(f"unknown curve '{curve}' of a tunnel", cure=f"choose from {', '.join(_CURVES)}")
@@ -66,9 +61,6 @@ def build(
     pose[:3, :3] = np.stack([line.tangent[start], line.left[start], line.up[start]], axis=1)
     pose[:3, 3] = line.points[start]
     return World(
-        kind="tunnel",
-        seed=seed,
-        params={"length": length, "curve": curve, "roughness": roughness, "lamps": lamps, "step": step},
         mesh=mesh,
         textures=tuple(textures),
         lighting=Lighting(ambient=0.015, head_lamp=1.6),
