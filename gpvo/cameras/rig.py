@@ -109,12 +109,17 @@ def check_pose(T: object, name: str, where: object = None) -> Array:
     return M if np.abs(R @ R.T - np.eye(3)).max() < 1e-15 else se3.orthonormalise(M)
 
 
-def check_rig(rig: StereoRig) -> None:
-    """Refuse a rig that cannot exist.
+def mean_view(T_right_left: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) of left camera axes into the mean orientation of both, and there the direction (3,) from the left
+    camera to the right one."""
+    half = se3.so3_exp(0.5 * se3.so3_log(T_right_left[:3, :3]))
+    right = half @ (-T_right_left[:3, :3].T @ T_right_left[:3, 3])
+    return half, right / np.linalg.norm(right)
 
-    Raises CalibrationError, naming the reason: baseline absent, too long, pointing the wrong way or not sideways;
-    cameras turned apart; lenses that do not belong together; intrinsics outside the image.
-    """
+
+def check_rig(rig: StereoRig) -> None:
+    """Raise CalibrationError for a rig that cannot exist: baseline absent, too long, pointing the wrong way or not
+    sideways; cameras turned apart; lenses that do not belong together; intrinsics outside the image."""
     for name, lens in (("left", rig.left), ("right", rig.right)):
         _check_lens(lens, name, rig.where)
     check_pose(rig.T_right_left, "T_right_left", rig.where)
@@ -176,9 +181,7 @@ def _check_baseline(rig: StereoRig) -> None:
             where=where,
             cure="check the order and the direction of the chained transforms",
         )
-    # Position of the right camera along the mean orientation of the two.
-    half = se3.so3_exp(0.5 * se3.so3_log(T[:3, :3]))
-    x, y, z = half @ (-T[:3, :3].T @ T[:3, 3]) / length
+    x, y, z = mean_view(T)[1]
     if x < -0.7:
         raise CalibrationError(
             f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped",

@@ -138,7 +138,7 @@ def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRi
     kind = "radtan" if "radtan" in r.kind else "equidistant"
     intrinsics = [r.fx_px * scale, r.fy_px * scale, r.cx_px + p[4] * r.fx_px, r.cy_px + p[5] * r.fy_px]
     distortion = [float(k) for k in r.distortion]
-    right = make_lens("pinhole", kind, intrinsics, distortion, (r.width, r.height), rig.where)
+    right = make_lens(kind, intrinsics, distortion, (r.width, r.height), rig.where)
     return replace(rig, right=right, T_right_left=T)
 
 
@@ -176,7 +176,7 @@ def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRi
             c = calibration[side]
             kind = "radtan" if "radtan" in c["model"] else "equidistant"
             width, height = c["resolution_px"]
-            lenses.append(make_lens("pinhole", kind, c["intrinsics_px"], c["distortion"], (width, height), "rig.json"))
+            lenses.append(make_lens(kind, c["intrinsics_px"], c["distortion"], (width, height), "rig.json"))
         T_imu_left = calibration.get("T_imu_left")
         return StereoRig(
             lenses[0],
