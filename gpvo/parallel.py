@@ -6,9 +6,10 @@ import queue
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from itertools import starmap
 from typing import Any, TypeVar
 
-from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.errors import GpvoError, require
 
 T = TypeVar("T")
 
@@ -32,7 +33,7 @@ def map_jobs(
     if backend != "local":
         raise GpvoError(f"unknown backend '{backend}'", cure="local or dask")
     if jobs == 1 or len(jobs_arguments) < 2:
-        return _told((function(*arguments) for arguments in jobs_arguments), on_done)
+        return _told(starmap(function, jobs_arguments), on_done)
     from joblib import Parallel, delayed
 
     calls = (delayed(function)(*arguments) for arguments in jobs_arguments)
@@ -53,10 +54,9 @@ def _told(results: Iterable[Any], on_done: Callable[[], None]) -> list[Any]:
 def _on_dask(
     function: Callable[..., Any], jobs_arguments: Sequence[tuple[Any, ...]], scheduler: str | None
 ) -> list[Any]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise MissingExtraError("distributed", "dask") from None
+    require("distributed")
+    from distributed import Client
+
     try:
         client = Client(scheduler, timeout="10s") if scheduler else Client(processes=True, dashboard_address=None)
     except (OSError, TimeoutError, ValueError) as problem:
