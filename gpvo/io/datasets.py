@@ -91,7 +91,7 @@ class EurocSource(FileSource):
             stated = _stated_noise(mav / folder / "sensor.yaml")
             T_marker_imu = _marker_to_imu(mav, folder)
             truth = carry(read_euroc_csv(file), T_marker_imu @ self.mounting.T_imu_cam, noise or stated or usual)
-            check_overlap(truth, np.array([p.t_ns for p in self._pairs], dtype=np.int64), file)
+            check_overlap(truth, self.span_ns, file)
             return truth
         return None
 
@@ -100,9 +100,8 @@ def _mav_folder(path: Path) -> Path:
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     for camera in ("cam0", "cam1"):
         if not (mav / camera / "data.csv").is_file():
-            raise SourceError(
-                "no list of images", where=mav / camera / "data.csv", cure="a line 'stamp_ns,file' per image"
-            )
+            cure = "a line 'stamp_ns,file' per image"
+            raise SourceError("no list of images", where=mav / camera / "data.csv", cure=cure)
     return mav
 
 
@@ -146,8 +145,7 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
                 raise ValueError
             out.append((integer_ns(stamp), name))
         except ValueError:
-            known.unreadable += 1
-            known.note(f"{path.parent.name}/{path.name} line {number} is not 'stamp_ns,file'")
+            known.count("unreadable", f"{path.parent.name}/{path.name} line {number} is not 'stamp_ns,file'")
     if not out:
         raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
     in_time = sorted(out, key=lambda line: line[0])
@@ -244,9 +242,8 @@ class KittiSource(FileSource):
                 continue
             if (path / f"image_{left}").is_dir() and (path / f"image_{right}").is_dir():
                 return left, right
-        raise SourceError(
-            "has no pair of image folders", where=path, cure="image_0 and image_1 (grey) or image_2 and image_3"
-        )
+        cure = "image_0 and image_1 (grey) or image_2 and image_3"
+        raise SourceError("has no pair of image folders", where=path, cure=cure)
 
     @staticmethod
     def _list_pairs(path: Path, left: int, right: int, known: SourceReport) -> list[PairFiles]:
@@ -265,8 +262,7 @@ class KittiSource(FileSource):
             raise SourceError("holds no images", where=empty, cure="expected names like 000000.png")
         surplus = {i for found in names for i in found if i >= len(stamps)}
         if surplus:
-            known.missing += len(surplus)
-            known.note(f"{len(surplus)} frames have no line in times.txt")
+            known.count("missing", f"{len(surplus)} frames have no line in times.txt", len(surplus))
         suffix = next(iter(names[0].values())).suffix
         return [
             PairFiles(int(t), *(found.get(i, folder / f"{i:06d}{suffix}") for found, folder in zip(names, folders)))
@@ -282,10 +278,8 @@ class KittiSource(FileSource):
         T_world_cam0 = read_kitti_poses(file)
         stamps = read_times(path / "times.txt")
         if len(T_world_cam0) != len(stamps):
-            raise SourceError(
-                f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt",
-                where=file,
-                cure="KITTI poses have no stamps: both files must have one line per frame",
-            )
+            text = f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt"
+            cure = "KITTI poses have no stamps: both files must have one line per frame"
+            raise SourceError(text, where=file, cure=cure)
         grows = growing(stamps)
         return carry(Trajectory(stamps[grows], T_world_cam0[grows]), T_cam0_cam, noise)

@@ -45,6 +45,11 @@ class SourceReport:
         if text not in self.notes and len(self.notes) < 50:
             self.notes.append(text)
 
+    def count(self, what: str, text: str, n: int = 1) -> None:
+        """Count ``n`` more of ``what``, the name of a count, with a remark."""
+        setattr(self, what, getattr(self, what) + n)
+        self.note(text)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for ``run.json``."""
         return asdict(self)
