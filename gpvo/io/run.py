@@ -12,9 +12,9 @@ import hashlib
 import platform
 import shutil
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
@@ -29,7 +29,7 @@ from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
 from gpvo.io.run_folder import SCHEMA, is_finished
-from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
+from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks, table_of
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
@@ -85,16 +85,13 @@ class RunWriter:
         resume: str | None = None,
     ) -> None:
         self._target = Path(path)
-        self._meta = dict(meta or {})
-        self._chunk = max(1, chunk)
-        self._state = _State()
+        self._meta, self._chunk, self._state = dict(meta or {}), chunk, _State()
         self._lock = run_folder.claim(self._target)
         self.path = self._target
         if is_finished(self._target):
             if not overwrite:
-                raise SourceError(
-                    "holds a finished run", where=path, cure="give --overwrite, or another folder with -o"
-                )
+                cure = "give --overwrite, or another folder with -o"
+                raise SourceError("holds a finished run", where=path, cure=cure)
             self.path = self._target.with_name(f".{self._target.name}.new")
         self._chunks, self._resume = self.path / "chunks", resume
         self.kept = None if resume is None else run_folder.take_up(self._chunks, resume)
@@ -105,7 +102,9 @@ class RunWriter:
             # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
             self._write_meta(complete=False)
             self._chunks.mkdir(exist_ok=True)
-            write_json(self.path / "rig.json", run_folder.rig_document(camera, mounting or Mounting(), calibration))
+            place = mounting or Mounting()
+            rig = {"camera": camera and asdict(camera), **vars(place), "calibration": calibration}
+            write_json(self.path / "rig.json", {"schema": SCHEMA, **rig})
             if truth is not None:
                 run_folder.write_truth(self.path / "truth.parquet", truth)
             if imu is not None:
@@ -132,12 +131,8 @@ class RunWriter:
     ) -> None:
         """Add one record, what a model predicted for it, and the observations that came with it.
 
-        ``state``: where all stands after it. It is kept with the chunk that ends here, for going on from it.
-
-        Raises
-        ------
-        ValueError
-            Where the stamp does not grow or the record starts from an unknown frame.
+        ``state``: where all stands after it. It is kept with the chunk that ends here, for going on from it. Raises
+        ValueError where the stamp does not grow or the record starts from an unknown frame.
         """
         now = self._state
         T_prev = now.poses.get(record.t_prev_ns)
@@ -172,19 +167,18 @@ class RunWriter:
         """Write the records so far as one chunk, which survives a kill."""
         state = self._state
         if state.records:
-            name = f"{state.chunks:06d}.parquet"
-            self._keep("log", name, run_table.record_columns(state.records))
+            tables: dict[str, Mapping[str, Any]] = {"log": run_table.record_columns(state.records)}
             if state.predictions:
-                self._keep("predictions", name, run_table.prediction_columns(state.predictions))
+                tables["predictions"] = run_table.prediction_columns(state.predictions)
             if state.tracks:
-                self._keep("tracks", name, run_table.track_columns(state.tracks))
+                tables["tracks"] = run_table.track_columns(state.tracks)
+            for kind, columns in tables.items():
+                part = write_table(self._chunks / f"{kind}_{state.chunks:06d}.parquet", columns)
+                state.written.setdefault(kind, []).append(part)
             with (self.path / "trajectory.tum").open("a", encoding="ascii", newline="\n") as file:
                 file.writelines(line + "\n" for line in state.lines)
             state.chunks += 1
         state.records, state.predictions, state.lines, state.tracks = [], [], [], []
-
-    def _keep(self, kind: str, name: str, columns: Mapping[str, Any]) -> None:
-        self._state.written.setdefault(kind, []).append(write_table(self._chunks / f"{kind}_{name}", columns))
 
     def close(self, *, complete: bool = True) -> None:
         """Join the chunks and finish ``run.json``; ``complete=False`` leaves a run that broke off in its chunks."""
@@ -207,8 +201,7 @@ class RunWriter:
         self.flush()
         if complete:
             for kind, parts in self._state.written.items():
-                target = "vo_log.parquet" if kind == "log" else f"{kind}.parquet"
-                join_tables(parts, self.path / target, {"schema": str(SCHEMA)})
+                join_tables(parts, self.path / table_of(kind), {"schema": str(SCHEMA)})
             shutil.rmtree(self._chunks, ignore_errors=True)
         self._write_meta(complete=complete)
 
@@ -227,7 +220,7 @@ class RunWriter:
                 **self._meta,
                 "complete": complete,
                 "frames": state.records_total,
-                "statuses": dict(state.statuses),
+                "statuses": state.statuses,
                 "started": state.started,
                 "finished": datetime.now(timezone.utc).isoformat(timespec="seconds") if complete else None,
                 "wall_s": round(time.monotonic() - state.clock, 3),
@@ -248,7 +241,7 @@ class _State:
     tracks: list[StereoTracks] = field(default_factory=list)
     written: dict[str, list[RowGroup]] = field(default_factory=dict)
     poses: OrderedDict[int, Array] = field(default_factory=OrderedDict)
-    statuses: dict[str, int] = field(default_factory=dict)
+    statuses: Counter[str] = field(default_factory=Counter)
     stage_ms: dict[str, float] = field(default_factory=dict)
     records_total: int = 0
     chunks: int = 0
@@ -266,7 +259,7 @@ class _State:
         """Add to the sums of ``run.json``."""
         self.records_total += 1
         self.last_t_ns = record.t_ns
-        self.statuses[record.status.value] = self.statuses.get(record.status.value, 0) + 1
+        self.statuses[record.status.value] += 1
         for stage, ms in record.stage_ms.items():
             self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + ms
 
