@@ -17,10 +17,10 @@ from typer.core import TyperGroup
 from gpvo.cli import output
 from gpvo.cli.output import one_of
 from gpvo.errors import GpvoError
-from gpvo.types import VEHICLES, Vehicle
+from gpvo.files import read_toml
+from gpvo.types import VEHICLES, StereoCamera, Vehicle
 
 if TYPE_CHECKING:
-    from gpvo.types import StereoCamera
     from gpvo.vo.config import VoConfig
     from gpvo.vo.rig_error import RigState
 
@@ -102,15 +102,12 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
 
     Raises GpvoError, in one line, for a table that belongs to no command, an unknown option or a bad value.
     """
-    from gpvo.files import read_toml
-
     found = read_toml(path)
     words: list[str] = []
     for key, value in found.items():
         if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
-            raise GpvoError(
-                f"'{key}' is not the table of any command", where=path, cure=f"write options under [{name}]"
-            )
+            cure = f"write options under [{name}]"
+            raise GpvoError(f"'{key}' is not the table of any command", where=path, cure=cure)
     known = {word.lstrip("-").replace("-", "_"): p for p in command.params for word in p.opts if word.startswith("--")}
     del known["config"]
     context = command.context_class(command, info_name=name)
@@ -155,6 +152,27 @@ ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")
 TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none to ignore it.")]
 TruthFrame = Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
+
+
+@dataclass(frozen=True)
+class WireOptions:
+    """How messages of a running system come in."""
+
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False
+    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False
+    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False
+    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False
+    address: Annotated[
+        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
+    ] = None
+    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0
+
+    def transport(self) -> str | None:
+        """The one that was chosen, None if none was. Raises GpvoError if several were."""
+        chosen = [name for name in ("zenoh", "dds", "ros2", "ros1") if getattr(self, name)]
+        if len(chosen) > 1:
+            raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
+        return chosen[0] if chosen else None
 
 
 @dataclass(frozen=True)

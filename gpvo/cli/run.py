@@ -12,10 +12,15 @@ import typer
 
 from gpvo.cli import common as flags
 from gpvo.cli.output import Json, note, print_json, progress
+from gpvo.errors import SourceError
+from gpvo.files import read_json, write_text
+from gpvo.io.run import read_run
+from gpvo.io.source import open_source
+from gpvo.online.predictor import Predictor
+from gpvo.types import Prediction
 
 if TYPE_CHECKING:
     from gpvo.runner import RunSummary
-    from gpvo.types import Prediction
 
 _MOST_NOTES = 5
 _MUCH_LEFT = 1 / 3  # of a displacement: with 0.4 left, drive 0001 of KITTI drifts twice as far
@@ -55,8 +60,6 @@ def run(
     """
     from gpvo import runner
     from gpvo.dataset.check import ENOUGH_INSIDE, odometry_problems
-    from gpvo.io import open_source
-    from gpvo.online.predictor import Predictor
 
     config = odometry.config(vehicle.bounds())
     options = flags.source_options(
@@ -123,9 +126,6 @@ def calibration(
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
-    from gpvo.errors import SourceError
-    from gpvo.files import read_json, write_text
-    from gpvo.io.run import read_run
     from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, read_state, rig_of
 
     camera = read_run(run).log.camera
