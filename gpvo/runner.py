@@ -206,11 +206,8 @@ def _refuse_swapped(frame: TrackFrame, where: object) -> None:
     disparity = frame.uv_left[:, 0] - frame.uv_right[:, 0]
     behind = int((disparity < -1.0).sum())
     if behind >= 10 and behind > 0.8 * len(disparity):
-        raise SourceError(
-            f"left and right look swapped: {behind} of {len(disparity)} points have negative disparity",
-            where=where,
-            cure="exchange uv_left and uv_right",
-        )
+        text = f"left and right look swapped: {behind} of {len(disparity)} points have negative disparity"
+        raise SourceError(text, where=where, cure="exchange uv_left and uv_right")
 
 
 def config_of(run: Path) -> VoConfig:

@@ -219,11 +219,8 @@ def _right_left(
     elif chained is not None:
         return chained
     else:
-        raise CalibrationError(
-            f"does not say where '{right}' sits relative to '{left}'",
-            where=path,
-            cure="add T_cn_cnm1 to the second camera, or T_cam_imu to both",
-        )
+        cure = "add T_cn_cnm1 to the second camera, or T_cam_imu to both"
+        raise CalibrationError(f"does not say where '{right}' sits relative to '{left}'", where=path, cure=cure)
     if chained is None:
         return by_imu
     difference = se3.log(se3.inverse(by_imu) @ chained)

@@ -44,7 +44,7 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
     if path.suffix.lower() == ".txt":
         if size is None:
             raise CalibrationError("does not give the image size", where=path, cure="convert it to a camchain.yaml")
-        return read_kitti_calib(path, left=0, right=1, size=size)
+        return read_kitti_calib(path, 0, 1, size)
     document = read_yaml(path)
     if "cam0" in document or "cam1" in document:
         return read_camchain(path)
@@ -185,11 +185,8 @@ def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool
     """
     for name, info in (("left", left), ("right", right)):
         if info.K[0, 0] == 0 or info.P[0, 0] == 0:
-            raise CalibrationError(
-                f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)",
-                where=where,
-                cure="put a Kalibr camchain.yaml beside the bag",
-            )
+            cure = "put a Kalibr camchain.yaml beside the bag"
+            raise CalibrationError(f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)", where=where, cure=cure)
     baseline = left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0]
     place, text = np.array([-baseline, 0.0, 0.0]), None if where is None else str(where)
     if rectified:
@@ -219,7 +216,7 @@ def read_projections(path: Path) -> dict[str, Array]:
     return found
 
 
-def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]) -> StereoRig:
+def read_kitti_calib(path: Path, left: int, right: int, size: tuple[int, int]) -> StereoRig:
     """The rectified pair of cameras ``left`` and ``right`` (0 and 1 grey, 2 and 3 colour) with images of ``size``.
 
     Raises CalibrationError where a matrix is missing, the two do not share their intrinsics, or the baseline is

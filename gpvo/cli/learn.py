@@ -126,10 +126,8 @@ def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path |
     """Raise GpvoError, before any work, if training would leave out no run that ``gpvo score`` could judge."""
     whole = len(runs) > 1 and all(p.is_dir() for p in runs) and update is None
     if not whole or settings["target"] != "frame" or settings["backend"] != "local":
-        raise GpvoError(
-            "--statements needs two or more run folders, --target frame and --backend local, without --update",
-            cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER",
-        )
+        text = "--statements needs two or more run folders, --target frame and --backend local, without --update"
+        raise GpvoError(text, cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER")
 
 
 def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[str, Any], folder: Path) -> None:

@@ -202,15 +202,15 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
     """Left and right topic by the calibration, by name, or because there are but two."""
     if chain is not None and "cam0" in read_yaml(chain):
         a, b = camchain_topics(chain)
-        if a in images and b in images and a is not None and b is not None:
+        if a is not None and b is not None and {a, b} <= set(images):
             return a, b
-    pairs = []
-    for rank, (one, other) in enumerate(_SIDES):
-        for topic in images:
-            partner = topic.replace(one, other)
-            if partner != topic and partner in images and "depth" not in topic:
-                # Raw before rectified before compressed.
-                pairs.append(("compressed" in topic, "rect" in topic, rank, topic, partner))
+    sides = ((topic, topic.replace(one, other), k) for k, (one, other) in enumerate(_SIDES) for topic in images)
+    # Raw before rectified before compressed.
+    pairs = [
+        ("compressed" in topic, "rect" in topic, rank, topic, partner)
+        for topic, partner, rank in sides
+        if partner != topic and partner in images and "depth" not in topic
+    ]
     if pairs:
         return min(pairs)[3:]
     return (images[0], images[1]) if len(images) == 2 else None

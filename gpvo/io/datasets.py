@@ -112,11 +112,9 @@ def _euroc_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
         return read_sensor_pair(*sensors, imu=imu if imu.is_file() else None, body_is_flu=_body_is_flu(mav))
     chain = given or next((c for c in map(find_calibration, (path, mav, path / "dso", mav.parent)) if c), None)
     if chain is None:
-        raise CalibrationError(
-            "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml",
-            where=mav,
-            cure="put Kalibr's camchain.yaml into the folder or name one with --calibration",
-        )
+        text = "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml"
+        cure = "put Kalibr's camchain.yaml into the folder or name one with --calibration"
+        raise CalibrationError(text, where=mav, cure=cure)
     return read_stereo_yaml(chain)
 
 
@@ -179,13 +177,10 @@ def _marker_to_imu(mav: Path, folder: str) -> Array:
 
 def _stated_noise(sensor: Path) -> TruthNoise | None:
     """Noise that the truth's own ``sensor.yaml`` states, as gpvo's simulator writes it."""
-    if not sensor.is_file():
-        return None
-    document = read_yaml(sensor)
-    values = [document.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
-    if not all(isinstance(v, (int, float)) and 0 <= v < 10 for v in values):
-        return None
-    return TruthNoise(float(values[0]), float(values[1]))  # type: ignore[arg-type]
+    document = read_yaml(sensor) if sensor.is_file() else {}
+    stated = [document.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
+    values = [float(v) for v in stated if isinstance(v, (int, float)) and 0 <= v < 10]
+    return TruthNoise(*values) if len(values) == 2 else None
 
 
 class KittiSource(FileSource):
@@ -217,10 +212,8 @@ class KittiSource(FileSource):
         first = first_size(pairs, "left")  # the calibration does not say it
         if first is None:
             raise SourceError("no readable left image", where=path)
-        if calib.suffix.lower() in (".yaml", ".yml"):
-            rig = read_stereo_yaml(calib, size=first[1])
-        else:
-            rig = read_kitti_calib(calib, left=left, right=right, size=first[1])
+        is_yaml, size = calib.suffix.lower() in (".yaml", ".yml"), first[1]
+        rig = read_stereo_yaml(calib, size=size) if is_yaml else read_kitti_calib(calib, left, right, size)
         super().__init__(path, path.name, rig, pairs, known, **options)
         # Poses are of camera 0, whose place only KITTI's own file tells.
         T_cam0_left = left_camera_offset(own if own.is_file() else calib, left)
@@ -257,9 +250,9 @@ class KittiSource(FileSource):
         for folder in folders:
             files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdecimal())
             names.append({int(f.stem): f for f in files})
-        if not names[0] or not names[1]:
-            empty = folders[0] if not names[0] else folders[1]
-            raise SourceError("holds no images", where=empty, cure="expected names like 000000.png")
+        for folder, found in zip(folders, names):
+            if not found:
+                raise SourceError("holds no images", where=folder, cure="expected names like 000000.png")
         surplus = {i for found in names for i in found if i >= len(stamps)}
         if surplus:
             known.count("missing", f"{len(surplus)} frames have no line in times.txt", len(surplus))

@@ -128,16 +128,11 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
         return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
     dates = " (dates are not read)" if _DATE.search(keys[0]) else ""
     if rate_hz is not None and not numbers:
-        raise SourceError(
-            f"the last number of names such as '{keys[0]}' does not count the images{dates}",
-            where=path,
-            cure="name images by nanoseconds, number them, or add times.txt (seconds, a line per pair)",
-        )
-    raise SourceError(
-        f"the image names are not stamps{dates}, and there is no times.txt",
-        where=path,
-        cure="name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz",
-    )
+        text = f"the last number of names such as '{keys[0]}' does not count the images{dates}"
+        cure = "name images by nanoseconds, number them, or add times.txt (seconds, a line per pair)"
+        raise SourceError(text, where=path, cure=cure)
+    cure = "name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz"
+    raise SourceError(f"the image names are not stamps{dates}, and there is no times.txt", where=path, cure=cure)
 
 
 def _numbers(keys: list[str]) -> dict[str, str]:

@@ -28,7 +28,7 @@ from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
 FARTHEST_M = 1e9
-_REMOVE = "remove the line: a gap does no harm"
+REMOVE = "remove the line: a gap does no harm"
 _REMOVE_OF_KITTI = "KITTI poses have no stamps: remove the line and its stamp from copies, for gpvo import --times"
 _MANY = 0.2  # of the stamps: so many repeat only where they are rounded, or every line is there twice
 _MANY_FIELDS = 1_000_000  # lines are shorter
@@ -123,7 +123,7 @@ def write_tum(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) ->
 def tum_line(t_ns: int, T_world_body: Array) -> str:
     """One TUM line, without the line end."""
     q = se3.rotation_to_quaternion_xyzw(T_world_body[:3, :3])
-    return " ".join([ns_to_seconds_text(int(t_ns)), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
+    return " ".join([ns_to_seconds_text(t_ns), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
 
 
 def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]]:
@@ -133,7 +133,7 @@ def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]
             yield number, [f.strip() for f in text.split(separator)]
 
 
-def _floats(path: Path, number: int, fields: list[str], cure: str = _REMOVE) -> Array:
+def _floats(path: Path, number: int, fields: list[str], cure: str = REMOVE) -> Array:
     try:
         values = np.array([float(f) for f in fields])
     except ValueError:
@@ -181,7 +181,7 @@ def check_growing(path: Path, t_ns: NDArray[np.int64], lines: list[int]) -> None
     if len(bad):
         k = int(bad[0])
         word = "repeats" if t_ns[k + 1] == t_ns[k] else "goes back"
-        text = f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(int(t_ns[k + 1]))} s {word}"
+        text = f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(t_ns[k + 1])} s {word}"
         cure = "sort the file by time and drop repeated lines"
         repeated = len(t_ns) - len(np.unique(t_ns))
         if repeated > _MANY * len(t_ns):
@@ -195,11 +195,8 @@ def check_unit(path: Path, q_xyzw: Array, lines: list[int]) -> None:
     norm = np.linalg.norm(q_xyzw, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)
     if len(bad):
-        raise SourceError(
-            f"line {lines[int(bad[0])]}: the quaternion has length {norm[bad[0]]:.4f}, not 1",
-            where=path,
-            cure="check the order of the columns",
-        )
+        text = f"line {lines[int(bad[0])]}: the quaternion has length {norm[bad[0]]:.4f}, not 1"
+        raise SourceError(text, where=path, cure="check the order of the columns")
 
 
 @dataclass(frozen=True)
