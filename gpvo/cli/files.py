@@ -136,20 +136,14 @@ def _frame(log: ForeignLog) -> str:
 def info(
     path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
     kind: options.Kind = None,
-    calibration: options.Calibration = None,
-    pair_tolerance: options.PairTolerance = None,
-    left_topic: options.LeftTopic = None,
-    right_topic: options.RightTopic = None,
+    pairs: options.PairOptions = options.PairOptions(),
     json_: Json = False,
 ) -> None:
     """Describe a file or folder.
 
     Example: gpvo info MH_01_easy/
     """
-    given = options.source_options(
-        calibration=calibration, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic
-    )
-    document = plain(describe(path, kind, given))
+    document = plain(describe(path, kind, pairs.given()))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:

@@ -62,10 +62,7 @@ def live(
     ] = None,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     vo: flags.OdometryOptions = flags.OdometryOptions(),
-    hfov_deg: flags.HfovDeg = None,
-    size: flags.Size = None,
-    mask_left: flags.MaskLeft = None,
-    mask_right: flags.MaskRight = None,
+    view: flags.ViewOptions = flags.ViewOptions(),
     depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
@@ -78,13 +75,12 @@ def live(
 
     one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
     carrier = vehicle.bounds()
-    view = flags.source_options(size, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right)
     one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
     result = run_live(
         LiveSettings(
             model=model,
             stereo=stereo,
-            vo=_stereo_settings(vo, carrier, stereo is not None, view),
+            vo=_stereo_settings(vo, carrier, stereo is not None, view.given()),
             imu=imu,
             odometry=odometry,
             pose_type=POSE_TYPE_NAMES[odometry_type],
