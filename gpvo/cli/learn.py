@@ -238,14 +238,15 @@ def _print_table(document: dict[str, Any]) -> None:
     show(table)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
     say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")
-    resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
-    if resting:
-        told = ", ".join(f"{n} of {name}" for name, n in resting.items())
-        say(f"left out, because the truth moves while the vehicle stands still: {told} (--stationary keep keeps them)")
-    differing = {f["held_out"]: n for f in document["folds"] if (n := f.get("odd"))}
-    if differing:
-        told = ", ".join(f"{n} of {name}" for name, n in differing.items())
-        say(f"motions in which odometry and truth differ far more than elsewhere: {told}")
+    at_rest, odd = (
+        ", ".join(f"{n} of {f['held_out']}" for f in document["folds"] if (n := f.get(count)))
+        for count in ("truth_moves_at_rest", "odd")
+    )
+    if at_rest:
+        why = "because the truth moves while the vehicle stands still"
+        say(f"left out, {why}: {at_rest} (--stationary keep keeps them)")
+    if odd:
+        say(f"motions in which odometry and truth differ far more than elsewhere: {odd}")
         say("('gpvo evaluate' lists them; 'gpvo train --odd drop' trains and scores without them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):

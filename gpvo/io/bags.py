@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.kalibr import camchain_topics, read_yaml
+from gpvo.cameras.kalibr import camchain_topics
 from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
@@ -200,7 +200,7 @@ def _is_capture(topic: str) -> bool:
 
 def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None:
     """Left and right topic by the calibration, by name, or because there are but two."""
-    if chain is not None and "cam0" in read_yaml(chain):
+    if chain is not None:
         a, b = camchain_topics(chain)
         if a is not None and b is not None and {a, b} <= set(images):
             return a, b

@@ -142,10 +142,7 @@ def read_foreign(
         out and counted.
     covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
 
-    Raises
-    ------
-    SourceError
-        One line that names the file, the place and the cure.
+    Raises SourceError: one line that names the file, the place and the cure.
     """
     p = Path(path)
     name = kind or guess_format(p)

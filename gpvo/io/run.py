@@ -62,11 +62,8 @@ class RunWriter:
     resume : what decides the records beside the source; a run that broke off under the same is resumed: ``kept``
         is what it left, and its records are to be appended again, first of all. None begins anew.
 
-    Raises
-    ------
-    SourceError
-        Where the folder holds something that is not a run, or a finished one and not ``overwrite``; where it cannot be
-        written, or another process writes it.
+    Raises SourceError where the folder holds something that is not a run, or a finished one and not ``overwrite``;
+    where it cannot be written, or another process writes it.
     """
 
     def __init__(
