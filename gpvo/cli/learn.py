@@ -80,13 +80,13 @@ def train(
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
-    from gpvo.learning.store import check_writable, folds_path, save_model
+    from gpvo.learning.store import check_writable, config_of, folds_path, save_model
     from gpvo.learning.train import unseen_axes
 
     check_writable(out)
     settings = asdict(options)
     if update is not None:
-        settings = _settings_of(update) | {k: v for k, v in settings.items() if is_given(ctx, k)}
+        settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
     if statements is not None:
@@ -146,13 +146,6 @@ def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) 
     before = [] if update is None else modelfile.load(update)[1].get("simulated_truth") or []
     origin = before + simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
-
-
-def _settings_of(model: Path) -> dict[str, Any]:
-    """What a model was trained with."""
-    from gpvo.learning.store import config_of
-
-    return asdict(config_of(model))
 
 
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
+from gpvo.io.stamps import Stamps
 from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
-
-Stamps = NDArray[np.int64]
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU_TYPE = "sensor_msgs/msg/Imu"

@@ -16,7 +16,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, growing, integer_ns, match_nearest, text_lines, tolerance_ns
+from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, growing, integer_ns, match_nearest, text_lines, tolerance_ns
 from gpvo.io.trajectory import (
     BATCH_ESTIMATE,
     GPS_INS,
@@ -207,8 +207,10 @@ class KittiSource(FileSource):
         if not calib.is_file():
             raise CalibrationError("no calibration", where=calib, cure="copy the sequence's calib.txt there")
         left, right = self._cameras(path, colour)
-        known = SourceReport()
-        pairs = self._list_pairs(path, left, right, known)
+        if not (path / "times.txt").is_file():
+            raise SourceError("no time stamps", where=path / "times.txt", cure="one line of seconds per frame")
+        stamps, known = read_times(path / "times.txt"), SourceReport()
+        pairs = self._list_pairs(path, stamps, left, right, known)
         first = first_size(pairs, "left")  # the calibration does not say it
         if first is None:
             raise SourceError("no readable left image", where=path)
@@ -217,7 +219,7 @@ class KittiSource(FileSource):
         super().__init__(path, path.name, rig, pairs, known, **options)
         # Poses are of camera 0, whose place only KITTI's own file tells.
         T_cam0_left = left_camera_offset(own if own.is_file() else calib, left)
-        self.truth = self._read_truth(path, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)
+        self.truth = self._read_truth(path, stamps, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -239,12 +241,8 @@ class KittiSource(FileSource):
         raise SourceError("has no pair of image folders", where=path, cure=cure)
 
     @staticmethod
-    def _list_pairs(path: Path, left: int, right: int, known: SourceReport) -> list[PairFiles]:
+    def _list_pairs(path: Path, stamps: Stamps, left: int, right: int, known: SourceReport) -> list[PairFiles]:
         """One pair per line of ``times.txt``, named by index; a file without a line is counted, not guessed."""
-        times = path / "times.txt"
-        if not times.is_file():
-            raise SourceError("no time stamps", where=times, cure="one line of seconds per frame")
-        stamps = read_times(times)
         folders = (path / f"image_{left}", path / f"image_{right}")
         names: list[dict[int, Path]] = []
         for folder in folders:
@@ -263,13 +261,12 @@ class KittiSource(FileSource):
         ]
 
     @staticmethod
-    def _read_truth(path: Path, T_cam0_cam: Array, noise: TruthNoise) -> TruthLog | None:
+    def _read_truth(path: Path, stamps: Stamps, T_cam0_cam: Array, noise: TruthNoise) -> TruthLog | None:
         candidates = (path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt")
         file = next((c for c in candidates if c.is_file()), None)
         if file is None:
             return None
         T_world_cam0 = read_kitti_poses(file)
-        stamps = read_times(path / "times.txt")
         if len(T_world_cam0) != len(stamps):
             text = f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt"
             cure = "KITTI poses have no stamps: both files must have one line per frame"

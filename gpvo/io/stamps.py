@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.io.source import SourceReport
 
+Stamps = NDArray[np.int64]
+"""Nanoseconds (N,)."""
+
 GAP_FACTOR = 1.75
 PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
 _WINDOW = 51
@@ -164,7 +167,7 @@ def _growing_frames(frames: Iterable[F], report: SourceReport) -> Iterator[F]:
         yield pending
 
 
-def growing(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def growing(t_ns: Stamps) -> NDArray[np.bool_]:
     """(N,) whether each stamp is later than all before it."""
     return np.concatenate([[True], t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]])
 
@@ -176,7 +179,7 @@ def usual_interval(t_ns: Iterable[int]) -> float | None:
 
 
 def check_interval(
-    t_ns: Sequence[int] | NDArray[np.int64], where: object, cure: Callable[[str], str], *, is_stated: bool = False
+    t_ns: Sequence[int] | Stamps, where: object, cure: Callable[[str], str], *, is_stated: bool = False
 ) -> None:
     """Refuse stamps whose usual interval no odometry has, because they are in another unit than they were read in.
 
@@ -248,7 +251,7 @@ def _by_stamp(images: list[tuple[int, str]], side: str, report: SourceReport) ->
     return names
 
 
-def _nearest(t: NDArray[np.int64], among: NDArray[np.int64]) -> NDArray[np.intp]:
+def _nearest(t: Stamps, among: Stamps) -> NDArray[np.intp]:
     """Index of the nearest of the sorted stamps ``among``, for each of ``t``."""
     after = np.searchsorted(among, t).clip(max=len(among) - 1)
     before = (after - 1).clip(min=0)

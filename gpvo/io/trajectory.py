@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.io.stamps import (
+    Stamps,
     check_interval,
     cure_of_seconds,
     cure_of_unit,
@@ -38,7 +38,7 @@ _MANY_FIELDS = 1_000_000  # lines are shorter
 class Trajectory:
     """Poses of one moving frame: ``t_ns`` (N,) int64, strictly growing, and ``T_world_body`` (N, 4, 4)."""
 
-    t_ns: NDArray[np.int64]
+    t_ns: Stamps
     T_world_body: Array
 
     def __len__(self) -> int:
@@ -96,7 +96,7 @@ def read_kitti_poses(path: str | Path) -> Array:
     return se3.orthonormalise(se3.from_rt(R, M[:, :, 3]))
 
 
-def read_times(path: str | Path) -> NDArray[np.int64]:
+def read_times(path: str | Path) -> Stamps:
     """KITTI's ``times.txt`` (seconds) as (N,) nanoseconds, in the order of the file.
 
     Raises SourceError, naming file and line.
@@ -113,7 +113,7 @@ def read_times(path: str | Path) -> NDArray[np.int64]:
     return np.array(stamps, dtype=np.int64)
 
 
-def write_tum(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) -> None:
+def write_tum(path: str | Path, t_ns: Stamps, T_world_body: Array) -> None:
     """Write TUM lines, stamps and values with nine decimals."""
     lines = (tum_line(t, T) + "\n" for t, T in zip(t_ns, T_world_body, strict=True))
     with replacing(Path(path)) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
@@ -175,7 +175,7 @@ def _read_poses(
     return Trajectory(t, se3.from_quaternion(data[:, :3], data[:, q_xyzw])), behind
 
 
-def check_growing(path: Path, t_ns: NDArray[np.int64], lines: list[int]) -> None:
+def check_growing(path: Path, t_ns: Stamps, lines: list[int]) -> None:
     """Refuse stamps that repeat or go back, naming the line."""
     bad = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(bad):
@@ -232,7 +232,7 @@ def carry(trajectory: Trajectory, T_body_cam: Array, noise: TruthNoise) -> Truth
     )
 
 
-def check_overlap(truth: TruthLog, t_ns: Sequence[int] | NDArray[np.int64], path: Path) -> None:
+def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path) -> None:
     """Raise SourceError for a truth that does not overlap frames in time, the first and the last of ``t_ns``."""
     (first, last), (begin, end) = ((int(t[0]), int(t[-1])) for t in (t_ns, truth.t_ns))
     if end < first or begin > last:
