@@ -154,12 +154,14 @@ def _choose_topics(
     reader: Any, path: Path, chain: Path | None, asked: tuple[str | None, ...], *, any_truth: bool
 ) -> _Topics:
     left, right, imu, truth = asked
-    images = topics_of(reader, IMAGE_TYPES)
-    for topic in (left, right):
-        if topic is not None and topic not in images:
-            raise SourceError(f"has no images on '{topic}' (images on: {', '.join(images) or 'none'})", where=path)
+    images, imus, poses = (list(topics_of(reader, types)) for types in (IMAGE_TYPES, (IMU_TYPE,), POSE_TYPES))
+    for topic, what, found in (
+        (left, "images", images), (right, "images", images), (imu, "IMU", imus), (truth, "poses", [*poses, "none"])
+    ):  # fmt: skip
+        if topic is not None and topic not in found:
+            raise SourceError(f"has no {what} on '{topic}' ({what} on: {', '.join(found) or 'none'})", where=path)
     if left is None or right is None:
-        pair = _guess_pair(list(images), chain)
+        pair = _guess_pair(images, chain)
         if pair is None:
             cure = "name them with --left-topic and --right-topic" if images else "is this the bag with the images?"
             text = f"no stereo pair among its image topics ({', '.join(images) or 'none'})"
@@ -167,11 +169,6 @@ def _choose_topics(
         left, right = left or pair[0], right or pair[1]
     if left == right:
         raise SourceError(f"left and right are the same topic '{left}'", where=path)
-    imus = list(topics_of(reader, (IMU_TYPE,)))
-    poses = list(topics_of(reader, POSE_TYPES))
-    for topic, available in ((imu, imus), (truth, [*poses, "none"])):
-        if topic is not None and topic not in available:
-            raise SourceError(f"has nothing to read on '{topic}' (there are: {', '.join(available)})", where=path)
     count = min(reader.topics[t].msgcount for t in (left, right))
     doubtful = None
     if truth is None:

@@ -24,6 +24,7 @@ from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_TO_GREY = {True: (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY), False: (cv2.COLOR_RGB2GRAY, cv2.COLOR_RGBA2GRAY)}
 _MAX_IMAGE_BYTES = 500_000_000
 _MAX_HEAD_BYTES = 1 << 20  # Thumbnails and colour profiles stand before the size.
 # Are left and right swapped? Points in front of both cameras lie further right in the left image.
@@ -49,9 +50,8 @@ def to_grey8(image: NDArray[Any], *, bgr: bool = True, depth: Depth | None = Non
         if channels == 1:
             image = image[:, :, 0]
         else:
-            code = {(3, True): cv2.COLOR_BGR2GRAY, (3, False): cv2.COLOR_RGB2GRAY}.get((channels, bgr))
-            code = (cv2.COLOR_BGRA2GRAY if bgr else cv2.COLOR_RGBA2GRAY) if code is None else code
-            image = np.asarray(cv2.cvtColor(image, code))
+            of_three, of_four = _TO_GREY[bgr]
+            image = np.asarray(cv2.cvtColor(image, of_three if channels == 3 else of_four))
     if image.dtype == np.uint16:
         return (depth or Depth()).to8(image)
     return np.ascontiguousarray(image, dtype=np.uint8)
