@@ -143,10 +143,8 @@ class _OfSource:
     """Options that go to :func:`gpvo.io.open_source`."""
 
     def given(self) -> dict[str, Any]:
-        """Those that were given, by the names there. Raises GpvoError if a size is not WIDTHxHEIGHT."""
+        """Those that were given, parsed. Raises GpvoError if a size is not WIDTHxHEIGHT."""
         options = {name: value for name, value in vars(self).items() if value is not None}
-        if "pair_tolerance" in options:
-            options["tolerance_s"] = options.pop("pair_tolerance")
         if "size" in options:
             from gpvo.cameras.rectify import read_size
 
@@ -159,8 +157,9 @@ class PairOptions(_OfSource):
     """What makes the stereo pairs of a sequence."""
 
     calibration: Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")] = None
-    pair_tolerance: Annotated[
-        float | None, typer.Option(help="Largest difference between the stamps of a stereo pair [s].")
+    tolerance_s: Annotated[
+        float | None,
+        typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
     ] = None
     left_topic: Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")] = None
     right_topic: Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")] = None
@@ -208,7 +207,8 @@ class WireOptions:
 
     def transport(self) -> str | None:
         """The one that was chosen, None if none was. Raises GpvoError if several were."""
-        chosen = [name for name in ("zenoh", "dds", "ros2", "ros1") if getattr(self, name)]
+        flags = {"zenoh": self.zenoh, "dds": self.dds, "ros2": self.ros2, "ros1": self.ros1}
+        chosen = [name for name, is_on in flags.items() if is_on]
         if len(chosen) > 1:
             raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
         return chosen[0] if chosen else None
