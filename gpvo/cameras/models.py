@@ -38,17 +38,24 @@ class CameraModel(ABC):
         """fx, fy, cx, cy."""
         return [float(v) for v in (self.fx_px, self.fy_px, self.cx_px, self.cy_px)]
 
-    @abstractmethod
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) points to (N, 2) pixels and (N,) whether the lens can see the point (also outside the image)."""
+        xy, valid = self._to_plane(np.asarray(points, dtype=np.float64).reshape(-1, 3))
+        uv = xy * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+        return np.where(valid[:, None], uv, np.nan), valid
 
-    @abstractmethod
     def unproject(self, uv: Array) -> Array:
         """(N, 2) pixels to (N, 3) unit rays; NaN where no ray maps to the pixel."""
+        uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+        return self._from_plane((uv - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px))
 
-    def _normalised(self, uv: Array) -> Array:
-        """(N, 2) pixels to the plane of unit focal length."""
-        return (np.asarray(uv, dtype=np.float64).reshape(-1, 2) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
+    @abstractmethod
+    def _to_plane(self, P: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """(N, 3) points to the plane of unit focal length (N, 2), distorted, and (N,) validity."""
+
+    @abstractmethod
+    def _from_plane(self, distorted: Array) -> Array:
+        """The way back, to unit rays; NaN where there is none."""
 
 
 @dataclass(frozen=True)
@@ -145,18 +152,13 @@ class PinholeRadtan(CameraModel):
         y_by_y = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
         return x_by_x, y_by_y, x * y * slope + 2 * p1 * x + 2 * p2 * y
 
-    def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, 3) points to (N, 2) pixels and (N,) validity."""
-        P = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    def _to_plane(self, P: Array) -> tuple[Array, NDArray[np.bool_]]:
         front = P[:, 2] > 1e-12
         xy = P[:, :2] / np.where(front, P[:, 2], 1.0)[:, None]
-        valid = front & (np.hypot(xy[:, 0], xy[:, 1]) < self.max_radius)
-        uv = self._distort(xy) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
-        return np.where(valid[:, None], uv, np.nan), valid
+        return self._distort(xy), front & (np.hypot(xy[:, 0], xy[:, 1]) < self.max_radius)
 
-    def unproject(self, uv: Array) -> Array:
-        """(N, 2) pixels to (N, 3) unit rays, by Newton's method in two dimensions; NaN where there is none."""
-        distorted = self._normalised(uv)
+    def _from_plane(self, distorted: Array) -> Array:
+        """By Newton's method in two dimensions."""
         xy = self._undistort_radially(distorted)
         for _ in range(20):
             residual = self._distort(xy) - distorted
@@ -201,21 +203,16 @@ class KannalaBrandt(CameraModel):
         """Largest angle from the optical axis up to which the polynomial grows, at most pi."""
         return min(_Radial(self.distortion).limit, np.pi)
 
-    def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, 3) points to (N, 2) pixels and (N,) validity."""
-        P = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    def _to_plane(self, P: Array) -> tuple[Array, NDArray[np.bool_]]:
         r = np.hypot(P[:, 0], P[:, 1])
         theta = np.arctan2(r, P[:, 2])
         on_axis = r == 0
         valid = (theta <= self.max_angle_rad) & ~(on_axis & (P[:, 2] <= 0))
         direction = P[:, :2] / np.where(on_axis, 1.0, r)[:, None]
-        uv = _Radial(self.distortion)(theta)[:, None] * direction * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
-        return np.where(valid[:, None], uv, np.nan), valid
+        return _Radial(self.distortion)(theta)[:, None] * direction, valid
 
-    def unproject(self, uv: Array) -> Array:
-        """(N, 2) pixels to (N, 3) unit rays; NaN beyond the largest angle."""
-        m = self._normalised(uv)
-        r = np.linalg.norm(m, axis=1)
+    def _from_plane(self, distorted: Array) -> Array:
+        r = np.linalg.norm(distorted, axis=1)
         theta = _Radial(self.distortion).invert(r, self.max_angle_rad)
-        direction = m / np.where(r > 0, r, 1.0)[:, None]
+        direction = distorted / np.where(r > 0, r, 1.0)[:, None]
         return np.concatenate([np.sin(theta)[:, None] * direction, np.cos(theta)[:, None]], axis=1)

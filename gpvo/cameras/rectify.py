@@ -135,8 +135,7 @@ class Rectifier:
             seen.append(inside)
             # 16-bit fixed point: 1/32 px steps, half the memory traffic of floats.
             clipped = np.clip(uv, -100.0, 32000.0).astype(np.float32)
-            whole, fraction = cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2)
-            maps.append((np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)))
+            maps.append(cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2))
         return maps, seen
 
     def _mask_or_none(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
