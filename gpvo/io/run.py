@@ -25,7 +25,7 @@ import numpy as np
 from gpvo import __version__
 from gpvo.errors import SourceError
 from gpvo.files import write_json, write_toml
-from gpvo.geometry.covariance import are_positive_definite
+from gpvo.geometry.covariance import are_positive_definite, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
 from gpvo.io.run_folder import SCHEMA, is_finished
@@ -277,7 +277,7 @@ def write_predictions(path: str | Path, predictions: Sequence[Prediction]) -> No
 def as_stored(record: VoRecord) -> VoRecord:
     """The record as it will be read: covariances by their upper triangles, without those that are none: not finite, or
     not positive definite."""
-    names, C = list(record.covariances), np.array(list(record.covariances.values())).reshape(-1, 6, 6)
-    C = np.where(np.tri(6, k=-1, dtype=bool), np.swapaxes(C, 1, 2), C)
+    C = from_upper(upper(np.array(list(record.covariances.values())).reshape(-1, 6, 6)), 6)
     good = are_positive_definite(C) if record.usable else np.ones(len(C), bool)
-    return replace(record, covariances={name: c for name, c, is_good in zip(names, C, good) if is_good})
+    kept = {name: c for name, c, is_good in zip(record.covariances, C, good) if is_good}
+    return replace(record, covariances=kept)
