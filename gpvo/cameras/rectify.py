@@ -26,6 +26,8 @@ _Map = tuple[NDArray[np.int16], NDArray[np.uint16]]
 class Rectifier:
     """Maps raw stereo pairs to the virtual pair :attr:`camera`.
 
+    Raises CalibrationError where the asked field of view or size is not possible, or shows almost nothing.
+
     Parameters
     ----------
     rig : the calibrated rig.
@@ -41,8 +43,6 @@ class Rectifier:
     mask_right : the same of the right image.
     R_rect_left : (3, 3), left camera axes to rectified axes.
     mounting : where the rectified left camera sits.
-
-    Raises CalibrationError where the asked field of view or size is not possible, or shows almost nothing.
     """
 
     def __init__(self, rig: StereoRig, *, hfov_deg: float | None = None, size: tuple[int, int] | None = None) -> None:

@@ -131,6 +131,8 @@ def read_foreign(
 ) -> ForeignLog:
     """Read another odometry's log, or a ground truth.
 
+    Raises SourceError: one line that names the file, the place and the cure.
+
     Parameters
     ----------
     kind : one of :data:`FORMATS`, by default guessed.
@@ -141,8 +143,6 @@ def read_foreign(
     complete : refuse rows of a CSV, or messages of a bag, without a pose, as a ground truth must; else they are left
         out and counted.
     covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
-
-    Raises SourceError: one line that names the file, the place and the cure.
     """
     p = Path(path)
     name = kind or guess_format(p)

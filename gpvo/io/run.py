@@ -50,6 +50,9 @@ __all__ = [
 class RunWriter:
     """Writes a run folder as the records come; use as a context manager.
 
+    Raises SourceError where the folder holds something that is not a run, or a finished one and not ``overwrite``;
+    where it cannot be written, or another process writes it.
+
     Parameters
     ----------
     path : the folder; made if need be. What a killed run left is replaced, anything but a run refused.
@@ -61,9 +64,6 @@ class RunWriter:
     chunk : records per chunk; a killed run loses at most so many.
     resume : what decides the records beside the source; a run that broke off under the same is resumed: ``kept``
         is what it left, and its records are to be appended again, first of all. None begins anew.
-
-    Raises SourceError where the folder holds something that is not a run, or a finished one and not ``overwrite``;
-    where it cannot be written, or another process writes it.
     """
 
     def __init__(
