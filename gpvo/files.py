@@ -219,15 +219,11 @@ def _toml_key(name: str) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if isinstance(value, list):
         return "[" + ", ".join(_toml_value(v) for v in value if v is not None) + "]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in value.items() if v is not None) + "}"
-    if isinstance(value, (int, float)):
-        return repr(value)
-    return json.dumps(str(value))
+    return json.dumps(value)  # numbers, texts and truth values are written alike
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import queue
-import threading
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from itertools import starmap
 from typing import Any, TypeVar
 
-from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.errors import GpvoError, require
 
 T = TypeVar("T")
 
@@ -32,7 +34,7 @@ def map_jobs(
     if backend != "local":
         raise GpvoError(f"unknown backend '{backend}'", cure="local or dask")
     if jobs == 1 or len(jobs_arguments) < 2:
-        return _told((function(*arguments) for arguments in jobs_arguments), on_done)
+        return _told(starmap(function, jobs_arguments), on_done)
     from joblib import Parallel, delayed
 
     calls = (delayed(function)(*arguments) for arguments in jobs_arguments)
@@ -53,10 +55,9 @@ def _told(results: Iterable[Any], on_done: Callable[[], None]) -> list[Any]:
 def _on_dask(
     function: Callable[..., Any], jobs_arguments: Sequence[tuple[Any, ...]], scheduler: str | None
 ) -> list[Any]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise MissingExtraError("distributed", "dask") from None
+    require("distributed")
+    from distributed import Client
+
     try:
         client = Client(scheduler, timeout="10s") if scheduler else Client(processes=True, dashboard_address=None)
     except (OSError, TimeoutError, ValueError) as problem:
@@ -71,41 +72,19 @@ def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:
 
     An exception in the thread is raised here; the thread ends when the consumer stops.
     """
-    waiting: queue.Queue[tuple[str, Any]] = queue.Queue(maxsize=depth)
-    stop = threading.Event()
-
-    def put(entry: tuple[str, Any]) -> None:
-        while not stop.is_set():
-            try:
-                waiting.put(entry, timeout=0.1)
-                return
-            except queue.Full:
-                continue
-
-    def work() -> None:
-        try:
-            for item in items:
-                put(("item", item))
-                if stop.is_set():
-                    return
-            put(("end", None))
-        except BaseException as error:
-            put(("error", error))
-        finally:
-            # A generator's files belong to this thread: close them here, not wherever it is collected.
-            if isinstance(items, Generator):
-                items.close()
-
-    thread = threading.Thread(target=work, name="gpvo-decode", daemon=True)
-    thread.start()
+    remaining = iter(items)
+    end: Any = object()
+    thread = ThreadPoolExecutor(1, "gpvo-decode")
+    ahead = deque(thread.submit(next, remaining, end) for _ in range(depth))
     try:
-        while True:
-            what, value = waiting.get()
-            if what == "end":
-                return
-            if what == "error":
-                raise value
-            yield value
+        while (item := ahead.popleft().result()) is not end:
+            ahead.append(thread.submit(next, remaining, end))
+            yield item
     finally:
-        stop.set()
-        thread.join()
+        for future in ahead:
+            future.cancel()
+        # A generator's files belong to the thread: close them there, not wherever it is collected.
+        if isinstance(items, Generator):
+            with suppress(RuntimeError):  # at the end of the process no thread takes more
+                thread.submit(items.close)
+        thread.shutdown()

@@ -70,11 +70,7 @@ def run(
     written; ``meta``: further keys of ``run.json``. An interrupted run leaves a folder that can be read up to its last
     complete chunk. ``resume``: the options that the source was opened with, in words. A run of the same source, options
     and settings that broke off in ``out`` is resumed, and ends with the same bytes apart from times; None begins anew.
-
-    Raises
-    ------
-    SourceError
-        If the source holds no frames, or its left and right images look swapped.
+    Raises SourceError if the source holds no frames, or its left and right images look swapped.
     """
     config = config or VoConfig()
     known: dict[str, object] = {"source": str(source.name), "source_format": source.format, "kind": source.kind}
@@ -157,10 +153,7 @@ def steps(
 ) -> Iterator[Step]:
     """The frames of a source through odometry, one by one; the records of the first ones may be known already.
 
-    Raises
-    ------
-    SourceError
-        Where these are of other frames.
+    Raises SourceError where these are of other frames.
     """
     odometry = odometry or StereoOdometry(source.camera, config, source.mask)
     t_last_ns: int | None = None
@@ -206,11 +199,8 @@ def _refuse_swapped(frame: TrackFrame, where: object) -> None:
     disparity = frame.uv_left[:, 0] - frame.uv_right[:, 0]
     behind = int((disparity < -1.0).sum())
     if behind >= 10 and behind > 0.8 * len(disparity):
-        raise SourceError(
-            f"left and right look swapped: {behind} of {len(disparity)} points have negative disparity",
-            where=where,
-            cure="exchange uv_left and uv_right",
-        )
+        text = f"left and right look swapped: {behind} of {len(disparity)} points have negative disparity"
+        raise SourceError(text, where=where, cure="exchange uv_left and uv_right")
 
 
 def config_of(run: Path) -> VoConfig:

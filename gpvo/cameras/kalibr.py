@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -110,9 +111,8 @@ def read_camchain(path: Path, *, left: str = "cam0", right: str = "cam1") -> Ste
     for name in (left, right):
         if not isinstance(document.get(name), dict):
             found = ", ".join(k for k in document if str(k).startswith("cam")) or "none"
-            raise CalibrationError(
-                f"has no block '{name}' (cameras found: {found})", where=path, cure="a stereo pair needs two cameras"
-            )
+            cure = "a stereo pair needs two cameras"
+            raise CalibrationError(f"has no block '{name}' (cameras found: {found})", where=path, cure=cure)
         blocks[name] = document[name]
     T_left_imu, T_right_imu = (_cam_imu(blocks[n], f"{path}: {n}") for n in (left, right))
     shift = blocks[left].get("timeshift_cam_imu", 0.0)
@@ -141,8 +141,7 @@ def read_imu_noise(path: Path) -> ImuNoise:
     document = read_yaml(path)
     block = document["imu0"] if isinstance(document.get("imu0"), dict) else document
 
-    def number(*keys: str) -> float:
-        key = next((k for k in keys if k in block), keys[0])
+    def number(key: str) -> float:
         value = get_numbers(block, key, 1, path)[0]
         if value < 0:
             raise CalibrationError(f"'{key}' is negative", where=path)
@@ -157,37 +156,28 @@ def read_imu_noise(path: Path) -> ImuNoise:
 
 
 def make_lens(
-    camera_model: str,
     distortion_model: str,
-    intrinsics: list[float],
-    distortion: list[float],
-    resolution: tuple[int, int],
+    intrinsics_px: Sequence[float],
+    distortion: Sequence[float],
+    resolution_px: tuple[int, int],
     where: object,
 ) -> CameraModel:
-    """A lens from the names that Kalibr, EuRoC and ROS use for the two models.
+    """A lens from the names that Kalibr, EuRoC and ROS use for distortion; ``intrinsics_px``: fx, fy, cx, cy.
 
-    Raises CalibrationError for a model other than pinhole with radial-tangential or equidistant distortion.
+    Raises CalibrationError for a distortion other than radial-tangential or equidistant.
     """
-    fx, fy, cx, cy = intrinsics
-    width, height = resolution
+    fx, fy, cx, cy = intrinsics_px
+    width, height = resolution_px
     name = distortion_model.lower().replace("_", "-")
-    if camera_model != "pinhole":
-        raise CalibrationError(
-            f"camera model '{camera_model}' is not supported",
-            where=where,
-            cure="calibrate as pinhole with radtan, or with equidistant distortion for a fisheye",
-        )
     if name in ("radtan", "radial-tangential", "plumb-bob", "rational-polynomial", "none", ""):
         # The rational model with zeros beyond the fifth coefficient is the common one.
         if any(distortion[5:]):
             raise CalibrationError("more than five distortion coefficients are not supported", where=where)
-        k = (*distortion[:5], *([0.0] * (5 - len(distortion[:5]))))
-        return PinholeRadtan(fx, fy, cx, cy, width, height, k)
+        return PinholeRadtan(fx, fy, cx, cy, width, height, (*distortion, *[0.0] * 5)[:5])
     if name in ("equidistant", "fisheye", "kannala-brandt", "kannala-brandt4"):
         if len(distortion) < 4 or any(distortion[4:]):
             raise CalibrationError(f"a fisheye needs 4 distortion coefficients, not {len(distortion)}", where=where)
-        k1, k2, k3, k4 = distortion[:4]
-        return KannalaBrandt(fx, fy, cx, cy, width, height, (k1, k2, k3, k4))
+        return KannalaBrandt(fx, fy, cx, cy, width, height, tuple(distortion[:4]))
     raise CalibrationError(
         f"distortion model '{distortion_model}' is not supported", where=where, cure="use radtan or equidistant"
     )
@@ -197,7 +187,8 @@ def _lens(block: dict[str, Any], where: str) -> CameraModel:
     width, height = get_numbers(block, "resolution", 2, where)
     model = str(block.get("camera_model", "pinhole"))
     if model != "pinhole":
-        return make_lens(model, "", [0.0] * 4, [], (0, 0), where)
+        cure = "calibrate as pinhole with radtan, or with equidistant distortion for a fisheye"
+        raise CalibrationError(f"camera model '{model}' is not supported", where=where, cure=cure)
     distortion = []
     distortion_model = str(block.get("distortion_model", "none"))
     if distortion_model != "none":
@@ -205,7 +196,7 @@ def _lens(block: dict[str, Any], where: str) -> CameraModel:
         key = "distortion_coefficients" if "distortion_coefficients" in block else "distortion_coeffs"
         distortion = get_numbers(block, key, (4, 5), where)
     intrinsics = get_numbers(block, "intrinsics", 4, where)
-    return make_lens(model, distortion_model, intrinsics, distortion, (int(width), int(height)), where)
+    return make_lens(distortion_model, intrinsics, distortion, (int(width), int(height)), where)
 
 
 def _cam_imu(block: dict[str, Any], where: str) -> Array | None:
@@ -223,28 +214,25 @@ def _right_left(
 ) -> Array:
     """Left to right camera by the chain, by the IMU, or by both where they agree."""
     chained = _chain(document, left, right, path)
-    by_imu = None
     if T_left_imu is not None and T_right_imu is not None:
         by_imu = T_right_imu @ se3.inverse(T_left_imu)
-    if chained is None and by_imu is None:
+    elif chained is not None:
+        return chained
+    else:
+        cure = "add T_cn_cnm1 to the second camera, or T_cam_imu to both"
+        raise CalibrationError(f"does not say where '{right}' sits relative to '{left}'", where=path, cure=cure)
+    if chained is None:
+        return by_imu
+    difference = se3.log(se3.inverse(by_imu) @ chained)
+    shift_m, turn_rad = np.linalg.norm(difference[:3]), np.linalg.norm(difference[3:])
+    if shift_m > _CHAIN_TOLERANCE_M or turn_rad > _CHAIN_TOLERANCE_RAD:
         raise CalibrationError(
-            f"does not say where '{right}' sits relative to '{left}'",
+            f"T_cn_cnm1 and the transforms to the IMU disagree by {shift_m * 1e3:.1f} mm and"
+            f" {np.rad2deg(turn_rad):.2f} degrees",
             where=path,
-            cure="add T_cn_cnm1 to the second camera, or T_cam_imu to both",
+            cure="T_cn_cnm1 maps points of the previous camera to this one; T_cam_imu those of the IMU",
         )
-    if chained is not None and by_imu is not None:
-        difference = se3.log(se3.inverse(by_imu) @ chained)
-        shift_m, turn_rad = np.linalg.norm(difference[:3]), np.linalg.norm(difference[3:])
-        if shift_m > _CHAIN_TOLERANCE_M or turn_rad > _CHAIN_TOLERANCE_RAD:
-            raise CalibrationError(
-                f"T_cn_cnm1 and the transforms to the IMU disagree by {shift_m * 1e3:.1f} mm and"
-                f" {np.rad2deg(turn_rad):.2f} degrees",
-                where=path,
-                cure="T_cn_cnm1 maps points of the previous camera to this one; T_cam_imu those of the IMU",
-            )
-    result = chained if chained is not None else by_imu
-    assert result is not None
-    return result
+    return chained
 
 
 def _chain(document: dict[str, Any], left: str, right: str, path: Path) -> Array | None:
@@ -274,11 +262,6 @@ def read_sensor_pose(path: Path) -> Array:
     return check_pose(block, "T_BS", path)
 
 
-def _read_sensor_lens(path: Path) -> CameraModel:
-    """The lens of one camera."""
-    return _lens(read_yaml(path), str(path))
-
-
 def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_is_flu: bool = False) -> StereoRig:
     """The rig of two camera ``sensor.yaml`` files; ``imu``: that of the IMU, else the IMU is the body's origin.
 
@@ -287,8 +270,8 @@ def read_sensor_pair(left: Path, right: Path, *, imu: Path | None = None, body_i
     T_body_left, T_body_right = read_sensor_pose(left), read_sensor_pose(right)
     T_body_imu = read_sensor_pose(imu) if imu is not None else np.eye(4)
     return StereoRig(
-        left=_read_sensor_lens(left),
-        right=_read_sensor_lens(right),
+        left=_lens(read_yaml(left), str(left)),
+        right=_lens(read_yaml(right), str(right)),
         T_right_left=se3.inverse(T_body_right) @ T_body_left,
         T_imu_left=se3.inverse(T_body_imu) @ T_body_left,
         T_body_left=T_body_left if body_is_flu else None,

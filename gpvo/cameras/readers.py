@@ -15,6 +15,7 @@ from gpvo.cameras.kalibr import calibration_text, get_numbers, make_lens, read_c
 from gpvo.cameras.models import CameraModel, PinholeRadtan
 from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import CalibrationError
+from gpvo.geometry import se3
 from gpvo.types import Array
 
 _T265_SIZE = (848, 800)
@@ -43,7 +44,7 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
     if path.suffix.lower() == ".txt":
         if size is None:
             raise CalibrationError("does not give the image size", where=path, cure="convert it to a camchain.yaml")
-        return read_kitti_calib(path, left=0, right=1, size=size)
+        return read_kitti_calib(path, 0, 1, size)
     document = read_yaml(path)
     if "cam0" in document or "cam1" in document:
         return read_camchain(path)
@@ -60,11 +61,8 @@ def read_stereo_yaml(path: Path, *, size: tuple[int, int] | None = None) -> Ster
 
 def find_calibration(folder: Path) -> Path | None:
     """The calibration file in a folder, None where there is none."""
-    for pattern in CALIBRATION_NAMES:
-        for path in sorted(folder.glob(pattern)):
-            if path.is_file():
-                return path
-    return None
+    found = (path for pattern in CALIBRATION_NAMES for path in sorted(folder.glob(pattern)))
+    return next((path for path in found if path.is_file()), None)
 
 
 def read_opencv_stereo(path: Path, *, size: tuple[int, int] | None = None) -> StereoRig:
@@ -75,9 +73,8 @@ def read_opencv_stereo(path: Path, *, size: tuple[int, int] | None = None) -> St
     CalibrationError where a key is missing or the rig impossible.
     """
     document = read_yaml(path)
-    T = np.eye(4)
-    T[:3, :3] = np.reshape(get_numbers(document, "R", 9, path), (3, 3))
-    T[:3, 3] = get_numbers(document, "T", 3, path)
+    R = np.reshape(get_numbers(document, "R", 9, path), (3, 3))
+    T = se3.from_rt(R, np.array(get_numbers(document, "T", 3, path)))
     resolution = _size(document, size, path)
     return StereoRig(
         left=_lens(document, "1", resolution, path),
@@ -93,11 +90,16 @@ def _size(document: dict[str, Any], size: tuple[int, int] | None, path: Path) ->
             width, height = get_numbers(document, key, 2, path)
             return int(width), int(height)
     if "image_width" in document and "image_height" in document:
-        width, height = (get_numbers(document, key, 1, path)[0] for key in ("image_width", "image_height"))
-        return int(width), int(height)
+        return _stated_size(document, path)
     if size is None:
         raise CalibrationError("does not give the image size", where=path, cure="add the line 'resolution: [848, 800]'")
     return size
+
+
+def _stated_size(document: dict[str, Any], path: Path) -> tuple[int, int]:
+    """ROS' ``image_width`` and ``image_height``."""
+    width, height = (int(get_numbers(document, key, 1, path)[0]) for key in ("image_width", "image_height"))
+    return width, height
 
 
 def _lens(document: dict[str, Any], index: str, size: tuple[int, int], path: Path) -> CameraModel:
@@ -109,7 +111,12 @@ def _lens(document: dict[str, Any], index: str, size: tuple[int, int], path: Pat
         # Nothing names the lens: only the T265's own size tells its fisheye from a radial-tangential lens.
         fisheye = len(D) == 4 and size == _T265_SIZE
     model = "equidistant" if fisheye else "radtan"
-    return make_lens("pinhole", model, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], D, size, path)
+    return make_lens(model, _of_matrix(K), D, size, path)
+
+
+def _of_matrix(K: Array) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a camera or projection matrix."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 @dataclass(frozen=True)
@@ -160,8 +167,7 @@ def _read_camera_info(path: Path) -> CameraInfo:
     holder = document.get("distortion_coefficients")
     count = len(holder.get("data", ())) if isinstance(holder, dict) else 0
     return CameraInfo(
-        width=int(get_numbers(document, "image_width", 1, path)[0]),
-        height=int(get_numbers(document, "image_height", 1, path)[0]),
+        *_stated_size(document, path),
         distortion_model=str(document.get("distortion_model", "plumb_bob")),
         D=matrix("distortion_coefficients", 1, count)[0],
         K=matrix("camera_matrix", 3, 3),
@@ -179,33 +185,17 @@ def rig_from_camera_info(left: CameraInfo, right: CameraInfo, *, rectified: bool
     """
     for name, info in (("left", left), ("right", right)):
         if info.K[0, 0] == 0 or info.P[0, 0] == 0:
-            raise CalibrationError(
-                f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)",
-                where=where,
-                cure="put a Kalibr camchain.yaml beside the bag",
-            )
+            cure = "put a Kalibr camchain.yaml beside the bag"
+            raise CalibrationError(f"the {name} CameraInfo is uncalibrated (K[0] or P[0] is 0)", where=where, cure=cure)
     baseline = left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0]
-    T_rect = np.eye(4)
-    T_rect[0, 3] = -baseline
-    text = None if where is None else str(where)
+    place, text = np.array([-baseline, 0.0, 0.0]), None if where is None else str(where)
     if rectified:
-        lenses = [PinholeRadtan(c.P[0, 0], c.P[1, 1], c.P[0, 2], c.P[1, 2], c.width, c.height) for c in (left, right)]
-        return StereoRig(left=lenses[0], right=lenses[1], T_right_left=T_rect, where=text)
+        lenses = [PinholeRadtan(*_of_matrix(c.P), c.width, c.height) for c in (left, right)]
+        return StereoRig(lenses[0], lenses[1], se3.from_rt(np.eye(3), place), where=text)
     raw = [
-        make_lens(
-            "pinhole",
-            c.distortion_model,
-            [c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]],
-            [float(d) for d in c.D],
-            (c.width, c.height),
-            where,
-        )
-        for c in (left, right)
+        make_lens(c.distortion_model, _of_matrix(c.K), c.D.tolist(), (c.width, c.height), where) for c in (left, right)
     ]
-    T_right_left = np.eye(4)
-    T_right_left[:3, :3] = right.R.T @ left.R
-    T_right_left[:3, 3] = right.R.T @ T_rect[:3, 3]
-    return StereoRig(left=raw[0], right=raw[1], T_right_left=T_right_left, where=text)
+    return StereoRig(raw[0], raw[1], se3.from_rt(right.R.T @ left.R, right.R.T @ place), where=text)
 
 
 def read_projections(path: Path) -> dict[str, Array]:
@@ -226,7 +216,7 @@ def read_projections(path: Path) -> dict[str, Array]:
     return found
 
 
-def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]) -> StereoRig:
+def read_kitti_calib(path: Path, left: int, right: int, size: tuple[int, int]) -> StereoRig:
     """The rectified pair of cameras ``left`` and ``right`` (0 and 1 grey, 2 and 3 colour) with images of ``size``.
 
     Raises CalibrationError where a matrix is missing, the two do not share their intrinsics, or the baseline is
@@ -235,37 +225,33 @@ def read_kitti_calib(path: Path, *, left: int, right: int, size: tuple[int, int]
     P = read_projections(path)
     for camera in (left, right):
         if f"P{camera}" not in P:
-            raise CalibrationError(
-                f"lacks the line 'P{camera}:'", where=path, cure="12 numbers, the 3x4 matrix row by row"
-            )
+            cure = "12 numbers, the 3x4 matrix row by row"
+            raise CalibrationError(f"lacks the line 'P{camera}:'", where=path, cure=cure)
     P_left, P_right = P[f"P{left}"], P[f"P{right}"]
     if not np.allclose(P_left[:, :3], P_right[:, :3], rtol=1e-6, atol=1e-3):
         raise CalibrationError(f"P{left} and P{right} differ in their intrinsics: not a rectified pair", where=path)
-    fx, fy, cx, cy = P_left[0, 0], P_left[1, 1], P_left[0, 2], P_left[1, 2]
-    if fx <= 1:
-        raise CalibrationError(f"P{left} has focal length {fx:g} px", where=path)
-    _check_centre(float(cx), float(cy), size, path)
+    lens = PinholeRadtan(*_of_matrix(P_left), *size)
+    if lens.fx_px <= 1:
+        raise CalibrationError(f"P{left} has focal length {lens.fx_px:g} px", where=path)
+    _check_centre(lens, path)
     # Both matrices place their camera relative to camera 0; K^-1 p is the translation from it.
-    K = P_left[:, :3]
     try:
-        t_right_left = np.linalg.solve(K, P_right[:, 3] - P_left[:, 3])
+        t_right_left = np.linalg.solve(P_left[:, :3], P_right[:, 3] - P_left[:, 3])
     except np.linalg.LinAlgError:
         raise CalibrationError(f"P{left} is not a projection matrix", where=path) from None
     # Colour cameras carry millimetres in y and z as well; rectified rows absorb y, and z stays a small scale error.
-    T_right_left = np.eye(4)
-    T_right_left[0, 3] = t_right_left[0]
     if np.abs(t_right_left[1:]).max() > 0.05 * max(abs(t_right_left[0]), 1e-9):
         raise CalibrationError(f"P{left} and P{right} do not sit side by side", where=path)
-    lens = PinholeRadtan(float(fx), float(fy), float(cx), float(cy), *size)
+    T_right_left = se3.from_rt(np.eye(3), np.array([t_right_left[0], 0.0, 0.0]))
     return StereoRig(left=lens, right=lens, T_right_left=T_right_left, where=str(path))
 
 
-def _check_centre(cx: float, cy: float, size: tuple[int, int], path: Path) -> None:
+def _check_centre(lens: CameraModel, path: Path) -> None:
     """The file does not say its resolution; a principal point far from the middle tells that it is another."""
-    width, height = size
-    if not (0.3 < cx / width < 0.7 and 0.3 < cy / height < 0.7):
+    if not (0.3 < lens.cx_px / lens.width < 0.7 and 0.3 < lens.cy_px / lens.height < 0.7):
         raise CalibrationError(
-            f"its principal point ({cx:.1f}, {cy:.1f}) is far from the middle of the {width}x{height} images",
+            f"its principal point ({lens.cx_px:.1f}, {lens.cy_px:.1f}) is far from the middle of the"
+            f" {lens.width}x{lens.height} images",
             where=path,
             cure="is it the calibration of another resolution? Scale its first two rows like the images",
         )
@@ -274,8 +260,7 @@ def _check_centre(cx: float, cy: float, size: tuple[int, int], path: Path) -> No
 def left_camera_offset(path: Path, left: int) -> Array:
     """(4, 4) camera 0, of which the poses are, from camera ``left``."""
     P = read_projections(path)
-    T = np.eye(4)
-    if left != 0 and "P0" in P:
-        K = P[f"P{left}"][:, :3]
-        T[:3, 3] = -np.linalg.solve(K, P[f"P{left}"][:, 3])
-    return T
+    if left == 0 or "P0" not in P:
+        return np.eye(4)
+    P_left = P[f"P{left}"]
+    return se3.from_rt(np.eye(3), np.asarray(-np.linalg.solve(P_left[:, :3], P_left[:, 3])))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.imagesize import is_decodable
 from gpvo.cameras.models import CameraModel, KannalaBrandt
-from gpvo.cameras.rig import StereoRig
+from gpvo.cameras.rig import StereoRig, mean_view
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
 from gpvo.types import Array, Mounting, StereoCamera
@@ -25,6 +25,8 @@ _Map = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
 class Rectifier:
     """Maps raw stereo pairs to the virtual pair :attr:`camera`.
+
+    Raises CalibrationError where the asked field of view or size is not possible, or shows almost nothing.
 
     Parameters
     ----------
@@ -41,26 +43,22 @@ class Rectifier:
     mask_right : the same of the right image.
     R_rect_left : (3, 3), left camera axes to rectified axes.
     mounting : where the rectified left camera sits.
-
-    Raises
-    ------
-    CalibrationError
-        Where the asked field of view is not possible.
     """
 
     def __init__(self, rig: StereoRig, *, hfov_deg: float | None = None, size: tuple[int, int] | None = None) -> None:
         self.rig = rig
         self.is_identity = rig.is_rectified and hfov_deg is None and size is None
-        self.R_rect_left, self.R_rect_right = rectifying_rotations(rig.T_right_left)
         if self.is_identity:
             self.R_rect_left = self.R_rect_right = np.eye(3)
-        self.camera = self._same_camera() if self.is_identity else self._virtual_camera(hfov_deg, size)
-        self.mounting = Mounting(T_body_cam=self._place(rig.T_body_left), T_imu_cam=self._place(rig.T_imu_left))
-        if self.is_identity:
-            self._maps: list[_Map] | None = None
+            a = rig.left
+            self.camera = StereoCamera(a.fx_px, a.fy_px, a.cx_px, a.cy_px, rig.baseline_m, a.width, a.height)
+            self._maps: list[_Map] = []
             seen = [rig.mask_left, rig.mask_right]
         else:
+            self.R_rect_left, self.R_rect_right = rectifying_rotations(rig.T_right_left)
+            self.camera = self._virtual_camera(hfov_deg, size)
             self._maps, seen = self._make_maps()
+        self.mounting = Mounting(T_body_cam=self._place(rig.T_body_left), T_imu_cam=self._place(rig.T_imu_left))
         self.mask, self.mask_right = (self._mask_or_none(m) for m in seen)
 
     @property
@@ -70,17 +68,16 @@ class Rectifier:
 
     def apply(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Rectify one pair of (H, W) uint8 images."""
-        if self._maps is None:
+        if self.is_identity:
             return left, right
-        (l1, l2), (r1, r2) = self._maps
-        return _remap(left, l1, l2), _remap(right, r1, r2)
+        left, right = (
+            np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), dtype=np.uint8)
+            for image, maps in zip((left, right), self._maps)
+        )
+        return left, right
 
     def _place(self, T_x_left: Array | None) -> Array | None:
         return None if T_x_left is None else T_x_left @ self.T_left_cam
-
-    def _same_camera(self) -> StereoCamera:
-        a = self.rig.left
-        return StereoCamera(a.fx_px, a.fy_px, a.cx_px, a.cy_px, self.rig.baseline_m, a.width, a.height)
 
     def _virtual_camera(self, hfov_deg: float | None, size: tuple[int, int] | None) -> StereoCamera:
         lenses = (self.rig.left, self.rig.right)
@@ -90,11 +87,9 @@ class Rectifier:
             raise CalibrationError(f"rectified size {width}x{height} is not possible", where=self.rig.where)
         if hfov_deg is not None:
             if not 5.0 <= hfov_deg <= 160.0:
-                raise CalibrationError(
-                    f"a pinhole image of {hfov_deg:g} degrees is not possible",
-                    where=self.rig.where,
-                    cure="choose a field of view from 5 to 160 degrees, 90 to 115 for a fisheye",
-                )
+                cure = "choose a field of view from 5 to 160 degrees, 90 to 115 for a fisheye"
+                text = f"a pinhole image of {hfov_deg:g} degrees is not possible"
+                raise CalibrationError(text, where=self.rig.where, cure=cure)
             f = 0.5 * width / np.tan(0.5 * np.deg2rad(hfov_deg))
         elif size is None and isinstance(self.rig.left, KannalaBrandt):
             limit = 2 * int(f * np.tan(MAX_DEFAULT_HALF_ANGLE_RAD))
@@ -140,8 +135,7 @@ class Rectifier:
             seen.append(inside)
             # 16-bit fixed point: 1/32 px steps, half the memory traffic of floats.
             clipped = np.clip(uv, -100.0, 32000.0).astype(np.float32)
-            whole, fraction = cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2)
-            maps.append((np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)))
+            maps.append(cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2))
         return maps, seen
 
     def _mask_or_none(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -150,20 +144,13 @@ class Rectifier:
         return None if mask is None or mask.all() else mask
 
 
-def _remap(image: NDArray[np.uint8], whole: NDArray[np.int16], fraction: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    out = cv2.remap(image, whole, fraction, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(out, dtype=np.uint8)
-
-
 def rectifying_rotations(T_right_left: Array) -> tuple[Array, Array]:
     """Rotations (3, 3) of left and right camera axes into common axes with x along the baseline.
 
     The common orientation is the mean of the two; only its yaw and roll are then turned onto the baseline, so that
     the view changes as little as possible (A. Fusiello et al., 2000, with the mean in place of the old left axis).
     """
-    half = se3.so3_exp(0.5 * se3.so3_log(T_right_left[:3, :3]))
-    centre_right = half @ (-T_right_left[:3, :3].T @ T_right_left[:3, 3])
-    x = centre_right / np.linalg.norm(centre_right)
+    half, x = mean_view(T_right_left)
     y = np.cross([0.0, 0.0, 1.0], x)
     y /= np.linalg.norm(y)
     R_rect_mean = np.stack([x, y, np.cross(x, y)])

@@ -109,29 +109,30 @@ def check_pose(T: object, name: str, where: object = None) -> Array:
     return M if np.abs(R @ R.T - np.eye(3)).max() < 1e-15 else se3.orthonormalise(M)
 
 
-def check_rig(rig: StereoRig) -> None:
-    """Refuse a rig that cannot exist.
+def mean_view(T_right_left: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) of left camera axes into the mean orientation of both, and there the direction (3,) from the left
+    camera to the right one."""
+    half = se3.so3_exp(0.5 * se3.so3_log(T_right_left[:3, :3]))
+    right = half @ (-T_right_left[:3, :3].T @ T_right_left[:3, 3])
+    return half, right / np.linalg.norm(right)
 
-    Raises CalibrationError, naming the reason: baseline absent, too long, pointing the wrong way or not sideways;
-    cameras turned apart; lenses that do not belong together; intrinsics outside the image.
-    """
+
+def check_rig(rig: StereoRig) -> None:
+    """Raise CalibrationError for a rig that cannot exist: baseline absent, too long, pointing the wrong way or not
+    sideways; cameras turned apart; lenses that do not belong together; intrinsics outside the image."""
     for name, lens in (("left", rig.left), ("right", rig.right)):
         _check_lens(lens, name, rig.where)
     check_pose(rig.T_right_left, "T_right_left", rig.where)
     _check_baseline(rig)
     ratio = max(rig.left.fx_px, rig.right.fx_px) / min(rig.left.fx_px, rig.right.fx_px)
     if ratio > MAX_FOCAL_RATIO:
-        raise CalibrationError(
-            f"focal lengths of {rig.left.fx_px:.1f} px and {rig.right.fx_px:.1f} px do not make a stereo pair",
-            where=rig.where,
-            cure="are these two cameras of one rig, calibrated at one resolution?",
-        )
+        text = f"focal lengths of {rig.left.fx_px:.1f} px and {rig.right.fx_px:.1f} px do not make a stereo pair"
+        cure = "are these two cameras of one rig, calibrated at one resolution?"
+        raise CalibrationError(text, where=rig.where, cure=cure)
     for name, mask, lens in (("left", rig.mask_left, rig.left), ("right", rig.mask_right, rig.right)):
         if mask is not None and mask.shape != (lens.height, lens.width):
-            raise CalibrationError(
-                f"the {name} mask is {mask.shape[1]}x{mask.shape[0]}, the camera {lens.width}x{lens.height}",
-                where=rig.where,
-            )
+            text = f"the {name} mask is {mask.shape[1]}x{mask.shape[0]}, the camera {lens.width}x{lens.height}"
+            raise CalibrationError(text, where=rig.where)
 
 
 def _check_lens(lens: CameraModel, name: str, where: str | None) -> None:
@@ -158,40 +159,24 @@ def _check_baseline(rig: StereoRig) -> None:
     T, where = rig.T_right_left, rig.where
     length = rig.baseline_m
     if length < MIN_BASELINE_M:
-        raise CalibrationError(
-            f"the baseline is {length * 1e3:.3g} mm: both cameras in one place",
-            where=where,
-            cure="give the transform between left and right camera in metres",
-        )
+        text = f"the baseline is {length * 1e3:.3g} mm: both cameras in one place"
+        raise CalibrationError(text, where=where, cure="give the transform between left and right camera in metres")
     if length > MAX_BASELINE_M:
-        raise CalibrationError(
-            f"the baseline is {length:.3g} m, more than {MAX_BASELINE_M:g} m",
-            where=where,
-            cure="are the translations in metres?",
-        )
+        text = f"the baseline is {length:.3g} m, more than {MAX_BASELINE_M:g} m"
+        raise CalibrationError(text, where=where, cure="are the translations in metres?")
     angle = float(np.linalg.norm(se3.so3_log(T[:3, :3])))
     if angle > MAX_ROTATION_RAD:
-        raise CalibrationError(
-            f"the cameras are rotated by {np.rad2deg(angle):.0f} degrees to each other, too far for stereo",
-            where=where,
-            cure="check the order and the direction of the chained transforms",
-        )
-    # Position of the right camera along the mean orientation of the two.
-    half = se3.so3_exp(0.5 * se3.so3_log(T[:3, :3]))
-    x, y, z = half @ (-T[:3, :3].T @ T[:3, 3]) / length
+        text = f"the cameras are rotated by {np.rad2deg(angle):.0f} degrees to each other, too far for stereo"
+        raise CalibrationError(text, where=where, cure="check the order and the direction of the chained transforms")
+    x, y, z = mean_view(T)[1]
     if x < -0.7:
-        raise CalibrationError(
-            f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped",
-            where=where,
-            cure="swap the two cameras, or invert the transform between them",
-        )
+        text = f"the right camera sits {length * 1e3:.0f} mm to the left of the left one: left and right are swapped"
+        raise CalibrationError(text, where=where, cure="swap the two cameras, or invert the transform between them")
     if x < 0.7:
         axis = "above or below" if abs(y) >= abs(z) else "in front of or behind"
-        raise CalibrationError(
-            f"the right camera sits {axis} the left one, direction ({x:.2f}, {y:.2f}, {z:.2f})",
-            where=where,
-            cure="the pair must sit side by side in image axes; check the chained transforms",
-        )
+        text = f"the right camera sits {axis} the left one, direction ({x:.2f}, {y:.2f}, {z:.2f})"
+        cure = "the pair must sit side by side in image axes; check the chained transforms"
+        raise CalibrationError(text, where=where, cure=cure)
 
 
 @dataclass(frozen=True)

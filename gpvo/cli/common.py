@@ -17,10 +17,10 @@ from typer.core import TyperGroup
 from gpvo.cli import output
 from gpvo.cli.output import one_of
 from gpvo.errors import GpvoError
-from gpvo.types import VEHICLES, Vehicle
+from gpvo.files import read_toml
+from gpvo.types import VEHICLES, StereoCamera, Vehicle
 
 if TYPE_CHECKING:
-    from gpvo.types import StereoCamera
     from gpvo.vo.config import VoConfig
     from gpvo.vo.rig_error import RigState
 
@@ -102,15 +102,12 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
 
     Raises GpvoError, in one line, for a table that belongs to no command, an unknown option or a bad value.
     """
-    from gpvo.files import read_toml
-
     found = read_toml(path)
     words: list[str] = []
     for key, value in found.items():
         if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
-            raise GpvoError(
-                f"'{key}' is not the table of any command", where=path, cure=f"write options under [{name}]"
-            )
+            cure = f"write options under [{name}]"
+            raise GpvoError(f"'{key}' is not the table of any command", where=path, cure=cure)
     known = {word.lstrip("-").replace("-", "_"): p for p in command.params for word in p.opts if word.startswith("--")}
     del known["config"]
     context = command.context_class(command, info_name=name)
@@ -139,22 +136,82 @@ def options_of_file(path: Path, name: str, command: Any) -> list[str]:
 
 
 Kind = Annotated[str | None, typer.Option("--source", help="Format of the sequence; guessed by default.")]
-Calibration = Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")]
-HfovDeg = Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")]
-Size = Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")]
-MaskLeft = Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")]
-MaskRight = Annotated[Path | None, typer.Option(help="The same for the right lens.")]
-Bits = Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")]
-RateHz = Annotated[float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")]
-PairTolerance = Annotated[
-    float | None, typer.Option(help="Largest difference between the stamps of a stereo pair [s].")
-]
-LeftTopic = Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")]
-RightTopic = Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")]
-ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")]
-TruthTopic = Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none to ignore it.")]
-TruthFrame = Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
+
+
+class _OfSource:
+    """Options that go to :func:`gpvo.io.open_source`."""
+
+    def given(self) -> dict[str, Any]:
+        """Those that were given, parsed. Raises GpvoError if a size is not WIDTHxHEIGHT."""
+        options = {name: value for name, value in vars(self).items() if value is not None}
+        if "size" in options:
+            from gpvo.cameras.rectify import read_size
+
+            options["size"] = read_size(options["size"])
+        return options
+
+
+@dataclass(frozen=True)
+class PairOptions(_OfSource):
+    """What makes the stereo pairs of a sequence."""
+
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")] = None
+    tolerance_s: Annotated[
+        float | None,
+        typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
+    ] = None
+    left_topic: Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")] = None
+    right_topic: Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")] = None
+
+
+@dataclass(frozen=True)
+class ViewOptions(_OfSource):
+    """How images are rectified."""
+
+    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")] = None
+    size: Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")] = None
+    mask_left: Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")] = (
+        None
+    )
+    mask_right: Annotated[Path | None, typer.Option(help="The same for the right lens.")] = None
+
+
+@dataclass(frozen=True)
+class SequenceOptions(ViewOptions, PairOptions):
+    """How a sequence is read."""
+
+    bits: Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")] = None
+    rate_hz: Annotated[
+        float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")
+    ] = None
+    imu_topic: Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")] = None
+    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none to ignore it.")] = (
+        None
+    )
+    truth_frame: Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")] = None
+
+
+@dataclass(frozen=True)
+class WireOptions:
+    """How messages of a running system come in."""
+
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False
+    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False
+    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False
+    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False
+    address: Annotated[
+        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
+    ] = None
+    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0
+
+    def transport(self) -> str | None:
+        """The one that was chosen, None if none was. Raises GpvoError if several were."""
+        flags = {"zenoh": self.zenoh, "dds": self.dds, "ros2": self.ros2, "ros1": self.ros1}
+        chosen = [name for name, is_on in flags.items() if is_on]
+        if len(chosen) > 1:
+            raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
+        return chosen[0] if chosen else None
 
 
 @dataclass(frozen=True)
@@ -240,16 +297,3 @@ def is_given(ctx: typer.Context, option: str) -> bool:
     """Whether the user gave an option, rather than leaving its default."""
     source = ctx.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
-
-
-def source_options(size: str | None = None, **given: Any) -> dict[str, Any]:
-    """Options for :func:`gpvo.io.open_source` from the flags; those that were not given are left out.
-
-    Raises GpvoError if ``size`` is not WIDTHxHEIGHT.
-    """
-    options = {name: value for name, value in given.items() if value is not None}
-    if size is not None:
-        from gpvo.cameras.rectify import read_size
-
-        options["size"] = read_size(size)
-    return options

@@ -9,6 +9,12 @@ import numpy as np
 
 from gpvo.errors import GpvoError, ModelError, SourceError, printable
 from gpvo.geometry.se3 import path_length_m
+from gpvo.io.bag_reader import IMAGE_TYPES, is_bag, open_bag, topics_of
+from gpvo.io.foreign import guess_format, read_foreign
+from gpvo.io.run import read_run, read_tracks
+from gpvo.io.run_read import is_run
+from gpvo.io.source import guess, open_source
+from gpvo.io.trajectory import read_kitti_poses
 
 _HEAD = 100_000
 
@@ -23,9 +29,6 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
         raise SourceError("no such file or folder", where=path)
     if kind is None and path.suffix.lower() in (".safetensors", ".gpvo"):
         return _model(path)  # before imports that a vehicle's computer need not have
-    from gpvo.io.bag_reader import is_bag
-    from gpvo.io.run_read import is_run
-    from gpvo.io.source import guess
 
     if kind is None:
         if is_run(path):
@@ -42,8 +45,6 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
 
 
 def _sequence(path: Path, kind: str, options: dict[str, Any]) -> dict[str, Any]:
-    from gpvo.io import open_source
-
     source = open_source(path, kind, **options)
     camera, truth, imu = source.camera, source.truth, source.imu
     duration = (source.span_ns[1] - source.span_ns[0]) * 1e-9
@@ -81,8 +82,6 @@ def _poses(t_ns: Any, T: Any) -> dict[str, Any]:
 
 
 def _run(path: Path) -> dict[str, Any]:
-    from gpvo.io.run import read_run, read_tracks
-
     run = read_run(path)
     log = run.log
     kept = (path / "tracks.parquet").is_file()
@@ -104,9 +103,6 @@ def _run(path: Path) -> dict[str, Any]:
 
 
 def _trajectory(path: Path) -> dict[str, Any]:
-    from gpvo.io.foreign import guess_format, read_foreign
-    from gpvo.io.trajectory import read_kitti_poses
-
     name = guess_format(path)
     if name == "kitti":
         T = read_kitti_poses(path)
@@ -177,8 +173,6 @@ def _is_safetensors(path: Path) -> bool:
 
 
 def _bag(path: Path, options: dict[str, Any]) -> dict[str, Any]:
-    from gpvo.io.bag_reader import IMAGE_TYPES, open_bag, topics_of
-
     with open_bag(path) as reader:
         document: dict[str, Any] = {
             "what": "bag",

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
-from gpvo.cli.twin import Seed, TwinOptions, say_simulated
+from gpvo.cli.twin import Seed, TwinOptions, make_all, say_simulated
 from gpvo.errors import GpvoError
+from gpvo.io.run import Run, read_run
+from gpvo.io.source import open_source
+from gpvo.io.trajectory import read_tum
+from gpvo.online.predictor import Predictor
+from gpvo.types import TruthLog
 
 if TYPE_CHECKING:
     from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation
     from gpvo.evaluation.pictures import MatchPicture
-    from gpvo.io.run import Run
-    from gpvo.online.predictor import Predictor
     from gpvo.twin.replicate import TwinSettings
 
 Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
@@ -147,7 +151,6 @@ def report(
 
 def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[MatchPicture]:
     from gpvo.evaluation.pictures import match_pictures
-    from gpvo.io import open_source, read_run
     from gpvo.runner import config_of
 
     if sequence is None or len(runs) != 1:
@@ -157,13 +160,6 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
 
 
 def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:
-    from dataclasses import replace
-
-    from gpvo.io.run import read_run
-    from gpvo.io.trajectory import read_tum
-    from gpvo.online.predictor import Predictor
-    from gpvo.types import TruthLog
-
     model = judge.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     loaded = [read_run(path) for path in runs]
@@ -209,11 +205,7 @@ def _with_twins(
     runs: list[Run], predictor: Predictor | None, model: Path | None, options: EvaluateOptions, settings: TwinSettings
 ) -> tuple[list[dict[str, Any]], list[Evaluation]]:
     """Documents of the runs, and the evaluations behind them: a run's own if it has truth, else those of its twins."""
-    from tempfile import TemporaryDirectory
-
-    from gpvo.cli.twin import make_all
     from gpvo.evaluation.by_twins import by_twins
-    from gpvo.io.run import read_run
 
     documents, found = [], []
     for run in runs:

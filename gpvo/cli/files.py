@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,12 +11,14 @@ import numpy as np
 import typer
 
 from gpvo.cli import common as options
+from gpvo.cli.describe import as_lines, describe
 from gpvo.cli.output import Json, note, numbers, one_of, print_json
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError, SourceError
-from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, check_same_rows
+from gpvo.files import plain
+from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
 from gpvo.io.foreign_csv import NO_HEADER
 from gpvo.io.run import write_run
 from gpvo.io.stated import to_records
@@ -39,13 +42,16 @@ class ImportSummary:
 
     def __str__(self) -> str:
         parts = [f"{self.frames} records", f"{self.with_truth} with truth"]
-        parts += [f"covariances: {', '.join(self.methods)}"] if self.methods else []
-        parts += [f"stamps shifted by {self.time_offset_s:+.4f} s"] if self.time_offset_s else []
-        parts += [f"truth rotated by {self.rotation_deg:.2f} deg"] if self.rotation_deg is not None else []
-        parts += [f"moved by {1e3 * self.lever_m:.0f} mm"] if self.lever_m else []
-        parts += (
-            [f"its attitudes rotated by {self.worlds_deg:.2f} deg relative to its positions"] if self.worlds_deg else []
-        )
+        if self.methods:
+            parts.append(f"covariances: {', '.join(self.methods)}")
+        if self.time_offset_s:
+            parts.append(f"stamps shifted by {self.time_offset_s:+.4f} s")
+        if self.rotation_deg is not None:
+            parts.append(f"truth rotated by {self.rotation_deg:.2f} deg")
+        if self.lever_m:
+            parts.append(f"moved by {1e3 * self.lever_m:.0f} mm")
+        if self.worlds_deg:
+            parts.append(f"its attitudes rotated by {self.worlds_deg:.2f} deg relative to its positions")
         return "\n  ".join([", ".join(parts), *self.notes])
 
 
@@ -72,7 +78,7 @@ def import_log(
     """
     frame = _frame(log) if frame == "auto" else frame
     place = T_FLU_OPTICAL if frame == "body" else np.eye(4)
-    log, given, carrier, assumed = log.seen_from(place), None, vehicle or Vehicle(), list[str]()
+    log, given, assumed = log.seen_from(place), None, list[str]()
     if truth is not None:
         check_same_rows(truth, log)
         sigma = truth_sigma or (0.0, 0.0)
@@ -96,6 +102,7 @@ def import_log(
             whole = align == "transform"
             fixed = fit_fixed_transform(A, B, attitudes if whole else None, lever_arm=whole)
             given = replace(given, T_world_cam=fixed.in_log_frame(given.T_world_cam))
+    meta: dict[str, Any] = {"source": log.path.name, "format": "import", "kind": "import"}
     write_run(
         out,
         VoLog(records),
@@ -103,13 +110,7 @@ def import_log(
         truth=given,
         mounting=Mounting(T_body_cam=T_FLU_OPTICAL if frame == "body" else None),
         config={"import": {"frame": frame, "align": align, "time_offset_s": time_offset_s}},
-        meta={
-            "source": log.path.name,
-            "format": "import",
-            "kind": "import",
-            "notes": notes,
-            "vehicle": asdict(carrier),
-        },
+        meta=meta | {"notes": notes, "vehicle": asdict(vehicle or Vehicle())},
     )
     return ImportSummary(
         frames=len(records),
@@ -135,23 +136,14 @@ def _frame(log: ForeignLog) -> str:
 def info(
     path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
     kind: options.Kind = None,
-    calibration: options.Calibration = None,
-    pair_tolerance: options.PairTolerance = None,
-    left_topic: options.LeftTopic = None,
-    right_topic: options.RightTopic = None,
+    pairs: options.PairOptions = options.PairOptions(),
     json_: Json = False,
 ) -> None:
     """Describe a file or folder.
 
     Example: gpvo info MH_01_easy/
     """
-    from gpvo.cli.describe import as_lines, describe
-    from gpvo.files import plain
-
-    given = options.source_options(
-        calibration=calibration, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic
-    )
-    document = plain(describe(path, kind, given))
+    document = plain(describe(path, kind, pairs.given()))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:
@@ -206,8 +198,6 @@ def import_(
 
     Example: gpvo import 00_est.txt --truth 00_gt.txt -o runs/kitti00
     """
-    from gpvo.io.foreign import read_foreign
-
     offset, sigma = None, None
     if time_offset != "auto":
         (offset,) = numbers("--time-offset", time_offset, "give seconds, such as -0.02, or auto", counts=(1,))
@@ -215,23 +205,18 @@ def import_(
         cure = "give metres,radians, such as 0.003,0.0002"
         translation, rotation = numbers("--truth-sigma", truth_sigma, cure, counts=(2,), least=0.0)
         sigma = (translation, rotation)
-    stamps: dict[str, Any] = {"times": times, "rate_hz": rate_hz}
-    covariances: dict[str, Any] = {
-        "covariance_of": one_of("--covariance-of", covariance_of, ("pose", "motion")),
-        "covariance_axes": one_of("--covariance-axes", covariance_axes, ("world", "body")),
-    }
-    chosen: dict[str, Any] = {
-        "frame": one_of("--frame", frame, ("auto", "cam", "body")),
-        "align": one_of("--align", align, ("none", "rotation", "transform")),
-    }
+    one_of("--covariance-of", covariance_of, ("pose", "motion"))
+    one_of("--covariance-axes", covariance_axes, ("world", "body"))
+    one_of("--frame", frame, ("auto", "cam", "body"))
+    one_of("--align", align, ("none", "rotation", "transform"))
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])
+    read = partial(read_foreign, times=times, rate_hz=rate_hz)
     summary = import_log(
-        read_foreign(log, format_, mapping=mapping, topic=topic, **stamps, **covariances),
-        None
-        if truth is None
-        else read_foreign(truth, truth_format, mapping=truth_mapping, topic=truth_topic, complete=True, **stamps),
+        read(log, format_, mapping=mapping, topic=topic, covariance_of=covariance_of, covariance_axes=covariance_axes),
+        None if truth is None else read(truth, truth_format, mapping=truth_mapping, topic=truth_topic, complete=True),
         out,
-        **chosen,
+        frame=frame,
+        align=align,
         time_offset_s=offset,
         truth_sigma=sigma,
         vehicle=vehicle.bounds(),

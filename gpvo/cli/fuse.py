@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -96,29 +96,36 @@ def fuse(
             say("With fewer than three runs there is no interval.")
 
 
-def publish(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
-    to: Annotated[str | None, typer.Option(help="bag (default), mcap or mavlink.")] = None,
+@dataclass(frozen=True)
+class PublishOptions:
+    """What is published, and where to."""
+
+    to: Annotated[str | None, typer.Option(help="bag (default), mcap or mavlink.")] = None
     out: Annotated[
         Path | None,
         typer.Option(
             "-o", "--out", help="File or folder to write; a suffix .bag (ROS 1), .mcap or .tlog stands in for --to."
         ),
-    ] = None,
-    link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
-    model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the run.")] = None,
+    ] = None
+    link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None
+    model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the run.")] = None
     method: Annotated[str, typer.Option(help="Geometric covariance to use where there is no prediction.")] = (
         "pointing_matching"
-    ),
-    topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry",
-    system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1,
-    consumer: Annotated[str | None, typer.Option(help="px4, ardupilot, robot_localization or fusioncore.")] = None,
+    )
+    topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry"
+    system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1
+    consumer: Annotated[str | None, typer.Option(help="px4, ardupilot, robot_localization or fusioncore.")] = None
     check: Annotated[
         bool,
         typer.Option(
             "--check", help="Report what the consumer will do with the messages; writes a file only with --to or -o."
         ),
-    ] = False,
+    ] = False
+
+
+def publish(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    options: PublishOptions = PublishOptions(),
     json_: Json = False,
 ) -> None:
     """Write messages for robot_localization, PX4, ArduPilot and FusionCore.
@@ -127,18 +134,7 @@ def publish(
     """
     from gpvo.publish.job import PublishSettings, publish_run
 
-    settings = PublishSettings(
-        to=to,
-        out=out,
-        link=link,
-        model=model,
-        method=method,
-        topic=topic,
-        system=system,
-        consumer=consumer,
-        check=check,
-    )
-    result = publish_run(run, settings)
+    result = publish_run(run, PublishSettings(**vars(options)))
     if json_:
         print_json(result.document())
     else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +12,10 @@ import typer
 from gpvo.cli.common import is_given
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, in_place_of_runs_without_truth
+from gpvo.dataset.errors import outweighed_by_truth
 from gpvo.errors import GpvoError
+from gpvo.files import read_json
+from gpvo.io.run import read_run
 
 if TYPE_CHECKING:
     from gpvo.learning.config import TrainConfig
@@ -21,32 +26,38 @@ _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth, or one file of training rows.")]
 
 
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is learned, from which rows; a model that is updated keeps its own."""
+
+    features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto"
+    target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame"
+    regressor: Annotated[
+        str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
+    ] = "auto"
+    align: Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth first: rotation or none.")] = (
+        "none"
+    )
+    waits: Annotated[
+        str,
+        typer.Option("--stationary", "--waits", help="Motions at rest during which the truth wanders: drop or keep."),
+    ] = "drop"
+    odd: Annotated[
+        str, typer.Option(help="Stretches where odometry and truth differ far more than elsewhere: keep or drop.")
+    ] = "keep"
+    max_rows: Annotated[int, typer.Option(min=1000, help="Rows held in memory; more are streamed in blocks.")] = 100_000
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0
+
+
 def train(
     ctx: typer.Context,
     runs: Runs,
     out: Annotated[Path, typer.Option("-o", "--out", help="Model file to write.")],
-    features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto",
-    target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame",
-    regressor: Annotated[
-        str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
-    ] = "auto",
-    align: Annotated[
-        str, typer.Option(help="Fit a fixed rotation between log and truth first: rotation or none.")
-    ] = "none",
-    waits: Annotated[
-        str,
-        typer.Option("--stationary", "--waits", help="Motions at rest during which the truth wanders: drop or keep."),
-    ] = "drop",
-    odd: Annotated[
-        str, typer.Option(help="Stretches where odometry and truth differ far more than elsewhere: keep or drop.")
-    ] = "keep",
+    options: TrainOptions = TrainOptions(),
     update: Annotated[
         Path | None,
         typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
     ] = None,
-    max_rows: Annotated[
-        int, typer.Option(min=1000, help="Rows held in memory; more are streamed in blocks.")
-    ] = 100_000,
     twins: Annotated[
         bool,
         typer.Option(
@@ -58,7 +69,6 @@ def train(
         Path | None,
         typer.Option(help="Folder for the covariances that each method states for the runs left out, for gpvo score."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
     backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
@@ -70,27 +80,18 @@ def train(
 
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
-    from gpvo.learning.store import check_writable, folds_path, save_model
+    from gpvo.learning.store import check_writable, config_of, folds_path, save_model
     from gpvo.learning.train import unseen_axes
 
     check_writable(out)
-    settings: dict[str, Any] = {
-        "features": features,
-        "target": target,
-        "regressor": regressor,
-        "align": align,
-        "waits": waits,
-        "odd": odd,
-        "seed": seed,
-        "max_rows": max_rows,
-    }
+    settings = asdict(options)
     if update is not None:
-        settings = _settings_of(update) | {k: v for k, v in settings.items() if is_given(ctx, k)}
+        settings = asdict(config_of(update)) | {k: v for k, v in settings.items() if is_given(ctx, k)}
     settings |= {"jobs": jobs, "backend": backend, "scheduler": scheduler}
     settings["keep"] = str(folds_path(out)) if backend == "local" else None
     if statements is not None:
         _check_statements(runs, settings, update)
-    drawn = twin_options.asked(ctx, twins, seed)
+    drawn = twin_options.asked(ctx, twins, options.seed)
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
             trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
@@ -98,7 +99,7 @@ def train(
             _write_statements(trained, paths, settings, statements)
     if trained.header["target"] != "position" and (axes := unseen_axes(trained.sets)):
         note(f"gpvo: log and truth never differ in {', '.join(axes)} (planar?): the model states almost no error there")
-    if target == "frame" and (noisy := _noisy_truths(runs)):
+    if settings["target"] == "frame" and (noisy := _noisy_truths(runs)):
         note(
             f"gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of {noisy}: for one"
             " motion the model states both together, over a distance only the odometry's, as the noise does not add up"
@@ -117,9 +118,6 @@ def train(
 
 def _noisy_truths(paths: list[Path]) -> str:
     """Names of the runs whose truth cannot judge single motions."""
-    from gpvo.dataset.errors import outweighed_by_truth
-    from gpvo.io.run import read_run
-
     read = (read_run(p) for p in paths if p.is_dir())
     return ", ".join(run.name for run in read if run.truth is not None and outweighed_by_truth(run.log, run.truth))
 
@@ -128,15 +126,12 @@ def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path |
     """Raise GpvoError, before any work, if training would leave out no run that ``gpvo score`` could judge."""
     whole = len(runs) > 1 and all(p.is_dir() for p in runs) and update is None
     if not whole or settings["target"] != "frame" or settings["backend"] != "local":
-        raise GpvoError(
-            "--statements needs two or more run folders, --target frame and --backend local, without --update",
-            cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER",
-        )
+        text = "--statements needs two or more run folders, --target frame and --backend local, without --update"
+        raise GpvoError(text, cure="or give one run at a time to gpvo evaluate RUN --model MODEL --stated FOLDER")
 
 
 def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[str, Any], folder: Path) -> None:
     from gpvo.evaluation.score import write_left_out
-    from gpvo.io.run import read_run
     from gpvo.learning.config import TrainConfig
 
     write_left_out(trained, [read_run(p) for p in paths], TrainConfig(**settings), folder)
@@ -145,9 +140,6 @@ def _write_statements(trained: TrainedModel, paths: list[Path], settings: dict[s
 
 def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) -> TrainedModel:
     """The header also says which sequences are twins, whose truth was simulated; those of an updated model too."""
-    from dataclasses import replace
-
-    from gpvo.files import read_json
     from gpvo.online import modelfile
     from gpvo.twin.gap import simulated_truth
 
@@ -156,17 +148,7 @@ def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) 
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 
-def _settings_of(model: Path) -> dict[str, Any]:
-    """What a model was trained with."""
-    from dataclasses import asdict
-
-    from gpvo.learning.store import config_of
-
-    return asdict(config_of(model))
-
-
 def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:
-    from gpvo.io.run import read_run
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
@@ -212,17 +194,12 @@ def _train_file(paths: list[Path], config: TrainConfig, update: Path | None, on_
 
 def _frames(paths: list[Path]) -> int:
     """How many frames the runs say they have."""
-    from gpvo.files import read_json
-
     return sum(int(read_json(p / "run.json").get("frames") or 0) for p in paths if (p / "run.json").is_file())
 
 
 def _train_streaming(paths: list[Path], config: TrainConfig, on_fit: OnFit) -> TrainedModel:
     """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
-    import tempfile
-
     from gpvo.dataset.table import write_sets
-    from gpvo.io.run import read_run
     from gpvo.learning.store import train_stored
 
     with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
@@ -254,14 +231,15 @@ def _print_table(document: dict[str, Any]) -> None:
     show(table)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
     say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")
-    resting = {f["held_out"]: n for f in document["folds"] if (n := f.get("truth_moves_at_rest"))}
-    if resting:
-        told = ", ".join(f"{n} of {name}" for name, n in resting.items())
-        say(f"left out, because the truth moves while the vehicle stands still: {told} (--stationary keep keeps them)")
-    differing = {f["held_out"]: n for f in document["folds"] if (n := f.get("odd"))}
-    if differing:
-        told = ", ".join(f"{n} of {name}" for name, n in differing.items())
-        say(f"motions in which odometry and truth differ far more than elsewhere: {told}")
+    at_rest, odd = (
+        ", ".join(f"{n} of {f['held_out']}" for f in document["folds"] if (n := f.get(count)))
+        for count in ("truth_moves_at_rest", "odd")
+    )
+    if at_rest:
+        why = "because the truth moves while the vehicle stands still"
+        say(f"left out, {why}: {at_rest} (--stationary keep keeps them)")
+    if odd:
+        say(f"motions in which odometry and truth differ far more than elsewhere: {odd}")
         say("('gpvo evaluate' lists them; 'gpvo train --odd drop' trains and scores without them)")
     slips = [f["slips"] for f in document["folds"] if "slips" in f]
     if any(sum(s[k] for k in ("caught", "missed", "falsely_flagged")) for s in slips):

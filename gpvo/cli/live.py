@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gpvo.cli import common as flags
+from gpvo.cli.files import import_log
 from gpvo.cli.output import one_of, print_json, say
 from gpvo.errors import GpvoError, printable
+from gpvo.io.foreign import ForeignLog, read_foreign
+from gpvo.io.run import read_run
+from gpvo.types import IMPORTED, Vehicle
 
 if TYPE_CHECKING:
-    from gpvo.io.foreign import ForeignLog
     from gpvo.live.stereo_stage import StereoSettings
-    from gpvo.types import Vehicle
 
 
 def live(
@@ -33,14 +36,7 @@ def live(
     truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
     replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False,
-    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False,
-    address: Annotated[
-        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
-    ] = None,
-    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0,
+    wire: flags.WireOptions = flags.WireOptions(),
     mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
     px4: Annotated[
         bool, typer.Option("--px4", help="Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS.")
@@ -66,10 +62,7 @@ def live(
     ] = None,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     vo: flags.OdometryOptions = flags.OdometryOptions(),
-    hfov_deg: flags.HfovDeg = None,
-    size: flags.Size = None,
-    mask_left: flags.MaskLeft = None,
-    mask_right: flags.MaskRight = None,
+    view: flags.ViewOptions = flags.ViewOptions(),
     depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
     json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
 ) -> None:
@@ -82,13 +75,12 @@ def live(
 
     one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
     carrier = vehicle.bounds()
-    view = flags.source_options(size, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right)
     one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
     result = run_live(
         LiveSettings(
             model=model,
             stereo=stereo,
-            vo=_stereo_settings(vo, carrier, stereo is not None, view),
+            vo=_stereo_settings(vo, carrier, stereo is not None, view.given()),
             imu=imu,
             odometry=odometry,
             pose_type=POSE_TYPE_NAMES[odometry_type],
@@ -98,9 +90,9 @@ def live(
             base_frame=base_frame,
             replay=replay,
             fast=fast,
-            wire=_one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1),
-            address=address,
-            domain=domain,
+            wire=wire.transport(),
+            address=wire.address,
+            domain=wire.domain,
             mavlink=mavlink,
             px4=px4,
             out=out,
@@ -138,13 +130,8 @@ def doctor(
         str,
         typer.Option(help="Fit a fixed transform between bag and truth, as gpvo import does."),
     ] = "none",
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Listen over Zenoh.")] = False,
-    dds: Annotated[bool, typer.Option("--dds", help="Listen over DDS.")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="Listen through rclpy.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="Listen through rospy.")] = False,
+    wire: flags.WireOptions = flags.WireOptions(),
     odometry_type: Annotated[str, typer.Option(help="Type of a topic: odometry, pose, or pose_stamped.")] = "odometry",
-    address: Annotated[str | None, typer.Option(help="Zenoh router.")] = None,
-    domain: Annotated[int, typer.Option(help="ROS domain id.", min=0, max=232)] = 0,
     seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
     json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
@@ -152,18 +139,16 @@ def doctor(
 
     Example: gpvo doctor flight.mcap --truth mocap.tum
     """
-    from gpvo.io.foreign import read_foreign
     from gpvo.live.doctor import examine_bag, examine_topic
     from gpvo.live.job import POSE_TYPE_NAMES
 
-    wire = _one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1)
+    transport = wire.transport()
     one_of("--align", align, ("none", "rotation", "transform"))
-    if truth is not None and wire is not None:
-        raise GpvoError(
-            "--truth judges a bag, not a running topic", cure="record it first, or use gpvo live --truth TOPIC"
-        )
+    if truth is not None and transport is not None:
+        cure = "record it first, or use gpvo live --truth TOPIC"
+        raise GpvoError("--truth judges a bag, not a running topic", cure=cure)
     judged = {}
-    if wire is None:
+    if transport is None:
         found = examine_bag(Path(source), topic)
         if truth is not None:
             if truth_topic is None and truth.exists() and truth.samefile(source):
@@ -172,7 +157,7 @@ def doctor(
             judged = {t: _nees_of_bag(Path(source), t, given, align) for t in found if t != truth_topic}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
-        found = {source: examine_topic(wire, source, kind, seconds, address, domain)}
+        found = {source: examine_topic(transport, source, kind, seconds, wire.address, wire.domain)}
     if json_:
         rows = [
             {"topic": t, "findings": [f.__dict__ for f in findings], "nees": judged.get(t)}
@@ -189,27 +174,14 @@ def doctor(
             say(f"  {line}")
 
 
-def _one_wire(**given: bool) -> str | None:
-    chosen = [name for name, on in given.items() if on]
-    if len(chosen) > 1:
-        raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
-    return chosen[0] if chosen else None
-
-
 def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[str, Any]:
     """NEES per degree of freedom of the ``poses`` and of the ``motions`` whose covariances a topic states.
 
     Each is None, or by block of the error {``nees_dof``, ``interval``, ``median``} with the ``count``; ``problem`` is
     the reason why nothing could be judged. ``truth``: of the same body.
     """
-    from tempfile import TemporaryDirectory
-
-    from gpvo.cli.files import import_log
     from gpvo.evaluation.evaluate import evaluate_run
     from gpvo.evaluation.trajectory import nees_document
-    from gpvo.io.foreign import read_foreign
-    from gpvo.io.run import read_run
-    from gpvo.types import IMPORTED
 
     try:
         with TemporaryDirectory(prefix="gpvo-") as folder:

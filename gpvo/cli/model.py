@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from gpvo.cli.output import Json, new_table, print_json, say, show
 from gpvo.errors import GpvoError
+from gpvo.files import replacing, write_csv
+from gpvo.io.parquet import write_table
+from gpvo.io.run import read_run, write_predictions
+from gpvo.io.run_folder import FILES
+from gpvo.online.predictor import Predictor
+from gpvo.types import Prediction
 
 if TYPE_CHECKING:
     from gpvo.evaluation.forecast import Forecast
-    from gpvo.types import Prediction
 
 _LINES = 11  # of the table of a forecast
 _TOLD = ("t_s", "distance_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_m")
@@ -32,9 +39,6 @@ def predict(
     Example: gpvo predict errors.gpvo runs/flight -o predictions.parquet
     """
     from gpvo.evaluation.evaluate import distinct
-    from gpvo.io.run import read_run, write_predictions
-    from gpvo.io.run_folder import FILES
-    from gpvo.online.predictor import Predictor
 
     if len(runs) == 1 and out.is_dir():
         raise GpvoError("is a folder", where=out, cure="give a file that ends in .parquet")
@@ -62,8 +66,6 @@ def predict(
 
 
 def _summary(predictions: list[Prediction]) -> dict[str, Any]:
-    import numpy as np
-
     moving = [p for p in predictions if p.dt_s > 0 and p.status.severity < 2]
     sigma = np.median([p.sigma for p in moving], axis=0) if moving else np.full(6, np.nan)
     return {
@@ -80,11 +82,7 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
 
     Example: gpvo check errors.gpvo runs/hover
     """
-    from dataclasses import asdict
-
     from gpvo.dataset.check import check as check_model
-    from gpvo.io.run import read_run
-    from gpvo.online.predictor import Predictor
 
     found = check_model(Predictor.load(model), read_run(run))
     if json_:
@@ -146,7 +144,6 @@ def forecast(
     """
     from gpvo.evaluation.forecast import forecast as run_forecast
     from gpvo.evaluation.forecast import read_plan
-    from gpvo.online.predictor import Predictor
 
     if out is not None and out.suffix not in (".parquet", ".csv"):
         raise GpvoError("does not have the suffix of a table", where=out, cure="end it in .parquet or .csv")
@@ -224,15 +221,11 @@ def _print_forecast(f: Forecast, path: Path) -> None:
 
 
 def _write_forecast(out: Path, f: Forecast) -> None:
-    from gpvo.files import write_csv
-    from gpvo.io.parquet import write_table
-
     (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(f))
 
 
 def _draw_forecast(plot: Path, f: Forecast, title: str) -> None:
     from gpvo.evaluation import plots
-    from gpvo.files import replacing
 
     with replacing(plot) as temporary:
         plots.forecast(f, title).savefig(temporary, dpi=110, format="png")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.errors import GpvoError
+from gpvo.files import plain
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -85,8 +86,6 @@ def new_table(*columns: str) -> Table:
 
 def print_json(document: dict[str, Any]) -> None:
     """Print a document as JSON, for scripts."""
-    from gpvo.files import plain
-
     print(json.dumps(plain(document), indent=2))
 
 

@@ -12,10 +12,15 @@ import typer
 
 from gpvo.cli import common as flags
 from gpvo.cli.output import Json, note, print_json, progress
+from gpvo.errors import SourceError
+from gpvo.files import read_json, write_text
+from gpvo.io.run import read_run
+from gpvo.io.source import open_source
+from gpvo.online.predictor import Predictor
+from gpvo.types import Prediction
 
 if TYPE_CHECKING:
     from gpvo.runner import RunSummary
-    from gpvo.types import Prediction
 
 _MOST_NOTES = 5
 _MUCH_LEFT = 1 / 3  # of a displacement: with 0.4 left, drive 0001 of KITTI drifts twice as far
@@ -28,19 +33,7 @@ def run(
     odometry: flags.OdometryOptions = flags.OdometryOptions(),
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     kind: flags.Kind = None,
-    calibration: flags.Calibration = None,
-    hfov_deg: flags.HfovDeg = None,
-    size: flags.Size = None,
-    mask_left: flags.MaskLeft = None,
-    mask_right: flags.MaskRight = None,
-    bits: flags.Bits = None,
-    rate_hz: flags.RateHz = None,
-    pair_tolerance: flags.PairTolerance = None,
-    left_topic: flags.LeftTopic = None,
-    right_topic: flags.RightTopic = None,
-    imu_topic: flags.ImuTopic = None,
-    truth_topic: flags.TruthTopic = None,
-    truth_frame: flags.TruthFrame = None,
+    reading: flags.SequenceOptions = flags.SequenceOptions(),
     keep_tracks: Annotated[
         bool, typer.Option("--keep-tracks", help="Keep the tracks of the points; 'gpvo twin' needs them.")
     ] = False,
@@ -55,16 +48,9 @@ def run(
     """
     from gpvo import runner
     from gpvo.dataset.check import ENOUGH_INSIDE, odometry_problems
-    from gpvo.io import open_source
-    from gpvo.online.predictor import Predictor
 
     config = odometry.config(vehicle.bounds())
-    options = flags.source_options(
-        size, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right, bits=bits,
-        rate_hz=rate_hz, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic,
-        imu_topic=imu_topic, truth_topic=truth_topic, truth_frame=truth_frame,
-    )  # fmt: skip
-    sequence = open_source(source, kind=kind, **options)
+    sequence = open_source(source, kind=kind, **reading.given())
     state = odometry.state(sequence.camera)
     predictor = None if model is None else Predictor.load(model)
     for problem in odometry_problems(predictor, asdict(config)) if predictor is not None else ():
@@ -123,9 +109,6 @@ def calibration(
 
     Example: gpvo calibration runs/mine -o corrected.yaml
     """
-    from gpvo.errors import SourceError
-    from gpvo.files import read_json, write_text
-    from gpvo.io.run import read_run
     from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, read_state, rig_of
 
     camera = read_run(run).log.camera

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gpvo.cli.evaluate import JudgeOptions
 from gpvo.cli.output import Json, cell, new_table, print_json, say, show
 from gpvo.errors import GpvoError
 
@@ -33,7 +34,6 @@ def score(
 
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
-    from gpvo.cli.evaluate import JudgeOptions
     from gpvo.evaluation.score import board, on_other_axes, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
 

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gpvo.errors import EXTRA_OF, GpvoError
+from gpvo.io.run import read_run
+from gpvo.io.source import open_source
+from gpvo.online.predictor import Predictor
 
 _FLIGHTS = 3
 _SECONDS, _RATE_HZ = 15.0, 10.0
@@ -87,7 +90,6 @@ def _simulate(bench: _Bench) -> str:
 
 def _odometry(bench: _Bench) -> str:
     from gpvo import runner
-    from gpvo.io import open_source
 
     said = []
     for seed in range(_FLIGHTS):
@@ -101,7 +103,6 @@ def _odometry(bench: _Bench) -> str:
 
 def _evaluate(bench: _Bench) -> str:
     from gpvo.evaluation.evaluate import evaluate_run
-    from gpvo.io.run_read import read_run
 
     t = evaluate_run(read_run(bench.runs[-1])).trajectory
     _require(t.ate_rmse_m < 0.05 * t.path_length_m, f"ATE of {t.ate_rmse_m:.2g} m over {t.path_length_m:.3g} m")
@@ -109,7 +110,6 @@ def _evaluate(bench: _Bench) -> str:
 
 
 def _train(bench: _Bench) -> str:
-    from gpvo.io.run_read import read_run
     from gpvo.learning.config import TrainConfig
     from gpvo.learning.store import save_model
     from gpvo.learning.train import train_sets
@@ -122,8 +122,6 @@ def _train(bench: _Bench) -> str:
 
 def _predict(bench: _Bench) -> str:
     from gpvo.evaluation.evaluate import evaluate_run
-    from gpvo.io.run_read import read_run
-    from gpvo.online.predictor import Predictor
 
     learned = evaluate_run(read_run(bench.runs[-1]), Predictor.load(bench.model)).consistency["learned"]
     nees = learned.nees_dof["joint"]
@@ -142,8 +140,6 @@ def _filter(bench: _Bench) -> str:
 
 
 def _messages(bench: _Bench) -> str:
-    from gpvo.io.run_read import read_run
-    from gpvo.online.predictor import Predictor
     from gpvo.publish.odometry import OdometryBuilder
 
     run = read_run(bench.runs[-1])

@@ -11,6 +11,7 @@ import typer
 
 from gpvo.cli.output import Json, print_json, progress
 from gpvo.errors import GpvoError
+from gpvo.files import parse_toml
 
 if TYPE_CHECKING:
     from gpvo.sim.scenario import Flight, Scenario
@@ -145,8 +146,6 @@ def _show_list(json_: bool) -> None:
 
 def _assignment(text: str) -> tuple[str, Any]:
     """``key=value`` with a TOML value; anything that is not TOML is text."""
-    from gpvo.files import parse_toml
-
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise GpvoError(f"--set '{text}' is not key=value", cure="such as --set noise_sigma=0.05")

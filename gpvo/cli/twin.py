@@ -9,11 +9,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from gpvo.cli.common import is_given
 from gpvo.cli.output import Json, new_table, note, print_json, progress, say, show
 from gpvo.errors import GpvoError
+from gpvo.io.run import Run, read_run
+from gpvo.online.features import AXES
 
 if TYPE_CHECKING:
     from gpvo.twin.replicate import TwinSettings
@@ -86,13 +89,14 @@ def twin(
     settings = options.settings(seed)
     if out is None and not against:
         raise GpvoError("no folder was given for the twins", cure="give a folder with -o, or compare with --against")
-    if against:
-        _require_truth(runs)
+    real = [read_run(path) for path in runs] if against else []  # before the work, not after it
+    if without := [run.path for run in real if run.truth is None]:
+        raise GpvoError("has no ground truth to compare twins with", where=without[0], cure="leave out --against")
     with nullcontext(out) if out is not None else TemporaryDirectory(prefix="gpvo-twins-") as folder:
         made = make_all(runs, Path(folder), settings, jobs)
         if against:
             n = settings.replicates
-            _print_ratios(runs, [made[i : i + n] for i in range(0, len(made), n)], json_)
+            _print_ratios(real, [made[i : i + n] for i in range(0, len(made), n)], json_)
             return
     if json_:
         print_json({"schema": 1, "twins": [str(p) for p in made]})
@@ -100,24 +104,12 @@ def twin(
         print(f"{out}: {len(made)} twins of {len(runs)} runs")
 
 
-def _require_truth(runs: Sequence[Path]) -> None:
-    """Raise GpvoError, before any work, for a run that twins cannot be compared with."""
-    from gpvo.io.run import read_run
-
-    if without := [r for r in runs if read_run(r).truth is None]:
-        raise GpvoError("has no ground truth to compare twins with", where=without[0], cure="leave out --against")
-
-
-def _print_ratios(runs: Sequence[Path], twins: Sequence[Sequence[Path]], json_: bool) -> None:
-    import numpy as np
-
+def _print_ratios(runs: Sequence[Run], twins: Sequence[Sequence[Path]], json_: bool) -> None:
     from gpvo.evaluation.by_twins import SPANS, ratios
-    from gpvo.io.run import read_run
-    from gpvo.online.features import AXES
     from gpvo.twin.gap import pooled
 
-    found = np.array([ratios(read_run(r), [read_run(t) for t in made]) for r, made in zip(runs, twins, strict=True)])
-    names = [r.resolve().name for r in runs]
+    found = np.array([ratios(run, [read_run(t) for t in made]) for run, made in zip(runs, twins, strict=True)])
+    names = [run.path.resolve().name for run in runs]
     mean, spread = pooled(found)
     if json_:
         of_all = {s: {"ratio": m, "spread": d} for s, m, d in zip(SPANS, mean, spread)}
@@ -158,8 +150,6 @@ def in_place_of_runs_without_truth(
     paths: list[Path], settings: TwinSettings | None, jobs: int = 1
 ) -> Iterator[list[Path]]:
     """Runs with truth, and twins of the others, for as long as the context is open; no twins without settings."""
-    from gpvo.io.run import read_run
-
     if settings is None:
         yield paths
         return

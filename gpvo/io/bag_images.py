@@ -113,6 +113,4 @@ def pair_streams(
 
 def _drop(queue: deque[tuple[int, Any]], count: int, report: SourceReport) -> None:
     for _ in range(count):
-        t, _message = queue.popleft()
-        report.missing += 1
-        report.note(f"no partner for the image at {t} ns")
+        report.count("missing", f"no partner for the image at {queue.popleft()[0]} ns")

@@ -19,22 +19,16 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
+from gpvo.io.stamps import Stamps
 from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
-
-Stamps = NDArray[np.int64]
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU_TYPE = "sensor_msgs/msg/Imu"
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSE_TYPES = (
-    ODOMETRY_TYPE,
-    "geometry_msgs/msg/PoseStamped",
-    POSE_TYPE,
-    "geometry_msgs/msg/TransformStamped",
-)
+POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", POSE_TYPE, "geometry_msgs/msg/TransformStamped")
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
 _BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
@@ -93,9 +87,8 @@ def open_bag(path: Path) -> Iterator[Any]:
 
 def topics_of(reader: Any, types: tuple[str, ...]) -> dict[str, str]:
     """Topics that hold messages of one of the types, with the type."""
-    return {
-        name: info.msgtype for name, info in sorted(reader.topics.items()) if info.msgtype in types and info.msgcount
-    }
+    topics = sorted(reader.topics.items())
+    return {name: info.msgtype for name, info in topics if info.msgtype in types and info.msgcount}
 
 
 def messages(reader: Any, topics: list[str]) -> Iterator[tuple[str, Any]]:
@@ -131,19 +124,15 @@ def read_poses(
     they are lost, are dropped, or refused where the poses must be ``complete``. Raises SourceError where the topic has
     no poses, and where its clock goes back by more than a second or gives many messages one stamp.
     """
-    stamps, rows, kept = [], [], []
     with open_bag(path) as reader:
         available = topics_of(reader, POSE_TYPES)
         if topic not in available:
             found = ", ".join(available) or "none"
             raise SourceError(f"has no poses on '{topic}' (topics with poses: {found})", where=path)
-        for _, message in messages(reader, [topic]):
-            stamps.append(stamp_ns(message))
-            rows.append(pose_of(message))
-            kept.append(message)
-    if not rows:
+        kept = [message for _, message in messages(reader, [topic])]
+    if not kept:
         raise SourceError(f"holds no message on '{topic}'", where=path)
-    t, data = np.array(stamps, dtype=np.int64), np.stack(rows)
+    t, data = np.array([stamp_ns(m) for m in kept], dtype=np.int64), np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)
     good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
     if bad := int((~good).sum()):
@@ -226,15 +215,15 @@ def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
     stamps, rows = [], []
     with open_bag(path) as reader:
         for _, m in messages(reader, [topic]):
-            w, a = m.angular_velocity, m.linear_acceleration
             stamps.append(stamp_ns(m))
-            covariances = (m.angular_velocity_covariance[0], m.linear_acceleration_covariance[0])
-            rows.append((w.x, w.y, w.z, a.x, a.y, a.z, *covariances))
-    data = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    for values, stated in ((data[:, :3], data[:, 6]), (data[:, 3:6], data[:, 7])):
-        if np.all(stated == -1) or not values.any():
+            measured = (m.angular_velocity, m.linear_acceleration)
+            covariances = (m.angular_velocity_covariance, m.linear_acceleration_covariance)
+            rows.append([(v.x, v.y, v.z, C[0]) for v, C in zip(measured, covariances)])
+    data = np.array(rows, dtype=np.float64).reshape(-1, 2, 4)
+    for values in (data[:, 0], data[:, 1]):
+        if (values[:, 3] == -1).all() or not values[:, :3].any():
             values[:] = np.nan
-    return np.array(stamps, dtype=np.int64), data[:, :6]
+    return np.array(stamps, dtype=np.int64), data[:, :, :3].reshape(-1, 6)
 
 
 def _with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:

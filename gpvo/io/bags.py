@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.kalibr import camchain_topics, read_yaml
+from gpvo.cameras.kalibr import camchain_topics
 from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
@@ -31,7 +31,7 @@ from gpvo.io.bag_reader import (
     stamp_ns,
     topics_of,
 )
-from gpvo.io.images import Image8, ImageSource
+from gpvo.io.images import Image8, ImageSource, check_size
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
 from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
@@ -94,9 +94,10 @@ class BagSource(ImageSource):
         with open_bag(path) as reader:
             asked = (left_topic, right_topic, imu_topic, truth_topic)
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
-            size, span = _first_images(reader, path, self._topics)
-            rig = read_stereo_yaml(chain, size=size[0]) if chain else _rig_from_bag(reader, path, self._topics)
-            _check_sizes(size, rig, path, self._topics)
+            sizes, span = _first_images(reader, path, self._topics)
+            rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics)
+            for size, lens, topic in zip(sizes, (rig.left, rig.right), (self._topics.left, self._topics.right)):
+                check_size(f"images on '{topic}' are", size, lens, path)
         super().__init__(path, path.stem, rig, **options)
         self.span_ns = span
         self._tolerance_ns = tolerance_ns(tolerance_s)
@@ -140,7 +141,7 @@ class BagSource(ImageSource):
         self.remark(f"truth on '{topic}' taken as poses of the {whose} frame")
         usual = MOTION_CAPTURE if _is_capture(topic) else UNKNOWN
         truth = carry(Trajectory(t, T), place, noise or usual)
-        check_overlap(truth, np.array(self.span_ns, dtype=np.int64), self.path)
+        check_overlap(truth, self.span_ns, self.path)
         return truth
 
 
@@ -153,28 +154,22 @@ def _choose_topics(
     reader: Any, path: Path, chain: Path | None, asked: tuple[str | None, ...], *, any_truth: bool
 ) -> _Topics:
     left, right, imu, truth = asked
-    images = topics_of(reader, IMAGE_TYPES)
-    for topic in (left, right):
-        if topic is not None and topic not in images:
-            raise SourceError(f"has no images on '{topic}' (images on: {', '.join(images) or 'none'})", where=path)
+    images, imus, poses = (list(topics_of(reader, types)) for types in (IMAGE_TYPES, (IMU_TYPE,), POSE_TYPES))
+    for topic, what, found in (
+        (left, "images", images), (right, "images", images), (imu, "IMU", imus), (truth, "poses", [*poses, "none"])
+    ):  # fmt: skip
+        if topic is not None and topic not in found:
+            raise SourceError(f"has no {what} on '{topic}' ({what} on: {', '.join(found) or 'none'})", where=path)
     if left is None or right is None:
-        pair = _guess_pair(list(images), chain)
+        pair = _guess_pair(images, chain)
         if pair is None:
-            found = ", ".join(images) or "none"
-            raise SourceError(
-                f"no stereo pair among its image topics ({found})",
-                where=path,
-                cure="name them with --left-topic and --right-topic" if images else "is this the bag with the images?",
-            )
+            cure = "name them with --left-topic and --right-topic" if images else "is this the bag with the images?"
+            text = f"no stereo pair among its image topics ({', '.join(images) or 'none'})"
+            raise SourceError(text, where=path, cure=cure)
         left, right = left or pair[0], right or pair[1]
     if left == right:
         raise SourceError(f"left and right are the same topic '{left}'", where=path)
-    imus = list(topics_of(reader, (IMU_TYPE,)))
-    poses = list(topics_of(reader, POSE_TYPES))
-    for topic, available in ((imu, imus), (truth, [*poses, "none"])):
-        if topic is not None and topic not in available:
-            raise SourceError(f"has nothing to read on '{topic}' (there are: {', '.join(available)})", where=path)
-    counts = [reader.topics[t].msgcount for t in (left, right)]
+    count = min(reader.topics[t].msgcount for t in (left, right))
     doubtful = None
     if truth is None:
         truth, doubtful = _guess_truth(poses, any_truth)
@@ -183,7 +178,7 @@ def _choose_topics(
     if imu is not None:
         sensors = [s for s in sensors if s[0] == imu] or [(imu,)]
     unused = tuple(t for t in topics_of(reader, (ODOMETRY_TYPE,)) if t not in (truth, doubtful))
-    return _Topics(left, right, sensors, truth, doubtful, min(counts), unused)
+    return _Topics(left, right, sensors, truth, doubtful, count, unused)
 
 
 def _guess_truth(poses: list[str], any_truth: bool) -> tuple[str | None, str | None]:
@@ -202,17 +197,17 @@ def _is_capture(topic: str) -> bool:
 
 def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None:
     """Left and right topic by the calibration, by name, or because there are but two."""
-    if chain is not None and "cam0" in read_yaml(chain):
+    if chain is not None:
         a, b = camchain_topics(chain)
-        if a in images and b in images and a is not None and b is not None:
+        if a is not None and b is not None and {a, b} <= set(images):
             return a, b
-    pairs = []
-    for rank, (one, other) in enumerate(_SIDES):
-        for topic in images:
-            partner = topic.replace(one, other)
-            if partner != topic and partner in images and "depth" not in topic:
-                # Raw before rectified before compressed.
-                pairs.append(("compressed" in topic, "rect" in topic, rank, topic, partner))
+    sides = ((topic, topic.replace(one, other), k) for k, (one, other) in enumerate(_SIDES) for topic in images)
+    # Raw before rectified before compressed.
+    pairs = [
+        ("compressed" in topic, "rect" in topic, rank, topic, partner)
+        for topic, partner, rank in sides
+        if partner != topic and partner in images and "depth" not in topic
+    ]
     if pairs:
         return min(pairs)[3:]
     return (images[0], images[1]) if len(images) == 2 else None
@@ -224,32 +219,17 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
     The end is reckoned from the first intervals: the bag's own times are those of recording, of all its topics.
     """
     sizes: list[tuple[int, int]] = []
-    stamps: list[int] = []
     for topic in (topics.left, topics.right):
-        stamps = []
-        found = False
-        for _, message in islice(messages(reader, [topic]), 20):
-            stamps.append(stamp_ns(message))
-            image = None if found else decode_message(message)
-            if image is not None:
-                sizes.append((image.shape[1], image.shape[0]))
-                found = True
-        if not found:
-            encoding = getattr(message, "encoding", getattr(message, "format", "?"))
+        first = [message for _, message in islice(messages(reader, [topic]), 20)]
+        stamps = [stamp_ns(message) for message in first]
+        image = next((i for i in map(decode_message, first) if i is not None), None)
+        if image is None:
+            encoding = getattr(first[-1], "encoding", getattr(first[-1], "format", "?"))
             raise SourceError(f"no readable image on '{topic}' (encoding '{encoding}')", where=path)
+        sizes.append((image.shape[1], image.shape[0]))
         if stamps[0] == 0:
             raise SourceError(f"images on '{topic}' carry no stamp", where=path, cure="the driver must set them")
     return sizes, (min(stamps), min(stamps) + round((usual_interval(stamps) or 0.0) * (topics.count - 1)))
-
-
-def _check_sizes(sizes: list[tuple[int, int]], rig: StereoRig, path: Path, topics: _Topics) -> None:
-    for size, lens, topic in zip(sizes, (rig.left, rig.right), (topics.left, topics.right), strict=True):
-        if size != (lens.width, lens.height):
-            raise CalibrationError(
-                f"images on '{topic}' are {size[0]}x{size[1]}, the calibration is for {lens.width}x{lens.height}",
-                where=path,
-                cure="use the calibration of this resolution, or scale its intrinsics",
-            )
 
 
 def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
@@ -258,11 +238,9 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
     for topic in (topics.left, topics.right):
         name = info_topic(topic)
         if name not in available:
-            raise CalibrationError(
-                f"no calibration: no CameraInfo on '{name}' and no camchain.yaml beside the bag",
-                where=path,
-                cure="put Kalibr's camchain.yaml beside the bag or name one with --calibration",
-            )
+            text = f"no calibration: no CameraInfo on '{name}' and no camchain.yaml beside the bag"
+            cure = "put Kalibr's camchain.yaml beside the bag or name one with --calibration"
+            raise CalibrationError(text, where=path, cure=cure)
         _, message = next(messages(reader, [name]))
         infos.append(camera_info_of(message, path, name))
     rectified = all("rect" in t for t in (topics.left, topics.right))

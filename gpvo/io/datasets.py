@@ -16,7 +16,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, growing, integer_ns, match_nearest, text_lines, tolerance_ns
+from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, growing, integer_ns, match_nearest, text_lines, tolerance_ns
 from gpvo.io.trajectory import (
     BATCH_ESTIMATE,
     GPS_INS,
@@ -91,7 +91,7 @@ class EurocSource(FileSource):
             stated = _stated_noise(mav / folder / "sensor.yaml")
             T_marker_imu = _marker_to_imu(mav, folder)
             truth = carry(read_euroc_csv(file), T_marker_imu @ self.mounting.T_imu_cam, noise or stated or usual)
-            check_overlap(truth, np.array([p.t_ns for p in self._pairs], dtype=np.int64), file)
+            check_overlap(truth, self.span_ns, file)
             return truth
         return None
 
@@ -100,9 +100,8 @@ def _mav_folder(path: Path) -> Path:
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     for camera in ("cam0", "cam1"):
         if not (mav / camera / "data.csv").is_file():
-            raise SourceError(
-                "no list of images", where=mav / camera / "data.csv", cure="a line 'stamp_ns,file' per image"
-            )
+            cure = "a line 'stamp_ns,file' per image"
+            raise SourceError("no list of images", where=mav / camera / "data.csv", cure=cure)
     return mav
 
 
@@ -113,11 +112,9 @@ def _euroc_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
         return read_sensor_pair(*sensors, imu=imu if imu.is_file() else None, body_is_flu=_body_is_flu(mav))
     chain = given or next((c for c in map(find_calibration, (path, mav, path / "dso", mav.parent)) if c), None)
     if chain is None:
-        raise CalibrationError(
-            "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml",
-            where=mav,
-            cure="put Kalibr's camchain.yaml into the folder or name one with --calibration",
-        )
+        text = "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml"
+        cure = "put Kalibr's camchain.yaml into the folder or name one with --calibration"
+        raise CalibrationError(text, where=mav, cure=cure)
     return read_stereo_yaml(chain)
 
 
@@ -146,8 +143,7 @@ def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:
                 raise ValueError
             out.append((integer_ns(stamp), name))
         except ValueError:
-            known.unreadable += 1
-            known.note(f"{path.parent.name}/{path.name} line {number} is not 'stamp_ns,file'")
+            known.count("unreadable", f"{path.parent.name}/{path.name} line {number} is not 'stamp_ns,file'")
     if not out:
         raise SourceError("lists no images", where=path, cure="a line 'stamp_ns,file' per image")
     in_time = sorted(out, key=lambda line: line[0])
@@ -181,13 +177,10 @@ def _marker_to_imu(mav: Path, folder: str) -> Array:
 
 def _stated_noise(sensor: Path) -> TruthNoise | None:
     """Noise that the truth's own ``sensor.yaml`` states, as gpvo's simulator writes it."""
-    if not sensor.is_file():
-        return None
-    document = read_yaml(sensor)
-    values = [document.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
-    if not all(isinstance(v, (int, float)) and 0 <= v < 10 for v in values):
-        return None
-    return TruthNoise(float(values[0]), float(values[1]))  # type: ignore[arg-type]
+    document = read_yaml(sensor) if sensor.is_file() else {}
+    stated = [document.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
+    values = [float(v) for v in stated if isinstance(v, (int, float)) and 0 <= v < 10]
+    return TruthNoise(*values) if len(values) == 2 else None
 
 
 class KittiSource(FileSource):
@@ -214,19 +207,19 @@ class KittiSource(FileSource):
         if not calib.is_file():
             raise CalibrationError("no calibration", where=calib, cure="copy the sequence's calib.txt there")
         left, right = self._cameras(path, colour)
-        known = SourceReport()
-        pairs = self._list_pairs(path, left, right, known)
+        if not (path / "times.txt").is_file():
+            raise SourceError("no time stamps", where=path / "times.txt", cure="one line of seconds per frame")
+        stamps, known = read_times(path / "times.txt"), SourceReport()
+        pairs = self._list_pairs(path, stamps, left, right, known)
         first = first_size(pairs, "left")  # the calibration does not say it
         if first is None:
             raise SourceError("no readable left image", where=path)
-        if calib.suffix.lower() in (".yaml", ".yml"):
-            rig = read_stereo_yaml(calib, size=first[1])
-        else:
-            rig = read_kitti_calib(calib, left=left, right=right, size=first[1])
+        is_yaml, size = calib.suffix.lower() in (".yaml", ".yml"), first[1]
+        rig = read_stereo_yaml(calib, size=size) if is_yaml else read_kitti_calib(calib, left, right, size)
         super().__init__(path, path.name, rig, pairs, known, **options)
         # Poses are of camera 0, whose place only KITTI's own file tells.
         T_cam0_left = left_camera_offset(own if own.is_file() else calib, left)
-        self.truth = self._read_truth(path, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)
+        self.truth = self._read_truth(path, stamps, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -244,29 +237,23 @@ class KittiSource(FileSource):
                 continue
             if (path / f"image_{left}").is_dir() and (path / f"image_{right}").is_dir():
                 return left, right
-        raise SourceError(
-            "has no pair of image folders", where=path, cure="image_0 and image_1 (grey) or image_2 and image_3"
-        )
+        cure = "image_0 and image_1 (grey) or image_2 and image_3"
+        raise SourceError("has no pair of image folders", where=path, cure=cure)
 
     @staticmethod
-    def _list_pairs(path: Path, left: int, right: int, known: SourceReport) -> list[PairFiles]:
+    def _list_pairs(path: Path, stamps: Stamps, left: int, right: int, known: SourceReport) -> list[PairFiles]:
         """One pair per line of ``times.txt``, named by index; a file without a line is counted, not guessed."""
-        times = path / "times.txt"
-        if not times.is_file():
-            raise SourceError("no time stamps", where=times, cure="one line of seconds per frame")
-        stamps = read_times(times)
         folders = (path / f"image_{left}", path / f"image_{right}")
         names: list[dict[int, Path]] = []
         for folder in folders:
             files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.isdecimal())
             names.append({int(f.stem): f for f in files})
-        if not names[0] or not names[1]:
-            empty = folders[0] if not names[0] else folders[1]
-            raise SourceError("holds no images", where=empty, cure="expected names like 000000.png")
+        for folder, found in zip(folders, names):
+            if not found:
+                raise SourceError("holds no images", where=folder, cure="expected names like 000000.png")
         surplus = {i for found in names for i in found if i >= len(stamps)}
         if surplus:
-            known.missing += len(surplus)
-            known.note(f"{len(surplus)} frames have no line in times.txt")
+            known.count("missing", f"{len(surplus)} frames have no line in times.txt", len(surplus))
         suffix = next(iter(names[0].values())).suffix
         return [
             PairFiles(int(t), *(found.get(i, folder / f"{i:06d}{suffix}") for found, folder in zip(names, folders)))
@@ -274,18 +261,15 @@ class KittiSource(FileSource):
         ]
 
     @staticmethod
-    def _read_truth(path: Path, T_cam0_cam: Array, noise: TruthNoise) -> TruthLog | None:
+    def _read_truth(path: Path, stamps: Stamps, T_cam0_cam: Array, noise: TruthNoise) -> TruthLog | None:
         candidates = (path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt")
         file = next((c for c in candidates if c.is_file()), None)
         if file is None:
             return None
         T_world_cam0 = read_kitti_poses(file)
-        stamps = read_times(path / "times.txt")
         if len(T_world_cam0) != len(stamps):
-            raise SourceError(
-                f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt",
-                where=file,
-                cure="KITTI poses have no stamps: both files must have one line per frame",
-            )
+            text = f"holds {len(T_world_cam0)} poses for the {len(stamps)} lines of times.txt"
+            cure = "KITTI poses have no stamps: both files must have one line per frame"
+            raise SourceError(text, where=file, cure=cure)
         grows = growing(stamps)
         return carry(Trajectory(stamps[grows], T_world_cam0[grows]), T_cam0_cam, noise)

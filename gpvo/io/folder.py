@@ -6,8 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gpvo.cameras.kalibr import read_imu_noise
 from gpvo.cameras.readers import find_calibration, read_stereo_yaml
 from gpvo.errors import CalibrationError, SourceError
@@ -48,11 +46,8 @@ class FolderSource(FileSource):
     ) -> None:
         chain = Path(calibration) if calibration is not None else find_calibration(path)
         if chain is None:
-            raise CalibrationError(
-                "no calibration beside the images",
-                where=path,
-                cure="put Kalibr's camchain.yaml there or name one with --calibration",
-            )
+            cure = "put Kalibr's camchain.yaml there or name one with --calibration"
+            raise CalibrationError("no calibration beside the images", where=path, cure=cure)
         known = SourceReport()
         pairs = _list_pairs(path, rate_hz, tolerance_s, known)
         first = first_size(pairs, "left")
@@ -67,9 +62,8 @@ class FolderSource(FileSource):
                 remark=self.remark,
             )
         if (path / "truth.tum").is_file():
-            truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, truth_noise)
-            check_overlap(truth, np.array([p.t_ns for p in self._pairs], dtype=np.int64), path / "truth.tum")
-            self.truth = truth
+            self.truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, truth_noise)
+            check_overlap(self.truth, self.span_ns, path / "truth.tum")
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -89,9 +83,8 @@ def _is_image(path: Path) -> bool:
 def _list_pairs(path: Path, rate_hz: float | None, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
     left, right = _find_images(path)
     if not left or not right:
-        raise SourceError(
-            "holds no image pairs", where=path, cure="left/ and right/ with equal names, or names ending _left, _right"
-        )
+        cure = "left/ and right/ with equal names, or names ending _left, _right"
+        raise SourceError("holds no image pairs", where=path, cure=cure)
     stamps = _stamps(path, sorted({*left, *right}), rate_hz, known)
     lists = [[(stamps[key], key) for key in side if key in stamps] for side in (left, right)]
     pairs = match_nearest(lists[0], lists[1], tolerance_ns(tolerance_s), known, path)
@@ -115,8 +108,7 @@ def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
 
 def _key(file: Path) -> str:
     """The name without a side at its end: ``000012_left`` and ``000012`` alike."""
-    match = re.fullmatch(r"(.*?)[_-](left|right|cam0|cam1)", file.stem, re.IGNORECASE)
-    return match[1] if match else file.stem
+    return re.sub(r"[_-](left|right|cam0|cam1)$", "", file.stem, flags=re.IGNORECASE)
 
 
 def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceReport) -> dict[str, int]:
@@ -136,16 +128,11 @@ def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceRep
         return {k: round(float(n) * 1e9 / rate_hz) for k, n in numbers.items()}
     dates = " (dates are not read)" if _DATE.search(keys[0]) else ""
     if rate_hz is not None and not numbers:
-        raise SourceError(
-            f"the last number of names such as '{keys[0]}' does not count the images{dates}",
-            where=path,
-            cure="name images by nanoseconds, number them, or add times.txt (seconds, a line per pair)",
-        )
-    raise SourceError(
-        f"the image names are not stamps{dates}, and there is no times.txt",
-        where=path,
-        cure="name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz",
-    )
+        text = f"the last number of names such as '{keys[0]}' does not count the images{dates}"
+        cure = "name images by nanoseconds, number them, or add times.txt (seconds, a line per pair)"
+        raise SourceError(text, where=path, cure=cure)
+    cure = "name images by nanoseconds, add times.txt (seconds, a line per pair), or give --rate-hz"
+    raise SourceError(f"the image names are not stamps{dates}, and there is no times.txt", where=path, cure=cure)
 
 
 def _numbers(keys: list[str]) -> dict[str, str]:
@@ -165,8 +152,8 @@ def _stamps_by_line(path: Path, keys: list[str], numbers: dict[str, str], known:
         first = 1 if min(index.values()) == 1 and max(index.values()) == len(lines) else 0
         inside = {k: i - first for k, i in index.items() if 0 <= i - first < len(lines)}
         if len(inside) < len(keys):
-            known.missing += len(keys) - len(inside)
-            known.note(f"{len(keys) - len(inside)} images have no line in times.txt")
+            absent = len(keys) - len(inside)
+            known.count("missing", f"{absent} images have no line in times.txt", absent)
         return {k: int(lines[i]) for k, i in inside.items()}
     if len(keys) != len(lines):
         raise SourceError(f"holds {len(lines)} stamps for {len(keys)} images", where=path / "times.txt")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import compress, islice
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
 from gpvo.io.foreign_csv import Table, is_number, names_other_columns, read_table
 from gpvo.io.stamps import check_interval, text_lines
-from gpvo.io.trajectory import Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
+from gpvo.io.trajectory import REMOVE, Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
 from gpvo.stats.consistency import SEEN, seen_axes
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
@@ -100,21 +101,20 @@ def guess_format(path: Path) -> str:
         return "bag"
     if path.is_dir():
         raise SourceError("is a folder, not a log", where=path, cure="name the trajectory file or the bag")
-    lines = [text for _, (_, text) in zip(range(50), text_lines(path))]
-    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    data, above = "".join(lines[first : first + 1]), lines[:first]
+    comment, data = "", ""
+    for _, data in islice(text_lines(path), 50):
+        if not data.startswith("#"):
+            break
+        comment, data = data, ""
     words = data.split()
-    if "," in data or ";" in data or (words and not all(is_number(w) for w in words)):
+    if "," in data or ";" in data or not all(map(is_number, words)):
         return "csv"
-    if above and names_other_columns(above[-1].lstrip("# ").split(), len(words)):
+    if comment and names_other_columns(comment.lstrip("# ").split(), len(words)):
         return "csv"
     if len(words) in (8, 12):
         return "tum" if len(words) == 8 else "kitti"
-    raise SourceError(
-        "does not look like a trajectory file",
-        where=path,
-        cure="TUM has 8 numbers a line, KITTI 12, CSV a header; see --format",
-    )
+    cure = "TUM has 8 numbers a line, KITTI 12, CSV a header; see --format"
+    raise SourceError("does not look like a trajectory file", where=path, cure=cure)
 
 
 def read_foreign(
@@ -131,6 +131,8 @@ def read_foreign(
 ) -> ForeignLog:
     """Read another odometry's log, or a ground truth.
 
+    Raises SourceError: one line that names the file, the place and the cure.
+
     Parameters
     ----------
     kind : one of :data:`FORMATS`, by default guessed.
@@ -141,11 +143,6 @@ def read_foreign(
     complete : refuse rows of a CSV, or messages of a bag, without a pose, as a ground truth must; else they are left
         out and counted.
     covariance_axes : ``"world"`` for covariances in the axes of the fixed frame, as ROS has them, or ``"body"``.
-
-    Raises
-    ------
-    SourceError
-        One line that names the file, the place and the cure.
     """
     p = Path(path)
     name = kind or guess_format(p)
@@ -172,18 +169,16 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
     if not known.any():
         raise SourceError("holds no complete pose", where=path)
     if complete and not known.all():
-        line = table.lines[int(np.flatnonzero(~known)[0])]
-        cure = "remove the line: a gap does no harm"
-        raise SourceError(f"line {line} holds NaN or infinity", where=path, cure=cure)
-    lines = [n for n, k in zip(table.lines, known, strict=True) if k]
+        line = table.lines[int(np.argmin(known))]
+        raise SourceError(f"line {line} holds NaN or infinity", where=path, cure=REMOVE)
+    lines = list(compress(table.lines, known))
     t, pose = table.t_ns[known], pose[known]
     check_growing(path, t, lines)
     check_unit(path, pose[:, 3:], lines)
     trajectory = Trajectory(t, se3.from_quaternion(pose[:, :3], pose[:, 3:]))
     cov = _table_covariance(c, known)
-    if cov is not None and axes == "world":
-        cov = _into_body(trajectory, cov)
     if cov is not None:
+        cov = _into_body(trajectory, cov) if axes == "world" else cov
         still = still_axes(trajectory.T_world_body)
         stated = np.array([f"cov_{i}{i}" in c for i in range(6)])
         planar = (stated | still).all() and stated[3:].any()  # of the position alone, it says nothing of the motion
@@ -201,12 +196,12 @@ def _from_table(path: Path, table: Table, covariance_of: str, axes: str, complet
 
 def _unused(table: Table, covariance: Array | None) -> tuple[str, ...]:
     """A remark on columns that state an uncertainty and that nothing reads."""
-    names, notes = ", ".join(table.unused), []
-    if names:
-        notes.append(f"columns not used: {names}; --map COLUMN=cov_00 takes a variance, see --help")
-    absent = [f"cov_{i}{i}" for i in range(6) if f"cov_{i}{i}" not in table.columns]
+    notes = []
+    if table.unused:
+        notes.append(f"columns not used: {', '.join(table.unused)}; --map COLUMN=cov_00 takes a variance, see --help")
     if covariance is None and any(c.startswith("cov_") for c in table.columns):
-        notes.append(f"the covariance is not used: it has no {', '.join(absent)}; --map COLUMN=NAME names them")
+        absent = ", ".join(f"cov_{i}{i}" for i in range(6) if f"cov_{i}{i}" not in table.columns)
+        notes.append(f"the covariance is not used: it has no {absent}; --map COLUMN=NAME names them")
     return tuple(notes)
 
 
@@ -215,12 +210,10 @@ def _table_covariance(columns: Mapping[str, Array], known: NDArray[np.bool_]) ->
     if not any(f"cov_{i}{i}" in columns for i in range(6)):
         return None
     C = np.zeros((int(known.sum()), 6, 6))
-    for i in range(6):
-        for j in range(6):
-            if f"cov_{i}{j}" in columns:
-                C[:, i, j] = columns[f"cov_{i}{j}"][known]
-                if f"cov_{j}{i}" not in columns:
-                    C[:, j, i] = C[:, i, j]
+    for i, j in np.ndindex(6, 6):
+        column = columns.get(f"cov_{i}{j}", columns.get(f"cov_{j}{i}"))
+        if column is not None:
+            C[:, i, j] = column[known]
     return np.where(np.isfinite(C), C, np.nan)
 
 
@@ -276,9 +269,8 @@ def _read_kitti(path: Path, times: str | Path | None, rate_hz: float | None) -> 
         check_interval(t, times, lambda _: "the file of --times holds seconds", is_stated=True)
     elif rate_hz is not None:
         if not 1e-3 <= rate_hz <= 1e5:
-            raise SourceError(
-                f"a rate of {rate_hz:g} Hz is not possible", where=path, cure="give --rate-hz from 0.001 to 100000"
-            )
+            cure = "give --rate-hz from 0.001 to 100000"
+            raise SourceError(f"a rate of {rate_hz:g} Hz is not possible", where=path, cure=cure)
         t = np.rint(np.arange(len(T)) * (1e9 / rate_hz)).astype(np.int64)
     else:
         raise SourceError("KITTI poses have no stamps", where=path, cure="give --times FILE or --rate-hz RATE")

@@ -67,10 +67,10 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     SourceError, naming file and line, or the column that is wanted.
     """
     lines = _lines(path)
-    try:
-        top, header = next(lines)
-    except StopIteration:
-        raise SourceError("is empty", where=path) from None
+    first = next(lines, None)
+    if first is None:
+        raise SourceError("is empty", where=path)
+    top, header = first
     targets = _targets(path, header, mapping)
     stamps: list[int] = []
     rows: list[list[float]] = []
@@ -100,8 +100,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
         raise SourceError("holds a header and no rows", where=path)
     check_interval(stamps, path, lambda unit: _unit_cure(column, unit), is_stated=is_stated)
     data = np.array(rows, dtype=np.float64)
-    used = {targets[n] for n in targets}
-    unused = tuple(c for k, c in enumerate(header) if k not in used and _UNCERTAIN.search(c))
+    unused = tuple(c for k, c in enumerate(header) if k not in targets.values() and _UNCERTAIN.search(c))
     columns = {n: data[:, i] for i, n in enumerate(order)}
     return Table(np.array(stamps, dtype=np.int64), columns, numbers, unused, () if top else (NO_HEADER,))
 
@@ -174,11 +173,8 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     """Target name -> column index."""
     for column, target in mapping.items():
         if target not in TARGETS:
-            raise SourceError(
-                f"--map {column}={target}: unknown name '{target}'",
-                where=path,
-                cure="targets are t_s, t_ms, t_us, t_ns, p_x.., q_x..q_w, cov_00..cov_55, n_inliers and the like",
-            )
+            cure = "targets are t_s, t_ms, t_us, t_ns, p_x.., q_x..q_w, cov_00..cov_55, n_inliers and the like"
+            raise SourceError(f"--map {column}={target}: unknown name '{target}'", where=path, cure=cure)
         if column not in header:
             raise SourceError(f"has no column '{column}' (there are: {', '.join(header)})", where=path)
     found: dict[str, int] = {mapping[c]: header.index(c) for c in mapping}
@@ -197,11 +193,9 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     if not found.keys() & _STAMPS:
         absent.insert(0, "t_s")
     if absent:
-        raise SourceError(
-            f"no column for {', '.join(absent)} (there are: {', '.join(header)})",
-            where=path,
-            cure=f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map",
-        )
+        text = f"no column for {', '.join(absent)} (there are: {', '.join(header)})"
+        cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
+        raise SourceError(text, where=path, cure=cure)
     return found
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.cameras.imagesize import image_size, is_decodable
+from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
@@ -23,6 +24,7 @@ from gpvo.types import ImuLog, Mounting, StereoCamera, StereoFrame, TruthLog
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_TO_GREY = {True: (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY), False: (cv2.COLOR_RGB2GRAY, cv2.COLOR_RGBA2GRAY)}
 _MAX_IMAGE_BYTES = 500_000_000
 _MAX_HEAD_BYTES = 1 << 20  # Thumbnails and colour profiles stand before the size.
 # Are left and right swapped? Points in front of both cameras lie further right in the left image.
@@ -48,9 +50,8 @@ def to_grey8(image: NDArray[Any], *, bgr: bool = True, depth: Depth | None = Non
         if channels == 1:
             image = image[:, :, 0]
         else:
-            code = {(3, True): cv2.COLOR_BGR2GRAY, (3, False): cv2.COLOR_RGB2GRAY}.get((channels, bgr))
-            code = (cv2.COLOR_BGRA2GRAY if bgr else cv2.COLOR_RGBA2GRAY) if code is None else code
-            image = np.asarray(cv2.cvtColor(image, code))
+            of_three, of_four = _TO_GREY[bgr]
+            image = np.asarray(cv2.cvtColor(image, of_three if channels == 3 else of_four))
     if image.dtype == np.uint16:
         return (depth or Depth()).to8(image)
     return np.ascontiguousarray(image, dtype=np.uint8)
@@ -176,27 +177,19 @@ class ImageSource(ABC):
 
     def _readable(self, report: SourceReport) -> Iterator[StereoFrame]:
         """The pairs that can be used, as they are. Raises SourceError at the end where there was none."""
-        problem = "no readable image pair"
+        problem, is_any_good = "no readable image pair", False
         for t_ns, left, right in self.raw_pairs(report):
             if left is None or right is None:
-                report.unreadable += 1
-                report.note(f"unreadable image at {t_ns} ns")
-            elif not (self._fits(left, self.rig.left) and self._fits(right, self.rig.right)):
-                report.unreadable += 1
-                report.note(f"image of another size at {t_ns} ns")
-                sizes = [f"{w}x{h}" for h, w in (left.shape, right.shape)]
-                problem = (
-                    problem and f"no image pair has the size of its calibration: the last is {' and '.join(sizes)}"
-                )
+                report.count("unreadable", f"unreadable image at {t_ns} ns")
+            elif [left.shape, right.shape] != [(c.height, c.width) for c in (self.rig.left, self.rig.right)]:
+                report.count("unreadable", f"image of another size at {t_ns} ns")
+                sizes = " and ".join(f"{w}x{h}" for h, w in (left.shape, right.shape))
+                problem = f"no image pair has the size of its calibration: the last is {sizes}"
             else:
-                problem = ""
+                is_any_good = True
                 yield StereoFrame(t_ns, left, right)
-        if problem:
+        if not is_any_good:
             raise SourceError(problem, where=self.path)
-
-    @staticmethod
-    def _fits(image: Image8, lens: Any) -> bool:
-        return image.shape == (lens.height, lens.width)
 
 
 class FileSource(ImageSource):
@@ -212,7 +205,7 @@ class FileSource(ImageSource):
         self._pairs = pairs
         self.span_ns = (min(p.t_ns for p in pairs), max(p.t_ns for p in pairs))
         self.usual_interval_ns = usual_interval(p.t_ns for p in pairs)
-        check_size(pairs, rig)
+        _check_sizes(pairs, rig)
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -222,8 +215,7 @@ class FileSource(ImageSource):
         for pair in self._pairs:
             absent = [p for p in (pair.left, pair.right) if not p.is_file()]
             if absent:
-                report.missing += 1
-                report.note(f"missing {absent[0].parent.name}/{absent[0].name}")
+                report.count("missing", f"missing {absent[0].parent.name}/{absent[0].name}")
                 continue
             yield pair.t_ns, read_grey8(pair.left, self.depth), read_grey8(pair.right, self.depth)
 
@@ -243,20 +235,22 @@ def first_size(pairs: Sequence[PairFiles], side: str) -> tuple[Path, tuple[int, 
     return next(((path, size) for path, size in sizes if size is not None), None)
 
 
-def check_size(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
-    """Refuse a calibration for another resolution, judged by the first readable image of each camera.
+def _check_sizes(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
+    """:func:`check_size` of the first readable image of each camera."""
+    for side, lens in (("left", rig.left), ("right", rig.right)):
+        if (first := first_size(pairs, side)) is not None:
+            check_size("the image is", first[1], lens, first[0], f" ({rig.where})" if rig.where else "")
+
+
+def check_size(images: str, size: tuple[int, int], lens: CameraModel, where: object, source: str = "") -> None:
+    """Refuse a lens calibrated at another (width, height) than that of ``images``; ``source``: of the calibration.
 
     Raises CalibrationError, naming both resolutions.
     """
-    for side, lens in (("left", rig.left), ("right", rig.right)):
-        path, (width, height) = first_size(pairs, side) or (None, (lens.width, lens.height))
-        if (width, height) != (lens.width, lens.height):
-            raise CalibrationError(
-                f"the image is {width}x{height}, its calibration is for {lens.width}x{lens.height}"
-                + (f" ({rig.where})" if rig.where else ""),
-                where=path,
-                cure="use the calibration of this resolution, or scale its intrinsics",
-            )
+    if size != (lens.width, lens.height):
+        text = f"{images} {size[0]}x{size[1]}, the calibration is for {lens.width}x{lens.height}{source}"
+        cure = "use the calibration of this resolution, or scale its intrinsics"
+        raise CalibrationError(text, where=where, cure=cure)
 
 
 class OrderCheck:

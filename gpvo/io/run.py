@@ -12,9 +12,9 @@ import hashlib
 import platform
 import shutil
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
@@ -25,11 +25,11 @@ import numpy as np
 from gpvo import __version__
 from gpvo.errors import SourceError
 from gpvo.files import write_json, write_toml
-from gpvo.geometry.covariance import are_positive_definite
+from gpvo.geometry.covariance import are_positive_definite, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
 from gpvo.io.run_folder import SCHEMA, is_finished
-from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks
+from gpvo.io.run_read import Run, read_predictions, read_run, read_tracks, table_of
 from gpvo.io.snapshot import save_snapshot
 from gpvo.io.trajectory import tum_line
 from gpvo.types import Array, ImuLog, Mounting, Prediction, StereoCamera, StereoTracks, TruthLog, VoLog, VoRecord
@@ -50,6 +50,9 @@ __all__ = [
 class RunWriter:
     """Writes a run folder as the records come; use as a context manager.
 
+    Raises SourceError where the folder holds something that is not a run, or a finished one and not ``overwrite``;
+    where it cannot be written, or another process writes it.
+
     Parameters
     ----------
     path : the folder; made if need be. What a killed run left is replaced, anything but a run refused.
@@ -61,12 +64,6 @@ class RunWriter:
     chunk : records per chunk; a killed run loses at most so many.
     resume : what decides the records beside the source; a run that broke off under the same is resumed: ``kept``
         is what it left, and its records are to be appended again, first of all. None begins anew.
-
-    Raises
-    ------
-    SourceError
-        Where the folder holds something that is not a run, or a finished one and not ``overwrite``; where it cannot be
-        written, or another process writes it.
     """
 
     def __init__(
@@ -85,16 +82,13 @@ class RunWriter:
         resume: str | None = None,
     ) -> None:
         self._target = Path(path)
-        self._meta = dict(meta or {})
-        self._chunk = max(1, chunk)
-        self._state = _State()
+        self._meta, self._chunk, self._state = dict(meta or {}), chunk, _State()
         self._lock = run_folder.claim(self._target)
         self.path = self._target
         if is_finished(self._target):
             if not overwrite:
-                raise SourceError(
-                    "holds a finished run", where=path, cure="give --overwrite, or another folder with -o"
-                )
+                cure = "give --overwrite, or another folder with -o"
+                raise SourceError("holds a finished run", where=path, cure=cure)
             self.path = self._target.with_name(f".{self._target.name}.new")
         self._chunks, self._resume = self.path / "chunks", resume
         self.kept = None if resume is None else run_folder.take_up(self._chunks, resume)
@@ -105,7 +99,9 @@ class RunWriter:
             # First of all files: a run that is killed while it begins is known as one, and may be begun anew.
             self._write_meta(complete=False)
             self._chunks.mkdir(exist_ok=True)
-            write_json(self.path / "rig.json", run_folder.rig_document(camera, mounting or Mounting(), calibration))
+            place = mounting or Mounting()
+            rig = {"camera": camera and asdict(camera), **vars(place), "calibration": calibration}
+            write_json(self.path / "rig.json", {"schema": SCHEMA, **rig})
             if truth is not None:
                 run_folder.write_truth(self.path / "truth.parquet", truth)
             if imu is not None:
@@ -132,12 +128,8 @@ class RunWriter:
     ) -> None:
         """Add one record, what a model predicted for it, and the observations that came with it.
 
-        ``state``: where all stands after it. It is kept with the chunk that ends here, for going on from it.
-
-        Raises
-        ------
-        ValueError
-            Where the stamp does not grow or the record starts from an unknown frame.
+        ``state``: where all stands after it. It is kept with the chunk that ends here, for going on from it. Raises
+        ValueError where the stamp does not grow or the record starts from an unknown frame.
         """
         now = self._state
         T_prev = now.poses.get(record.t_prev_ns)
@@ -172,19 +164,18 @@ class RunWriter:
         """Write the records so far as one chunk, which survives a kill."""
         state = self._state
         if state.records:
-            name = f"{state.chunks:06d}.parquet"
-            self._keep("log", name, run_table.record_columns(state.records))
+            tables: dict[str, Mapping[str, Any]] = {"log": run_table.record_columns(state.records)}
             if state.predictions:
-                self._keep("predictions", name, run_table.prediction_columns(state.predictions))
+                tables["predictions"] = run_table.prediction_columns(state.predictions)
             if state.tracks:
-                self._keep("tracks", name, run_table.track_columns(state.tracks))
+                tables["tracks"] = run_table.track_columns(state.tracks)
+            for kind, columns in tables.items():
+                part = write_table(self._chunks / f"{kind}_{state.chunks:06d}.parquet", columns)
+                state.written.setdefault(kind, []).append(part)
             with (self.path / "trajectory.tum").open("a", encoding="ascii", newline="\n") as file:
                 file.writelines(line + "\n" for line in state.lines)
             state.chunks += 1
         state.records, state.predictions, state.lines, state.tracks = [], [], [], []
-
-    def _keep(self, kind: str, name: str, columns: Mapping[str, Any]) -> None:
-        self._state.written.setdefault(kind, []).append(write_table(self._chunks / f"{kind}_{name}", columns))
 
     def close(self, *, complete: bool = True) -> None:
         """Join the chunks and finish ``run.json``; ``complete=False`` leaves a run that broke off in its chunks."""
@@ -207,8 +198,7 @@ class RunWriter:
         self.flush()
         if complete:
             for kind, parts in self._state.written.items():
-                target = "vo_log.parquet" if kind == "log" else f"{kind}.parquet"
-                join_tables(parts, self.path / target, {"schema": str(SCHEMA)})
+                join_tables(parts, self.path / table_of(kind), {"schema": str(SCHEMA)})
             shutil.rmtree(self._chunks, ignore_errors=True)
         self._write_meta(complete=complete)
 
@@ -227,7 +217,7 @@ class RunWriter:
                 **self._meta,
                 "complete": complete,
                 "frames": state.records_total,
-                "statuses": dict(state.statuses),
+                "statuses": state.statuses,
                 "started": state.started,
                 "finished": datetime.now(timezone.utc).isoformat(timespec="seconds") if complete else None,
                 "wall_s": round(time.monotonic() - state.clock, 3),
@@ -248,7 +238,7 @@ class _State:
     tracks: list[StereoTracks] = field(default_factory=list)
     written: dict[str, list[RowGroup]] = field(default_factory=dict)
     poses: OrderedDict[int, Array] = field(default_factory=OrderedDict)
-    statuses: dict[str, int] = field(default_factory=dict)
+    statuses: Counter[str] = field(default_factory=Counter)
     stage_ms: dict[str, float] = field(default_factory=dict)
     records_total: int = 0
     chunks: int = 0
@@ -266,7 +256,7 @@ class _State:
         """Add to the sums of ``run.json``."""
         self.records_total += 1
         self.last_t_ns = record.t_ns
-        self.statuses[record.status.value] = self.statuses.get(record.status.value, 0) + 1
+        self.statuses[record.status.value] += 1
         for stage, ms in record.stage_ms.items():
             self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + ms
 
@@ -287,7 +277,7 @@ def write_predictions(path: str | Path, predictions: Sequence[Prediction]) -> No
 def as_stored(record: VoRecord) -> VoRecord:
     """The record as it will be read: covariances by their upper triangles, without those that are none: not finite, or
     not positive definite."""
-    names, C = list(record.covariances), np.array(list(record.covariances.values())).reshape(-1, 6, 6)
-    C = np.where(np.tri(6, k=-1, dtype=bool), np.swapaxes(C, 1, 2), C)
+    C = from_upper(upper(np.array(list(record.covariances.values())).reshape(-1, 6, 6)), 6)
     good = are_positive_definite(C) if record.usable else np.ones(len(C), bool)
-    return replace(record, covariances={name: c for name, c, is_good in zip(names, C, good) if is_good})
+    kept = {name: c for name, c, is_good in zip(record.covariances, C, good) if is_good}
+    return replace(record, covariances=kept)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from gpvo.io import run_table
 from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
 from gpvo.io.run_read import check_log
 from gpvo.io.snapshot import load_snapshot
-from gpvo.types import ImuLog, Mounting, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import ImuLog, TruthLog, VoLog, VoRecord
 
 SCHEMA = 1
 FILES = (
@@ -25,7 +24,7 @@ FILES = (
 )  # fmt: skip
 _OWN = (*FILES, "config.toml", "run.json", "calibration_state.json")
 KINDS = ("log", "predictions", "tracks")
-"""Tables that are written in chunks, ``KIND_000000.parquet`` and so on."""
+"""Tables that are written in chunks."""
 STATE = "state.npz"
 """In the folder of the chunks: how many there are, and where what made them stood."""
 
@@ -123,16 +122,3 @@ def write_imu(path: Path, imu: ImuLog) -> None:
     if imu.noise is not None:
         metadata["noise"] = json.dumps(asdict(imu.noise))
     write_table(path, run_table.imu_columns(imu), metadata)
-
-
-def rig_document(
-    camera: StereoCamera | None, mounting: Mounting, calibration: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """What ``rig.json`` holds."""
-    return {
-        "schema": SCHEMA,
-        "camera": None if camera is None else asdict(camera),
-        "T_body_cam": None if mounting.T_body_cam is None else mounting.T_body_cam.tolist(),
-        "T_imu_cam": None if mounting.T_imu_cam is None else mounting.T_imu_cam.tolist(),
-        "calibration": None if calibration is None else dict(calibration),
-    }

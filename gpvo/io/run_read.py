@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ from gpvo.types import (
     VoLog,
     field_names,
 )
+
+T = TypeVar("T")
 
 _MAX_SCHEMA = 1
 _LARGEST = 1e12  # No mean or variance that a model states is larger [m, rad, m^2, rad^2].
@@ -87,7 +89,7 @@ def read_run(path: str | Path) -> Run:
     if not isinstance(schema, int) or schema > _MAX_SCHEMA:
         raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=p / "run.json", cure="upgrade")
     camera, mounting = _read_rig(p / "rig.json")
-    log = replace(_read_log(p, camera), vehicle=_vehicle_of(meta, p / "run.json"))
+    log = _read_log(p, camera, _vehicle_of(meta, p / "run.json"))
     return Run(
         path=p,
         name=printable(meta.get("name") or p.resolve().name),
@@ -95,7 +97,7 @@ def read_run(path: str | Path) -> Run:
         truth=_read_truth(p / "truth.parquet"),
         imu=_read_imu(p / "imu.parquet"),
         mounting=mounting,
-        predictions=_read_predictions_of(p),
+        predictions=[q for part in _parts(p, "predictions") for q in read_predictions(part)],
         meta=meta,
         settings=read_toml(p / "config.toml") if (p / "config.toml").is_file() else {},
     )
@@ -104,9 +106,7 @@ def read_run(path: str | Path) -> Run:
 def read_predictions(path: str | Path) -> list[Prediction]:
     """Predictions of a Parquet file. Raises SourceError where it is damaged or holds something else."""
     p = Path(path)
-    columns, _ = read_columns(p)
-    with _guarded(p):
-        predictions = run_table.predictions_from(columns)
+    predictions = _read_table(p, run_table.predictions_from)
     if not predictions:
         return []
     numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
@@ -129,18 +129,12 @@ def read_tracks(path: str | Path) -> StereoTracks:
     Raises SourceError where the run folder holds no tracks, or they are damaged.
     """
     p = Path(path)
-    parts = _parts(p, "tracks.parquet", "tracks")
+    parts = _parts(p, "tracks")
     if not parts:
-        raise SourceError(
-            "holds no tracks: poses alone show neither structure nor pixel noise",
-            where=p,
-            cure="run the sequence again with 'gpvo run --keep-tracks'; an imported log has none",
-        )
-    read = []
-    for part in parts:
-        with _guarded(part):
-            read.append(run_table.tracks_from(read_columns(part)[0]))
-    return StereoTracks.join(read)
+        text = "holds no tracks: poses alone show neither structure nor pixel noise"
+        cure = "run the sequence again with 'gpvo run --keep-tracks'; an imported log has none"
+        raise SourceError(text, where=p, cure=cure)
+    return StereoTracks.join([_read_table(part, run_table.tracks_from) for part in parts])
 
 
 def _vehicle_of(meta: dict[str, Any], path: Path) -> Vehicle:
@@ -149,7 +143,7 @@ def _vehicle_of(meta: dict[str, Any], path: Path) -> Vehicle:
     with _guarded(path):
         vehicle = Vehicle(**{k: float(v) for k, v in known.items()})
     if not all(v > 0 for v in vars(vehicle).values()):
-        raise SourceError("its vehicle cannot move: an acceleration is not above 0", where=path)
+        raise SourceError("its vehicle cannot move: its largest accelerations are not above 0", where=path)
     return vehicle
 
 
@@ -164,24 +158,28 @@ def _guarded(path: Path) -> Iterator[None]:
         raise SourceError(f"is malformed: {error}", where=path) from None
 
 
-def _parts(path: Path, joined: str, kind: str) -> list[Path]:
-    """The joined file, else the chunks of a run that never closed."""
-    if (path / joined).is_file():
-        return [path / joined]
-    return sorted((path / "chunks").glob(f"{kind}_*.parquet"))
+def table_of(kind: str) -> str:
+    """The file of a table that is written in chunks, ``chunks/KIND_000000.parquet`` and so on."""
+    return "vo_log.parquet" if kind == "log" else f"{kind}.parquet"
 
 
-def _read_log(path: Path, camera: StereoCamera | None) -> VoLog:
-    parts = _parts(path, "vo_log.parquet", "log")
+def _parts(path: Path, kind: str) -> list[Path]:
+    """The joined table of a run folder, else the chunks of a run that never closed."""
+    joined = path / table_of(kind)
+    return [joined] if joined.is_file() else sorted((path / "chunks").glob(f"{kind}_*.parquet"))
+
+
+def _read_table(path: Path, table_from: Callable[[dict[str, NDArray[Any]]], T]) -> T:
+    with _guarded(path):
+        return table_from(read_columns(path)[0])
+
+
+def _read_log(path: Path, camera: StereoCamera | None, vehicle: Vehicle) -> VoLog:
+    parts = _parts(path, "log")
     if not parts:
-        raise SourceError(
-            "holds no records: the run broke off before its first chunk", where=path, cure="run the sequence again"
-        )
-    records = []
-    for part in parts:
-        with _guarded(part):
-            records += run_table.records_from(read_columns(part)[0])
-    log = VoLog(records, camera)
+        text = "holds no records: the run broke off before its first chunk"
+        raise SourceError(text, where=path, cure="run the sequence again")
+    log = VoLog([r for part in parts for r in _read_table(part, run_table.records_from)], camera, vehicle)
     check_log(log, path / "vo_log.parquet")
     return log
 
@@ -273,10 +271,3 @@ def _stamps(columns: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     if (np.diff(t) <= 0).any():
         raise ValueError("stamps do not increase")
     return t
-
-
-def _read_predictions_of(path: Path) -> list[Prediction]:
-    out: list[Prediction] = []
-    for part in _parts(path, "predictions.parquet", "predictions"):
-        out += read_predictions(part)
-    return out

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import scaled_root
+from gpvo.geometry.covariance import from_upper, scaled_root
 from gpvo.types import (
     COUNT_FIELDS,
     FLOAT_FIELDS,
@@ -28,10 +28,11 @@ from gpvo.types import (
     Status,
     StereoTracks,
     TruthLog,
+    VoLog,
     VoRecord,
 )
 
-Columns = dict[str, list[Any]]
+Columns = dict[str, Any]
 
 _AXES = ("x", "y", "z")
 _POSITION = tuple(f"p_{a}_m" for a in _AXES)
@@ -51,11 +52,9 @@ _SHORT6 = tuple(a.rsplit("_", 1)[0] for a in _SIGMA6)
 def pose_columns(T: Array) -> dict[str, NDArray[np.float64]]:
     """(N, 4, 4) poses as columns of length N."""
     T = np.asarray(T, dtype=np.float64).reshape(-1, 4, 4)
-    q = se3.rotation_to_quaternion_xyzw(T[:, :3, :3])
-    out = {name: T[:, i, 3] for i, name in enumerate(_POSITION)}
-    out.update({name: q[:, i] for i, name in enumerate(_QUATERNION)})
-    out.update({name: T[:, i // 3, i % 3] for i, name in enumerate(_ROTATION)})
-    return out
+    R = T[:, :3, :3]
+    numbers = (*T[:, :3, 3].T, *se3.rotation_to_quaternion_xyzw(R).T, *R.reshape(-1, 9).T)
+    return dict(zip((*_POSITION, *_QUATERNION, *_ROTATION), numbers, strict=True))
 
 
 def poses_from(columns: Mapping[str, NDArray[Any]]) -> Array:
@@ -84,30 +83,26 @@ def tracks_from(columns: Mapping[str, NDArray[Any]]) -> StereoTracks:
 
 def record_columns(records: Sequence[VoRecord]) -> Columns:
     """Records as columns; methods and stages are the union over the records."""
+    log = VoLog(records)
+    dt_s = log.column("dt_s")
     out: Columns = {
-        "t_ns": [r.t_ns for r in records],
-        "t_prev_ns": [r.t_prev_ns for r in records],
-        "dt_s": [r.dt_s for r in records],
+        "t_ns": log.t_ns,
+        "t_prev_ns": log.column("t_prev_ns"),
+        "dt_s": dt_s,
         "status": [r.status.value for r in records],
         "reason": [r.reason for r in records],
-        "is_reference": [r.is_reference for r in records],
+        "is_reference": log.column("is_reference"),
+        **pose_columns(log.T_prev_cur),
+        **dict(zip(_TWIST, (se3.log(log.T_prev_cur) / np.where(dt_s > 0, dt_s, np.nan)[:, None]).T)),
     }
-    T = np.array([r.T_prev_cur for r in records], dtype=np.float64).reshape(-1, 4, 4)
-    out.update({k: list(v) for k, v in pose_columns(T).items()})
-    dt = np.array([r.dt_s for r in records])
-    twist = se3.log(T) / np.where(dt > 0, dt, np.nan)[:, None]
-    out.update({name: _nulls(twist[:, i]) for i, name in enumerate(_TWIST)})
     for name in COUNT_FIELDS:
-        out[name] = [v if v >= 0 else None for v in (getattr(r, name) for r in records)]
-    out["inlier_ratio"] = _nulls([r.inlier_ratio for r in records])
-    for name in FLOAT_FIELDS:
-        out[name] = _nulls([getattr(r, name) for r in records])
+        out[name] = [v if v >= 0 else None for v in log.column(name)]
+    out |= {name: log.column(name) for name in ("inlier_ratio", *FLOAT_FIELDS)}
     for name, pattern in _IMU.items():
-        vectors = [getattr(r, name) for r in records]
-        for i, axis in enumerate(_AXES):
-            out[pattern.format(axis)] = [None if v is None else float(v[i]) for v in vectors]
-    _put_matrices(out, "cov", [r.covariances for r in records], _UPPER6)
-    _put_matrices(out, "vt", [r.v_t for r in records], _UPPER3)
+        vectors = np.array([np.full(3, np.nan) if v is None else v for v in (getattr(r, name) for r in records)])
+        out |= dict(zip(map(pattern.format, _AXES), vectors.T))
+    out |= _matrix_columns("cov", [r.covariances for r in records], _UPPER6)
+    out |= _matrix_columns("vt", [r.v_t for r in records], _UPPER3)
     for stage in _union(r.stage_ms for r in records):
         out[f"stage_{stage}_ms"] = [r.stage_ms.get(stage) for r in records]
     return out
@@ -123,14 +118,13 @@ def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
     counts = {c: np.where(np.isnan(f := _float(columns, c, n)), -1, f).astype(np.int64) for c in COUNT_FIELDS}
     floats = {c: _float(columns, c, n) for c in FLOAT_FIELDS}
     imu = {c: np.stack([_float(columns, p.format(a), n) for a in _AXES], 1) for c, p in _IMU.items()}
-    imu_known = {c: p.format("x") in columns for c, p in _IMU.items()}
-    cov, v_t = _get_matrices(columns, "cov", _UPPER6, 6), _get_matrices(columns, "vt", _UPPER3, 3)
+    cov, v_t = _matrices_from(columns, "cov", 6), _matrices_from(columns, "vt", 3)
     stages = {c[6:-3]: _float(columns, c, n) for c in columns if c.startswith("stage_") and c.endswith("_ms")}
 
     def known(k: int) -> dict[str, Any]:
         out: dict[str, Any] = {c: int(v[k]) for c, v in counts.items()}
         out.update({c: float(v[k]) for c, v in floats.items()})
-        out.update({c: v[k] if imu_known[c] and not np.isnan(v[k]).all() else None for c, v in imu.items()})
+        out.update({c: None if np.isnan(v[k]).all() else v[k] for c, v in imu.items()})
         return out
 
     return [
@@ -156,27 +150,24 @@ def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
     ``cov_bias`` is all that persists. Of models with errors of calibration, ``root_calibration_<i><j>`` and
     ``calibration_tau_*_s`` besides; ``nu`` where the tails are heavier than a Gaussian's.
     """
-    out: Columns = {
-        "t_ns": [p.t_ns for p in predictions],
-        "dt_s": [float(p.dt_s) for p in predictions],
-        "status": [p.status.value for p in predictions],
-        "confidence": [float(p.confidence) for p in predictions],
-        "in_domain": [float(p.in_domain) for p in predictions],
-    }
+    out: Columns = {name: [getattr(p, name) for p in predictions] for name in ("t_ns", "dt_s")}
+    out["status"] = [p.status.value for p in predictions]
+    out |= {name: [getattr(p, name) for p in predictions] for name in ("confidence", "in_domain")}
     if any(math.isfinite(p.nu) for p in predictions):
         out["nu"] = [p.nu for p in predictions]
-    tau = [p.persistent_tau_s for p in predictions]
+    tau = [_wide(p.persistent_tau_s, 1.0) for p in predictions]
     for i, axis in enumerate(_SIGMA6):
-        out[f"mean_{axis}"] = [float(p.mean[i]) for p in predictions]
+        out[f"mean_{axis}"] = [p.mean[i] for p in predictions]
     for i, axis in enumerate(_SHORT6):
-        out[f"epistemic_var_{axis}"] = [float(p.epistemic[i]) for p in predictions]
-        out[f"bias_tau_{axis}_s"] = [float(t[i]) if len(t) else 1.0 for t in tau]
+        out[f"epistemic_var_{axis}"] = [p.epistemic[i] for p in predictions]
+        out[f"bias_tau_{axis}_s"] = [t[i] for t in tau]
     parts = ({"total": p.covariance, "jitter": p.jitter, "white": p.white, "bias": p.persistent} for p in predictions)
-    _put_matrices(out, "cov", list(parts), _UPPER6)
+    out |= _matrix_columns("cov", list(parts), _UPPER6)
     if any((t[6:] != 1.0).any() for t in tau):
-        _put_matrices(out, "root", [{"calibration": _wide(p.persistent_root)[:, 6:]} for p in predictions], _ALL6)
+        roots = [{"calibration": _wide(p.persistent_root, 0.0)[:, 6:]} for p in predictions]
+        out |= _matrix_columns("root", roots, _ALL6)
         for i, axis in enumerate(_SHORT6):
-            out[f"calibration_tau_{axis}_s"] = [float(t[6 + i]) if len(t) > 6 else 1.0 for t in tau]
+            out[f"calibration_tau_{axis}_s"] = [t[6 + i] for t in tau]
     return out
 
 
@@ -194,7 +185,7 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     if "root_calibration_00" in columns:
         root[:, :, 6:] = _stacked(columns, (f"root_calibration_{i}{j}" for i, j in _ALL6)).reshape(n, 6, 6)
         tau[:, 6:] = _stacked(columns, (f"calibration_tau_{a}_s" for a in _SHORT6))
-    cov = _get_matrices(columns, "cov", _UPPER6, 6)
+    cov = _matrices_from(columns, "cov", 6)
     jitter, bias = (cov.get(part, np.zeros((n, 6, 6))) for part in ("jitter", "bias"))
     white = cov["white"] if "white" in cov else cov["total"] - jitter - bias
     finite = np.isfinite(np.concatenate([bias, root], axis=2)).all(axis=(1, 2))
@@ -222,9 +213,11 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     ]
 
 
-def _wide(root: Array) -> Array:
-    """A root (6, P) with columns of zeros up to 12."""
-    return np.pad(root, ((0, 0), (0, 12 - root.shape[-1])))
+def _wide(persistent: Array, fill: float) -> Array:
+    """Roots (6, P) or time constants (P,) of what persists, filled up to 12 of them."""
+    out = np.full((*persistent.shape[:-1], 12), fill)
+    out[..., : persistent.shape[-1]] = persistent
+    return out
 
 
 def truth_columns(truth: TruthLog) -> dict[str, NDArray[Any]]:
@@ -256,40 +249,28 @@ def _stacked(columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> Array
     return np.stack([columns[name] for name in names], axis=-1)
 
 
-def _nulls(values: Iterable[float]) -> list[float | None]:
-    """NaN becomes null."""
-    return [None if np.isnan(v) else float(v) for v in values]
-
-
 def _union(maps: Iterable[Mapping[str, Any]]) -> list[str]:
-    seen: dict[str, None] = {}
-    for m in maps:
-        seen.update(dict.fromkeys(m))
-    return list(seen)
+    """All keys, in first-seen order."""
+    return list(dict.fromkeys(key for m in maps for key in m))
 
 
-def _put_matrices(
-    out: Columns, prefix: str, maps: Sequence[Mapping[str, Array]], upper: tuple[tuple[int, int], ...]
-) -> None:
-    for method in _union(maps):
-        for i, j in upper:
-            out[f"{prefix}_{method}_{i}{j}"] = [float(m[method][i, j]) if method in m else None for m in maps]
-
-
-def _get_matrices(
-    columns: Mapping[str, NDArray[Any]], prefix: str, upper: tuple[tuple[int, int], ...], size: int
+def _matrix_columns(
+    prefix: str, maps: Sequence[Mapping[str, Array]], elements: tuple[tuple[int, int], ...]
 ) -> dict[str, Array]:
-    out = {}
-    for name in columns:
-        match = _METHOD.fullmatch(name)
-        if match is None or match[1] != prefix:
-            continue
-        method = match[2]
-        C = np.empty((len(columns[name]), size, size))
-        for i, j in upper:
-            C[:, i, j] = C[:, j, i] = columns[f"{prefix}_{method}_{i}{j}"]
-        out[method] = C
+    """The elements of square matrices by method, NaN where a map has none of that method."""
+    out, absent = {}, np.full((6, 6), np.nan)
+    for method in _union(maps):
+        for i, j in elements:
+            out[f"{prefix}_{method}_{i}{j}"] = np.array([m.get(method, absent)[i, j] for m in maps])
     return out
+
+
+def _matrices_from(columns: Mapping[str, NDArray[Any]], prefix: str, n: int) -> dict[str, Array]:
+    """Symmetric matrices (N, n, n) by method, of :func:`_matrix_columns` on and above the diagonal."""
+    found = (_METHOD.fullmatch(name) for name in columns)
+    methods = [match[2] for match in found if match is not None and match[1] == prefix]
+    indices = np.transpose(np.triu_indices(n))
+    return {m: from_upper(_stacked(columns, (f"{prefix}_{m}_{i}{j}" for i, j in indices)), n) for m in methods}
 
 
 def _float(columns: Mapping[str, NDArray[Any]], name: str, n: int) -> Array:

@@ -46,16 +46,8 @@ def load_snapshot(path: Path, key: str) -> Any:
         arrays = load_arrays(path, ("tree", "data"))
         document = json.loads(arrays["tree"].tobytes())
         return None if document["key"] != key else _Restore(arrays["data"].tobytes()).value(document["state"])
-    except (
-        SourceError,
-        ImportError,
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ):
+    except (SourceError, ImportError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError,
+            ValueError):  # fmt: skip
         return None
 
 
@@ -108,11 +100,8 @@ class _Capture:
         if isinstance(value, np.ndarray):
             return {"array": self._array(value)}
         if isinstance(value, (list, deque)):
-            return {
-                "list": [self.node(v) for v in value],
-                "most": getattr(value, "maxlen", None),
-                "is": type(value).__name__,
-            }
+            most = getattr(value, "maxlen", None)
+            return {"list": [self.node(v) for v in value], "most": most, "is": type(value).__name__}
         if type(value).__name__ in _MAPPINGS:
             return {"mapping": [[self.node(k), self.node(v)] for k, v in value.items()], "is": type(value).__name__}
         if isinstance(value, ThreadPoolExecutor):

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
-from importlib import import_module
-from importlib.metadata import entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -44,6 +43,11 @@ class SourceReport:
         text = printable(text)
         if text not in self.notes and len(self.notes) < 50:
             self.notes.append(text)
+
+    def count(self, what: str, text: str, n: int = 1) -> None:
+        """Count ``n`` more of ``what``, the name of a count, with a remark."""
+        setattr(self, what, getattr(self, what) + n)
+        self.note(text)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for ``run.json``."""
@@ -78,10 +82,8 @@ class Depth:
     def doubt(self) -> str:
         """What the largest sample says against ``bits``; empty for nothing."""
         if self.most >> self.bits:
-            cure = self.most.bit_length()
-            return (
-                f"samples reach {self.most}, more than {self.bits} bits hold: brighter ones are clipped (--bits {cure})"
-            )
+            held = f"samples reach {self.most}, more than {self.bits} bits hold"
+            return f"{held}: brighter ones are clipped (--bits {self.most.bit_length()})"
         likely = next(n for n in (8, 10, 12, 16) if self.most < 1 << n)
         if self.most and likely < self.bits == 16:
             return f"the samples of 16-bit images reach only {self.most}: are these {likely} bits (--bits {likely})?"
@@ -126,11 +128,6 @@ BUILT_IN: dict[str, str] = {
 }
 
 
-def _load(target: str) -> Any:
-    module, attribute = target.split(":")
-    return getattr(import_module(module), attribute)
-
-
 @cache
 def source_kinds() -> dict[str, Callable[[], Any]]:
     """Names of all sources with a loader of each class, those of other packages after the built-in ones.
@@ -138,9 +135,9 @@ def source_kinds() -> dict[str, Callable[[], Any]]:
     A package joins with ``[project.entry-points."gpvo.sources"]`` and ``name = "package.module:Class"``; the class
     follows :class:`Source` and is built from a path. A built-in name cannot be taken over.
     """
-    kinds: dict[str, Callable[[], Any]] = {}
-    for name, target in BUILT_IN.items():
-        kinds[name] = partial(_load, target)
+    kinds: dict[str, Callable[[], Any]] = {
+        name: EntryPoint(name, target, "gpvo.sources").load for name, target in BUILT_IN.items()
+    }
     for entry in entry_points(group="gpvo.sources"):
         kinds.setdefault(entry.name, entry.load)
     return kinds
@@ -180,12 +177,11 @@ def open_source(path: str | Path, kind: str | None = None, **options: Any) -> So
     kinds = source_kinds()
     if kind is not None and kind not in kinds:
         raise SourceError(f"unknown source '{kind}'", cure=f"choose one of {', '.join(kinds)}")
-    name = kind if kind is not None else guess(path)
+    name = guess(path) if kind is None else kind
     if not Path(path).exists():
         raise SourceError("no such file or folder", where=path)
-    chosen = kinds[name]()
     try:
-        return chosen(Path(path), **options)
+        return kinds[name]()(Path(path), **options)
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
             raise

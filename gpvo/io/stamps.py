@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.io.source import SourceReport
+
+Stamps = NDArray[np.int64]
+"""Nanoseconds (N,)."""
 
 GAP_FACTOR = 1.75
 PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
@@ -42,9 +46,7 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError("is larger than 2 GB: too large for a log", where=path)
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            number = 0
-            while line := file.readline(_MAX_CHARACTERS + 1):
-                number += 1
+            for number, line in enumerate(iter(partial(file.readline, _MAX_CHARACTERS + 1), ""), 1):
                 if len(line) > _MAX_CHARACTERS:
                     raise SourceError(f"line {number} is longer than a million characters", where=path)
                 if text := line.strip().removeprefix("\ufeff"):
@@ -132,52 +134,40 @@ def in_order(frames: Iterable[F], report: SourceReport, usual_ns: float | None =
     Looks one frame ahead, so that a single stamp far in the future is dropped instead of everything behind it.
     ``usual_ns``: the usual interval where it is known beforehand, else the median of the last ones.
     """
-    gaps = _GapWatch(report, usual_ns)
+    last: F | None = None
+    intervals: deque[int] = deque(maxlen=_WINDOW)
+    for frame in _growing_frames(frames, report):
+        if last is not None:
+            interval, usual = frame.t_ns - last.t_ns, usual_ns
+            if usual is None and len(intervals) >= 3:
+                usual = float(np.median(intervals))
+            if usual is not None and interval > GAP_FACTOR * usual:
+                report.count("gaps", f"gap of {interval * 1e-9:.3f} s before {frame.t_ns} ns")
+            intervals.append(interval)
+        yield frame
+        last = frame
+
+
+def _growing_frames(frames: Iterable[F], report: SourceReport) -> Iterator[F]:
     last: int | None = None
     pending: F | None = None
     for frame in frames:
         if pending is None:
             pending = frame
         elif frame.t_ns == pending.t_ns:
-            report.duplicate += 1
-            report.note(f"stamp {frame.t_ns} ns twice")
+            report.count("duplicate", f"stamp {frame.t_ns} ns twice")
         elif frame.t_ns < pending.t_ns:
-            report.out_of_order += 1
-            report.note(f"stamp {frame.t_ns} ns after {pending.t_ns} ns")
+            report.count("out_of_order", f"stamp {frame.t_ns} ns after {pending.t_ns} ns")
             if last is None or frame.t_ns > last:
                 pending = frame
         else:
-            gaps.see(pending.t_ns)
             yield pending
             last, pending = pending.t_ns, frame
     if pending is not None:
-        gaps.see(pending.t_ns)
         yield pending
 
 
-class _GapWatch:
-    """Counts intervals that are too long."""
-
-    def __init__(self, report: SourceReport, usual_ns: float | None) -> None:
-        self._report, self._usual_ns = report, usual_ns
-        self._last: int | None = None
-        self._intervals: deque[int] = deque(maxlen=_WINDOW)
-
-    def see(self, t_ns: int) -> None:
-        """Take the next stamp."""
-        if self._last is not None:
-            interval = t_ns - self._last
-            usual = self._usual_ns
-            if usual is None and len(self._intervals) >= 3:
-                usual = float(np.median(self._intervals))
-            if usual is not None and interval > GAP_FACTOR * usual:
-                self._report.gaps += 1
-                self._report.note(f"gap of {interval * 1e-9:.3f} s before {t_ns} ns")
-            self._intervals.append(interval)
-        self._last = t_ns
-
-
-def growing(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def growing(t_ns: Stamps) -> NDArray[np.bool_]:
     """(N,) whether each stamp is later than all before it."""
     return np.concatenate([[True], t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]])
 
@@ -189,7 +179,7 @@ def usual_interval(t_ns: Iterable[int]) -> float | None:
 
 
 def check_interval(
-    t_ns: Sequence[int] | NDArray[np.int64], where: object, cure: Callable[[str], str], *, is_stated: bool = False
+    t_ns: Sequence[int] | Stamps, where: object, cure: Callable[[str], str], *, is_stated: bool = False
 ) -> None:
     """Refuse stamps whose usual interval no odometry has, because they are in another unit than they were read in.
 
@@ -234,11 +224,9 @@ def match_nearest(
     if not paired.any():
         raise no_pair(tolerance_ns, int(apart.min()), where)
     for t in t_left[~paired]:
-        report.missing += 1
-        report.note(f"no right image for {t} ns")
+        report.count("missing", f"no right image for {t} ns")
     for t in np.delete(t_right, partner[paired]):
-        report.missing += 1
-        report.note(f"no left image for {t} ns")
+        report.count("missing", f"no left image for {t} ns")
     both = zip(t_left[paired].tolist(), t_right[partner[paired]].tolist(), strict=True)
     return [(a, names[0][a], names[1][b]) for a, b in both]
 
@@ -257,14 +245,13 @@ def _by_stamp(images: list[tuple[int, str]], side: str, report: SourceReport) ->
     names: dict[int, str] = {}
     for t_ns, name in images:
         if t_ns in names:
-            report.duplicate += 1
-            report.note(f"{side} stamp {t_ns} ns twice")
+            report.count("duplicate", f"{side} stamp {t_ns} ns twice")
         else:
             names[t_ns] = name
     return names
 
 
-def _nearest(t: NDArray[np.int64], among: NDArray[np.int64]) -> NDArray[np.intp]:
+def _nearest(t: Stamps, among: Stamps) -> NDArray[np.intp]:
     """Index of the nearest of the sorted stamps ``among``, for each of ``t``."""
     after = np.searchsorted(among, t).clip(max=len(among) - 1)
     before = (after - 1).clip(min=0)

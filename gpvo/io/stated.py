@@ -64,18 +64,14 @@ def read_stated(path: Path) -> VoLog:
     index = {int(t): k for k, t in enumerate(t_ns)}
     records = [VoRecord(int(t_ns[0]), int(t_ns[0]), Status.START, np.eye(4))]
     for k in range(1, len(t_ns)):
-        start = k - 1 if behind == 21 else index.get(_stamp(path, rest[k][21]), k)
+        try:
+            start = k - 1 if behind == 21 else index.get(seconds_text_to_ns(rest[k][21]), k)
+        except ValueError as error:
+            raise SourceError(str(error), where=path) from None
         if start >= k:
             raise SourceError(f"the motion that ends at {rest[k][21]} s starts from no earlier frame", where=path)
         records.append(_record(path, trajectory, start, k, rest[k][:21]))
     return VoLog(records)
-
-
-def _stamp(path: Path, text: str) -> int:
-    try:
-        return seconds_text_to_ns(text)
-    except ValueError as error:
-        raise SourceError(str(error), where=path) from None
 
 
 def _record(path: Path, trajectory: Trajectory, start: int, end: int, elements: Sequence[str]) -> VoRecord:
@@ -109,9 +105,9 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
     T = log.trajectory.T_world_body
     motions = se3.inverse(T[:-1]) @ T[1:]
     name, cov, notes = _motion_covariances(log, motions)
-    t = log.t_ns
-    gaps = _after_gaps(t)
-    unknown = set[int]()
+    t, unknown = log.t_ns, set[int]()
+    steps = np.diff(t)
+    gaps = (np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1).tolist() if len(steps) else []
     if cov is not None and name == IMPORTED:
         unstated = is_turn_unknown(cov) & (np.arange(len(T)) > 0)  # before the first row is no motion
         known = np.maximum.accumulate(np.where(unstated, 0, np.arange(len(T))))
@@ -119,19 +115,18 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
         unknown = set(np.flatnonzero(unstated | np.append(False, unstated[:-1])).tolist()) - set(gaps)
     lost = {**dict.fromkeys(gaps, "gap in the log"), **dict.fromkeys(unknown, "stated as unknown")}
     if gaps:
-        notes = [*notes, f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}"]
+        notes.append(f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}")
     if unknown:
-        notes = [*notes, f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}"]
+        notes.append(f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}")
     if cov is not None and (bad := int((np.isfinite(cov).all(axis=(1, 2)) & ~are_positive_definite(cov))[1:].sum())):
-        notes = [*notes, f"{bad} of {len(motions)} covariances are not positive definite and were left out"]
+        notes.append(f"{bad} of {len(motions)} covariances are not positive definite and were left out")
     records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
     for k, motion in enumerate(motions, 1):
-        stated: dict[str, Any] = {}
+        said = _fields(log, k) | {"reason": lost.get(k, "")}
         if cov is not None and is_positive_definite(cov[k]):
-            stated = {"covariances": {name: cov[k]}, "v_t": {}}
+            said["covariances"] = {name: cov[k]}
         status = Status.LOST if k in lost else Status.OK
-        record = VoRecord(int(t[k]), int(t[k - 1]), status, motion, reason=lost.get(k, ""), **stated, **_fields(log, k))
-        records.append(record)
+        records.append(VoRecord(int(t[k]), int(t[k - 1]), status, motion, **said))
     return records, [*log.notes, *notes]
 
 
@@ -143,18 +138,9 @@ def is_turn_unknown(covariance: Array) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.eigvalsh(symmetrise(turn))[:, 0] > UNKNOWN_RAD**2)
 
 
-def _after_gaps(t_ns: NDArray[np.int64]) -> set[int]:
-    """Rows that follow an interval far beyond the usual one."""
-    steps = np.diff(t_ns)
-    return set() if len(steps) == 0 else set((np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1).tolist())
-
-
 def _fields(log: ForeignLog, k: int) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name, values in log.columns.items():
-        if np.isfinite(values[k]):
-            out[name] = int(values[k]) if name in COUNT_FIELDS else float(values[k])
-    return out
+    known = {name: values[k] for name, values in log.columns.items() if np.isfinite(values[k])}
+    return {name: int(v) if name in COUNT_FIELDS else float(v) for name, v in known.items()}
 
 
 def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | None, list[str]]:

@@ -112,9 +112,8 @@ class TracksSource:
             width = max(int(np.ceil(both[:, 0].max())) + 1, round(2 * cx) + 1)
             height = max(int(np.ceil(both[:, 1].max())) + 1, round(2 * cy) + 1)
         lens = PinholeRadtan(fx, fy, cx, cy, width, height)
-        T = np.eye(4)
-        T[0, 3] = -b
-        StereoRig(left=lens, right=lens, T_right_left=T, where=str(self.path))
+        # Refuses what cannot be a pair.
+        StereoRig(lens, lens, se3.from_rt(np.eye(3), np.array([-b, 0.0, 0.0])), where=str(self.path))
         return StereoCamera(fx, fy, cx, cy, b, width, height)
 
     def _body_cam(self) -> Array | None:
@@ -170,8 +169,7 @@ class TracksSource:
             return None
         v, gyro = (self._array(a, len(self._t_ns), 3)[keep] for a in ("vel_body_mps", "gyro_body_radps"))
         v_cam = (v + np.cross(gyro, T_body_cam[:3, 3])) @ T_body_cam[:3, :3]
-        rotated: Array = np.einsum("nij,nj->ni", T_world_cam[:, :3, :3], v_cam)
-        return rotated
+        return np.asarray(np.einsum("nij,nj->ni", T_world_cam[:, :3, :3], v_cam))
 
     def _array(
         self, key: str, *shape: int | None, finite: bool = True, most: float = 1e12, absent: Array | None = None

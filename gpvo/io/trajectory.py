@@ -3,17 +3,17 @@ IMU samples beside them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.io.stamps import (
+    Stamps,
     check_interval,
     cure_of_seconds,
     cure_of_unit,
@@ -28,16 +28,17 @@ from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
 # Published ground truth is unit to about 1e-4; with three printed decimals to 1e-3. Worse is another column order.
 _UNIT_TOLERANCE = 1e-2
 FARTHEST_M = 1e9
-_REMOVE = "remove the line: a gap does no harm"
+REMOVE = "remove the line: a gap does no harm"
 _REMOVE_OF_KITTI = "KITTI poses have no stamps: remove the line and its stamp from copies, for gpvo import --times"
 _MANY = 0.2  # of the stamps: so many repeat only where they are rounded, or every line is there twice
+_MANY_FIELDS = 1_000_000  # lines are shorter
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Poses of one moving frame: ``t_ns`` (N,) int64, strictly growing, and ``T_world_body`` (N, 4, 4)."""
 
-    t_ns: NDArray[np.int64]
+    t_ns: Stamps
     T_world_body: Array
 
     def __len__(self) -> int:
@@ -62,10 +63,8 @@ def read_tum_with(path: Path, more: int) -> tuple[Trajectory, list[list[str]]]:
 
     Raises SourceError as :func:`read_tum`.
     """
-    behind: list[list[str]] = []
-    what = "t tx ty tz qx qy qz qw" + (f" and {more} more" if more else "")
-    rows = _rows(path, None, exactly=8 + more, stamp=seconds_text_to_ns, what=what, behind=behind)
-    return _from_rows(path, rows, q_columns=(3, 4, 5, 6)), behind
+    what = f"{8 + more}: t tx ty tz qx qy qz qw" + (f" and {more} more" if more else "")
+    return _read_poses(path, None, range(8 + more, 9 + more), what, seconds_text_to_ns, (3, 4, 5, 6))
 
 
 def read_euroc_csv(path: str | Path) -> Trajectory:
@@ -73,9 +72,8 @@ def read_euroc_csv(path: str | Path) -> Trajectory:
 
     Raises SourceError as :func:`read_tum`.
     """
-    p = Path(path)
-    rows = _rows(p, ",", at_least=8, stamp=integer_ns, what="t[ns],px,py,pz,qw,qx,qy,qz")
-    return _from_rows(p, rows, q_columns=(4, 5, 6, 3))
+    what = "at least 8: t[ns],px,py,pz,qw,qx,qy,qz"
+    return _read_poses(Path(path), ",", range(8, _MANY_FIELDS), what, integer_ns, (4, 5, 6, 3))[0]
 
 
 def read_kitti_poses(path: str | Path) -> Array:
@@ -90,15 +88,15 @@ def read_kitti_poses(path: str | Path) -> Array:
     if not out:
         raise SourceError("holds no poses", where=p)
     M = np.stack(out)
-    T = se3.from_rt(M[:, :, :3], M[:, :, 3])
-    deviation = np.abs(M[:, :, :3] @ np.swapaxes(M[:, :, :3], 1, 2) - np.eye(3)).max(axis=(1, 2))
-    bad = np.flatnonzero((deviation > _UNIT_TOLERANCE) | (np.linalg.det(M[:, :, :3]) < 0))
+    R = M[:, :, :3]
+    deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((deviation > _UNIT_TOLERANCE) | (np.linalg.det(R) < 0))
     if len(bad):
         raise SourceError(f"pose {bad[0] + 1} is not a rigid transform", where=p, cure="12 numbers: rows of [R | t]")
-    return se3.orthonormalise(T)
+    return se3.orthonormalise(se3.from_rt(R, M[:, :, 3]))
 
 
-def read_times(path: str | Path) -> NDArray[np.int64]:
+def read_times(path: str | Path) -> Stamps:
     """KITTI's ``times.txt`` (seconds) as (N,) nanoseconds, in the order of the file.
 
     Raises SourceError, naming file and line.
@@ -115,7 +113,7 @@ def read_times(path: str | Path) -> NDArray[np.int64]:
     return np.array(stamps, dtype=np.int64)
 
 
-def write_tum(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) -> None:
+def write_tum(path: str | Path, t_ns: Stamps, T_world_body: Array) -> None:
     """Write TUM lines, stamps and values with nine decimals."""
     lines = (tum_line(t, T) + "\n" for t, T in zip(t_ns, T_world_body, strict=True))
     with replacing(Path(path)) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
@@ -125,17 +123,17 @@ def write_tum(path: str | Path, t_ns: NDArray[np.int64], T_world_body: Array) ->
 def tum_line(t_ns: int, T_world_body: Array) -> str:
     """One TUM line, without the line end."""
     q = se3.rotation_to_quaternion_xyzw(T_world_body[:3, :3])
-    return " ".join([ns_to_seconds_text(int(t_ns)), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
+    return " ".join([ns_to_seconds_text(t_ns), *(f"{v:.9f}" for v in (*T_world_body[:3, 3], *q))])
 
 
 def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and fields of the lines that hold something; comments and one header line are skipped."""
+    """Line numbers and fields of the lines that hold something and are no comments."""
     for number, text in text_lines(path):
         if not text.startswith("#"):
             yield number, [f.strip() for f in text.split(separator)]
 
 
-def _floats(path: Path, number: int, fields: list[str], cure: str = _REMOVE) -> Array:
+def _floats(path: Path, number: int, fields: list[str], cure: str = REMOVE) -> Array:
     try:
         values = np.array([float(f) for f in fields])
     except ValueError:
@@ -147,56 +145,43 @@ def _floats(path: Path, number: int, fields: list[str], cure: str = _REMOVE) -> 
     return values
 
 
-def _rows(
+def _read_poses(
     path: Path,
     separator: str | None,
-    *,
-    stamp: Callable[[str], int],
+    counts: range,
     what: str,
-    exactly: int | None = None,
-    at_least: int = 0,
-    behind: list[list[str]] | None = None,
-) -> Iterator[tuple[int, int, Array]]:
-    """(line number, stamp, the seven numbers of the pose) of each line; what follows them goes to ``behind``."""
+    stamp: Callable[[str], int],
+    q_xyzw: tuple[int, int, int, int],
+) -> tuple[Trajectory, list[list[str]]]:
+    """Lines of a stamp and the seven numbers of a pose, where ``q_xyzw`` of these are the quaternion; and what follows
+    them in each line, up to the least of the ``counts`` of fields that are allowed, ``what`` in words."""
+    numbers, stamps, poses, behind = [], [], [], []
     for number, fields in _fields(path, separator):
-        if len(fields) < at_least or (exactly is not None and len(fields) != exactly):
-            wanted = f"{exactly}" if exactly is not None else f"at least {at_least}"
-            raise SourceError(f"line {number} holds {len(fields)} fields, expected {wanted}: {what}", where=path)
+        if len(fields) not in counts:
+            raise SourceError(f"line {number} holds {len(fields)} fields, expected {what}", where=path)
         try:
-            t_ns = stamp(fields[0])
+            stamps.append(stamp(fields[0]))
         except ValueError as error:
             cure = cure_of_seconds(fields[0]) if stamp is seconds_text_to_ns else None
             raise SourceError(f"line {number}: {error}", where=path, cure=cure) from None
-        if behind is not None:
-            behind.append(fields[8:])
-        yield number, t_ns, _floats(path, number, fields[1:8])
-
-
-def _from_rows(
-    path: Path, rows: Iterator[tuple[int, int, Array]], *, q_columns: tuple[int, int, int, int]
-) -> Trajectory:
-    numbers, stamps, values = [], [], []
-    for number, t_ns, pose in rows:
         numbers.append(number)
-        stamps.append(t_ns)
-        values.append(pose)
-    if not stamps:
+        poses.append(_floats(path, number, fields[1:8]))
+        behind.append(fields[8 : counts.start])
+    t, data = np.array(stamps, dtype=np.int64), np.array(poses)
+    if len(t) == 0:
         raise SourceError("holds no poses", where=path)
-    t = np.array(stamps, dtype=np.int64)
-    data = np.stack(values)
     check_growing(path, t, numbers)
-    q_xyzw = data[:, q_columns]
-    check_unit(path, q_xyzw, numbers)
-    return Trajectory(t, se3.from_quaternion(data[:, :3], q_xyzw))
+    check_unit(path, data[:, q_xyzw], numbers)
+    return Trajectory(t, se3.from_quaternion(data[:, :3], data[:, q_xyzw])), behind
 
 
-def check_growing(path: Path, t_ns: NDArray[np.int64], lines: list[int]) -> None:
+def check_growing(path: Path, t_ns: Stamps, lines: list[int]) -> None:
     """Refuse stamps that repeat or go back, naming the line."""
     bad = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(bad):
         k = int(bad[0])
         word = "repeats" if t_ns[k + 1] == t_ns[k] else "goes back"
-        text = f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(int(t_ns[k + 1]))} s {word}"
+        text = f"line {lines[k + 1]}: the stamp {ns_to_seconds_text(t_ns[k + 1])} s {word}"
         cure = "sort the file by time and drop repeated lines"
         repeated = len(t_ns) - len(np.unique(t_ns))
         if repeated > _MANY * len(t_ns):
@@ -210,11 +195,8 @@ def check_unit(path: Path, q_xyzw: Array, lines: list[int]) -> None:
     norm = np.linalg.norm(q_xyzw, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)
     if len(bad):
-        raise SourceError(
-            f"line {lines[int(bad[0])]}: the quaternion has length {norm[bad[0]]:.4f}, not 1",
-            where=path,
-            cure="check the order of the columns",
-        )
+        text = f"line {lines[int(bad[0])]}: the quaternion has length {norm[bad[0]]:.4f}, not 1"
+        raise SourceError(text, where=path, cure="check the order of the columns")
 
 
 @dataclass(frozen=True)
@@ -250,18 +232,14 @@ def carry(trajectory: Trajectory, T_body_cam: Array, noise: TruthNoise) -> Truth
     )
 
 
-def check_overlap(truth: TruthLog, t_ns: NDArray[np.int64], path: Path) -> None:
-    """Refuse a truth that does not overlap the frames in time.
-
-    Raises SourceError, naming both intervals and how far they are apart.
-    """
-    if len(t_ns) == 0 or len(truth.t_ns) == 0:
-        return
-    if truth.t_ns[-1] < t_ns[0] or truth.t_ns[0] > t_ns[-1]:
-        apart = max(int(t_ns[0]) - int(truth.t_ns[-1]), int(truth.t_ns[0]) - int(t_ns[-1])) * 1e-9
+def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path) -> None:
+    """Raise SourceError for a truth that does not overlap frames in time, the first and the last of ``t_ns``."""
+    (first, last), (begin, end) = ((int(t[0]), int(t[-1])) for t in (t_ns, truth.t_ns))
+    if end < first or begin > last:
+        apart_s = max(first - end, begin - last) * 1e-9
         raise SourceError(
-            f"the ground truth ({truth.t_ns[0] * 1e-9:.3f} to {truth.t_ns[-1] * 1e-9:.3f} s) does not overlap the"
-            f" frames ({t_ns[0] * 1e-9:.3f} to {t_ns[-1] * 1e-9:.3f} s): they are {apart:.3f} s apart",
+            f"the ground truth ({begin * 1e-9:.3f} to {end * 1e-9:.3f} s) does not overlap the frames"
+            f" ({first * 1e-9:.3f} to {last * 1e-9:.3f} s): they are {apart_s:.3f} s apart",
             where=path,
             cure="is it the truth of this sequence, and of the same clock?",
         )

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.errors import GpvoError, MissingExtraError, require
 from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import upper
@@ -32,10 +32,9 @@ _OUTSIDE_BELOW = 0.01
 
 def dialect() -> ModuleType:
     """pymavlink's MAVLink 2 dialect. Raises ``MissingExtraError`` without pymavlink."""
-    try:
-        from pymavlink.dialects.v20 import common
-    except ImportError:
-        raise MissingExtraError("pymavlink", "mavlink") from None
+    require("pymavlink")
+    from pymavlink.dialects.v20 import common
+
     module: ModuleType = common
     return module
 

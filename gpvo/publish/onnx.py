@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpvo.errors import MissingExtraError
+from gpvo.errors import require
 from gpvo.files import replacing
 from gpvo.online.base import motion_noise, positions
 from gpvo.online.division import LEAST_LEFT, LN_FASTEST, PARTS
@@ -30,10 +30,9 @@ def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[s
     (N, 6), ``in_domain``, ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names; the degrees
     of freedom ``nu``, 0 for a Gaussian, are among it. Raises MissingExtraError without the package onnx.
     """
-    try:
-        import onnx
-    except ImportError:
-        raise MissingExtraError("onnx", "onnx") from None
+    require("onnx")
+    import onnx
+
     graph = _Graph(onnx)
     _predict(graph, model)
     shapes: dict[str, list[Any]] = {"features": ["N", len(model.columns)], "geometry": ["N", 6, 6], "dt_s": ["N"]}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from gpvo.errors import GpvoError, MissingExtraError
+from gpvo.errors import GpvoError, require
 from gpvo.geometry import se3
 from gpvo.sim.imu import Motion
 from gpvo.sim.paths import Path3, rotations
@@ -44,10 +44,9 @@ _LATERAL_GAIN, _HEADING_GAIN = 0.6, 1.6
 
 def _model(name: str, **values: object) -> tuple[Any, Any, Any]:
     """MuJoCo, a vehicle's model, and its state."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise MissingExtraError("mujoco", "sim") from error
+    require("mujoco")
+    import mujoco
+
     text = (Path(__file__).parent / "models" / f"{name}.xml").read_text(encoding="utf-8")
     model = mujoco.MjModel.from_xml_string(text.format(**values))
     return mujoco, model, mujoco.MjData(model)

@@ -148,10 +148,7 @@ class VoLog:
     @property
     def methods(self) -> tuple[str, ...]:
         """Names of the geometric covariance methods present, in first-seen order."""
-        seen: dict[str, None] = {}
-        for record in self.records:
-            seen.update(dict.fromkeys(record.covariances))
-        return tuple(seen)
+        return tuple(dict.fromkeys(method for record in self.records for method in record.covariances))
 
     def covariance(self, method: str) -> Array:
         """(N, 6, 6) of one method; NaN where a record has none."""

@@ -141,7 +141,7 @@ def _lens(
     """Of a kind as :attr:`CameraModel.kind` names it."""
     width, height = size
     model = "radtan" if "radtan" in kind else "equidistant"
-    return make_lens("pinhole", model, intrinsics_px, distortion, (width, height), where)
+    return make_lens(model, intrinsics_px, distortion, (width, height), where)
 
 
 def explained_px(state: RigState, camera: StereoCamera) -> tuple[float, float]:

@@ -324,7 +324,7 @@ def test_failures_of_the_system_in_one_line(gpvo, monkeypatch, tmp_path, error, 
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("gpvo.cli.describe.describe", fail)
+    monkeypatch.setattr("gpvo.cli.files.describe", fail)
     monkeypatch.setattr("sys.stdout", sys.stdout)  # put back what the command line puts before a broken pipe
     monkeypatch.setattr("sys.stderr", sys.stderr)
     stopped, _, err = gpvo("info", tmp_path)

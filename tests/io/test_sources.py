@@ -423,7 +423,7 @@ def test_wrong_resolution(tmp_path, kind):
     path = MAKERS[kind](tmp_path / "s")
     for file in [*path.rglob("sensor.yaml"), *path.rglob("camchain.yaml")]:
         file.write_text(file.read_text().replace("[64, 48]", "[128, 96]"))
-    with pytest.raises(CalibrationError, match="64x48, its calibration is for 128x96") as caught:
+    with pytest.raises(CalibrationError, match="64x48, the calibration is for 128x96") as caught:
         open_source(path)
     assert ".png" in _one_line(caught)
 

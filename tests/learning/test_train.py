@@ -320,6 +320,21 @@ def test_an_update_keeps_the_settings_of_the_model(tmp_path):
     assert config_of(out) == replace(config, seed=6)
 
 
+def test_an_update_of_a_model_of_windows_says_nothing_of_single_motions(tmp_path, monkeypatch):
+    path = tmp_path / "m.gpvo"
+    config = replace(QUICK, target="window:0.5s")
+    runs = [make_run(seed, n=120) for seed in range(3)]
+    sets = [build(log, truth, name=f"flight{k}", target=config.target) for k, (log, truth) in enumerate(runs)]
+    save_model(train_sets(sets, config, judge=False), path)
+    log, truth = make_run(9, n=120)
+    write_run(tmp_path / "flight9", log, truth=truth)
+    monkeypatch.setattr("gpvo.cli.learn._noisy_truths", lambda paths: "flight9")
+    command = ["train", str(tmp_path / "flight9"), "--update", str(path), "-o", str(tmp_path / "more.gpvo")]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "single motions" not in result.output
+
+
 def test_a_model_of_positions_is_not_updated(tmp_path):
     path = tmp_path / "m.gpvo"
     save_model(_of_three(), path)

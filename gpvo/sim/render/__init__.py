@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.cameras.models import CameraModel
-from gpvo.errors import MissingExtraError
+from gpvo.errors import require
 from gpvo.sim.render.scene import RayTable, Scene
 from gpvo.sim.worlds import World
 from gpvo.types import Array
@@ -44,10 +44,9 @@ class StereoRenderer:
         max_angle_rad: float = np.deg2rad(82.0),
         far_m: float = 500.0,
     ) -> None:
-        try:
-            from gpvo.sim.render.draw import Drawer
-        except ImportError as error:
-            raise MissingExtraError("numba", "sim") from error
+        require("numba")
+        from gpvo.sim.render.draw import Drawer
+
         scene = Scene.of(world)
         lamp = world.lighting.head_lamp if head_lamp is None else head_lamp
         self._lights = np.array([world.lighting.ambient, lamp])

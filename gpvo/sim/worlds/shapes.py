@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.errors import MissingExtraError
+from gpvo.errors import require
 from gpvo.sim.worlds import F32, Mesh
 from gpvo.types import Array
 
@@ -113,11 +113,10 @@ class Baker:
     """
 
     def __init__(self, parts: Parts, smooth: Callable[[Array], Array] = lambda normals: normals) -> None:
-        try:
-            from embreex import rtcore_scene
-            from embreex.mesh_construction import TriangleMesh
-        except ImportError as error:
-            raise MissingExtraError("embreex", "sim") from error
+        require("embreex")
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
         self._scene: Any = rtcore_scene.EmbreeScene()
         self.vertices, self._uv, self._faces, self._material, self.glow = map(np.concatenate, zip(*parts.pieces))
         TriangleMesh(self._scene, np.ascontiguousarray(self.vertices[self._faces], dtype=np.float32))
