@@ -129,7 +129,7 @@ def write(outcome: Outcome, stem: Path) -> None:
     risen = outcome.rise
     extra = {"share": risen.share, "standard_deviation": risen.standard_deviation, "median": risen.median}
     write_json(stem.with_suffix(".json"), {**document(outcome.report), "title": outcome.title, "rise": extra})
-    save(experiment_figure(outcome.study, outcome.title), stem.with_suffix(".png"))
+    save(experiment_figure(outcome.study, outcome.title), stem.with_suffix(".png"), dpi=120, bbox_inches="tight")
 
 
 def experiment_figure(result: Study, title: str) -> Figure:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.doubtful import in_waits, odd_stretches, odd_times, wandering_waits
-from gpvo.dataset.errors import check_target, motion_targets, position_targets, turn_without_truth_deg
+from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN
 from gpvo.online.features import resolve
-from gpvo.online.observer import Observer
+from gpvo.online.observer import Observer, Window
 from gpvo.online.predictor import Predictor
 from gpvo.online.slip import REASON, SlipDetector, flag_slips
 from gpvo.types import Array, Prediction, Status, StereoCamera, TruthLog, VoLog, VoRecord
@@ -118,7 +118,7 @@ def build(
     (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
     ``where``, by default ``name``.
     """
-    check_target(target)
+    Window.of(target)  # refuses an unknown one before any work
     for what, way in (("waits", waits), ("odd stretches", odd)):
         if way not in ("drop", "keep"):
             raise GpvoError(f"unknown treatment of {what}: '{way}'", cure="drop or keep")
@@ -137,8 +137,7 @@ def build(
         )
     records, X = observe(log, names, target)
     if target == "position":
-        usable = np.array([r.usable for r in records], dtype=bool)
-        Y, known = position_targets(log.trajectory(), log.t_ns, usable, truth)
+        Y, known = position_targets(log.trajectory(), log.t_ns, VoLog(records).usable, truth)
     else:
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.online.observer import Window
 from gpvo.stats.series import block_bootstrap, moving_sums
 from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
@@ -151,12 +150,6 @@ def _turn_deg(T: Array) -> float:
     return float(np.rad2deg(np.linalg.norm(se3.so3_log(R), axis=1).max()))
 
 
-def check_target(target: str) -> str:
-    """The target's name, or GpvoError: ``frame``, ``window:1s``, ``length:1m`` (any size) or ``position``."""
-    Window.of(target)
-    return target
-
-
 def motion_targets(records: Sequence[VoRecord], truth: TruthLog) -> tuple[Array, NDArray[np.bool_]]:
     """Errors ``xi = Log(T_true^-1 T_est)`` (N, 6) of records that span ``t_prev_ns`` to ``t_ns``, and which are known.
 
@@ -238,8 +231,7 @@ def telling_distance_m(log: VoLog, T_true: Array, known: NDArray[np.bool_], sigm
     if not sigma.any():
         return 0.0
     T_est, whole = log.trajectory(), known & (log.usable | (np.arange(len(log)) == 0))
-    broken, steps_m = np.cumsum(~whole), np.linalg.norm(np.diff(T_true[:, :3, 3], axis=0), axis=1)
-    path_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    broken, path_m = np.cumsum(~whole), se3.path_length_m(T_true[:, :3, 3])
     span = 1
     while span < len(log) - _MIN_WINDOWS:
         start = np.flatnonzero(broken[span:] == broken[:-span])

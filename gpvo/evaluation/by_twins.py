@@ -20,6 +20,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.methods import average
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
+from gpvo.stats.series import moving_sums
 from gpvo.twin.gap import SPAN
 from gpvo.types import Array, VoLog
 
@@ -111,7 +112,5 @@ def _errors(log: VoLog, twin: Run) -> Array:
 
 def _over_window(values: Array) -> Array:
     """Sums over each entry (N, ...) and its neighbours."""
-    n = len(values)
-    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    k = np.arange(n)
-    return total[np.minimum(k + _HALF_WINDOW + 1, n)] - total[np.maximum(k - _HALF_WINDOW, 0)]
+    padding = [(_HALF_WINDOW, _HALF_WINDOW), *[(0, 0)] * (values.ndim - 1)]
+    return moving_sums(np.pad(values, padding), 2 * _HALF_WINDOW + 1)

@@ -8,7 +8,7 @@ path. NaN is None, a gap.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from itertools import groupby, pairwise
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.statements import Statement
+from gpvo.geometry.covariance import half_axes
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.stats import consistency
 from gpvo.stats.series import allan_deviation, autocorrelation
@@ -64,10 +65,9 @@ def views(e: Evaluation) -> list[Panel]:
     to_plane, names = level(e)
     origin = (e.T_true[e.covered] if e.covered.any() else e.T_est)[0, :3, 3]
     p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
-    stated = None if e.shown is None else e.shown.pose_covariance(e.run.log)
-    bounds = np.zeros((0, 6, 6)) if stated is None else stated
+    bounds = np.zeros((0, 6, 6)) if e.shown_bounds is None else e.shown_bounds
     keep, panels = spread(len(p)), []
-    told = {name: _rounded(values[keep]) for name, values in _along(e, stated).items()}
+    told = {name: _rounded(values[keep]) for name, values in _along(e).items()}
     for i, j in ((0, 1), (0, 2)):
         lines = []
         for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
@@ -84,14 +84,14 @@ def views(e: Evaluation) -> list[Panel]:
     return panels
 
 
-def _along(e: Evaluation, stated: Array | None) -> dict[str, Array]:
+def _along(e: Evaluation) -> dict[str, Array]:
     """What the pointer shows of each pose of the path, with units: (N,) each."""
     out = {"time [s]": e.t_s}
     if e.covered.any():
         off = np.linalg.norm(e.T_est[:, :3, 3] - e.T_true[:, :3, 3], axis=1)
         out["off by [m]"] = np.where(e.covered, off, np.nan)
-    if stated is not None:
-        out["stated sigma [m]"] = np.sqrt(np.trace(stated[:, :3, :3], axis1=1, axis2=2))
+    if e.shown_bounds is not None:
+        out["stated sigma [m]"] = np.sqrt(np.trace(e.shown_bounds[:, :3, :3], axis1=1, axis2=2))
     return out
 
 
@@ -209,17 +209,12 @@ def inputs(e: Evaluation) -> list[Panel]:
 
 def _shades(e: Evaluation) -> list[dict[str, Any]]:
     """Stretches of time that were degraded or lost; each frame reaches back to the one before."""
-    t = e.t_s
-    out: list[dict[str, Any]] = []
-    for k, record in enumerate(e.run.log):
-        tint = _SHADES.get(record.status)
-        if tint is None or k == 0:
-            continue
-        if out and out[-1]["colour"] == tint and out[-1]["k"] == k - 1:
-            out[-1].update(to=round(float(t[k]), 3), k=k)
-        else:
-            out.append({"from": round(float(t[k - 1]), 3), "to": round(float(t[k]), 3), "colour": tint, "k": k})
-    return [{key: shade[key] for key in ("from", "to", "colour")} for shade in out]
+    t_s, out = [round(float(t), 3) for t in e.t_s], []
+    for tint, group in groupby(range(1, len(t_s)), lambda k: _SHADES.get(e.run.log.records[k].status)):
+        frames = list(group)
+        if tint is not None:
+            out.append({"from": t_s[frames[0] - 1], "to": t_s[frames[-1]], "colour": tint})
+    return out
 
 
 def _panel(title: str, x: str, y: str, lines: list[dict[str, Any]], **more: Any) -> Panel:
@@ -237,10 +232,8 @@ def _of_method(e: Evaluation, s: Statement, x: Array, y: Array) -> dict[str, Any
 
 def _ring(C: Array) -> Array:
     """(49, 2) points of the 3-sigma ellipse of a (2, 2) covariance."""
-    values, vectors = np.linalg.eigh(C)
     angle = np.linspace(0, 2 * np.pi, 49)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return 3 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) @ half_axes(C)
 
 
 def spread(n: int, most: int = MAX_POINTS) -> NDArray[np.int64]:

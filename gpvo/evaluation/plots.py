@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +21,7 @@ from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour
 from gpvo.files import replacing
+from gpvo.geometry.covariance import half_axes
 from gpvo.types import Array
 
 
@@ -79,10 +81,8 @@ def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]
     out = []
     for figure, draw in FIGURES.items():
         drawn, path = draw(e), folder / f"{name or e.run.name}_{figure}.png"
-        with replacing(path) as temporary:
-            drawn.savefig(temporary, dpi=110, format="png")
-        with replacing(path.with_suffix(".pdf")) as temporary:
-            drawn.savefig(temporary, format="pdf", metadata={"CreationDate": None})
+        save(drawn, path, dpi=110)
+        save(drawn, path.with_suffix(".pdf"), metadata={"CreationDate": None})
         out.append(path)
     return out
 
@@ -118,9 +118,9 @@ def forecast(f: Forecast, title: str) -> Figure:
 
 
 def _ellipse(centre: Array, C: Array) -> Ellipse:
-    values, vectors = np.linalg.eigh(C)
-    width, height = 2 * 3 * np.sqrt(np.maximum(values, 0))
-    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+    axes = half_axes(C)
+    width, height = 2 * np.linalg.norm(axes, axis=1)
+    angle = np.degrees(np.arctan2(axes[0, 1], axes[0, 0]))
     return Ellipse((centre[0], centre[1]), width, height, angle=angle, fill=False, ec="#2ca02c", lw=0.8)
 
 
@@ -136,13 +136,13 @@ def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
     target = Path(path)
     require_picture(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    save(figure_of(traces), target)
+    save(figure_of(traces), target, dpi=120, bbox_inches="tight")
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write to an image file, whole or not at all."""
+def save(figure: Figure, path: Path, **options: Any) -> None:
+    """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120, bbox_inches="tight", format=path.suffix[1:].lower())
+        figure.savefig(temporary, format=path.suffix[1:].lower(), **options)
 
 
 def figure_of(traces: Sequence[Trace]) -> Figure:

@@ -41,8 +41,7 @@ class Statistics:
     def of(cls, values: Array) -> Statistics:
         """All NaN for an empty set."""
         if len(values) == 0:
-            nan = float("nan")
-            return cls(nan, nan, nan, nan, nan, nan, 0)
+            return cls(*[float("nan")] * 6, count=0)
         return cls(
             rmse=float(np.sqrt((values**2).mean())),
             mean=float(values.mean()),
@@ -87,16 +86,10 @@ class TrajectoryErrors:
     segments: tuple[Segment, ...]
 
 
-def relative_errors(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
-    """``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,): (M, 4, 4)."""
-    d_est = se3.inverse(T_est[start]) @ T_est[end]
-    d_true = se3.inverse(T_true[start]) @ T_true[end]
-    return se3.inverse(d_true) @ d_est
-
-
 def rpe(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> RelativeError:
-    """Relative pose error over given pairs of poses."""
-    E = relative_errors(T_est, T_true, start, end)
+    """Of ``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,)."""
+    d_est, d_true = (se3.inverse(T[start]) @ T[end] for T in (T_est, T_true))
+    E = se3.inverse(d_true) @ d_est
     angle = np.linalg.norm(se3.so3_log(E[:, :3, :3]), axis=1)
     return RelativeError(Statistics.of(np.linalg.norm(E[:, :3, 3], axis=1)), Statistics.of(angle))
 
@@ -126,16 +119,9 @@ def segments(
     frame = np.arange(len(arc)) if frame is None else frame
     out = []
     for length in lengths_m:
-        start, end = _unbroken(frame, *pairs_ahead(arc, length, every))
-        error = rpe(T_est, T_true, start, end)
-        out.append(
-            Segment(
-                length,
-                100 * error.translation_m.mean / length,
-                float(np.degrees(error.rotation_rad.mean)) / length,
-                len(start),
-            )
-        )
+        error = rpe(T_est, T_true, *_unbroken(frame, *pairs_ahead(arc, length, every)))
+        translation, rotation = error.translation_m, float(np.degrees(error.rotation_rad.mean))
+        out.append(Segment(length, 100 * translation.mean / length, rotation / length, translation.count))
     return tuple(out)
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gpvo.files import markdown_table, replacing
+from gpvo.evaluation.plots import save
+from gpvo.files import markdown_table
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
@@ -151,8 +152,7 @@ def draw(cells: Sequence[Cell], studied: Studies | None, store: Store, out: Path
     def keep(name: str, title: str, figure: Figure) -> None:
         path = out / "figures" / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})
+        save(figure, path, dpi=100, metadata={"Software": None})
         drawn.append({"file": f"figures/{name}.png", "title": title})
 
     simulated: dict[tuple[str, str], list[Cell]] = {}
