@@ -88,8 +88,7 @@ def drift_percent(flown: FlownRun) -> float:
 
 
 def _interval(values: list[float]) -> dict[str, Any]:
-    i = sequence_bootstrap(np.array(values))
-    return {"mean": i.mean, "low": i.low, "high": i.high, "values": values}
+    return {**sequence_bootstrap(np.array(values)).document(), "values": values}
 
 
 def clean(folder: Path, seeds: int) -> dict[str, Any]:
