@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.doubtful import in_waits, odd_stretches, odd_times, wandering_waits
+from gpvo.dataset.doubtful import in_waits, odd_stretches, wandering_waits
 from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError
@@ -144,7 +144,7 @@ def build(
     if waits == "drop":
         known &= ~in_waits(records, wandering_waits(log, truth))
     moves_at_rest = with_truth - int(known.sum())
-    is_odd = known & in_waits(records, odd_times(odd_stretches(log, truth)))
+    is_odd = known & in_waits(records, [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:
@@ -204,11 +204,7 @@ def build_run(
     odd: str = "keep",
 ) -> TrainingSet:
     """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
-    truth = run.truth
-    if align == "rotation" and truth is not None:
-        truth = align_rotation(run.log, truth)
-    elif align not in ("none", "rotation"):
-        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
+    truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
     rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
     return replace(rows, odometry=that_matter(run.settings))
 
@@ -226,8 +222,14 @@ def that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: list(v) if isinstance(v := known[name], tuple) else v for name in names}
 
 
-def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:
-    """Truth turned by the fixed rotation between its camera and the log's, so that motions of a second agree best."""
+def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
+    """The truth as it is, with ``align`` "none"; with "rotation" turned by the fixed rotation between its camera and
+    the log's, so that motions of a second agree best. Raises GpvoError for another word, or where nothing tells it.
+    """
+    if align == "none":
+        return truth
+    if align != "rotation":
+        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
     A, B, _ = windowed_motions(flag_slips(log), truth)
     fixed = fit_fixed_transform(A, B, lever_arm=False)
     return replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))

@@ -66,25 +66,25 @@ class FixedTransform:
         return T @ se3.inverse(self.T_log_truth)
 
 
-def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) -> tuple[Array, Array, Array]:
-    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of ``window_s``, by half-windows; and the
-    truth's attitudes (M, 3, 3) at their ends.
+def windowed_motions(log: VoLog, truth: TruthLog) -> tuple[Array, Array, Array]:
+    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of :data:`WINDOW_S`, by half-windows; and
+    the truth's attitudes (M, 3, 3) at their ends.
 
     Windows that hold a lost frame or lack truth at an end are left out.
     """
-    start, end, T, T_world = _windows(log, truth, window_s)
+    start, end, T, T_world = _windows(log, truth)
     return _between(T, start, end), _between(T_world, start, end), T_world[end, :3, :3]
 
 
-def _windows(log: VoLog, truth: TruthLog, window_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+def _windows(log: VoLog, truth: TruthLog) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
     """First and last frame of each window, and the poses (N, 4, 4) of log and truth."""
     t, T = log.t_ns, log.trajectory()
     dt = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-    span = max(1, round(window_s * 1e9 / dt)) if dt > 0 else 1
+    span = max(1, round(WINDOW_S * 1e9 / dt)) if dt > 0 else 1
     start = np.arange(0, len(t) - span, max(1, span // 2))
     end = start + span
     lost = np.cumsum(~log.usable)
-    whole = (lost[end] == lost[start]) & (t[end] - t[start] < 2 * max(window_s * 1e9, dt))
+    whole = (lost[end] == lost[start]) & (t[end] - t[start] < 2 * max(WINDOW_S * 1e9, dt))
     T_world, known = interpolate_truth(truth, t)
     keep = whole & known[start] & known[end]
     return start[keep], end[keep], T, T_world
@@ -188,7 +188,7 @@ def inverse_poses(log: VoLog, truth: TruthLog) -> InversePoses | None:
 
     A log is known from its first pose only, which counts as the origin of its world.
     """
-    start, end, T, T_world = _windows(log, truth, WINDOW_S)
+    start, end, T, T_world = _windows(log, truth)
     if len(start) < _MIN_MOTIONS:
         return None
     A, B = _between(T, start, end), _between(T_world, start, end)

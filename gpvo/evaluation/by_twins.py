@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.build import build_run
+from gpvo.dataset.build import build_run, leave_one_out
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import SourceError
 from gpvo.evaluation.document import document
@@ -55,8 +55,7 @@ def by_twins(
         own = evaluate_run(run, predictor, options, [_statement(run.log, twins)])
         return document([own])["runs"][0], [own]
     found = []
-    for k, twin in enumerate(twins):
-        others = [t for j, t in enumerate(twins) if j != k]
+    for twin, others in leave_one_out(twins):
         found.append(evaluate_run(twin, predictor, options, [_statement(twin.log, others)]))
     mean = average([document([e])["runs"][0] for e in found])
     # A verdict is in words, which have no mean: the numbers speak.

@@ -220,34 +220,32 @@ def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float)
     """First frame and motions of each window."""
     stride, t_next = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS), float(progress[0])
     parent, usable = log.parent, log.usable
+    leads_on = np.append(parent[1:] == np.arange(len(parent) - 1), False)  # whether the next motion starts there
     # Nothing is long enough behind the last of these; without the cut a short run costs the square of its frames.
     for start in np.flatnonzero(progress[-1] - progress >= span * _HAIR).tolist():
         if progress[start] < t_next or not known[start]:
             continue
-        chain = _window(start, parent, usable, progress, span)
+        chain = _window(start, parent, usable, leads_on, progress, span)
         if chain and known[chain[-1]]:
             t_next = float(progress[start]) + stride
             yield start, chain
 
 
 def _window(
-    start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], progress: Array, span: float
-) -> Sequence[int]:
+    start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], leads_on: NDArray[np.bool_], progress: Array,
+    span: float,
+) -> Sequence[int]:  # fmt: skip
     """The chain of motions from frame ``start`` over at least ``span``; empty where it is broken or too short."""
     chain, here = [], start
     for k in range(start + 1, len(parent)):
-        if parent[k] == here and usable[k]:
-            done = progress[k] - progress[start] >= span * _HAIR
-            if done or _leads_on(k, parent):
-                chain.append(k)
-                here = k
-            if done:
-                return chain
-        elif parent[k] == here and _leads_on(k, parent):
-            return []
+        if parent[k] != here:
+            continue
+        done = usable[k] and progress[k] - progress[start] >= span * _HAIR
+        if done or leads_on[k]:
+            if not usable[k]:
+                return []
+            chain.append(k)
+            here = k
+        if done:
+            return chain
     return []
-
-
-def _leads_on(k: int, parent: NDArray[np.int64]) -> bool:
-    """Whether the next motion starts from frame k."""
-    return k + 1 < len(parent) and bool(parent[k + 1] == k)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
-from gpvo.dataset.build import align_rotation, predictions_of
+from gpvo.dataset.build import aligned_truth, predictions_of
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
@@ -24,7 +24,7 @@ from gpvo.dataset.errors import (
     velocity_path,
 )
 from gpvo.dataset.hand_eye import FixedRotation, InversePoses, fixed_rotation, inverse_poses, late_by
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import (
@@ -101,6 +101,11 @@ class Evaluation:
         if self.shown is None or self.shown.errors is None:
             return None
         return along(self.run.log.T_prev_cur, self.shown.errors, self.run.log.parent)[1]
+
+    @property
+    def T_world_first(self) -> Array:
+        """(4, 4) of the first frame with truth; where there is none, of the first frame."""
+        return self.T_true[self.covered][0] if self.covered.any() else self.T_est[0]
 
     @property
     def t_s(self) -> Array:
@@ -246,11 +251,7 @@ def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
         offset_s = estimate_time_offset(run.log, truth)
     if offset_s:
         truth = on_clock_of_log(truth, offset_s)
-    if options.align == "rotation":
-        truth = align_rotation(run.log, truth)
-    elif options.align != "none":
-        raise GpvoError(f"unknown alignment '{options.align}'", cure="none or rotation")
-    return truth, float(offset_s)
+    return aligned_truth(run.log, truth, options.align), float(offset_s)
 
 
 def distinct(names: Sequence[str]) -> list[str]:

@@ -47,14 +47,9 @@ _NEES_WINDOW_S = 0.5
 _SHADES = {Status.DEGRADED: "#ffbf00", Status.LOST: _RED}
 
 
-def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
-    """Axes to draw in, so that the third points up."""
-    return level_of(e.T_true[e.covered][0] if e.covered.any() else e.T_est[0])
-
-
-def level_of(T_world_cam: Array) -> tuple[Array, tuple[str, str, str]]:
-    """By the first pose. A camera's world (y down, as KITTI's) is turned."""
-    down = T_world_cam[:3, :3] @ np.array([0.0, 1.0, 0.0])
+def level(T_world_first: Array) -> tuple[Array, tuple[str, str, str]]:
+    """Axes to draw in, the third upwards, and their names. A camera's world (y down, as KITTI's) is turned."""
+    down = T_world_first[:3, :3] @ np.array([0.0, 1.0, 0.0])
     if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
         return R_FLU_OPTICAL, ("forward z", "left -x", "up -y")
     return np.eye(3), ("x", "y", "z")
@@ -62,8 +57,8 @@ def level_of(T_world_cam: Array) -> tuple[Array, tuple[str, str, str]]:
 
 def views(e: Evaluation) -> list[Panel]:
     """Top and side view of truth and estimate, with 3-sigma ellipses."""
-    to_plane, names = level(e)
-    origin = (e.T_true[e.covered] if e.covered.any() else e.T_est)[0, :3, 3]
+    to_plane, names = level(e.T_world_first)
+    origin = e.T_world_first[:3, 3]
     p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
     bounds = np.zeros((0, 6, 6)) if e.shown_bounds is None else e.shown_bounds
     keep, panels = spread(len(p)), []

@@ -91,7 +91,7 @@ def forecast(f: Forecast, title: str) -> Figure:
     """Of a planned path: top view with 3-sigma ellipses and sigma over the distance, one above the other."""
     figure = Figure(figsize=(8, 8), layout="constrained")
     top, below = figure.subplots(2, 1, height_ratios=(2, 1))
-    to_plane, names = panels.level_of(f.plan.T_world_cam[0])
+    to_plane, names = panels.level(f.plan.T_world_cam[0])
     p = f.plan.T_world_cam[:, :3, 3] @ to_plane.T
     C = to_plane @ f.position_covariance @ to_plane.T
     top.plot(p[:, 0], p[:, 1], color="black", lw=1.2, label="plan")

@@ -73,7 +73,7 @@ def _groups(e: Evaluation) -> list[dict[str, Any]]:
 
 def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
-    to_plane, _ = panels.level(e)
+    to_plane, _ = panels.level(e.T_world_first)
     keep, covered = spread(len(e.T_est), _MAX_POINTS), np.flatnonzero(e.covered)
     shown = covered[spread(len(covered), _MAX_POINTS)]
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T

@@ -133,9 +133,8 @@ def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[s
     """
     truths = sorted((folder / "truth").glob("*.txt"))
     if not truths:
-        raise SourceError(
-            "holds no truth/SEQUENCE.txt", where=folder, cure="gpvo evaluate RUN --stated makes such folders"
-        )
+        cure = "gpvo evaluate RUN --stated makes such folders"
+        raise SourceError("holds no truth/SEQUENCE.txt", where=folder, cure=cure)
     found = {}
     for method in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "truth"):
         pairs = [(_of_sequence(method, truth), truth) for truth in truths]
@@ -149,9 +148,8 @@ def _of_sequence(method: Path, truth: Path) -> Path:
     for path in (method / truth.name, method / f"{truth.stem}.csv"):
         if path.is_file():
             return path
-    raise SourceError(
-        f"states nothing for the sequence {truth.stem}", where=method, cure="each method must state all sequences"
-    )
+    cure = "each method must state all sequences"
+    raise SourceError(f"states nothing for the sequence {truth.stem}", where=method, cure=cure)
 
 
 def write_board(found: Mapping[str, Mapping[str, Any]], folder: Path) -> None:
@@ -176,9 +174,8 @@ def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
         for span in ("1s", "10m", "100m"):
             known = [v for s in sequences if (v := s["nees_dof_over"][span]) is not None]
             row[f"NEES {span}"] = float(np.mean(known)) if known else None
-        row["easy"], row["hard"] = (
-            float(np.mean([s["coverage_by_difficulty"][k] for s in sequences])) for k in (0, -1)
-        )
+        covered = np.mean([s["coverage_by_difficulty"] for s in sequences], axis=0)
+        row |= {"easy": covered[0], "hard": covered[-1]}
         out.setdefault("method", []).append(method)
         for name, value in row.items():
             out.setdefault(name, []).append(None if value is None else float(f"{value:.3g}"))

@@ -25,9 +25,10 @@ _AXES = ("x: right", "y: down", "z: forward")
 _GREEN = "#2ca02c"
 MODES = {"images": "images", "points": "points only", "real": "real"}
 _THESIS = ("rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "residual_m", "residual_over_rmse")
-_OURS = (
-    "rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "ratio_interval", "vector_residual_m",
-    "vector_over_rmse", "magnitude_residual_m", "magnitude_over_rmse", "coverage_3_sigma",
+_COLUMNS = (
+    "key", "table", "title", "mode", "seeds", "way", "rmse_m", "final_error_m", "predicted_final_error_m", "ratio",
+    "ratio_interval_low", "ratio_interval_high", "vector_residual_m", "vector_over_rmse", "magnitude_residual_m",
+    "magnitude_over_rmse", "coverage_3_sigma",
 )  # fmt: skip
 
 
@@ -45,16 +46,13 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """One line per row and way, every digit."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    ours = [c for name in _OURS for c in ((f"{name}_low", f"{name}_high") if name == "ratio_interval" else (name,))]
-    writer.writerow(["key", "table", "title", "mode", "seeds", "way", *ours, *(f"thesis_{n}" for n in _THESIS)])
+    writer.writerow([*_COLUMNS, *(f"thesis_{n}" for n in _THESIS)])
     for row in rows:
         thesis = row.get("thesis") or {}
         for way, found in row["ways"].items():
-            values: list[Any] = []
-            for name in _OURS:
-                values += (found[name] or [None, None]) if name == "ratio_interval" else [found[name]]
-            head = [row["key"], row["table"], row["title"], row["mode"], found["seeds"], way]
-            writer.writerow([*head, *values, *(thesis.get(n) for n in _THESIS)])
+            low, high = found["ratio_interval"] or (None, None)
+            known = {**row, **found, "way": way, "ratio_interval_low": low, "ratio_interval_high": high}
+            writer.writerow([*(known[name] for name in _COLUMNS), *(thesis.get(name) for name in _THESIS)])
     return stream.getvalue()
 
 
