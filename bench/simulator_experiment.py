@@ -30,7 +30,6 @@ from gpvo.types import Array
 from gpvo.vo.config import make_config
 
 CLEAN: dict[str, Any] = {"scenario": "tunnel-clean", "duration_s": 9.0, "rate_hz": 10.0}
-EXPERIMENTS = ("clean", "baseline", "noise", "bursts", "lunar")
 
 
 @dataclass(frozen=True)
@@ -179,6 +178,9 @@ def lunar(folder: Path, seeds: int) -> dict[str, Any]:
     }
 
 
+EXPERIMENTS = {f.__name__: f for f in (clean, baseline, noise, bursts, lunar)}
+
+
 def main() -> None:
     """Run the experiments and write ``simulator.json``."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -186,10 +188,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--only", default=",".join(EXPERIMENTS))
     given = parser.parse_args()
-    known = {"clean": clean, "baseline": baseline, "noise": noise, "bursts": bursts, "lunar": lunar}
     document: dict[str, Any] = {"schema": 1, "seeds": given.seeds}
     for name in given.only.split(","):
-        document[name] = known[name](given.out, given.seeds)
+        document[name] = EXPERIMENTS[name](given.out, given.seeds)
         print(name, json.dumps(document[name], indent=1), flush=True)
         write_json(given.out / "simulator.json", document)
 

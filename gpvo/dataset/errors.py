@@ -76,11 +76,9 @@ _TOGETHER = 4  # windows of a second whose drifts may be alike
 def interpolated_between(truth: TruthLog) -> int | None:
     """Every how many poses a truth was measured, if the others lie on straight lines between, to the digits of a file:
     somebody has interpolated it. None for any other truth."""
-    t_s = (truth.t_ns - truth.t_ns[0]) * 1e-9
-    bend_m = np.linalg.norm(
-        np.diff(np.diff(truth.T_world_cam[:, :3, 3], axis=0) / np.diff(t_s)[:, None], axis=0), axis=1
-    )
-    bends = np.flatnonzero(bend_m * np.diff(t_s)[1:] > _STRAIGHT_M)
+    steps_s = np.diff((truth.t_ns - truth.t_ns[0]) * 1e-9)
+    velocity_mps = np.diff(truth.T_world_cam[:, :3, 3], axis=0) / steps_s[:, None]
+    bends = np.flatnonzero(np.linalg.norm(np.diff(velocity_mps, axis=0), axis=1) * steps_s[1:] > _STRAIGHT_M)
     if len(bends) < _FEWEST_KNOTS:
         return None
     apart, count = np.unique(np.diff(bends), return_counts=True)

@@ -119,22 +119,22 @@ def errors(e: Evaluation) -> list[Panel]:
 
 def stated(e: Evaluation) -> list[Panel]:
     """What each method states of every motion, translation and rotation."""
-    t = e.t_s
-    lines: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
-    for s in (s for s in e.statements if s.errors is not None):
-        variance, keep = np.diagonal(s.covariance, axis1=1, axis2=2), spread(len(t))
-        for of_kind, block in zip(lines, (slice(0, 3), slice(3, 6))):
-            sigma = np.sqrt(variance[:, block].mean(axis=1))
-            of_kind.append(_of_method(e, s, t[keep], 1e3 * sigma[keep]))
-    names = ("translation [mm]", "rotation [mrad]")
-    return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
+    keep, panels = spread(len(e.t_s)), []
+    for name, block in (("translation [mm]", slice(0, 3)), ("rotation [mrad]", slice(3, 6))):
+        lines = []
+        for s in (s for s in e.statements if s.errors is not None):
+            sigma = np.sqrt(np.diagonal(s.covariance, axis1=1, axis2=2)[:, block].mean(axis=1))
+            lines.append(_of_method(e, s, e.t_s[keep], 1e3 * sigma[keep]))
+        if lines:
+            panels.append(_panel("", "time [s]", name, lines, log="y"))
+    return panels
 
 
 def reliability(e: Evaluation) -> list[Panel]:
     """Share of errors inside the stated central interval, all axes together, against its probability."""
-    lines = []
     if not len(e.errors.index):
         return []
+    lines = []
     for s, error, C, _ in _stated_errors(e):
         z = np.abs(error) / np.sqrt(np.diagonal(C, axis1=1, axis2=2))
         lines.append(_of_method(e, s, _LEVELS, np.array([(z <= width).mean() for width in _HALF_WIDTHS])))
@@ -144,9 +144,9 @@ def reliability(e: Evaluation) -> list[Panel]:
 
 def nees(e: Evaluation) -> list[Panel]:
     """Joint NEES per degree of freedom over time, averaged over half a second around each motion."""
-    lines = []
     if not len(e.errors.index):
         return []
+    lines = []
     for s, error, C, t in _stated_errors(e):
         values = consistency.nees(error, C) / error.shape[1]
         ones = np.ones(min(len(values), max(1, round(_NEES_WINDOW_S / max(float(np.median(e.errors.dt_s)), 1e-3)))))
@@ -159,13 +159,12 @@ def nees(e: Evaluation) -> list[Panel]:
 def _stated_errors(e: Evaluation) -> Iterator[tuple[Statement, Array, Array, Array]]:
     """Of each method that speaks of all axes of at least two motions with truth: itself, the errors about its mean on
     the d axes that count (K, d), the covariances (K, d, d) and the times [s] of these motions."""
-    index = e.errors.index
     for s in e.statements:
-        known = np.isfinite(s.covariance[index]).all(axis=(1, 2))
+        known = np.isfinite(s.covariance[e.errors.index]).all(axis=(1, 2))
         if s.errors is not None and known.sum() >= 2:
-            axes = np.array(e.consistency[s.method].axes)
-            error = (e.errors.xi - s.mean[index])[known][:, axes]
-            yield s, error, consistency.marginal(s.covariance[index][known], axes), e.t_s[e.errors.index][known]
+            axes, index = np.array(e.consistency[s.method].axes), e.errors.index[known]
+            error = (e.errors.xi[known] - s.mean[index])[:, axes]
+            yield s, error, consistency.marginal(s.covariance[index], axes), e.t_s[index]
 
 
 def memory(e: Evaluation) -> list[Panel]:
