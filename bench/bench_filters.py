@@ -14,18 +14,17 @@ from gpvo.publish.odometry import OdometryBuilder
 from gpvo.types import MotionError
 from tests.filters.synthetic_flights import synthetic_flight
 
-from bench import Rows, row
+from bench import Rows, median_s, row
 
 
-def _microseconds(call: Callable[[], object], number: int, repeats: int = 7) -> float:
-    call()
-    costs = []
-    for _ in range(repeats):
-        begin = time.process_time()
+def _microseconds(call: Callable[[], object], number: int) -> float:
+    """CPU time of a call, from seven times so many."""
+
+    def many(_: int) -> None:
         for _ in range(number):
             call()
-        costs.append((time.process_time() - begin) / number)
-    return float(np.median(costs)) * 1e6
+
+    return 1e6 * median_s(many, 7, warm_up=1, clock=time.process_time) / number
 
 
 def run() -> Rows:

@@ -190,7 +190,9 @@ def kept_rows(lengths: Sequence[int], max_rows: int) -> list[Any]:
 def _join(parts: Sequence[TrainingSet]) -> TrainingSet:
     """Pieces of one sequence below one another."""
     first = parts[0]
-    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in ("X", "Y", "t_ns", "dt_s")}
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(p, name) for p in parts]) for name in ("X", "Y", "t_ns", "dt_s")
+    }
     return replace(
         first,
         **columns,

@@ -159,7 +159,7 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
         covariance=symmetrise(C.mean(axis=0) + np.einsum("dni,dnj->nij", spread, spread) / draws),
         mean=m.mean(axis=0),
         independent_m=float(np.sqrt(independent_m2.mean())),
-        in_domain=np.mean([said.in_domain for _, said in flown], axis=0),
+        in_domain=np.mean(np.array([said.in_domain for _, said in flown]), axis=0),
         outside=_outside(predictor, plan),
         draws=draws,
     )

@@ -41,7 +41,8 @@ class Statistics:
     def of(cls, values: Array) -> Statistics:
         """All NaN for an empty set."""
         if len(values) == 0:
-            return cls(*[float("nan")] * 6, count=0)
+            nan = float("nan")
+            return cls(nan, nan, nan, nan, nan, nan, 0)
         return cls(
             rmse=float(np.sqrt((values**2).mean())),
             mean=float(values.mean()),

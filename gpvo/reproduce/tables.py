@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,36 +56,33 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def sections(document: Mapping[str, Any]) -> list[tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Titles and rows of the tables that have any."""
-    titles = {"rows": "Tables 4.1 to 4.6", "sensitivity": "Sensitivity to sigma_p and sigma_m", "real": "Real data"}
-    return [(title, document[key]) for key, title in titles.items() if document[key]]
+TABLES = {"rows": "Tables 4.1 to 4.6", "sensitivity": "Sensitivity to sigma_p and sigma_m", "real": "Real data"}
+REMARKS = {"errata": "Errata", "out_of_scope": "Out of scope", "failed": "Not flown"}
 
 
-def lists(document: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
-    """Titles and lines of the remarks that there are."""
-    titles = {"errata": "Errata", "out_of_scope": "Out of scope", "failed": "Not flown"}
+def present(document: Mapping[str, Any], titles: Mapping[str, str]) -> list[tuple[str, Sequence[Any]]]:
+    """Titles and entries of those lists of the document that hold any."""
     return [(title, document[key]) for key, title in titles.items() if document[key]]
 
 
 def as_markdown(document: Mapping[str, Any]) -> str:
     """All tables of the document."""
-    parts = ["# The thesis' experiments, reproduced", ""]
-    parts += [f"* {line}" for line in document["notes"]]
-    for title, rows in sections(document):
-        parts += ["", f"## {title}", "", *markdown_table(HEADS, [line for row in rows for line in cells(row)])]
-    parts += ["", "## What is asked of the full model", ""]
-    parts += markdown_table(
-        ("row", "flights", "target", "value", "met"),
-        [(t["key"], MODES[t["mode"]], t["target"], number(t["value"]), verdict(t["met"])) for t in document["targets"]],
-    )
+    parts = ["# The thesis' experiments, reproduced", "", *(f"* {line}" for line in document["notes"])]
+
+    def add(title: str, lines: Iterable[str]) -> None:
+        parts.extend(["", f"## {title}", "", *lines])
+
+    for title, rows in present(document, TABLES):
+        add(title, markdown_table(HEADS, [line for row in rows for line in cells(row)]))
+    told = [
+        (t["key"], MODES[t["mode"]], t["target"], number(t["value"]), verdict(t["met"])) for t in document["targets"]
+    ]
+    add("What is asked of the full model", markdown_table(("row", "flights", "target", "value", "met"), told))
     if document["claims"]:
-        parts += ["", "## The thesis' claims", ""]
-        parts += markdown_table(
-            ("claim", "verdict", "evidence"), [(c["claim"], c["verdict"], c["evidence"]) for c in document["claims"]]
-        )
-    for title, lines in lists(document):
-        parts += ["", f"## {title}", "", *(f"* {line}" for line in lines)]
+        head = ("claim", "verdict", "evidence")
+        add("The thesis' claims", markdown_table(head, [[c[name] for name in head] for c in document["claims"]]))
+    for title, lines in present(document, REMARKS):
+        add(title, (f"* {line}" for line in lines))
     return "\n".join(parts) + "\n"
 
 
@@ -103,12 +100,12 @@ def as_page(document: Mapping[str, Any], folder: Path) -> str:
 
     return environment.get_template("reproduce.html").render(
         result=document,
-        groups=[(title, [line for row in rows for line in cells(row)]) for title, rows in sections(document)],
+        groups=[(title, [line for row in rows for line in cells(row)]) for title, rows in present(document, TABLES)],
         heads=HEADS,
         modes=MODES,
         verdict=verdict,
         pictures=[{**f, "data": embedded(f["file"])} for f in document["figures"]],
-        lists=lists(document),
+        lists=present(document, REMARKS),
     )
 
 
