@@ -17,7 +17,7 @@ from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
-from gpvo.online.base import RESIDUAL_COLUMN
+from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer, Window
 from gpvo.online.predictor import Predictor
@@ -64,8 +64,7 @@ class TrainingSet:
 
     def select(self, names: Sequence[str]) -> Array:
         """(n, len(names)) some of the columns."""
-        place = {c: i for i, c in enumerate(self.columns)}
-        return self.X[:, [place[n] for n in names]]
+        return self.X[:, positions(self.columns, names)]
 
     def rows(self, keep: NDArray) -> TrainingSet:
         """A part of the rows."""
@@ -137,7 +136,7 @@ def build(
         )
     records, X = observe(log, names, target)
     if target == "position":
-        Y, known = position_targets(log.trajectory(), log.t_ns, VoLog(records).usable, truth)
+        Y, known = position_targets(log, VoLog(records).usable, truth)
     else:
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())

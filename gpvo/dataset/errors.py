@@ -159,14 +159,12 @@ def motion_targets(records: Sequence[VoRecord], truth: TruthLog) -> tuple[Array,
     return xi, known
 
 
-def position_targets(
-    trajectory: Array, t_ns: NDArray[np.int64], usable: NDArray[np.bool_], truth: TruthLog
-) -> tuple[Array, NDArray[np.bool_]]:
+def position_targets(log: VoLog, usable: NDArray[np.bool_], truth: TruthLog) -> tuple[Array, NDArray[np.bool_]]:
     """The thesis' target: residual of the position [m] (N, 3) in the axes of the first camera, and which are known.
 
-    ``trajectory`` (N, 4, 4) ``T_first_cam``; its first pose with truth is made equal to the truth there.
+    The first pose with truth is made equal to the truth there; ``usable`` (N,): the motions as judged.
     """
-    T_true, has = interpolate_truth(truth, t_ns)
+    trajectory, (T_true, has) = log.trajectory(), interpolate_truth(truth, log.t_ns)
     if not has.any():
         raise GpvoError("no frame has ground truth")
     first = int(np.argmax(has))

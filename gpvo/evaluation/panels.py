@@ -92,20 +92,17 @@ def _along(e: Evaluation) -> dict[str, Array]:
 
 def errors(e: Evaluation) -> list[Panel]:
     """The error of each motion and what is stated of it, axis by axis."""
-    statement, t, panels = e.shown, e.t_s[e.errors.index], []
-    if not len(t):
+    statement, index, panels = e.shown, e.errors.index, []
+    if not len(index):
         return []
+    t, keep = e.t_s[index], spread(len(index))
     for k, axis in enumerate(AXES):
-        error = 1e3 * e.errors.xi[:, k]
-        bands = []
-        if statement is not None:
-            mean = 1e3 * statement.mean[e.errors.index, k]
-            reach = 3e3 * np.sqrt(statement.covariance[e.errors.index, k, k])
-            keep = spread(len(t))
-            low, high = (mean - reach)[keep], (mean + reach)[keep]
-            bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
+        error, bands = 1e3 * e.errors.xi[:, k], []
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
-        if bands:
+        if statement is not None:
+            mean, bound = 1e3 * statement.mean[index, k], 3e3 * np.sqrt(statement.covariance[index, k, k])
+            low, high = (mean - bound)[keep], (mean + bound)[keep]
+            bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
             # Nine tenths of the bound are always in the plot; its peaks unless the error would be a flat line.
             edge = np.abs(np.concatenate([low, high]))
             edge = edge[np.isfinite(edge)]

@@ -21,7 +21,6 @@ from gpvo.evaluation.forecast import Forecast
 from gpvo.evaluation.fusion import Trace, nis_band, nis_over_runs
 from gpvo.evaluation.panels import Drawing, Panel, colour
 from gpvo.files import replacing
-from gpvo.geometry.covariance import half_axes
 from gpvo.types import Array
 
 
@@ -118,9 +117,9 @@ def forecast(f: Forecast, title: str) -> Figure:
 
 
 def _ellipse(centre: Array, C: Array) -> Ellipse:
-    axes = half_axes(C)
-    width, height = 2 * np.linalg.norm(axes, axis=1)
-    angle = np.degrees(np.arctan2(axes[0, 1], axes[0, 0]))
+    values, vectors = np.linalg.eigh(C)
+    width, height = 2 * 3 * np.sqrt(np.maximum(values, 0))
+    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
     return Ellipse((centre[0], centre[1]), width, height, angle=angle, fill=False, ec="#2ca02c", lw=0.8)
 
 

@@ -78,10 +78,10 @@ def scaled_root(C: Array) -> Array:
     return np.asarray(sigma[..., :, None] * root)
 
 
-def half_axes(C: Array, sigmas: float = 3.0) -> Array:
-    """(..., n, n) rows: the half axes of the ellipsoid of so many sigma of covariances (..., n, n)."""
+def half_axes(C: Array) -> Array:
+    """(..., n, n) rows: the half axes of the 3-sigma ellipsoid of covariances (..., n, n)."""
     values, vectors = np.linalg.eigh(C)
-    return np.asarray(sigmas * np.swapaxes(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :], -1, -2))
+    return np.asarray(3.0 * np.swapaxes(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :], -1, -2))
 
 
 def correlation(C: Array) -> Array:
