@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,7 @@ def rpe(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.i
 
 
 def pairs_ahead(
-    progress: Array, step: float, every: int = 1, frame: NDArray[np.int64] | None = None
+    progress: NDArray[Any], step: float, every: int = 1, frame: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of poses ``step`` apart in a growing quantity (N,): every n-th start, and the first pose at least that
     far on. ``frame`` (N,): number of each pose in the run; pairs with a left-out pose between them are dropped."""
