@@ -79,18 +79,17 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
     options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))
     run = Run(stated, stated.stem, log, TruthLog(poses.t_ns, poses.T_world_body), None, Mounting(), [])
     evaluation = evaluate_run(run, options=options)
-    c = evaluation.consistency.get(IMPORTED)
+    c, usable = evaluation.consistency.get(IMPORTED), int(log.usable.sum())
     if c is None or c.nll_per_dim is None or c.one_second is None:
-        what = f"{int(log.usable.sum())} of {len(log) - 1} motions"
-        raise SourceError(f"states {what}, of which fewer than two have truth", where=stated, cure="see --truth")
-    usable, lost = int(log.usable.sum()), sum(r.status is Status.LOST for r in log)
+        what = f"states {usable} of {len(log) - 1} motions, of which fewer than two have truth"
+        raise SourceError(what, where=stated, cure="see --truth")
     charged_m, charged_rad = _charged(log, evaluation)
     joint = c.nees_dof["joint"]
     over = {"1s": c.one_second, **{f"{h.span:g}m": h for h in c.horizons}}
     return SequenceScore(
         sequence=stated.stem,
         motions=usable,
-        lost=lost,
+        lost=sum(r.status is Status.LOST for r in log),
         axes=tuple(AXES[k] for k in c.axes),
         energy_translation_m=_mean_with(c.energy_translation_m or 0.0, c.count, charged_m),
         energy_rotation_rad=_mean_with(c.energy_rotation_rad or 0.0, c.count, charged_rad),
