@@ -97,8 +97,7 @@ def experiment(
 
 def markdown(outcome: Outcome) -> str:
     """Means, paired comparisons, the rise, and every run."""
-    result = outcome.study
-    names = list(result.scores)
+    result, names = outcome.study, list(outcome.study.scores)
     parts = [f"# {outcome.title}", "", f"{len(result.runs)} flights that no model and no constant has seen.", ""]
     parts += markdown_table(["policy", *(c[0] for c in _COLUMNS), "diverged"], [_mean_row(result, n) for n in names])
     parts += ["", f"VO in the episodes: {outcome.rise}.", ""]

@@ -87,10 +87,8 @@ def flights(*scenarios: str, poses_alone: bool = False, images: bool = False) ->
         count, sets = max(place.flights // len(scenarios), 2), []
         for scenario in scenarios:
             seconds = place.duration_s * (0.4 if images else 1.0)
-            campaign = Campaign(scenario, place.out / "flights", seconds, pictures=images)
-            sets += [
-                _poses_alone(r) if poses_alone else TrainConfig().rows_of(r) for r in training_runs(campaign, count)
-            ]
+            runs = training_runs(Campaign(scenario, place.out / "flights", seconds, pictures=images), count)
+            sets += [_poses_alone(r) if poses_alone else TrainConfig().rows_of(r) for r in runs]
         return sets
 
     return load

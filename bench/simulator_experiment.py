@@ -73,9 +73,8 @@ def scale_percent(errors: MotionErrors) -> float:
 def mean_error_percent(errors: MotionErrors) -> float:
     """Length of the mean translation error over the mean motion, in percent: what does not average out."""
     keep = moving(errors)
-    return float(
-        100 * np.linalg.norm(errors.xi[keep, :3].mean(0)) / np.linalg.norm(errors.T_true[keep, :3, 3], axis=1).mean()
-    )
+    usual = np.linalg.norm(errors.T_true[keep, :3, 3], axis=1).mean()
+    return float(100 * np.linalg.norm(errors.xi[keep, :3].mean(0)) / usual)
 
 
 def drift_percent(flown: FlownRun) -> float:
@@ -136,11 +135,10 @@ def bursts(folder: Path, seeds: int) -> dict[str, Any]:
     inside, outside, lost = _episodes(flown)
     quiet = outside.std(0)
     everything = np.concatenate(list(inside.values()))
+    far, near = ((xi[:, :3] ** 2).sum(1).mean() for xi in (everything, outside))
     return {
         "rise_by_axis": (everything.std(0) / quiet).tolist(),
-        "rise_translation": float(
-            np.sqrt((everything[:, :3] ** 2).sum(1).mean() / (outside[:, :3] ** 2).sum(1).mean())
-        ),
+        "rise_translation": float(np.sqrt(far / near)),
         "rise_by_cause": {c: float(np.sqrt(((x / quiet) ** 2).mean())) for c, x in sorted(inside.items())},
         "share_inside": len(everything) / (len(everything) + len(outside)),
         "lost_inside": lost,
