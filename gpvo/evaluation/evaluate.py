@@ -191,10 +191,8 @@ def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:
     t = run.log.t_ns
     inside = int(((t >= truth.t_ns[0]) & (t <= truth.t_ns[-1])).sum()) if len(truth.t_ns) else 0
     if inside < min(3, len(t)):
-        what, cure = (
-            "ground truth and frames do not overlap in time",
-            "use --time-offset auto, or give the truth of this run",
-        )
+        what = "ground truth and frames do not overlap in time"
+        cure = "use --time-offset auto, or give the truth of this run"
     elif inside < 3:
         what, cure = f"has {len(t)} frames; three with truth are needed", "give a longer sequence"
     else:

@@ -168,12 +168,12 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
 def _fly(
     predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Prediction]:
-    """What the model says of every motion of the plan in the conditions of training rows that moved alike.
+    """One draw: the pose that each motion starts from (N,), -1 for the first pose, and what the model says of the
+    motions that end at poses 1 to N - 1, in the conditions of training rows that moved alike.
 
     A row is taken as it is, with the velocities as odometry measured them, noise and all: the model knows no others.
     Only where the plan leaves the range of the training does the plan's own value stand in its place. Where odometry
-    kept its reference over several frames, so it does here: with the pose that each motion starts from (N,), -1 for the
-    first pose.
+    kept its reference over several frames, so it does here.
     """
     names = [n for n in PLANNED if n in predictor.features]
     at, domain = positions(predictor.features, names), predictor.model.domain
