@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,10 +17,12 @@ from gpvo.geometry import se3
 from gpvo.io.run import RunWriter
 from gpvo.types import Status, VoRecord
 
+from bench import Rows, row
+
 _SIZE = (848, 800)
 
 
-def run() -> dict[str, dict[str, object]]:
+def run() -> Rows:
     """Results by name."""
     return {"rectify_848x800": _rectify(), "run_folder_records": _write_records()}
 
@@ -34,7 +37,7 @@ def _cpu_ms(action: Callable[[], object], repeats: int) -> float:
     return 1e3 * float(best)
 
 
-def _rectify() -> dict[str, object]:
+def _rectify() -> dict[str, Any]:
     lens = KannalaBrandt(282.0, 281.0, 416.0, 397.0, *_SIZE, (-0.0033, 0.054, -0.0516, 0.0107))
     rectifier = Rectifier(StereoRig(lens, lens, se3.exp(np.array([-0.0627, 0, 0, 0.001, -0.004, 0.002]))))
     rng = np.random.default_rng(0)
@@ -49,16 +52,10 @@ def _rectify() -> dict[str, object]:
         return [cv2.remap(image, *m, cv2.INTER_LINEAR) for image, m in zip(images, maps, strict=True)]
 
     ours, theirs = _cpu_ms(lambda: rectifier.apply(*images), 30), _cpu_ms(with_floats, 30)
-    return {
-        "value": ours,
-        "unit": "ms CPU per pair",
-        "peer": "cv2.remap with float maps",
-        "peer_value": theirs,
-        "ratio": theirs / ours,
-    }
+    return row(ours, "ms CPU per pair", "cv2.remap with float maps", theirs, smaller_wins=True)
 
 
-def _write_records() -> dict[str, object]:
+def _write_records() -> dict[str, Any]:
     n = 1000
     C = np.eye(6) * 1e-4
     records = [
@@ -79,5 +76,4 @@ def _write_records() -> dict[str, object]:
             for record in records:
                 writer.append(record)
 
-    ms = _cpu_ms(write, 3)
-    return {"value": 1e3 * n / ms, "unit": "records/s", "peer": None, "peer_value": None, "ratio": None}
+    return row(1e3 * n / _cpu_ms(write, 3), "records/s")

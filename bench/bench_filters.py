@@ -7,40 +7,31 @@ from collections.abc import Callable
 from itertools import cycle
 
 import numpy as np
-from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
 from gpvo.filters.policies import LearnedPolicy
-from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
+from gpvo.filters.run import FuseOptions, begin, fuse_flight, make_filter
 from gpvo.publish.odometry import OdometryBuilder
 from gpvo.types import MotionError
 from tests.filters.synthetic_flights import synthetic_flight
 
+from bench import Rows, median_s, row
 
-def _microseconds(call: Callable[[], object], number: int, repeats: int = 7) -> float:
-    call()
-    costs = []
-    for _ in range(repeats):
-        begin = time.process_time()
+
+def _microseconds(call: Callable[[], object], number: int) -> float:
+    """CPU time of a call, from seven times so many."""
+
+    def many(_: int) -> None:
         for _ in range(number):
             call()
-        costs.append((time.process_time() - begin) / number)
-    return float(np.median(costs)) * 1e6
+
+    return 1e6 * median_s(many, 7, warm_up=1, clock=time.process_time) / number
 
 
-def _row(value: float, unit: str, limit: float | None) -> dict:
-    return {
-        "value": value,
-        "unit": unit,
-        "peer": None if limit is None else "limit",
-        "peer_value": limit,
-        "ratio": None if limit is None else value / limit,
-    }
-
-
-def run() -> dict[str, dict]:
+def run() -> Rows:
     """Measure on this machine."""
     flight = synthetic_flight(0, duration_s=4)
-    filter = _warm_filter(flight)
+    start, gravity = begin(flight, FuseOptions())
+    filter = make_filter(flight, start, gravity, 1, FuseOptions())
     gyro, acc = np.array([[0.1, 0.2, 0.3]]), np.array([[0.1, 0.2, 9.8]])
     sample = _microseconds(lambda: filter.propagate_imu(0.005, gyro, acc, gyro, acc), 500)
 
@@ -76,18 +67,13 @@ def run() -> dict[str, dict]:
     fuse_flight(flight, LearnedPolicy())
     whole = (time.process_time() - before) / 4.0
     return {
-        "filter_imu_sample": _row(sample, "us", 150.0),
-        "filter_vo_update": _row(vo, "us", 500.0),
-        "filter_second_of_flight": _row(whole * 1e3, "ms of CPU per s (200 Hz IMU, 20 Hz VO)", None),
-        "publish_message": _row(message, "us", None),
+        "filter_imu_sample": row(sample, "us", "limit", 150.0),
+        "filter_vo_update": row(vo, "us", "limit", 500.0),
+        "filter_second_of_flight": row(whole * 1e3, "ms of CPU per s (200 Hz IMU, 20 Hz VO)"),
+        "publish_message": row(message, "us"),
     }
 
 
-def _warm_filter(flight: Flight) -> ErrorStateFilter:
-    start, gravity = begin(flight, FuseOptions())
-    return make_filter(flight, start, gravity, 1, FuseOptions())
-
-
 if __name__ == "__main__":
-    for name, row in run().items():
-        print(f"{name:<28}{row['value']:>10.1f} {row['unit']}")
+    for name, found in run().items():
+        print(f"{name:<28}{found['value']:>10.1f} {found['unit']}")

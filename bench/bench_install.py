@@ -8,10 +8,12 @@ import tempfile
 import time
 from pathlib import Path
 
+from bench import Rows, row
+
 _ROOT = Path(__file__).parents[1]
 
 
-def run() -> dict[str, dict[str, object]]:
+def run() -> Rows:
     """Results by name."""
     with tempfile.TemporaryDirectory() as folder:
         _pip(Path(sys.executable), "wheel", "--no-deps", "--wheel-dir", folder, str(_ROOT))
@@ -28,11 +30,10 @@ def run() -> dict[str, dict[str, object]]:
                 start = time.perf_counter()
                 subprocess.run([python, "-I", "-m", "gpvo", "--help"], check=True, capture_output=True)
                 answer_s[name] = time.perf_counter() - start
-    rows: dict[str, dict[str, object]] = {}
+    rows: Rows = {}
     for name, seconds in answer_s.items():
-        added = size[name] - size["numpy"]
-        rows[f"install {name}"] = {"value": added, "unit": "MB", "peer": "numpy alone", "peer_value": size["numpy"]}
-        rows[f"{name} --help"] = {"value": seconds, "unit": "s"}
+        rows[f"install {name}"] = row(size[name] - size["numpy"], "MB", "numpy alone", size["numpy"])
+        rows[f"{name} --help"] = row(seconds, "s")
     return rows
 
 

@@ -10,6 +10,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,10 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-_TESTS = Path(__file__).resolve().parents[1] / "tests" / "learning"
+from bench import Rows, median_s, row
+
+_ROOT = Path(__file__).resolve().parents[1]
+_TESTS = _ROOT / "tests" / "learning"
 sys.path.insert(0, str(_TESTS))
 
 from gpvo.learning.logvariance import fit_log_variance  # noqa: E402
@@ -26,7 +30,7 @@ from gpvo.online import modelfile  # noqa: E402
 from gpvo.online.projected import ProjectedGP  # noqa: E402
 from synthetic_errors import Problem, gaussian_nll, make_problem  # noqa: E402
 
-Results = dict[str, dict[str, Any]]
+entry = partial(row, smaller_wins=True)
 
 N = 2000
 
@@ -56,29 +60,16 @@ def fit_mean_and_noise(problem: Problem) -> Fit:
     return Fit(mean.gp, replace(noise, centre=centre, lengthscale=noise.lengthscale * scale, offset=level))
 
 
-def entry(value: float, unit: str, peer: str | None = None, peer_value: float | None = None) -> dict[str, Any]:
-    """One line of bench.json; ``ratio`` is how many times better than the peer (smaller is better everywhere)."""
-    ratio = None if peer_value is None else peer_value / value
-    return {"value": value, "unit": unit, "peer": peer, "peer_value": peer_value, "ratio": ratio}
-
-
-def microseconds(call: Callable[[np.ndarray], Any], rows: np.ndarray, *, repeats: int, warm_up: int) -> float:
-    """Median time of one hot call."""
-    spent = []
-    for i in range(warm_up + repeats):
-        x = rows[i % len(rows)]
-        begin = time.perf_counter_ns()
-        call(x)
-        spent.append(time.perf_counter_ns() - begin)
-    return float(np.median(spent[warm_up:])) / 1e3
-
-
-def prediction(fit: Fit, rows: np.ndarray) -> Results:
+def prediction(fit: Fit, rows: np.ndarray) -> Rows:
     """One row: mean, aleatoric and epistemic variance of six outputs; mean and standard deviation by the peers."""
-    ours = microseconds(lambda x: fit.predict(x[None]), rows, repeats=5000, warm_up=500)
     few = make_problem(N, 1)
-    from_sklearn = microseconds(sklearn_predictor(few), rows, repeats=100, warm_up=5)
-    from_gpytorch = microseconds(gpytorch_predictor(few), rows, repeats=100, warm_up=20)
+
+    def microseconds(call: Callable[[np.ndarray], Any], repeats: int, warm_up: int) -> float:
+        return 1e6 * median_s(lambda k: call(rows[k % len(rows)]), repeats, warm_up=warm_up)
+
+    ours = microseconds(lambda x: fit.predict(x[None]), 5000, 500)
+    from_sklearn = microseconds(sklearn_predictor(few), 100, 5)
+    from_gpytorch = microseconds(gpytorch_predictor(few), 100, 20)
     return {
         "predict_one_us": entry(ours, "us", "scikit-learn GaussianProcessRegressor, n=2000", from_sklearn),
         "predict_one_us_vs_gpytorch": entry(ours, "us", "gpytorch ExactGP, n=2000, fast_pred_var", from_gpytorch),
@@ -122,7 +113,7 @@ def gpytorch_predictor(few: Problem) -> Callable[[np.ndarray], Any]:
     return predict
 
 
-def loading(fit: Fit) -> Results:
+def loading(fit: Fit) -> Rows:
     """Import of everything that flies, the model file, and one prediction, in a fresh interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.gpvo"
@@ -144,10 +135,10 @@ print(json.dumps([time.perf_counter() - begin, megabytes() - before]))
     return {"import_load_s": entry(float(seconds), "s"), "import_load_mb": entry(float(megabytes), "MB")}
 
 
-def training(test: Problem) -> Results:
+def training(test: Problem) -> Rows:
     """2,000 rows to hyperparameters and posterior; held-out NLL beside the time."""
     few = make_problem(N, 1)
-    out: Results = {}
+    out: Rows = {}
     begin = time.perf_counter()
     theirs, peer_nll = sklearn_fit(few, test)
     peer_s = time.perf_counter() - begin - theirs
@@ -178,12 +169,12 @@ def sklearn_fit(few: Problem, test: Problem) -> tuple[float, float]:
     return time.perf_counter() - begin, gaussian_nll(test.Y, mean, std**2)
 
 
-def scale(n_large: int = 100_000, n_huge: int = 1_000_000) -> Results:
+def scale(n_large: int = 100_000, n_huge: int = 1_000_000) -> Rows:
     """Mean and noise of six outputs: seconds at 100,000 rows, seconds and peak memory at 1,000,000."""
     code = """
 import json, sys, time
-sys.path[:0] = [{tests!r}, {bench!r}]
-from bench_learning import fit_mean_and_noise, make_problem
+sys.path[:0] = [{root!r}]
+from bench.bench_learning import fit_mean_and_noise, make_problem
 problem = make_problem({n}, 1)
 begin = time.perf_counter()
 fit_mean_and_noise(problem)
@@ -191,17 +182,16 @@ seconds = time.perf_counter() - begin
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
 print(json.dumps([seconds, int(peak.split()[1]) / 1024**2]))
 """
-    large = child(code.format(tests=str(_TESTS), bench=str(Path(__file__).parent), n=n_large))
-    huge = child(code.format(tests=str(_TESTS), bench=str(Path(__file__).parent), n=n_huge))
+    (large_s, large_gb), (huge_s, huge_gb) = (child(code.format(root=str(_ROOT), n=n)) for n in (n_large, n_huge))
     return {
-        "train_100k_s": entry(large[0], "s"),
-        "train_100k_peak_gb": entry(large[1], "GB"),
-        "train_1m_s": entry(huge[0], "s"),
-        "train_1m_peak_gb": entry(huge[1], "GB"),
+        "train_100k_s": entry(large_s, "s"),
+        "train_100k_peak_gb": entry(large_gb, "GB"),
+        "train_1m_s": entry(huge_s, "s"),
+        "train_1m_peak_gb": entry(huge_gb, "GB"),
     }
 
 
-def honesty(fit: Fit, test: Problem, seconds: float) -> Results:
+def honesty(fit: Fit, test: Problem, seconds: float) -> Rows:
     """20,000 rows of known truth: nats per output above the true density, and what one sigma covers."""
     mean, var = fit.predict(test.X)
     covered = float(np.mean(np.abs(test.Y - mean) < np.sqrt(var)))
@@ -218,7 +208,7 @@ def child(code: str) -> list[float]:
     return json.loads(out.stdout)
 
 
-def run() -> Results:
+def run() -> Rows:
     """All of it: about four minutes."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -7,19 +7,16 @@ installed. Latency is wall-clock time from sending to receiving, so it counts wh
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +29,26 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online import modelfile
 from gpvo.types import Status, TruthLog, VoLog, VoRecord
-from tests.vo.rendered_clip import pinhole, render_clip, wander
+from tests.vo.rendered_clip import write_pairs
 
+from bench import Rows, row
 from bench.live_peers import LEFT, POSES, RIGHT, pose
 
 _ROOT = Path(__file__).parents[1]
+sys.path += [str(_ROOT / "tests" / folder) for folder in ("clients", "live")]
+
+from ros1_tools import has, with_gpvo  # noqa: E402
+from wire_peers import place, running  # noqa: E402
+
 _READINGS = 10
-_SYSTEM_PYTHON = "/usr/bin/python3"
 
 
-def run() -> dict[str, dict[str, object]]:
+def run() -> Rows:
     """Results by name."""
     seconds = float(os.environ.get("GPVO_LIVE_SECONDS", "20"))
-    rows: dict[str, dict[str, object]] = {}
+    rows: Rows = {}
     with tempfile.TemporaryDirectory() as folder:
-        model, clip = _shim_model(Path(folder)), _clip(Path(folder))
+        model, clip = _shim_model(Path(folder)), write_pairs(Path(folder) / "clip.npz", 60)
         for wire in _wires():
             pictures = ("--stereo", LEFT, RIGHT, "--model", str(_ROOT / "models" / "tunnel.gpvo"))
             rows |= _rows(f"{wire}, pictures", measure(wire, ["pictures", str(clip)], pictures, seconds), 25, 60)
@@ -55,18 +57,17 @@ def run() -> dict[str, dict[str, object]]:
     return rows
 
 
-def _rows(name: str, got: dict[str, Any], p50: float | None, p99: float | None) -> dict[str, dict[str, object]]:
-    def row(value: float, unit: str, limit: float | None) -> dict[str, object]:
-        peer = {} if limit is None else {"peer": "goal", "peer_value": limit, "ratio": value / limit}
-        return {"value": value, "unit": unit, **peer}
+def _rows(name: str, got: dict[str, Any], p50: float | None, p99: float | None) -> Rows:
+    def beside(value: float, unit: str, goal: float | None) -> dict[str, Any]:
+        return row(value, unit, None if goal is None else "goal", goal)
 
     rows = {
-        f"{name}: latency, median": row(got["p50_ms"], "ms", p50),
-        f"{name}: latency, 99 %": row(got["p99_ms"], "ms", p99),
-        f"{name}: own latency, median": row(got["own_ms"][0], "ms", None if p50 else 2.0),
-        f"{name}: missing of {got['sent']}": row(got["missing"], "messages", None),
-        f"{name}: end after SIGTERM": row(got["end_s"], "s", 1.0),
-        f"{name}: memory, end less second reading": row(got["rss_mb"][-1] - got["rss_mb"][1], "MB", None),
+        f"{name}: latency, median": beside(got["p50_ms"], "ms", p50),
+        f"{name}: latency, 99 %": beside(got["p99_ms"], "ms", p99),
+        f"{name}: own latency, median": beside(got["own_ms"][0], "ms", None if p50 else 2.0),
+        f"{name}: missing of {got['sent']}": row(got["missing"], "messages"),
+        f"{name}: end after SIGTERM": row(got["end_s"], "s", "goal", 1.0),
+        f"{name}: memory, end less second reading": row(got["rss_mb"][-1] - got["rss_mb"][1], "MB"),
     }
     print(f"{name}: memory [MB] {got['rss_mb']}, CPU {got['cpu_percent']:.0f} %", file=sys.stderr, flush=True)
     return rows
@@ -74,22 +75,19 @@ def _rows(name: str, got: dict[str, Any], p50: float | None, p99: float | None) 
 
 def measure(wire: str, source: list[str], options: tuple[str, ...], seconds: float) -> dict[str, Any]:
     """One run of three processes: latencies [ms], own latency by its diagnostics, memory [MB] read ten times."""
-    place, sent = _place(wire), round(20 * seconds)
-    where = {"zenoh": ["--address", place], "dds": ["--domain", place], "ros1": []}[wire]
-    environment = _environment(wire, place)
+    sent = round(20 * seconds)
     with ExitStack() as held:
-        if wire == "zenoh":
-            held.enter_context(_router(place))
-        if wire == "ros1":
-            held.enter_context(_process(environment, "rosmaster", "--core", "-p", place.rpartition(":")[2]))
-            time.sleep(1.0)
-        python = _SYSTEM_PYTHON if wire == "ros1" else sys.executable
-        command = [python, "-m", "gpvo", "live", *options, f"--{wire}", *where]
-        live = held.enter_context(_process(environment, *command, ready="listening"))
-        peer = [python, "-m", "bench.live_peers"]
-        listen = [*peer, "listen", wire, place, str(sent - 1), str(seconds + 20)]
-        listener = held.enter_context(_process(environment, *listen, ready="ready"))
-        sender = held.enter_context(_process(environment, *peer, source[0], wire, place, str(seconds), *source[1:]))
+        at = held.enter_context(place(wire))
+
+        def process(*words: str, wait_for: str | None = None) -> subprocess.Popen[str]:
+            return held.enter_context(running(*words, wait_for=wait_for, env=at.env))
+
+        live = process(*at.python, "-m", "gpvo", "live", *options, *at.options, wait_for="listening")
+        peer = [*at.python, "-m", "bench.live_peers"]
+        listener = process(*peer, "listen", wire, at.address, str(sent - 1), str(seconds + 20))
+        assert listener.stdout is not None
+        assert listener.stdout.readline().strip() == "ready"
+        sender = process(*peer, source[0], wire, at.address, str(seconds), *source[1:])
         seen, rss = psutil.Process(live.pid), []
         for _ in range(_READINGS):
             time.sleep((seconds + 2) / _READINGS)
@@ -110,61 +108,10 @@ def measure(wire: str, source: list[str], options: tuple[str, ...], seconds: flo
 
 
 def _wires() -> list[str]:
-    have = [name for name, package in (("zenoh", "zenoh"), ("dds", "cyclonedds")) if importlib.util.find_spec(package)]
-    probe = [_SYSTEM_PYTHON, "-c", "import rospy, netifaces, nav_msgs.msg, sensor_msgs.msg, diagnostic_msgs.msg, numpy"]
-    if shutil.which("rosmaster") and Path(_SYSTEM_PYTHON).exists():
-        have += ["ros1"] * (subprocess.run(probe, env=_environment("ros1", ""), capture_output=True).returncode == 0)
-    return have
-
-
-def _place(wire: str) -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
-    return {"zenoh": f"tcp/127.0.0.1:{port}", "dds": str(100 + port % 100), "ros1": f"http://localhost:{port}"}[wire]
-
-
-def _environment(wire: str, place: str) -> dict[str, str]:
-    path = [str(_ROOT)] + ([sysconfig.get_path("purelib")] if wire == "ros1" else [])
-    ros = {"ROS_PYTHON_VERSION": "3", "ROS_HOSTNAME": "localhost", "ROS_MASTER_URI": place} if wire == "ros1" else {}
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), **ros}
-
-
-@contextmanager
-def _router(place: str) -> Iterator[None]:
-    from gpvo.live.rosless_wire import ZenohWire
-
-    router = ZenohWire(f"listen:{place}", node="router")
-    try:
-        yield
-    finally:
-        router.close()
-
-
-@contextmanager
-def _process(environment: dict[str, str], *command: str, ready: str | None = None) -> Iterator[subprocess.Popen[str]]:
-    """A process, ended at the end; ``ready``: a word of its first line."""
-    with tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True)
-        try:
-            for _ in range(600):
-                if ready is None or process.poll() is not None:
-                    break
-                if ready == "ready":
-                    assert process.stdout is not None
-                    assert process.stdout.readline().strip() == ready
-                    break
-                errors.seek(0)
-                if ready in errors.read():
-                    break
-                time.sleep(0.05)
-            yield process
-        finally:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.communicate(timeout=10)
-            except subprocess.TimeoutExpired:
-                process.kill()
+    probe = "rospy, netifaces, nav_msgs.msg, sensor_msgs.msg, diagnostic_msgs.msg, numpy"
+    ros1 = shutil.which("rosmaster") and has(probe, with_gpvo())
+    here = {"zenoh": find_spec("zenoh"), "dds": find_spec("cyclonedds"), "ros1": ros1}
+    return [wire for wire, found in here.items() if found]
 
 
 def _shim_model(folder: Path) -> Path:
@@ -181,12 +128,3 @@ def _shim_model(folder: Path) -> Path:
     model = train_sets(sets, TrainConfig(features="velocity,rotation"), judge=False)
     modelfile.save(folder / "shim.gpvo", model.arrays, model.header)
     return folder / "shim.gpvo"
-
-
-def _clip(folder: Path) -> Path:
-    camera = pinhole(752, 480, 0.11)
-    clip = render_clip(camera, wander(60))
-    pairs = np.array([[f.left, f.right] for f in clip.frames], dtype=np.uint8)
-    place: dict[str, Any] = {"f": camera.fx_px, "cx": camera.cx_px, "cy": camera.cy_px, "baseline_m": camera.baseline_m}
-    np.savez(folder / "clip.npz", pairs=pairs, **place)
-    return folder / "clip.npz"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from typing import Any
 
 import numpy as np
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
@@ -14,25 +13,27 @@ from gpvo.sim.eye import SensorModel
 from gpvo.sim.render import StereoRenderer
 from gpvo.sim.worlds import build_world
 
+from bench import Rows, median_s, row
+
 _CORES = 2
+_UNIT = "pairs/s on 2 cores"
 _WANTED = {"render_pinhole_vga": 20.0, "render_fisheye_848x800": None}
 
 
-def _pairs_per_second(camera: CameraModel, baseline_m: float, count: int = 16) -> float:
+def _pairs_per_second(camera: CameraModel, baseline_m: float) -> float:
     world = build_world("tunnel", 0)
     T_right_left = np.eye(4)
     T_right_left[0, 3] = -baseline_m
     renderer, sensor = StereoRenderer(world, camera, camera, T_right_left), SensorModel()
-    costs = []
-    for k in range(count + 2):
+
+    def draw(k: int) -> None:
         pose = world.start_pose.copy()
         pose[:3, :3] = pose[:3, :3] @ R_FLU_OPTICAL
         pose[:3, 3] = world.centreline[40 + 20 * k]
-        begin = time.process_time()
         left, right, _ = renderer.render(pose)
         sensor.expose(left, right, k)
-        costs.append(time.process_time() - begin)
-    return _CORES / float(np.median(costs[2:]))
+
+    return _CORES / median_s(draw, 16, warm_up=2, clock=time.process_time)
 
 
 def _gl_peer() -> tuple[str, float | None]:
@@ -45,7 +46,7 @@ def _gl_peer() -> tuple[str, float | None]:
     return "no OpenGL on this machine", None
 
 
-def run() -> dict[str, dict]:
+def run() -> Rows:
     """Measure on this machine."""
     cameras: dict[str, tuple[CameraModel, float]] = {
         "render_pinhole_vga": (PinholeRadtan(380, 380, 319.5, 239.5, 640, 480), 0.12),
@@ -54,22 +55,10 @@ def run() -> dict[str, dict]:
             0.064,
         ),
     }
-    out: dict[str, dict[str, Any]] = {}
+    out = {}
     for name, (camera, baseline) in cameras.items():
-        value, limit = _pairs_per_second(camera, baseline), _WANTED[name]
-        out[name] = {
-            "value": value,
-            "unit": "pairs/s on 2 cores",
-            "peer": None if limit is None else "wanted",
-            "peer_value": limit,
-            "ratio": None if limit is None else value / limit,
-        }
-    (peer, theirs), ours = _gl_peer(), out["render_pinhole_vga"]["value"]
-    out["render_pinhole_vga, beside OpenGL"] = {
-        "value": ours,
-        "unit": "pairs/s on 2 cores",
-        "peer": peer,
-        "peer_value": theirs,
-        "ratio": None if theirs is None else ours / theirs,
-    }
+        limit = _WANTED[name]
+        out[name] = row(_pairs_per_second(camera, baseline), _UNIT, None if limit is None else "wanted", limit)
+    ours = out["render_pinhole_vga"]["value"]
+    out["render_pinhole_vga, beside OpenGL"] = row(ours, _UNIT, *_gl_peer())
     return out

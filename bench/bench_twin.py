@@ -20,12 +20,10 @@ from gpvo.twin.replicate import TwinSettings, make_twins
 from gpvo.types import StereoCamera
 from gpvo.vo.points import triangulate
 
+from bench import Rows, row
+
 _CAMERA = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
 _STEP = np.array([0.002, 0.0, 0.05, 0.0, 0.003, 0.0])
-
-
-def _row(value: float, unit: str, limit: float) -> dict:
-    return {"value": value, "unit": unit, "peer": "limit", "peer_value": limit, "ratio": value / limit}
 
 
 def long_run(n_frames: int, per_frame: int = 100, life: int = 12) -> tuple[Observations, np.ndarray]:
@@ -58,7 +56,7 @@ def structure(n_frames: int) -> tuple[float, float]:
     return time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-def run() -> dict[str, dict]:
+def run() -> Rows:
     """Measure on this machine: about five minutes."""
     with tempfile.TemporaryDirectory() as folder:
         flight = simulate_points("tunnel-clean", seed=1, duration_s=60.0).save(Path(folder) / "flight.npz")
@@ -70,9 +68,9 @@ def run() -> dict[str, dict]:
     told = subprocess.run([sys.executable, "-m", "bench.bench_twin"], capture_output=True, text=True, check=True)
     fit_s, fit_gb = map(float, told.stdout.split())
     return {
-        "twins of 60 s, 8 replicates, 2 processes": _row(seconds, "s", 180.0),
-        "structure of 10,000 frames x 100 points": _row(fit_s, "s of CPU", 300.0),
-        "its peak memory": _row(fit_gb, "GB", 1.0),
+        "twins of 60 s, 8 replicates, 2 processes": row(seconds, "s", "limit", 180.0),
+        "structure of 10,000 frames x 100 points": row(fit_s, "s of CPU", "limit", 300.0),
+        "its peak memory": row(fit_gb, "GB", "limit", 1.0),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,8 @@ from gpvo.vo.motion import transfer
 from gpvo.vo.odometry import StereoOdometry
 from numpy.typing import NDArray
 from tests.vo.rendered_clip import pinhole, render_clip, wander
+
+from bench import Rows, median_s, row
 
 SIZES = ((640, 480), (752, 480), (848, 800))
 FRAMES = 80
@@ -68,9 +71,9 @@ def _rmse_mm(motions: Array, T_world_cam: Array) -> float:
     return 1e3 * float(np.sqrt((E[:, :3, 3] ** 2).sum(1).mean()))
 
 
-def run() -> dict[str, dict[str, object]]:
+def run() -> Rows:
     """Rates and errors at each size, and the cost of all covariances."""
-    out: dict[str, dict[str, object]] = {}
+    out = {}
     for width, height in SIZES:
         camera = pinhole(width, height)
         clip = render_clip(camera, wander(FRAMES))
@@ -79,30 +82,24 @@ def run() -> dict[str, dict[str, object]]:
         fps, records = _timed(odometry.step, frames)
         fps_naive, motions = _timed(naive.step, frames)
         size = f"{width}x{height}"
-        out[f"stereo frames per second, {size}"] = {
-            "value": fps, "unit": "1/s", "peer": "naive pipeline", "peer_value": fps_naive, "ratio": fps / fps_naive,
-        }  # fmt: skip
+        out[f"stereo frames per second, {size}"] = row(fps, "1/s", "naive pipeline", fps_naive)
         T = VoLog(records, camera).trajectory()  # type: ignore[arg-type]
         ours = _rmse_mm(se3.inverse(T[:-1]) @ T[1:], T_world_cam)
         theirs = _rmse_mm(np.array(motions[1:]), T_world_cam)
-        out[f"pose RMSE per frame, {size}"] = {
-            "value": ours, "unit": "mm", "peer": "naive pipeline", "peer_value": theirs, "ratio": theirs / ours,
-        }  # fmt: skip
+        out[f"pose RMSE per frame, {size}"] = row(ours, "mm", "naive pipeline", theirs, smaller_wins=True)
     out["all covariances of a frame, 500 points"] = _covariances()
     return out
 
 
-def _covariances() -> dict[str, object]:
+def _covariances() -> dict[str, Any]:
     rng = np.random.default_rng(0)
     camera = StereoCamera(380.0, 380.0, 319.5, 239.5, 0.12, 640, 480)
     uvd = np.column_stack([rng.uniform(0, 640, 500), rng.uniform(0, 480, 500), rng.uniform(3, 60, 500)])
     T = se3.exp(np.array([0.02, 0, 0.06, 0.01, 0.02, 0]))
     cur = transfer(T, uvd, camera).uvd.T
     config = make_config()
-    times = []
-    for _ in range(300):
-        start = time.perf_counter()
-        covariances_by_method(config, (0.1, 0.5), T, uvd, cur, camera)
-        times.append(time.perf_counter() - start)
-    value = 1e3 * float(np.median(times))
-    return {"value": value, "unit": "ms", "peer": "bound", "peer_value": 0.5, "ratio": 0.5 / value}
+
+    def state(_: int) -> object:
+        return covariances_by_method(config, (0.1, 0.5), T, uvd, cur, camera)
+
+    return row(1e3 * median_s(state, 300), "ms", "bound", 0.5, smaller_wins=True)

@@ -9,7 +9,6 @@ import argparse
 import os
 import shutil
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
 from gpvo.io import open_source
 from gpvo.io.run import Run, read_run
+from gpvo.parallel import map_jobs
 from gpvo.runner import run as run_vo
 from gpvo.sim.points import simulate_points
 from gpvo.sim.scenario import load_scenario, points_scenario
@@ -94,15 +94,10 @@ def with_accidents(run: Run) -> bool:
 def _make(campaign: Campaign, flights: Sequence[tuple[int, bool]], jobs: int) -> list[Run]:
     """Simulate and run VO where the folder does not hold the run yet."""
     campaign.folder.mkdir(parents=True, exist_ok=True)
-    tasks = [(campaign, *flight) for flight in flights]
-    if jobs <= 1:
-        return [read_run(_make_one(task)) for task in tasks]
-    with ProcessPoolExecutor(jobs) as pool:
-        return [read_run(path) for path in pool.map(_make_one, tasks)]
+    return [read_run(path) for path in map_jobs(_make_one, [(campaign, *f) for f in flights], jobs=jobs)]
 
 
-def _make_one(task: tuple[Campaign, int, bool]) -> Path:
-    campaign, seed, accidents = task
+def _make_one(campaign: Campaign, seed: int, accidents: bool) -> Path:
     out = campaign.run_path(seed, accidents)
     # The episodes are written last, so that a run which has them is whole.
     if not (out / _EPISODES).is_file():

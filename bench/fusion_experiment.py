@@ -97,8 +97,7 @@ def experiment(
 
 def markdown(outcome: Outcome) -> str:
     """Means, paired comparisons, the rise, and every run."""
-    result = outcome.study
-    names = list(result.scores)
+    result, names = outcome.study, list(outcome.study.scores)
     parts = [f"# {outcome.title}", "", f"{len(result.runs)} flights that no model and no constant has seen.", ""]
     parts += markdown_table(["policy", *(c[0] for c in _COLUMNS), "diverged"], [_mean_row(result, n) for n in names])
     parts += ["", f"VO in the episodes: {outcome.rise}.", ""]
@@ -129,7 +128,7 @@ def write(outcome: Outcome, stem: Path) -> None:
     risen = outcome.rise
     extra = {"share": risen.share, "standard_deviation": risen.standard_deviation, "median": risen.median}
     write_json(stem.with_suffix(".json"), {**document(outcome.report), "title": outcome.title, "rise": extra})
-    save(experiment_figure(outcome.study, outcome.title), stem.with_suffix(".png"))
+    save(experiment_figure(outcome.study, outcome.title), stem.with_suffix(".png"), dpi=120, bbox_inches="tight")
 
 
 def experiment_figure(result: Study, title: str) -> Figure:

@@ -21,7 +21,7 @@ from gpvo.dataset.build import TrainingSet, build
 from gpvo.files import markdown_table, read_json, write_json
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
-from gpvo.io.run import Run, read_run
+from gpvo.io.run import Run, is_finished, read_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.runner import run as run_vo
@@ -51,7 +51,7 @@ def drives(place: Place) -> list[TrainingSet]:
     runs = []
     for tracks in sorted((place.data / "tracks").glob("*.npz")):
         run = place.out / "drives" / tracks.stem
-        if not (run / "run.json").is_file():
+        if not is_finished(run):
             run_vo(open_source(tracks), run)
         runs.append(read_run(run))
     return [TrainConfig().rows_of(r) for r in runs]
@@ -62,7 +62,7 @@ def stereo_logs(place: Place) -> list[TrainingSet]:
     sets = []
     for log in sorted((place.data / "kitti_stereo_vo").glob("*_est.txt")):
         run = place.out / "stereo-logs" / log.stem
-        if not (run / "run.json").is_file():
+        if not is_finished(run):
             truth = read_foreign(log.with_name(log.name.replace("_est", "_gt")), complete=True)
             import_log(read_foreign(log), truth, run)
         sets.append(TrainConfig().rows_of(read_run(run)))
@@ -87,10 +87,8 @@ def flights(*scenarios: str, poses_alone: bool = False, images: bool = False) ->
         count, sets = max(place.flights // len(scenarios), 2), []
         for scenario in scenarios:
             seconds = place.duration_s * (0.4 if images else 1.0)
-            campaign = Campaign(scenario, place.out / "flights", seconds, pictures=images)
-            sets += [
-                _poses_alone(r) if poses_alone else TrainConfig().rows_of(r) for r in training_runs(campaign, count)
-            ]
+            runs = training_runs(Campaign(scenario, place.out / "flights", seconds, pictures=images), count)
+            sets += [_poses_alone(r) if poses_alone else TrainConfig().rows_of(r) for r in runs]
         return sets
 
     return load

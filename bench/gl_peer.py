@@ -12,6 +12,8 @@ import time
 
 import numpy as np
 
+from bench import median_s
+
 _CORES, _FRAMES, _SIZE = 2, 12, (640, 480)
 
 
@@ -33,16 +35,16 @@ def pairs_per_second(way: str) -> float:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     renderer = mujoco.Renderer(model, _SIZE[1], _SIZE[0])
-    camera, costs = mujoco.MjvCamera(), []
-    for k in range(_FRAMES + 2):
-        begin = time.process_time()
+    camera = mujoco.MjvCamera()
+
+    def draw(k: int) -> None:
         for side in (-0.06, 0.06):
             camera.lookat[:] = world.centreline[44 + 20 * k] + [0.0, side, 0.0]
             camera.distance, camera.azimuth, camera.elevation = 0.5, 0.0, 0.0
             renderer.update_scene(data, camera)
             renderer.render()
-        costs.append(time.process_time() - begin)
-    return _CORES / float(np.median(costs[2:]))
+
+    return _CORES / median_s(draw, _FRAMES, warm_up=2, clock=time.process_time)
 
 
 if __name__ == "__main__":

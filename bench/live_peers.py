@@ -10,7 +10,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ def _publish(seconds: float, send: Callable[[int, int], None]) -> None:
 
 
 def _poses(link: Wire) -> Callable[[int, int], None]:
-    emit, types = link.advertise(POSES, ODOMETRY_TYPE), _types(link)
+    emit, types = link.advertise(POSES, ODOMETRY_TYPE), link.store.types
     eye = 1e-4 * np.eye(6)
 
     def send(k: int, t_ns: int) -> None:
@@ -76,7 +76,7 @@ def _pictures(link: Wire, clip: Path) -> Callable[[int, int], None]:
     """The pairs of a clip, forward and backward without end, with CameraInfo beside them."""
     with np.load(clip) as data:
         pairs, camera = data["pairs"], {k: float(data[k]) for k in ("f", "cx", "cy", "baseline_m")}
-    t, sides = _types(link), []
+    t, sides = link.store.types, []
     for side, topic in enumerate((LEFT, RIGHT)):
         info = link.advertise(topic.replace("image_raw", "camera_info"), "sensor_msgs/msg/CameraInfo")
         sides.append((side, link.advertise(topic, "sensor_msgs/msg/Image"), info))
@@ -98,7 +98,7 @@ def _pictures(link: Wire, clip: Path) -> Callable[[int, int], None]:
 
 
 def _info(link: Wire, header: Any, camera: dict[str, float], side: int, shape: tuple[int, ...]) -> Any:
-    t, f, cx, cy = _types(link), camera["f"], camera["cx"], camera["cy"]
+    t, f, cx, cy = link.store.types, camera["f"], camera["cx"], camera["cy"]
     tx = -side * f * camera["baseline_m"]
     matrices = (np.zeros(5), np.array([f, 0, cx, 0, f, cy, 0, 0, 1]), np.eye(3).ravel(),
                 np.array([f, 0, cx, tx, 0, f, cy, 0, 0, 0, 1, 0]))  # fmt: skip
@@ -126,21 +126,10 @@ def _listen(link: Wire, want: int, seconds: float) -> None:
     link.subscribe(ros.TOPIC, ODOMETRY_TYPE, odometry)
     link.subscribe("/diagnostics", DIAGNOSTICS, diagnostics)
     print("ready", flush=True)
-    for _ in _until(seconds, lambda: len(came) >= want):
-        pass
-    print(json.dumps({"came": came, "health": health[0]}))
-
-
-def _until(seconds: float, done: Callable[[], bool]) -> Iterator[None]:
     end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s and not done():
+    while time.monotonic() < end_s and len(came) < want:
         time.sleep(0.05)
-        yield
-
-
-def _types(link: Wire) -> dict[str, Any]:
-    types: dict[str, Any] = link.store.types
-    return types
+    print(json.dumps({"came": came, "health": health[0]}))
 
 
 if __name__ == "__main__":

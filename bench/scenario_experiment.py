@@ -28,10 +28,10 @@ from gpvo.io.run import Run, read_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
+from gpvo.parallel import map_jobs
 from gpvo.sim.scenario import load_scenario, points_scenario
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.twin.replicate import TwinSettings, make_twins
-from joblib import Parallel, delayed
 
 from bench.experiment_flights import Campaign, check_numbers, experiment_parser, flights, training_runs
 
@@ -74,12 +74,12 @@ class MethodScores:
 
 def score_flights(runs: Sequence[Run], predictor: Predictor, jobs: int = 1) -> dict[str, MethodScores]:
     """Every method of :data:`METHODS` that the runs and the model allow."""
-    return _tabulated(Parallel(jobs)(delayed(_score_flight)(run, predictor) for run in runs))
+    return _tabulated(map_jobs(_score_flight, [(run, predictor) for run in runs], jobs=jobs))
 
 
 def score_by_twins(runs: Sequence[Run], settings: TwinSettings, jobs: int = 1) -> dict[str, MethodScores]:
     """Each flight by a model of its own twins alone: :data:`METHODS` as ``METHOD of twins``."""
-    rows = Parallel(jobs)(delayed(_score_by_twins)(run, settings) for run in runs)
+    rows = map_jobs(_score_by_twins, [(run, settings) for run in runs], jobs=jobs)
     return {f"{m} of twins": scores for m, scores in _tabulated(rows).items()}
 
 
@@ -136,8 +136,7 @@ def fly(name: str, folder: Path, train: int, test: int, *, test_seed: int = FIRS
 
 def judge(flown: ScenarioFlights, jobs: int = 1) -> dict[str, MethodScores]:
     """Train on the scenario's training flights and score the unseen ones."""
-    model = train_sets(flown.training, TrainConfig(), judge=False)
-    return score_flights(flown.test, model.predictor(), jobs)
+    return score_flights(flown.test, train_sets(flown.training, TrainConfig(), judge=False).predictor(), jobs)
 
 
 def markdown(results: Mapping[str, Mapping[str, MethodScores]]) -> str:
@@ -208,8 +207,7 @@ def _together(flown: Sequence[ScenarioFlights], jobs: int) -> dict[str, dict[str
     """One model of all scenarios that share the first one's rate, judged on each."""
     step = float(np.median(flown[0].training[0].dt_s))
     alike = [f for f in flown if abs(float(np.median(f.training[0].dt_s)) / step - 1) < 0.01]
-    model = train_sets([s for f in alike for s in f.training], TrainConfig(), judge=False)
-    predictor = model.predictor()
+    predictor = train_sets([s for f in alike for s in f.training], TrainConfig(), judge=False).predictor()
     return {f"{f.name}, model of all": score_flights(f.test, predictor, jobs) for f in alike}
 
 

@@ -22,7 +22,7 @@ from gpvo.dataset.build import TrainingSet
 from gpvo.dataset.check import check
 from gpvo.files import write_json
 from gpvo.io.foreign import read_foreign
-from gpvo.io.run import read_run
+from gpvo.io.run import is_finished, read_run
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.methods import method_arrays, score
 from gpvo.learning.train import TrainedModel, estimate_set, train_sets
@@ -57,7 +57,7 @@ def run(
 def imported(log: Path, runs: Path) -> Path:
     """The run of a log against the truth beside it, made unless it is there."""
     out = runs / log.stem / log.parent.name
-    if not (out / "run.json").is_file():
+    if not is_finished(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         truth = read_foreign(log.parent / "truth.tum", complete=True)
         summary = import_log(read_foreign(log), truth, out, frame="body", align="transform")
@@ -117,13 +117,8 @@ def main() -> None:
     parser.add_argument("--systems")
     parser.add_argument("--features", default=FEATURES)
     given = parser.parse_args()
-    run(
-        given.folder,
-        given.out,
-        given.only.split(","),
-        given.systems.split(",") if given.systems else None,
-        given.features,
-    )
+    systems = given.systems.split(",") if given.systems else None
+    run(given.folder, given.out, given.only.split(","), systems, given.features)
 
 
 if __name__ == "__main__":

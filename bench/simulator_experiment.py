@@ -30,7 +30,6 @@ from gpvo.types import Array
 from gpvo.vo.config import make_config
 
 CLEAN: dict[str, Any] = {"scenario": "tunnel-clean", "duration_s": 9.0, "rate_hz": 10.0}
-EXPERIMENTS = ("clean", "baseline", "noise", "bursts", "lunar")
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,8 @@ def scale_percent(errors: MotionErrors) -> float:
 def mean_error_percent(errors: MotionErrors) -> float:
     """Length of the mean translation error over the mean motion, in percent: what does not average out."""
     keep = moving(errors)
-    return float(
-        100 * np.linalg.norm(errors.xi[keep, :3].mean(0)) / np.linalg.norm(errors.T_true[keep, :3, 3], axis=1).mean()
-    )
+    usual = np.linalg.norm(errors.T_true[keep, :3, 3], axis=1).mean()
+    return float(100 * np.linalg.norm(errors.xi[keep, :3].mean(0)) / usual)
 
 
 def drift_percent(flown: FlownRun) -> float:
@@ -88,8 +86,7 @@ def drift_percent(flown: FlownRun) -> float:
 
 
 def _interval(values: list[float]) -> dict[str, Any]:
-    i = sequence_bootstrap(np.array(values))
-    return {"mean": i.mean, "low": i.low, "high": i.high, "values": values}
+    return {**sequence_bootstrap(np.array(values)).document(), "values": values}
 
 
 def clean(folder: Path, seeds: int) -> dict[str, Any]:
@@ -138,11 +135,10 @@ def bursts(folder: Path, seeds: int) -> dict[str, Any]:
     inside, outside, lost = _episodes(flown)
     quiet = outside.std(0)
     everything = np.concatenate(list(inside.values()))
+    far, near = ((xi[:, :3] ** 2).sum(1).mean() for xi in (everything, outside))
     return {
         "rise_by_axis": (everything.std(0) / quiet).tolist(),
-        "rise_translation": float(
-            np.sqrt((everything[:, :3] ** 2).sum(1).mean() / (outside[:, :3] ** 2).sum(1).mean())
-        ),
+        "rise_translation": float(np.sqrt(far / near)),
         "rise_by_cause": {c: float(np.sqrt(((x / quiet) ** 2).mean())) for c, x in sorted(inside.items())},
         "share_inside": len(everything) / (len(everything) + len(outside)),
         "lost_inside": lost,
@@ -180,6 +176,9 @@ def lunar(folder: Path, seeds: int) -> dict[str, Any]:
     }
 
 
+EXPERIMENTS = {f.__name__: f for f in (clean, baseline, noise, bursts, lunar)}
+
+
 def main() -> None:
     """Run the experiments and write ``simulator.json``."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -187,10 +186,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--only", default=",".join(EXPERIMENTS))
     given = parser.parse_args()
-    known = {"clean": clean, "baseline": baseline, "noise": noise, "bursts": bursts, "lunar": lunar}
     document: dict[str, Any] = {"schema": 1, "seeds": given.seeds}
     for name in given.only.split(","):
-        document[name] = known[name](given.out, given.seeds)
+        document[name] = EXPERIMENTS[name](given.out, given.seeds)
         print(name, json.dumps(document[name], indent=1), flush=True)
         write_json(given.out / "simulator.json", document)
 

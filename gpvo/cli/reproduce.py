@@ -58,7 +58,7 @@ def _print_tables(result: dict[str, Any], out: Path) -> None:
     from gpvo.reproduce import tables
 
     console = Console(width=max(Console().width, 190), highlight=False, markup=False)
-    for title, rows in tables.sections(result):
+    for title, rows in tables.present(result, tables.TABLES):
         table = Table(*tables.HEADS, title=title)
         for row in rows:
             for line in tables.cells(row):

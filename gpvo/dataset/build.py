@@ -11,15 +11,15 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.doubtful import in_waits, odd_stretches, odd_times, wandering_waits
-from gpvo.dataset.errors import check_target, motion_targets, position_targets, turn_without_truth_deg
+from gpvo.dataset.doubtful import in_waits, odd_stretches, wandering_waits
+from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
-from gpvo.online.base import RESIDUAL_COLUMN
+from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
-from gpvo.online.observer import Observer
+from gpvo.online.observer import Observer, Window
 from gpvo.online.predictor import Predictor
 from gpvo.online.slip import REASON, SlipDetector, flag_slips
 from gpvo.types import Array, Prediction, Status, StereoCamera, TruthLog, VoLog, VoRecord
@@ -64,8 +64,7 @@ class TrainingSet:
 
     def select(self, names: Sequence[str]) -> Array:
         """(n, len(names)) some of the columns."""
-        place = {c: i for i, c in enumerate(self.columns)}
-        return self.X[:, [place[n] for n in names]]
+        return self.X[:, positions(self.columns, names)]
 
     def rows(self, keep: NDArray) -> TrainingSet:
         """A part of the rows."""
@@ -118,7 +117,7 @@ def build(
     (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
     ``where``, by default ``name``.
     """
-    check_target(target)
+    Window.of(target)  # refuses an unknown one before any work
     for what, way in (("waits", waits), ("odd stretches", odd)):
         if way not in ("drop", "keep"):
             raise GpvoError(f"unknown treatment of {what}: '{way}'", cure="drop or keep")
@@ -137,15 +136,14 @@ def build(
         )
     records, X = observe(log, names, target)
     if target == "position":
-        usable = np.array([r.usable for r in records], dtype=bool)
-        Y, known = position_targets(log.trajectory(), log.t_ns, usable, truth)
+        Y, known = position_targets(log, VoLog(records).usable, truth)
     else:
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())
     if waits == "drop":
         known &= ~in_waits(records, wandering_waits(log, truth))
     moves_at_rest = with_truth - int(known.sum())
-    is_odd = known & in_waits(records, odd_times(odd_stretches(log, truth)))
+    is_odd = known & in_waits(records, [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:
@@ -205,11 +203,7 @@ def build_run(
     odd: str = "keep",
 ) -> TrainingSet:
     """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
-    truth = run.truth
-    if align == "rotation" and truth is not None:
-        truth = align_rotation(run.log, truth)
-    elif align not in ("none", "rotation"):
-        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
+    truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
     rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
     return replace(rows, odometry=that_matter(run.settings))
 
@@ -227,8 +221,14 @@ def that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: list(v) if isinstance(v := known[name], tuple) else v for name in names}
 
 
-def align_rotation(log: VoLog, truth: TruthLog) -> TruthLog:
-    """Truth turned by the fixed rotation between its camera and the log's, so that motions of a second agree best."""
+def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
+    """The truth as it is, with ``align`` "none"; with "rotation" turned by the fixed rotation between its camera and
+    the log's, so that motions of a second agree best. Raises GpvoError for another word, or where nothing tells it.
+    """
+    if align == "none":
+        return truth
+    if align != "rotation":
+        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
     A, B, _ = windowed_motions(flag_slips(log), truth)
     fixed = fit_fixed_transform(A, B, lever_arm=False)
     return replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.dataset.build import observe, that_matter
 from gpvo.io.run_read import Run
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
-from gpvo.types import VoRecord
+from gpvo.types import Array, VoLog, VoRecord
 
 _RATE = 0.2
 ENOUGH_INSIDE = 0.8
@@ -44,19 +45,23 @@ def check(predictor: Predictor, run: Run) -> Check:
     if any(s.get("of") == twin.get("of") and s.get("seed") == twin.get("seed") for s in known if twin):
         problems.append(f"it learned from these very twins of {twin['of']}: judge it by others, with another --seed")
     records, X = observe(run.log, predictor.features, predictor.target)
-    usable = np.array([r.usable for r in records], dtype=bool)
-    present = np.isfinite(X[usable]).mean(axis=0) if usable.any() else np.ones(X.shape[1])
-    missing = [n for n, share in zip(predictor.features, present) if share < 0.5]
+    seen = VoLog(records)
+    X = X[seen.usable]
+    missing = [n for n, lacks in zip(predictor.features, _mean(~np.isfinite(X))) if lacks > 0.5]
     if missing:
         problems.append(f"the run lacks features the model needs: {', '.join(missing)}")
-    place = predictor.model.locate(X[usable], np.array([r.dt_s for r in records])[usable])
-    inside = float((place.in_domain > 0.5).mean()) if usable.any() else 0.0
-    beyond = predictor.model.domain.outside(X[usable]).mean(axis=0) if usable.any() else np.zeros(X.shape[1])
+    place = predictor.model.locate(X, seen.column("dt_s")[seen.usable])
+    inside, beyond = float(_mean(place.in_domain > 0.5)), _mean(predictor.model.domain.outside(X))
     order = np.argsort(-beyond, kind="stable")[:3]
     farthest = tuple((predictor.features[i], float(beyond[i])) for i in order if beyond[i] > 0)
     if inside < ENOUGH_INSIDE:
         problems.append(f"only {100 * inside:.0f} % of the frames lie inside the training domain")
-    return Check(len(run.log), int(usable.sum()), inside, farthest, tuple(problems))
+    return Check(len(run.log), len(X), inside, farthest, tuple(problems))
+
+
+def _mean(rows: NDArray[Any]) -> Array:
+    """Over rows (n, ...), 0 where there are none."""
+    return np.asarray(rows.mean(axis=0) if len(rows) else np.zeros(rows.shape[1:]))
 
 
 def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list[str]:

@@ -25,7 +25,7 @@ _MIN_CORRELATION = 0.3
 _MAX_SAMPLES = 200_000
 
 
-def estimate_time_offset(log: VoLog, truth: TruthLog, max_offset_s: float = MAX_OFFSET_S) -> float:
+def estimate_time_offset(log: VoLog, truth: TruthLog) -> float:
     """Seconds to add to the log's stamps so that they are of the truth's clock.
 
     Clocks whose times do not overlap at all are searched over their whole length.
@@ -38,13 +38,14 @@ def estimate_time_offset(log: VoLog, truth: TruthLog, max_offset_s: float = MAX_
     if len(log) < 10 or len(truth.t_ns) < 10:
         raise GpvoError("too few poses to estimate a time offset", cure="give --time-offset in seconds")
     moving = TruthLog(log.t_ns, log.trajectory())
+    needed_s = _MIN_OVERLAP_S + _WINDOW_S
     for name, t_ns in (("log", log.t_ns), ("truth", truth.t_ns)):
-        if (lasts_s := (t_ns[-1] - t_ns[0]) * 1e-9) < _MIN_OVERLAP_S + _WINDOW_S:
-            needed = f"{_MIN_OVERLAP_S + _WINDOW_S:g} s are needed to estimate a time offset"
-            raise GpvoError(f"the {name} lasts {lasts_s:.2f} s; {needed}", cure="give --time-offset in seconds")
+        if (lasts_s := (t_ns[-1] - t_ns[0]) * 1e-9) < needed_s:
+            what = f"the {name} lasts {lasts_s:.2f} s; {needed_s:g} s are needed to estimate a time offset"
+            raise GpvoError(what, cure="give --time-offset in seconds")
     step_s = float(np.median(np.diff(moving.t_ns))) * 1e-9
     window = max(1, round(_WINDOW_S / step_s))
-    coarse = _coarse(moving, truth, min(step_s, _WINDOW_S), window * step_s, max_offset_s)
+    coarse = _coarse(moving, truth, min(step_s, _WINDOW_S), window * step_s)
     return _refine(moving, truth, coarse, window, 1.5 * step_s)
 
 
@@ -75,7 +76,7 @@ def _gap_s(poses: TruthLog) -> float:
     return max(MAX_GAP_S, 1.5e-9 * float(np.median(np.diff(poses.t_ns))))
 
 
-def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float, max_offset_s: float) -> float:
+def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float) -> float:
     """Offset [s] of the best normalised correlation, to one step."""
     window = max(1, round(window_s / step_s))
     a, a_first = _on_grid(log, step_s, window)
@@ -88,7 +89,7 @@ def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float, max_
     offset = (b_first - a_first) * 1e-9 + lag * step_s
     overlapping = log.t_ns[0] <= truth.t_ns[-1] and truth.t_ns[0] <= log.t_ns[-1]
     if overlapping:
-        score = np.where(np.abs(offset) <= max_offset_s, score, -1.0)
+        score = np.where(np.abs(offset) <= MAX_OFFSET_S, score, -1.0)
     best = int(np.argmax(score))
     if score[best] < _MIN_CORRELATION:
         raise GpvoError(

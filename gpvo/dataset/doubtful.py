@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
 from gpvo.stats.series import moving_sums
@@ -63,11 +63,12 @@ def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
-def in_waits(records: Sequence[VoRecord], waits: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(N,) which motions, or windows of motions, share time with one of the waits (W, 2)."""
+def in_waits(records: Sequence[VoRecord], waits: ArrayLike) -> NDArray[np.bool_]:
+    """(N,) which motions, or windows of motions, share time with one of the waits, or odd stretches, (W, 2) [ns]."""
+    first, last = np.asarray(waits, dtype=np.int64).reshape(-1, 2).T
     start = np.array([r.t_prev_ns for r in records], dtype=np.int64)[:, None]
     end = np.array([r.t_ns for r in records], dtype=np.int64)[:, None]
-    return np.asarray(((start < waits[:, 1]) & (end > waits[:, 0])).any(axis=1), dtype=np.bool_)
+    return np.asarray(((start < last) & (end > first)).any(axis=1), dtype=np.bool_)
 
 
 def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
@@ -258,8 +259,3 @@ def _stated_m(log: VoLog, errors: MotionErrors) -> Array:
     stated = np.sqrt([np.trace(r.covariances[known[0]][:3, :3]) for r in records])
     noise_px = np.array([r.reproj_rms_px for r in records])
     return np.maximum(stated * np.where(np.isfinite(noise_px), np.maximum(noise_px, 1e-3), 1.0), _NOWHERE_M)
-
-
-def odd_times(stretches: Sequence[Stretch]) -> NDArray[np.int64]:
-    """(S, 2) first and last time [ns] of each."""
-    return np.array([s.t_ns for s in stretches], dtype=np.int64).reshape(-1, 2)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.online.observer import Window
 from gpvo.stats.series import block_bootstrap, moving_sums
 from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
@@ -77,11 +76,9 @@ _TOGETHER = 4  # windows of a second whose drifts may be alike
 def interpolated_between(truth: TruthLog) -> int | None:
     """Every how many poses a truth was measured, if the others lie on straight lines between, to the digits of a file:
     somebody has interpolated it. None for any other truth."""
-    t_s = (truth.t_ns - truth.t_ns[0]) * 1e-9
-    bend_m = np.linalg.norm(
-        np.diff(np.diff(truth.T_world_cam[:, :3, 3], axis=0) / np.diff(t_s)[:, None], axis=0), axis=1
-    )
-    bends = np.flatnonzero(bend_m * np.diff(t_s)[1:] > _STRAIGHT_M)
+    steps_s = np.diff((truth.t_ns - truth.t_ns[0]) * 1e-9)
+    velocity_mps = np.diff(truth.T_world_cam[:, :3, 3], axis=0) / steps_s[:, None]
+    bends = np.flatnonzero(np.linalg.norm(np.diff(velocity_mps, axis=0), axis=1) * steps_s[1:] > _STRAIGHT_M)
     if len(bends) < _FEWEST_KNOTS:
         return None
     apart, count = np.unique(np.diff(bends), return_counts=True)
@@ -151,12 +148,6 @@ def _turn_deg(T: Array) -> float:
     return float(np.rad2deg(np.linalg.norm(se3.so3_log(R), axis=1).max()))
 
 
-def check_target(target: str) -> str:
-    """The target's name, or GpvoError: ``frame``, ``window:1s``, ``length:1m`` (any size) or ``position``."""
-    Window.of(target)
-    return target
-
-
 def motion_targets(records: Sequence[VoRecord], truth: TruthLog) -> tuple[Array, NDArray[np.bool_]]:
     """Errors ``xi = Log(T_true^-1 T_est)`` (N, 6) of records that span ``t_prev_ns`` to ``t_ns``, and which are known.
 
@@ -168,14 +159,12 @@ def motion_targets(records: Sequence[VoRecord], truth: TruthLog) -> tuple[Array,
     return xi, known
 
 
-def position_targets(
-    trajectory: Array, t_ns: NDArray[np.int64], usable: NDArray[np.bool_], truth: TruthLog
-) -> tuple[Array, NDArray[np.bool_]]:
+def position_targets(log: VoLog, usable: NDArray[np.bool_], truth: TruthLog) -> tuple[Array, NDArray[np.bool_]]:
     """The thesis' target: residual of the position [m] (N, 3) in the axes of the first camera, and which are known.
 
-    ``trajectory`` (N, 4, 4) ``T_first_cam``; its first pose with truth is made equal to the truth there.
+    The first pose with truth is made equal to the truth there; ``usable`` (N,): the motions as judged.
     """
-    T_true, has = interpolate_truth(truth, t_ns)
+    trajectory, (T_true, has) = log.trajectory(), interpolate_truth(truth, log.t_ns)
     if not has.any():
         raise GpvoError("no frame has ground truth")
     first = int(np.argmax(has))
@@ -238,8 +227,7 @@ def telling_distance_m(log: VoLog, T_true: Array, known: NDArray[np.bool_], sigm
     if not sigma.any():
         return 0.0
     T_est, whole = log.trajectory(), known & (log.usable | (np.arange(len(log)) == 0))
-    broken, steps_m = np.cumsum(~whole), np.linalg.norm(np.diff(T_true[:, :3, 3], axis=0), axis=1)
-    path_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    broken, path_m = np.cumsum(~whole), se3.path_length_m(T_true[:, :3, 3])
     span = 1
     while span < len(log) - _MIN_WINDOWS:
         start = np.flatnonzero(broken[span:] == broken[:-span])

@@ -66,25 +66,25 @@ class FixedTransform:
         return T @ se3.inverse(self.T_log_truth)
 
 
-def windowed_motions(log: VoLog, truth: TruthLog, window_s: float = WINDOW_S) -> tuple[Array, Array, Array]:
-    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of ``window_s``, by half-windows; and the
-    truth's attitudes (M, 3, 3) at their ends.
+def windowed_motions(log: VoLog, truth: TruthLog) -> tuple[Array, Array, Array]:
+    """Motions (M, 4, 4) of the log and (M, 4, 4) of the truth over windows of :data:`WINDOW_S`, by half-windows; and
+    the truth's attitudes (M, 3, 3) at their ends.
 
     Windows that hold a lost frame or lack truth at an end are left out.
     """
-    start, end, T, T_world = _windows(log, truth, window_s)
+    start, end, T, T_world = _windows(log, truth)
     return _between(T, start, end), _between(T_world, start, end), T_world[end, :3, :3]
 
 
-def _windows(log: VoLog, truth: TruthLog, window_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+def _windows(log: VoLog, truth: TruthLog) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
     """First and last frame of each window, and the poses (N, 4, 4) of log and truth."""
     t, T = log.t_ns, log.trajectory()
     dt = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-    span = max(1, round(window_s * 1e9 / dt)) if dt > 0 else 1
+    span = max(1, round(WINDOW_S * 1e9 / dt)) if dt > 0 else 1
     start = np.arange(0, len(t) - span, max(1, span // 2))
     end = start + span
     lost = np.cumsum(~log.usable)
-    whole = (lost[end] == lost[start]) & (t[end] - t[start] < 2 * max(window_s * 1e9, dt))
+    whole = (lost[end] == lost[start]) & (t[end] - t[start] < 2 * max(WINDOW_S * 1e9, dt))
     T_world, known = interpolate_truth(truth, t)
     keep = whole & known[start] & known[end]
     return start[keep], end[keep], T, T_world
@@ -120,8 +120,9 @@ def fit_fixed_transform(
     free = np.repeat([lever_arm, True, attitudes is not None], 3)
     ends = B[:, :3, :3] if attitudes is None else attitudes
     for _ in range(_ITERATIONS):
-        r, J = _residuals(A, _in_one_world(B, ends, R), X)
-        J = np.concatenate([J, _by_worlds(B, ends, R)], axis=2)
+        told, by_R = _in_one_world(B, ends, R)
+        r, J = _residuals(A, told, X)
+        J = np.concatenate([J, by_R], axis=2)
         scale = np.array([_spread(r[:, :3]), _spread(r[:, 3:])])
         H, g = _normal_equations(r, J, scale, X, R)
         step = np.zeros(9)
@@ -188,7 +189,7 @@ def inverse_poses(log: VoLog, truth: TruthLog) -> InversePoses | None:
 
     A log is known from its first pose only, which counts as the origin of its world.
     """
-    start, end, T, T_world = _windows(log, truth, WINDOW_S)
+    start, end, T, T_world = _windows(log, truth)
     if len(start) < _MIN_MOTIONS:
         return None
     A, B = _between(T, start, end), _between(T_world, start, end)
@@ -278,25 +279,19 @@ def _spread(r: Array) -> float:
     return max(1.4826 * float(np.median(np.abs(r))), 1e-9)
 
 
-def _in_one_world(B: Array, attitudes: Array, R: Array) -> Array:
-    """The truth's motions (M, 4, 4), its positions told in the world of its attitudes, which ``R`` takes to theirs."""
-    start = attitudes @ np.swapaxes(B[:, :3, :3], 1, 2)
-    out = B.copy()
-    out[:, :3, 3] = np.einsum("mji,kj,mkl,ml->mi", start, R, start, B[:, :3, 3], optimize=True)
-    return out
-
-
-def _by_worlds(B: Array, attitudes: Array, R: Array) -> Array:
-    """(M, 6, 3) derivative of the residuals by the right perturbation of R.
+def _in_one_world(B: Array, attitudes: Array, R: Array) -> tuple[Array, Array]:
+    """The truth's motions (M, 4, 4), its positions told in the world of its attitudes, which ``R`` takes to theirs; and
+    the derivative (M, 6, 3) of the residuals by the right perturbation of R.
 
     Over a window, positions move by p in the world of attitudes; ``R Exp(d)`` turns that to ``p + [p]x d``, and at the
     window's end the residual is less by it.
     """
     start = attitudes @ np.swapaxes(B[:, :3, :3], 1, 2)
     p = np.einsum("kj,mkl,ml->mj", R, start, B[:, :3, 3], optimize=True)
-    out = np.zeros((len(B), 6, 3))
-    out[:, :3] = -np.swapaxes(attitudes, 1, 2) @ se3.skew(p)
-    return out
+    told, by_R = B.copy(), np.zeros((len(B), 6, 3))
+    told[:, :3, 3] = np.einsum("mji,mj->mi", start, p)
+    by_R[:, :3] = -np.swapaxes(attitudes, 1, 2) @ se3.skew(p)
+    return told, by_R
 
 
 def _normal_equations(r: Array, J: Array, scale: Array, X: Array, R_worlds: Array) -> tuple[Array, Array]:

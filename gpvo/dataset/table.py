@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import SourceError
 from gpvo.files import replacing
+from gpvo.geometry.covariance import from_upper, upper
 from gpvo.types import Array, StereoCamera
 
 SCHEMA = 1
@@ -55,23 +56,8 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
 
 def read_sets(path: str | Path) -> list[TrainingSet]:
     """All sequences of a file. Raises SourceError where it is not such a file."""
-    return list(stream_sets(path))
-
-
-def stream_sets(path: str | Path) -> Iterator[TrainingSet]:
-    """The sequences one by one, so that only one is in memory. Raises SourceError where it is not such a file."""
-    try:
-        file = pq.ParquetFile(path)
-        meta = json.loads((file.schema_arrow.metadata or {})[b"gpvo"])
-        about = meta["sequences"]
-        if meta["schema"] > SCHEMA or len(about) != file.num_row_groups:
-            raise SourceError("was written by a newer gpvo", where=path, cure="update gpvo")
-    except (OSError, KeyError, ValueError, pa.ArrowException) as problem:
-        if isinstance(problem, SourceError):
-            raise
-        raise SourceError(f"is not a training set: {problem}", where=path) from None
-    for i, entry in enumerate(about):
-        yield set_of_table(entry, file.read_row_group(i))
+    stored = StoredSets(path)
+    return [stored.whole(i) for i in range(len(stored.lengths))]
 
 
 def _table(i: int, s: TrainingSet) -> pa.Table:
@@ -80,16 +66,29 @@ def _table(i: int, s: TrainingSet) -> pa.Table:
     columns |= {f"y.{k}": s.Y[:, k] for k in range(s.Y.shape[1])}
     for kind, matrices in (("cov", s.covariances), ("vt", s.v_t)):
         for method, C in matrices.items():
-            d = C.shape[-1]
-            columns |= {f"{kind}.{method}.{a}.{b}": C[:, a, b] for a in range(d) for b in range(a, d)}
+            columns |= zip(_elements(kind, method, C.shape[-1]), upper(C).T, strict=True)
     return pa.table({k: pa.array(v) for k, v in columns.items()})
 
 
-def set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
+def _elements(kind: str, method: str, d: int) -> list[str]:
+    """Columns of the elements of symmetric matrices (d, d), in the order of :func:`gpvo.geometry.covariance.upper`."""
+    return [f"{kind}.{method}.{a}.{b}" for a, b in zip(*np.triu_indices(d), strict=True)]
+
+
+def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
     """Rows of one sequence; ``entry``: what the file's metadata says of it."""
 
     def column(name: str) -> Any:
         return table[name].to_numpy(zero_copy_only=False)
+
+    def matrices(kind: str, d: int) -> dict[str, Array]:
+        methods = dict.fromkeys(n.split(".")[1] for n in table.column_names if n.startswith(f"{kind}."))
+        elements = {method: _elements(kind, method, d) for method in methods}
+        return {
+            method: from_upper(np.column_stack([column(name) for name in names]), d)
+            for method, names in elements.items()
+            if table[names[0]].null_count < table.num_rows
+        }
 
     outputs = sum(name.startswith("y.") for name in table.column_names)
     return TrainingSet(
@@ -99,8 +98,8 @@ def set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         Y=np.stack([column(f"y.{k}") for k in range(outputs)], axis=1),
         t_ns=column("t_ns"),
         dt_s=column("dt_s"),
-        covariances=_matrices(table, "cov", 6),
-        v_t=_matrices(table, "vt", 3),
+        covariances=matrices("cov", 6),
+        v_t=matrices("vt", 3),
         counts=entry["counts"],
         camera=None if entry["camera"] is None else StereoCamera(**entry["camera"]),
         target=entry["target"],
@@ -108,20 +107,6 @@ def set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         odometry=entry.get("odometry", {}),
         lost_jump=np.array(entry.get("lost_jump", []), dtype=np.float64).reshape(-1, 6),
     )
-
-
-def _matrices(table: pa.Table, kind: str, d: int) -> dict[str, Any]:
-    methods = dict.fromkeys(n.split(".")[1] for n in table.column_names if n.startswith(f"{kind}."))
-    out = {}
-    for method in methods:
-        if table[f"{kind}.{method}.0.0"].null_count == table.num_rows:
-            continue
-        C = np.empty((table.num_rows, d, d))
-        for a in range(d):
-            for b in range(a, d):
-                C[:, a, b] = C[:, b, a] = table[f"{kind}.{method}.{a}.{b}"].to_numpy(zero_copy_only=False)
-        out[method] = C
-    return out
 
 
 CHUNK_ROWS = 8192
@@ -134,7 +119,7 @@ _BUFFER_BYTES = 1 << 20
 class StoredSets:
     """The sequences of a file that :func:`gpvo.dataset.table.write_sets` wrote; never more than a chunk in memory.
 
-    ``names``, ``lengths``: of the sequences. Raises SourceError where it is not such a file.
+    ``lengths``: of the sequences. Raises SourceError where it is not such a file.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -143,15 +128,13 @@ class StoredSets:
             with self._open() as file:
                 meta = json.loads((file.schema_arrow.metadata or {})[b"gpvo"])
                 self._about: list[dict[str, Any]] = meta["sequences"]
-                groups = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
-                if meta["schema"] > SCHEMA or len(self._about) != len(groups):
+                self.lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
+                if meta["schema"] > SCHEMA or len(self._about) != len(self.lengths):
                     raise SourceError("was written by a newer gpvo", where=path, cure="update gpvo")
         except (OSError, KeyError, ValueError, pa.ArrowException) as problem:
             if isinstance(problem, SourceError):
                 raise
             raise SourceError(f"is not a training set: {problem}", where=path) from None
-        self.names = [str(entry["name"]) for entry in self._about]
-        self.lengths = groups
 
     def __len__(self) -> int:
         return sum(self.lengths)
@@ -159,21 +142,30 @@ class StoredSets:
     def _open(self) -> pq.ParquetFile:
         return pq.ParquetFile(self.path, buffer_size=_BUFFER_BYTES, pre_buffer=False)
 
+    def whole(self, i: int) -> TrainingSet:
+        """Sequence i."""
+        with self._open() as file:
+            return _set_of_table(self._about[i], file.read_row_group(i))
+
     def chunks(self, i: int, chunk_rows: int = CHUNK_ROWS) -> Iterator[TrainingSet]:
         """Sequence i in order, piece by piece."""
         with self._open() as file:
             for batch in file.iter_batches(batch_size=chunk_rows, row_groups=[i], use_threads=False):
-                yield set_of_table(self._about[i], pa.Table.from_batches([batch]))
+                yield _set_of_table(self._about[i], pa.Table.from_batches([batch]))
 
     def thinned(self, max_rows: int, chunk_rows: int = CHUNK_ROWS) -> list[TrainingSet]:
         """At most ``max_rows`` rows (or one of each sequence), in blocks, evenly over each sequence, sequences alike.
 
         What is kept does not depend on ``chunk_rows``.
         """
-        return [
-            _join([c.rows(kept[start : start + len(c)]) for start, c in _numbered(self.chunks(i, chunk_rows))])
-            for i, kept in enumerate(kept_rows(self.lengths, max_rows))
-        ]
+        out = []
+        for i, kept in enumerate(kept_rows(self.lengths, max_rows)):
+            parts, start = [], 0
+            for chunk in self.chunks(i, chunk_rows):
+                parts.append(chunk.rows(kept[start : start + len(chunk)]))
+                start += len(chunk)
+            out.append(_join(parts))
+        return out
 
 
 def kept_rows(lengths: Sequence[int], max_rows: int) -> list[Any]:
@@ -195,27 +187,15 @@ def kept_rows(lengths: Sequence[int], max_rows: int) -> list[Any]:
     return out
 
 
-def _numbered(chunks: Iterator[TrainingSet]) -> Iterator[tuple[int, TrainingSet]]:
-    start = 0
-    for chunk in chunks:
-        yield start, chunk
-        start += len(chunk)
-
-
 def _join(parts: Sequence[TrainingSet]) -> TrainingSet:
     """Pieces of one sequence below one another."""
-    from dataclasses import replace
-
-    def stack(values: list[Array]) -> Array:
-        return np.concatenate(values)
-
     first = parts[0]
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(p, name) for p in parts]) for name in ("X", "Y", "t_ns", "dt_s")
+    }
     return replace(
         first,
-        X=stack([p.X for p in parts]),
-        Y=stack([p.Y for p in parts]),
-        t_ns=np.concatenate([p.t_ns for p in parts]),
-        dt_s=stack([p.dt_s for p in parts]),
-        covariances={m: stack([p.covariances[m] for p in parts]) for m in first.covariances},
-        v_t={m: stack([p.v_t[m] for p in parts]) for m in first.v_t},
+        **columns,
+        covariances={m: np.concatenate([p.covariances[m] for p in parts]) for m in first.covariances},
+        v_t={m: np.concatenate([p.v_t[m] for p in parts]) for m in first.v_t},
     )

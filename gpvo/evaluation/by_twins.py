@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.dataset.build import build_run
+from gpvo.dataset.build import build_run, leave_one_out
 from gpvo.dataset.errors import motion_errors
 from gpvo.errors import SourceError
-from gpvo.evaluation.document import document
+from gpvo.evaluation.document import run_document
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run
 from gpvo.evaluation.statements import Statement, plain_statement
 from gpvo.io.run import Run
@@ -20,6 +20,7 @@ from gpvo.learning.config import TrainConfig
 from gpvo.learning.methods import average
 from gpvo.learning.train import train_sets
 from gpvo.online.predictor import Predictor
+from gpvo.stats.series import moving_sums
 from gpvo.twin.gap import SPAN
 from gpvo.types import Array, VoLog
 
@@ -47,24 +48,21 @@ def ratios(run: Run, twins: Sequence[Run]) -> Array:
 def by_twins(
     run: Run, twins: Sequence[Run], predictor: Predictor | None, options: EvaluateOptions
 ) -> tuple[dict[str, Any], list[Evaluation]]:
-    """Document (:func:`gpvo.evaluation.document.document`) and evaluation of a run with truth, with the covariance that
-    its twins show as the method ``twin``. Of a run without: the mean over its twins, without a verdict, and the
+    """Document (:func:`gpvo.evaluation.document.run_document`) and evaluation of a run with truth, with the covariance
+    that its twins show as the method ``twin``. Of a run without: the mean over its twins, without a verdict, and the
     evaluation of each; the method ``twin`` of each is that of the others."""
+
+    def statement(run: Run, twins: Sequence[Run]) -> Statement:
+        return plain_statement(run.log, METHOD, twin_covariance(run.log, twins))
+
     if run.truth is not None:
-        own = evaluate_run(run, predictor, options, [_statement(run.log, twins)])
-        return document([own])["runs"][0], [own]
-    found = []
-    for k, twin in enumerate(twins):
-        others = [t for j, t in enumerate(twins) if j != k]
-        found.append(evaluate_run(twin, predictor, options, [_statement(twin.log, others)]))
-    mean = average([document([e])["runs"][0] for e in found])
+        own = evaluate_run(run, predictor, options, [statement(run, twins)])
+        return run_document(own), [own]
+    found = [evaluate_run(t, predictor, options, [statement(t, others)]) for t, others in leave_one_out(twins)]
+    mean = average([run_document(e) for e in found])
     # A verdict is in words, which have no mean: the numbers speak.
     about = {"run": run.name, "source": run.meta.get("source"), "verdict": None}
     return {**mean, **about, "simulated_truth": {"twins": len(twins), **twins[0].meta["twin"]}}, found
-
-
-def _statement(log: VoLog, twins: Sequence[Run]) -> Statement:
-    return plain_statement(log, METHOD, twin_covariance(log, twins))
 
 
 def twin_covariance(log: VoLog, twins: Sequence[Run]) -> Array:
@@ -111,7 +109,5 @@ def _errors(log: VoLog, twin: Run) -> Array:
 
 def _over_window(values: Array) -> Array:
     """Sums over each entry (N, ...) and its neighbours."""
-    n = len(values)
-    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    k = np.arange(n)
-    return total[np.minimum(k + _HALF_WINDOW + 1, n)] - total[np.maximum(k - _HALF_WINDOW, 0)]
+    padding = [(_HALF_WINDOW, _HALF_WINDOW), *[(0, 0)] * (values.ndim - 1)]
+    return moving_sums(np.pad(values, padding), 2 * _HALF_WINDOW + 1)

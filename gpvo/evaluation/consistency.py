@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,25 +187,22 @@ def _ancestors(frame: int, root: int, parent: NDArray[np.int64]) -> list[int]:
 
 def horizon(
     statement: Statement, log: VoLog, T_true: Array, known: NDArray[np.bool_], progress: Array, span: float,
-    noise_sigma: Array, by_velocity: Array | None = None, axes: ArrayLike = BLOCKS["joint"],
+    noise_sigma: Array, by_velocity: Array | None, axes: ArrayLike,
 ) -> Horizon:  # fmt: skip
     """NEES over windows of ``span`` of a growing ``progress`` (N,), at most sixty, without lost frames.
 
     Each begins where the one before has at least half passed. ``axes``: those that count.
     """
     assert statement.errors is not None
-    windows = list(_windows(log, known, progress, span))
-    if not windows:
-        nan = float("nan")
-        return Horizon(span, nan, nan, (nan,) * 6, (0.0,) * 3, 0)
-    starts, ends = np.array([[start, chain[-1]] for start, chain in windows]).T
+    chains = list(_windows(log, known, progress, span))
+    if not chains:
+        return Horizon(span, np.nan, np.nan, (np.nan,) * 6, (0.0,) * 3, 0)
+    starts, ends = log.parent[[chain[0] for chain in chains]], np.array([chain[-1] for chain in chains])
     T = se3.inverse(T_true[starts]) @ T_true[ends]
     # The mean is taken off each motion, as a filter would.
-    motion, T_est = log.T_prev_cur @ se3.exp(-statement.mean), np.tile(np.eye(4), (len(T), 1, 1))
-    for i, (_, chain) in enumerate(windows):
-        for k in chain:
-            T_est[i] = T_est[i] @ motion[k]
-    C = over_windows(log.T_prev_cur, statement.errors, [chain for _, chain in windows])
+    motion = log.T_prev_cur @ se3.exp(-statement.mean)
+    T_est = np.array([reduce(np.matmul, motion[chain], np.eye(4)) for chain in chains])
+    C = over_windows(log.T_prev_cur, statement.errors, chains)
     e, noise, drift = se3.log(se3.inverse(T) @ T_est), truth_noise(T, noise_sigma), np.zeros(3)
     if by_velocity is not None:
         moved = T_true[ends, :3, 3] - T_true[starts, :3, 3] - (by_velocity[ends] - by_velocity[starts])
@@ -213,41 +211,40 @@ def horizon(
         noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
     z2 = (e**2 / np.diagonal(C + noise, axis1=1, axis2=2)).mean(axis=0)
     plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + noise))
-    return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(windows))
+    return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(chains))
 
 
-def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float) -> Iterator[tuple[int, Sequence[int]]]:
-    """First frame and motions of each window."""
+def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float) -> Iterator[list[int]]:
+    """The motions of each window."""
     stride, t_next = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS), float(progress[0])
     parent, usable = log.parent, log.usable
+    leads_on = np.append(parent[1:] == np.arange(len(parent) - 1), False)  # whether the next motion starts there
     # Nothing is long enough behind the last of these; without the cut a short run costs the square of its frames.
     for start in np.flatnonzero(progress[-1] - progress >= span * _HAIR).tolist():
         if progress[start] < t_next or not known[start]:
             continue
-        chain = _window(start, parent, usable, progress, span)
+        chain = _window(start, parent, usable, leads_on, progress, span)
         if chain and known[chain[-1]]:
             t_next = float(progress[start]) + stride
-            yield start, chain
+            yield chain
 
 
 def _window(
-    start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], progress: Array, span: float
-) -> Sequence[int]:
+    start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], leads_on: NDArray[np.bool_], progress: Array,
+    span: float,
+) -> list[int]:  # fmt: skip
     """The chain of motions from frame ``start`` over at least ``span``; empty where it is broken or too short."""
-    chain, here = [], start
+    chain: list[int] = []
+    here = start
     for k in range(start + 1, len(parent)):
-        if parent[k] == here and usable[k]:
-            done = progress[k] - progress[start] >= span * _HAIR
-            if done or _leads_on(k, parent):
-                chain.append(k)
-                here = k
-            if done:
-                return chain
-        elif parent[k] == here and _leads_on(k, parent):
-            return []
+        if parent[k] != here:
+            continue
+        done = usable[k] and progress[k] - progress[start] >= span * _HAIR
+        if done or leads_on[k]:
+            if not usable[k]:
+                return []
+            chain.append(k)
+            here = k
+        if done:
+            return chain
     return []
-
-
-def _leads_on(k: int, parent: NDArray[np.int64]) -> bool:
-    """Whether the next motion starts from frame k."""
-    return k + 1 < len(parent) and bool(parent[k + 1] == k)

@@ -71,7 +71,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     ``constant`` is for a motion of one frame: a motion that bridges lost frames has its covariance as many times over.
     ``gp_thesis`` needs a model file that holds it, as do all those written by this version.
     """
-    runs = [_run_document(e) for e in evaluations]
+    runs = [run_document(e) for e in evaluations]
     return {"schema": 1, "runs": runs, "pooled": pooled(runs)}
 
 
@@ -90,7 +90,8 @@ def pooled(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return out
 
 
-def _run_document(e: Evaluation) -> dict[str, Any]:
+def run_document(e: Evaluation) -> dict[str, Any]:
+    """One of the ``runs`` of :func:`document`."""
     t = e.trajectory
     counts = {s.value: sum(r.status is s for r in e.run.log) for s in Status}
     return {
@@ -181,7 +182,7 @@ def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
         sigma = np.sqrt(np.diagonal(s.covariance[rows], axis1=1, axis2=2))
         columns |= {f"{s.method}_sigma_{a}": sigma[:, i] for i, a in enumerate(AXES[: s.dof])}
     write_csv(paths[2], columns)
-    scores = _scores(document([e])["runs"][0]["methods"])
+    scores = _scores(run_document(e)["methods"])
     write_csv(paths[3], scores)
     write_text(paths[4], latex(scores))
     return paths

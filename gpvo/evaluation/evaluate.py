@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.build import align_rotation, predictions_of
+from gpvo.accumulation import along
+from gpvo.dataset.build import aligned_truth, predictions_of
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
@@ -22,7 +24,7 @@ from gpvo.dataset.errors import (
     velocity_path,
 )
 from gpvo.dataset.hand_eye import FixedRotation, InversePoses, fixed_rotation, inverse_poses, late_by
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import (
@@ -93,6 +95,18 @@ class Evaluation:
         """Its name for a caption."""
         return "no method" if self.shown is None else self.shown.method
 
+    @cached_property
+    def shown_bounds(self) -> Array | None:
+        """(N, 6, 6) covariance of every pose by that statement; None without one."""
+        if self.shown is None or self.shown.errors is None:
+            return None
+        return along(self.run.log.T_prev_cur, self.shown.errors, self.run.log.parent)[1]
+
+    @property
+    def T_world_first(self) -> Array:
+        """(4, 4) of the first frame with truth; where there is none, of the first frame."""
+        return self.T_true[self.covered][0] if self.covered.any() else self.T_est[0]
+
     @property
     def t_s(self) -> Array:
         """(N,) seconds since the first frame."""
@@ -127,8 +141,8 @@ def evaluate_run(
     stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
     sigma = stated
     if options.truth_sigma is None:
-        sigma = np.maximum(stated, estimate_truth_noise(errors, scored))
-        sigma = np.maximum(sigma, interpolation_sigma(truth, log.t_ns))
+        shown = estimate_truth_noise(errors, scored), interpolation_sigma(truth, log.t_ns)
+        sigma = np.maximum.reduce([stated, *shown])
     late_s = late_by(scored, truth) if options.time_offset_s == 0.0 else None
     on_its_clock = on_clock_of_log(truth, late_s) if late_s else truth
     turned, inverse = _misread(scored, on_its_clock) if options.align == "none" else (None, None)
@@ -174,16 +188,17 @@ def _misread(log: VoLog, truth: TruthLog) -> tuple[FixedRotation | None, Inverse
 def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:
     if known >= 3:
         return
-    t, where = run.log.t_ns, run.path
+    t = run.log.t_ns
     inside = int(((t >= truth.t_ns[0]) & (t <= truth.t_ns[-1])).sum()) if len(truth.t_ns) else 0
     if inside < min(3, len(t)):
+        what = "ground truth and frames do not overlap in time"
         cure = "use --time-offset auto, or give the truth of this run"
-        raise SourceError("ground truth and frames do not overlap in time", where=where, cure=cure)
-    if inside < 3:
-        cure = "give a longer sequence"
-        raise SourceError(f"has {len(t)} frames; three with truth are needed", where=where, cure=cure)
-    cure = f"give a truth with evenly spaced poses, at most {MAX_GAP_S:g} s apart"
-    raise SourceError(f"only {known} of {len(t)} frames lie near poses of the ground truth", where=where, cure=cure)
+    elif inside < 3:
+        what, cure = f"has {len(t)} frames; three with truth are needed", "give a longer sequence"
+    else:
+        what = f"only {known} of {len(t)} frames lie near poses of the ground truth"
+        cure = f"give a truth with evenly spaced poses, at most {MAX_GAP_S:g} s apart"
+    raise SourceError(what, where=run.path, cure=cure)
 
 
 def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
@@ -234,11 +249,7 @@ def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:
         offset_s = estimate_time_offset(run.log, truth)
     if offset_s:
         truth = on_clock_of_log(truth, offset_s)
-    if options.align == "rotation":
-        truth = align_rotation(run.log, truth)
-    elif options.align != "none":
-        raise GpvoError(f"unknown alignment '{options.align}'", cure="none or rotation")
-    return truth, float(offset_s)
+    return aligned_truth(run.log, truth, options.align), float(offset_s)
 
 
 def distinct(names: Sequence[str]) -> list[str]:

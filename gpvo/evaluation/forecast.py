@@ -152,32 +152,24 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
     rng = np.random.default_rng(seed)
     flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]
-    sums = [_sum_up(flight, plan) for flight in flown]
-    C, m = np.array([c for c, _, _ in sums]), np.array([m for _, m, _ in sums])
+    C, m, independent_m2 = (np.array(of_draws) for of_draws in zip(*(_sum_up(*f, plan) for f in flown), strict=True))
     spread = m - m.mean(axis=0)
     return Forecast(
         plan=plan,
         covariance=symmetrise(C.mean(axis=0) + np.einsum("dni,dnj->nij", spread, spread) / draws),
         mean=m.mean(axis=0),
-        independent_m=float(np.sqrt(np.mean([v for _, _, v in sums]))),
-        in_domain=np.mean(np.array([f.said.in_domain for f in flown]), axis=0),
+        independent_m=float(np.sqrt(independent_m2.mean())),
+        in_domain=np.mean(np.array([said.in_domain for _, said in flown]), axis=0),
         outside=_outside(predictor, plan),
         draws=draws,
     )
 
 
-@dataclass(frozen=True)
-class _Flight:
-    """One draw: the pose each motion starts from (N,), -1 for the first pose, and what the model says of the motions
-    that end at poses 1 to N - 1."""
-
-    parent: NDArray[np.int64]
-    said: Prediction
-    dt_s: Array
-
-
-def _fly(predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.random.Generator) -> _Flight:
-    """What the model says of every motion of the plan in the conditions of training rows that moved alike.
+def _fly(
+    predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Prediction]:
+    """One draw: the pose that each motion starts from (N,), -1 for the first pose, and what the model says of the
+    motions that end at poses 1 to N - 1, in the conditions of training rows that moved alike.
 
     A row is taken as it is, with the velocities as odometry measured them, noise and all: the model knows no others.
     Only where the plan leaves the range of the training does the plan's own value stand in its place. Where odometry
@@ -192,7 +184,7 @@ def _fly(predictor: Predictor, plan: Plan, sample: TrainingSample, rng: np.rando
     low, high = (edge[at] for edge in domain.reach)
     X[:, at] = np.where((planned < low) | (planned > high), planned, X[:, at])
     dt_s = plan.t_s[1:] - plan.t_s[parent[1:]]
-    return _Flight(parent, predictor.predict(X, None if sample.geometry is None else sample.geometry[rows], dt_s), dt_s)
+    return parent, predictor.predict(X, None if sample.geometry is None else sample.geometry[rows], dt_s)
 
 
 def _references(like: NDArray[np.int64], frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -230,12 +222,11 @@ def _features(names: list[str], plan: Plan) -> Array:
     return np.array([stream.step(r) for r in records]).reshape(-1, len(names))
 
 
-def _sum_up(flight: _Flight, plan: Plan) -> tuple[Array, Array, float]:
+def _sum_up(parent: NDArray[np.int64], said: Prediction, plan: Plan) -> tuple[Array, Array, float]:
     """Covariance (N, 6, 6) and mean (N, 6) of every pose's error, and the last position's variance if independent."""
-    parent, T_world = flight.parent, plan.T_world_cam
-    T = se3.inverse(T_world[parent]) @ T_world
+    T = se3.inverse(plan.T_world_cam[parent]) @ plan.T_world_cam
     nothing = MotionError.independent(np.zeros((6, 6)))
-    errors = [nothing, *(flight.said.row(k) for k in range(len(parent) - 1))]
+    errors = [nothing, *(said.row(k) for k in range(len(parent) - 1))]
     mean, covariance = along(T, errors, parent)
     _, plain = along(T, [MotionError.independent(error.covariance) for error in errors], parent)
     return covariance, mean, float(np.trace(plain[-1, :3, :3]))

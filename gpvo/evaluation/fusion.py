@@ -70,7 +70,7 @@ def fuse_runs(
     settings: FusionSettings,
     *,
     tell: Callable[[str], None] | None = None,
-    on_run: Callable[[FusedRun], None] | None = None,
+    on_run: Callable[[FusedRun], None] = lambda _: None,
 ) -> FusionReport:
     """Fuse run folders under every policy that has what it needs; ``on_run`` sees each filtered run whole.
 
@@ -100,15 +100,11 @@ def fuse_runs(
 
     def keep(flight: Flight, fused: FusedRun) -> None:
         traces.append(trace_of(flight, fused))
-        if on_run:
-            on_run(fused)
+        on_run(fused)
 
     result = study(flights, policies, options, constants=constants, progress=tell, on_run=keep)
-    failed = [
-        f"{name} is left out: {_why_not(name, constants, predictor)}"
-        for name, row in result.scores.items()
-        if not any(row)
-    ]
+    unable = [name for name, row in result.scores.items() if not any(row)]
+    failed = [f"{name} is left out: {_why_not(name, constants, predictor)}" for name in unable]
     if len(failed) == len(result.scores):
         raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
     diverging = _diverging(result) if any(f.imu is not None for f in flights) else []
@@ -218,16 +214,14 @@ def write_log(path: Path, fused: FusedRun) -> None:
 def document(report: FusionReport) -> dict[str, Any]:
     """The machine-readable result of ``gpvo fuse``; a policy that could not run is null."""
     result = report.study
-    names = list(result.scores)
-    runs = [
-        {"run": run, "policies": {name: _score(result.scores[name][i]) for name in names}}
-        for i, run in enumerate(result.runs)
-    ]
-    others = [n for n in names if n != LEARNED] if LEARNED in names else []
+    others = [n for n in result.scores if n != LEARNED] if LEARNED in result.scores else []
     return {
         "schema": 1,
-        "runs": runs,
-        "mean": {name: _mean(result, name, report.traces) for name in names},
+        "runs": [
+            {"run": run, "policies": {name: _score(of_runs[i]) for name, of_runs in result.scores.items()}}
+            for i, run in enumerate(result.runs)
+        ],
+        "mean": {name: _mean(result, name, report.traces) for name in result.scores},
         "comparisons": [_comparison(result, LEARNED, other) for other in others],
         "constants": None if result.constants is None else asdict(result.constants),
         "warnings": list(report.warnings),
@@ -290,7 +284,8 @@ def nis_in_band_percent(traces: Sequence[Trace]) -> float:
     return 100.0 * float(np.mean(inside)) if inside else float("nan")
 
 
-def nis_band(runs: int, level: float = 0.95, dof: int = 6) -> tuple[float, float]:
-    """Where the mean NIS per degree of freedom over so many runs should lie at each time step."""
-    total = dof * runs
-    return chi2_quantile((1 - level) / 2, total) / total, chi2_quantile((1 + level) / 2, total) / total
+def nis_band(runs: int) -> tuple[float, float]:
+    """Where the mean NIS per degree of freedom over so many runs should lie at each time step in 95 % of all cases."""
+    dof = 6 * runs
+    low, high = (chi2_quantile((1 + sign * 0.95) / 2, dof) / dof for sign in (-1, 1))
+    return low, high

@@ -8,7 +8,7 @@ path. NaN is None, a gap.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from itertools import groupby, pairwise
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.statements import Statement
+from gpvo.geometry.covariance import half_axes
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.stats import consistency
 from gpvo.stats.series import allan_deviation, autocorrelation
@@ -46,14 +47,9 @@ _NEES_WINDOW_S = 0.5
 _SHADES = {Status.DEGRADED: "#ffbf00", Status.LOST: _RED}
 
 
-def level(e: Evaluation) -> tuple[Array, tuple[str, str, str]]:
-    """Axes to draw in, so that the third points up."""
-    return level_of(e.T_true[e.covered][0] if e.covered.any() else e.T_est[0])
-
-
-def level_of(T_world_cam: Array) -> tuple[Array, tuple[str, str, str]]:
-    """By the first pose. A camera's world (y down, as KITTI's) is turned."""
-    down = T_world_cam[:3, :3] @ np.array([0.0, 1.0, 0.0])
+def level(T_world_first: Array) -> tuple[Array, tuple[str, str, str]]:
+    """Axes to draw in, the third upwards, and their names. A camera's world (y down, as KITTI's) is turned."""
+    down = T_world_first[:3, :3] @ np.array([0.0, 1.0, 0.0])
     if abs(down[2]) < 0.7 and abs(down[1]) > 0.7:
         return R_FLU_OPTICAL, ("forward z", "left -x", "up -y")
     return np.eye(3), ("x", "y", "z")
@@ -61,13 +57,12 @@ def level_of(T_world_cam: Array) -> tuple[Array, tuple[str, str, str]]:
 
 def views(e: Evaluation) -> list[Panel]:
     """Top and side view of truth and estimate, with 3-sigma ellipses."""
-    to_plane, names = level(e)
-    origin = (e.T_true[e.covered] if e.covered.any() else e.T_est)[0, :3, 3]
+    to_plane, names = level(e.T_world_first)
+    origin = e.T_world_first[:3, 3]
     p, q = (e.T_est[:, :3, 3] - origin) @ to_plane.T, (e.T_true[e.covered][:, :3, 3] - origin) @ to_plane.T
-    stated = None if e.shown is None else e.shown.pose_covariance(e.run.log)
-    bounds = np.zeros((0, 6, 6)) if stated is None else stated
+    bounds = np.zeros((0, 6, 6)) if e.shown_bounds is None else e.shown_bounds
     keep, panels = spread(len(p)), []
-    told = {name: _rounded(values[keep]) for name, values in _along(e, stated).items()}
+    told = {name: _rounded(values[keep]) for name, values in _along(e).items()}
     for i, j in ((0, 1), (0, 2)):
         lines = []
         for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
@@ -84,33 +79,30 @@ def views(e: Evaluation) -> list[Panel]:
     return panels
 
 
-def _along(e: Evaluation, stated: Array | None) -> dict[str, Array]:
+def _along(e: Evaluation) -> dict[str, Array]:
     """What the pointer shows of each pose of the path, with units: (N,) each."""
     out = {"time [s]": e.t_s}
     if e.covered.any():
         off = np.linalg.norm(e.T_est[:, :3, 3] - e.T_true[:, :3, 3], axis=1)
         out["off by [m]"] = np.where(e.covered, off, np.nan)
-    if stated is not None:
-        out["stated sigma [m]"] = np.sqrt(np.trace(stated[:, :3, :3], axis1=1, axis2=2))
+    if e.shown_bounds is not None:
+        out["stated sigma [m]"] = np.sqrt(np.trace(e.shown_bounds[:, :3, :3], axis1=1, axis2=2))
     return out
 
 
 def errors(e: Evaluation) -> list[Panel]:
     """The error of each motion and what is stated of it, axis by axis."""
-    statement, t, panels = e.shown, e.t_s[e.errors.index], []
-    if not len(t):
+    statement, index, panels = e.shown, e.errors.index, []
+    if not len(index):
         return []
+    t, keep = e.t_s[index], spread(len(index))
     for k, axis in enumerate(AXES):
-        error = 1e3 * e.errors.xi[:, k]
-        bands = []
-        if statement is not None:
-            mean = 1e3 * statement.mean[e.errors.index, k]
-            reach = 3e3 * np.sqrt(statement.covariance[e.errors.index, k, k])
-            keep = spread(len(t))
-            low, high = (mean - reach)[keep], (mean + reach)[keep]
-            bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
+        error, bands = 1e3 * e.errors.xi[:, k], []
         reach = max(1.3 * float(np.quantile(np.abs(error), 0.995)), 1e-6)
-        if bands:
+        if statement is not None:
+            mean, bound = 1e3 * statement.mean[index, k], 3e3 * np.sqrt(statement.covariance[index, k, k])
+            low, high = (mean - bound)[keep], (mean + bound)[keep]
+            bands = [{"x": _rounded(t[keep]), "low": _rounded(low), "high": _rounded(high), "colour": _GREEN}]
             # Nine tenths of the bound are always in the plot; its peaks unless the error would be a flat line.
             edge = np.abs(np.concatenate([low, high]))
             edge = edge[np.isfinite(edge)]
@@ -124,22 +116,22 @@ def errors(e: Evaluation) -> list[Panel]:
 
 def stated(e: Evaluation) -> list[Panel]:
     """What each method states of every motion, translation and rotation."""
-    t = e.t_s
-    lines: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
-    for s in (s for s in e.statements if s.errors is not None):
-        variance, keep = np.diagonal(s.covariance, axis1=1, axis2=2), spread(len(t))
-        for of_kind, block in zip(lines, (slice(0, 3), slice(3, 6))):
-            sigma = np.sqrt(variance[:, block].mean(axis=1))
-            of_kind.append(_of_method(e, s, t[keep], 1e3 * sigma[keep]))
-    names = ("translation [mm]", "rotation [mrad]")
-    return [_panel("", "time [s]", name, drawn, log="y") for name, drawn in zip(names, lines) if drawn]
+    keep, panels = spread(len(e.t_s)), []
+    for name, block in (("translation [mm]", slice(0, 3)), ("rotation [mrad]", slice(3, 6))):
+        lines = []
+        for s in (s for s in e.statements if s.errors is not None):
+            sigma = np.sqrt(np.diagonal(s.covariance, axis1=1, axis2=2)[:, block].mean(axis=1))
+            lines.append(_of_method(e, s, e.t_s[keep], 1e3 * sigma[keep]))
+        if lines:
+            panels.append(_panel("", "time [s]", name, lines, log="y"))
+    return panels
 
 
 def reliability(e: Evaluation) -> list[Panel]:
     """Share of errors inside the stated central interval, all axes together, against its probability."""
-    lines = []
     if not len(e.errors.index):
         return []
+    lines = []
     for s, error, C, _ in _stated_errors(e):
         z = np.abs(error) / np.sqrt(np.diagonal(C, axis1=1, axis2=2))
         lines.append(_of_method(e, s, _LEVELS, np.array([(z <= width).mean() for width in _HALF_WIDTHS])))
@@ -149,9 +141,9 @@ def reliability(e: Evaluation) -> list[Panel]:
 
 def nees(e: Evaluation) -> list[Panel]:
     """Joint NEES per degree of freedom over time, averaged over half a second around each motion."""
-    lines = []
     if not len(e.errors.index):
         return []
+    lines = []
     for s, error, C, t in _stated_errors(e):
         values = consistency.nees(error, C) / error.shape[1]
         ones = np.ones(min(len(values), max(1, round(_NEES_WINDOW_S / max(float(np.median(e.errors.dt_s)), 1e-3)))))
@@ -164,13 +156,12 @@ def nees(e: Evaluation) -> list[Panel]:
 def _stated_errors(e: Evaluation) -> Iterator[tuple[Statement, Array, Array, Array]]:
     """Of each method that speaks of all axes of at least two motions with truth: itself, the errors about its mean on
     the d axes that count (K, d), the covariances (K, d, d) and the times [s] of these motions."""
-    index = e.errors.index
     for s in e.statements:
-        known = np.isfinite(s.covariance[index]).all(axis=(1, 2))
+        known = np.isfinite(s.covariance[e.errors.index]).all(axis=(1, 2))
         if s.errors is not None and known.sum() >= 2:
-            axes = np.array(e.consistency[s.method].axes)
-            error = (e.errors.xi - s.mean[index])[known][:, axes]
-            yield s, error, consistency.marginal(s.covariance[index][known], axes), e.t_s[e.errors.index][known]
+            axes, index = np.array(e.consistency[s.method].axes), e.errors.index[known]
+            error = (e.errors.xi[known] - s.mean[index])[:, axes]
+            yield s, error, consistency.marginal(s.covariance[index], axes), e.t_s[index]
 
 
 def memory(e: Evaluation) -> list[Panel]:
@@ -209,17 +200,12 @@ def inputs(e: Evaluation) -> list[Panel]:
 
 def _shades(e: Evaluation) -> list[dict[str, Any]]:
     """Stretches of time that were degraded or lost; each frame reaches back to the one before."""
-    t = e.t_s
-    out: list[dict[str, Any]] = []
-    for k, record in enumerate(e.run.log):
-        tint = _SHADES.get(record.status)
-        if tint is None or k == 0:
-            continue
-        if out and out[-1]["colour"] == tint and out[-1]["k"] == k - 1:
-            out[-1].update(to=round(float(t[k]), 3), k=k)
-        else:
-            out.append({"from": round(float(t[k - 1]), 3), "to": round(float(t[k]), 3), "colour": tint, "k": k})
-    return [{key: shade[key] for key in ("from", "to", "colour")} for shade in out]
+    t_s, out = [round(float(t), 3) for t in e.t_s], []
+    for tint, group in groupby(range(1, len(t_s)), lambda k: _SHADES.get(e.run.log.records[k].status)):
+        frames = list(group)
+        if tint is not None:
+            out.append({"from": t_s[frames[0] - 1], "to": t_s[frames[-1]], "colour": tint})
+    return out
 
 
 def _panel(title: str, x: str, y: str, lines: list[dict[str, Any]], **more: Any) -> Panel:
@@ -237,10 +223,8 @@ def _of_method(e: Evaluation, s: Statement, x: Array, y: Array) -> dict[str, Any
 
 def _ring(C: Array) -> Array:
     """(49, 2) points of the 3-sigma ellipse of a (2, 2) covariance."""
-    values, vectors = np.linalg.eigh(C)
     angle = np.linspace(0, 2 * np.pi, 49)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return 3 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) @ half_axes(C)
 
 
 def spread(n: int, most: int = MAX_POINTS) -> NDArray[np.int64]:

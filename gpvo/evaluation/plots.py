@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -79,10 +80,8 @@ def save_all(e: Evaluation, folder: Path, name: str | None = None) -> list[Path]
     out = []
     for figure, draw in FIGURES.items():
         drawn, path = draw(e), folder / f"{name or e.run.name}_{figure}.png"
-        with replacing(path) as temporary:
-            drawn.savefig(temporary, dpi=110, format="png")
-        with replacing(path.with_suffix(".pdf")) as temporary:
-            drawn.savefig(temporary, format="pdf", metadata={"CreationDate": None})
+        save(drawn, path, dpi=110)
+        save(drawn, path.with_suffix(".pdf"), metadata={"CreationDate": None})
         out.append(path)
     return out
 
@@ -91,7 +90,7 @@ def forecast(f: Forecast, title: str) -> Figure:
     """Of a planned path: top view with 3-sigma ellipses and sigma over the distance, one above the other."""
     figure = Figure(figsize=(8, 8), layout="constrained")
     top, below = figure.subplots(2, 1, height_ratios=(2, 1))
-    to_plane, names = panels.level_of(f.plan.T_world_cam[0])
+    to_plane, names = panels.level(f.plan.T_world_cam[0])
     p = f.plan.T_world_cam[:, :3, 3] @ to_plane.T
     C = to_plane @ f.position_covariance @ to_plane.T
     top.plot(p[:, 0], p[:, 1], color="black", lw=1.2, label="plan")
@@ -136,13 +135,13 @@ def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
     target = Path(path)
     require_picture(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    save(figure_of(traces), target)
+    save(figure_of(traces), target, dpi=120, bbox_inches="tight")
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write to an image file, whole or not at all."""
+def save(figure: Figure, path: Path, **options: Any) -> None:
+    """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120, bbox_inches="tight", format=path.suffix[1:].lower())
+        figure.savefig(temporary, format=path.suffix[1:].lower(), **options)
 
 
 def figure_of(traces: Sequence[Trace]) -> Figure:

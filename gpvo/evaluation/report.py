@@ -16,6 +16,7 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.panels import spread
 from gpvo.evaluation.verdict import HONEST
 from gpvo.files import write_text
+from gpvo.geometry.covariance import half_axes
 from gpvo.types import Array
 
 if TYPE_CHECKING:
@@ -72,18 +73,17 @@ def _groups(e: Evaluation) -> list[dict[str, Any]]:
 
 def scene(e: Evaluation) -> dict[str, Any]:
     """Estimate, truth and 3-sigma ellipsoids for the turnable view, z up, centred, lengths in m."""
-    to_plane, _ = panels.level(e)
+    to_plane, _ = panels.level(e.T_world_first)
     keep, covered = spread(len(e.T_est), _MAX_POINTS), np.flatnonzero(e.covered)
     shown = covered[spread(len(covered), _MAX_POINTS)]
     est, true = e.T_est[keep, :3, 3] @ to_plane.T, e.T_true[shown, :3, 3] @ to_plane.T
     path = true if len(true) else est
     centre = (path.max(0) + path.min(0)) / 2
-    statement = e.shown
     ellipsoids: list[dict[str, Any]] = []
-    if statement is not None and (bounds := statement.pose_covariance(e.run.log)) is not None:
+    if (bounds := e.shown_bounds) is not None:
         for k in np.unique(np.linspace(0, len(e.T_est) - 1, 10).astype(int))[1:]:
             R = to_plane @ e.T_est[k, :3, :3]
-            axes = _axes(R @ bounds[k, :3, :3] @ R.T)
+            axes = half_axes(R @ bounds[k, :3, :3] @ R.T)
             ellipsoids.append({"at": _rounded(to_plane @ e.T_est[k, :3, 3] - centre), "axes": _rounded(axes)})
     # Whole ellipsoids lie inside the view, unless they are far larger than the path.
     reach = [np.abs(o["at"]).max() + np.linalg.norm(o["axes"], axis=1).max() for o in ellipsoids]
@@ -109,12 +109,6 @@ def _made(evaluations: Sequence[Evaluation]) -> str:
     """When the runs were made, so that the same runs give the same page."""
     days = sorted({str(e.run.meta.get("finished") or e.run.meta.get("created") or "")[:10] for e in evaluations} - {""})
     return f"runs of {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "undated runs"
-
-
-def _axes(C: Array) -> Array:
-    """(3, 3) rows: the half axes of the 3-sigma ellipsoid."""
-    values, vectors = np.linalg.eigh(C)
-    return 3 * (vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
 def _rounded(values: Array) -> Any:

@@ -79,18 +79,17 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
     options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))
     run = Run(stated, stated.stem, log, TruthLog(poses.t_ns, poses.T_world_body), None, Mounting(), [])
     evaluation = evaluate_run(run, options=options)
-    c = evaluation.consistency.get(IMPORTED)
+    c, usable = evaluation.consistency.get(IMPORTED), int(log.usable.sum())
     if c is None or c.nll_per_dim is None or c.one_second is None:
-        what = f"{int(log.usable.sum())} of {len(log) - 1} motions"
-        raise SourceError(f"states {what}, of which fewer than two have truth", where=stated, cure="see --truth")
-    usable, lost = int(log.usable.sum()), sum(r.status is Status.LOST for r in log)
+        what = f"states {usable} of {len(log) - 1} motions, of which fewer than two have truth"
+        raise SourceError(what, where=stated, cure="see --truth")
     charged_m, charged_rad = _charged(log, evaluation)
     joint = c.nees_dof["joint"]
     over = {"1s": c.one_second, **{f"{h.span:g}m": h for h in c.horizons}}
     return SequenceScore(
         sequence=stated.stem,
         motions=usable,
-        lost=lost,
+        lost=sum(r.status is Status.LOST for r in log),
         axes=tuple(AXES[k] for k in c.axes),
         energy_translation_m=_mean_with(c.energy_translation_m or 0.0, c.count, charged_m),
         energy_rotation_rad=_mean_with(c.energy_rotation_rad or 0.0, c.count, charged_rad),
@@ -133,9 +132,8 @@ def score_folder(folder: Path, options: EvaluateOptions | None = None) -> dict[s
     """
     truths = sorted((folder / "truth").glob("*.txt"))
     if not truths:
-        raise SourceError(
-            "holds no truth/SEQUENCE.txt", where=folder, cure="gpvo evaluate RUN --stated makes such folders"
-        )
+        cure = "gpvo evaluate RUN --stated makes such folders"
+        raise SourceError("holds no truth/SEQUENCE.txt", where=folder, cure=cure)
     found = {}
     for method in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "truth"):
         pairs = [(_of_sequence(method, truth), truth) for truth in truths]
@@ -149,9 +147,8 @@ def _of_sequence(method: Path, truth: Path) -> Path:
     for path in (method / truth.name, method / f"{truth.stem}.csv"):
         if path.is_file():
             return path
-    raise SourceError(
-        f"states nothing for the sequence {truth.stem}", where=method, cure="each method must state all sequences"
-    )
+    cure = "each method must state all sequences"
+    raise SourceError(f"states nothing for the sequence {truth.stem}", where=method, cure=cure)
 
 
 def write_board(found: Mapping[str, Mapping[str, Any]], folder: Path) -> None:
@@ -176,9 +173,8 @@ def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
         for span in ("1s", "10m", "100m"):
             known = [v for s in sequences if (v := s["nees_dof_over"][span]) is not None]
             row[f"NEES {span}"] = float(np.mean(known)) if known else None
-        row["easy"], row["hard"] = (
-            float(np.mean([s["coverage_by_difficulty"][k] for s in sequences])) for k in (0, -1)
-        )
+        covered = np.mean([s["coverage_by_difficulty"] for s in sequences], axis=0)
+        row |= {"easy": covered[0], "hard": covered[-1]}
         out.setdefault("method", []).append(method)
         for name, value in row.items():
             out.setdefault(name, []).append(None if value is None else float(f"{value:.3g}"))

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpvo.accumulation import along
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.learning.methods import simple_covariances
@@ -41,10 +40,6 @@ class Statement:
         """3 or 6."""
         return int(self.covariance.shape[-1])
 
-    def pose_covariance(self, log: VoLog) -> Array | None:
-        """(N, 6, 6) of every pose of the log by its motions, None for d = 3."""
-        return None if self.errors is None else along(log.T_prev_cur, self.errors, log.parent)[1]
-
 
 def statements(
     log: VoLog, predictions: Mapping[int, Prediction] | None = None, predictor: Predictor | None = None
@@ -57,7 +52,7 @@ def statements(
     """
     out: list[Statement] = []
     arrays = predictor.arrays if predictor is not None else {}
-    covariances = {m: _where_stated(log.covariance(m)) for m in log.methods if m != IMPORTED_POSE}
+    covariances = {m: where_stated(log.covariance(m)) for m in log.methods if m != IMPORTED_POSE}
     v_t = {m: _translation_alone(log, m) for m in covariances}
     for method, C in simple_covariances(arrays, covariances, v_t, len(log)).items():
         if method == "constant":
@@ -69,13 +64,13 @@ def statements(
     if "thesis.scale" in arrays and predictor is not None and predictor.target == "frame":
         out.append(_thesis(log, ThesisModel.of_file(arrays)))
     if predictions and predictor is not None:
-        out.append(_predicted("base", log, predictor.base().replay(log)))
+        out.append(predicted_statement("base", log, predictor.base().replay(log)))
     if predictions:
-        out.append(_predicted("learned", log, predictions))
+        out.append(predicted_statement("learned", log, predictions))
     return out
 
 
-def _where_stated(covariance: Array) -> Array:
+def where_stated(covariance: Array) -> Array:
     """NaN in place of what is no covariance: zeros, say, with which other software marks what it does not know."""
     stated = np.array([is_positive_definite(C) for C in covariance], dtype=bool)
     return np.where(stated[:, None, None], covariance, np.nan)
@@ -117,10 +112,11 @@ def _translation_alone(log: VoLog, method: str) -> Array:
     missing = np.full((3, 3), np.nan)
     # V_T is in the axes of the reference camera, the error in those of the current one.
     turned = [r.T_prev_cur[:3, :3].T @ r.v_t.get(method, missing) @ r.T_prev_cur[:3, :3] for r in log]
-    return _where_stated(np.array(turned).reshape(-1, 3, 3))
+    return where_stated(np.array(turned).reshape(-1, 3, 3))
 
 
-def _predicted(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
+def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:
+    """What a model predicts, by stamp; a motion that it says nothing of is taken to be like the one before."""
     mean, covariance = np.zeros((len(log), 6)), np.full((len(log), 6, 6), np.nan)
     errors: list[MotionError] = []
     last = MotionError.independent(np.eye(6) * 1e-6)

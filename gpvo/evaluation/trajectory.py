@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,28 +88,26 @@ class TrajectoryErrors:
     segments: tuple[Segment, ...]
 
 
-def relative_errors(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
-    """``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,): (M, 4, 4)."""
-    d_est = se3.inverse(T_est[start]) @ T_est[end]
-    d_true = se3.inverse(T_true[start]) @ T_true[end]
-    return se3.inverse(d_true) @ d_est
-
-
 def rpe(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> RelativeError:
-    """Relative pose error over given pairs of poses."""
-    E = relative_errors(T_est, T_true, start, end)
+    """Of ``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,)."""
+    d_est, d_true = (se3.inverse(T[start]) @ T[end] for T in (T_est, T_true))
+    E = se3.inverse(d_true) @ d_est
     angle = np.linalg.norm(se3.so3_log(E[:, :3, :3]), axis=1)
     return RelativeError(Statistics.of(np.linalg.norm(E[:, :3, 3], axis=1)), Statistics.of(angle))
 
 
-def pairs_ahead(progress: Array, step: float, every: int = 1) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pairs_ahead(
+    progress: NDArray[Any], step: float, every: int = 1, frame: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of poses ``step`` apart in a growing quantity (N,): every n-th start, and the first pose at least that
-    far on."""
+    far on. ``frame`` (N,): number of each pose in the run; pairs with a left-out pose between them are dropped."""
     start = np.arange(0, len(progress), every)
     # A hair of slack: times that are sums of a frame period must not miss the round number.
     end = np.searchsorted(progress, progress[start] + step * (1 - 1e-9), side="left")
     inside = end < len(progress)
-    return start[inside], end[inside]
+    start, end = start[inside], end[inside]
+    whole = slice(None) if frame is None else frame[end] - frame[start] == end - start
+    return start[whole], end[whole]
 
 
 def segments(
@@ -122,20 +121,11 @@ def segments(
 
     NaN, and a count of 0, for a length that the path does not reach. ``frame``: as in :func:`trajectory_errors`.
     """
-    arc = se3.path_length_m(T_true[:, :3, 3])
-    frame = np.arange(len(arc)) if frame is None else frame
-    out = []
+    arc, out = se3.path_length_m(T_true[:, :3, 3]), []
     for length in lengths_m:
-        start, end = _unbroken(frame, *pairs_ahead(arc, length, every))
-        error = rpe(T_est, T_true, start, end)
-        out.append(
-            Segment(
-                length,
-                100 * error.translation_m.mean / length,
-                float(np.degrees(error.rotation_rad.mean)) / length,
-                len(start),
-            )
-        )
+        error = rpe(T_est, T_true, *pairs_ahead(arc, length, every, frame))
+        translation, rotation = error.translation_m, float(np.degrees(error.rotation_rad.mean))
+        out.append(Segment(length, 100 * translation.mean / length, rotation / length, translation.count))
     return tuple(out)
 
 
@@ -151,33 +141,23 @@ def trajectory_errors(
     ``frame`` (N,): number of each pose in the run, where poses without truth were left out. Relative errors are not
     taken across such a gap, over which the path is longer than seen.
     """
-    frame = np.arange(len(t_ns)) if frame is None else frame
     arc = se3.path_length_m(T_true[:, :3, 3])
     lengths = lengths_m or (LONG_M if arc[-1] > _LONG_PATH_M else SHORT_M)
     from_start = se3.inverse(T_true[0]) @ T_true
     drift = (T_est[0] @ from_start)[:, :3, 3] - T_est[:, :3, 3]
     off = np.linalg.norm(drift, axis=1)
     t_s = (t_ns - t_ns[0]) * 1e-9
-    each = np.arange(len(t_ns) - 1)
     # A span, not an instant: a start at every frame, the end one second or ten metres on.
     return TrajectoryErrors(
         path_length_m=float(arc[-1]),
         ate_rmse_m=ate_rmse(T_est[:, :3, 3], T_true[:, :3, 3]),
         rmse_origin_m=float(np.sqrt((off**2).mean())),
         final_error_m=float(off[-1]),
-        rpe_frame=rpe(T_est, T_true, *_unbroken(frame, each, each + 1)),
-        rpe_second=rpe(T_est, T_true, *_unbroken(frame, *pairs_ahead(t_s, 1.0))),
-        rpe_10m=rpe(T_est, T_true, *_unbroken(frame, *pairs_ahead(arc, 10.0))),
+        rpe_frame=rpe(T_est, T_true, *pairs_ahead(np.arange(len(t_ns)), 1.0, frame=frame)),
+        rpe_second=rpe(T_est, T_true, *pairs_ahead(t_s, 1.0, frame=frame)),
+        rpe_10m=rpe(T_est, T_true, *pairs_ahead(arc, 10.0, frame=frame)),
         segments=segments(T_est, T_true, lengths, frame=frame),
     )
-
-
-def _unbroken(
-    frame: NDArray[np.int64], start: NDArray[np.int64], end: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The pairs without a left-out pose between them."""
-    whole = frame[end] - frame[start] == end - start
-    return start[whole], end[whole]
 
 
 _NAMES = {"translation": "position", "rotation": "orientation", "joint": "joint"}

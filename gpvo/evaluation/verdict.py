@@ -90,18 +90,18 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
         return Verdict("amber", headline, tuple(_conditions(e)), judged=False)
     wrong = told.wrong()
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
-    shown = dict.fromkeys((told.method, best, *(m for m in judged if m in _ALWAYS)))
+    shown = dict.fromkeys((told.c.method, best, *(m for m in judged if m in _ALWAYS)))
     lines = [*_conditions(e), *(found[m].line() for m in shown)]
     if not wrong and not outside:
         where = "per motion; over a second or a distance, nothing can be judged"
         if told.spans:
             where = "per motion and " * told.of_motions + f"over {_listed([n for n, _ in told.spans])}"
-        return Verdict("green", f"The {told.method} covariance is honest here, {where}.", tuple(lines))
-    if told.method != best and not found[best].wrong():
+        return Verdict("green", f"The {told.c.method} covariance is honest here, {where}.", tuple(lines))
+    if told.c.method != best and not found[best].wrong():
         lines.append(f"Use {best} here: it is honest{', and has the best likelihood of all' * told.of_motions}.")
     if outside:
         lines.append("Train on runs with this camera in these conditions, with ground truth or with twins.")
-    headline = f"The {told.method} covariance is {told.words()}"
+    headline = f"The {told.c.method} covariance is {told.words()}"
     if outside:
         headline += "; the model does not know these conditions"
     return Verdict("red" if outside or "overconfident" in headline else "amber", headline + ".", tuple(lines))
@@ -150,10 +150,6 @@ class _Judgement:
         enough = ((n, h) for n, m, h in spans if h and h.count >= _FEW_WINDOWS and m >= e.tells_from_m)
         return cls(c, e.tells_from_m == 0.0, tuple(enough))
 
-    @property
-    def method(self) -> str:
-        return self.c.method
-
     def loss(self) -> float:
         """What statements are ranked by: the likelihood of the motions, or how far the longest span is from honest."""
         if self.of_motions or not self.spans:
@@ -165,8 +161,7 @@ class _Judgement:
         out = {"one motion": _per_motion(self.c)} if self.of_motions else {}
         for name, h in self.spans:
             # Windows overlap by half, so half of them are independent: the mean of n chi-squared of so many dof.
-            chance = math.sqrt(2 / (len(self.c.axes) * h.count / 2))
-            out[name] = _word(h.nees_dof_truth_noise, chance)
+            out[name] = _word(h.nees_dof_truth_noise, chance=math.sqrt(2 / (len(self.c.axes) * h.count / 2)))
         return {name: word for name, word in out.items() if word != "honest"}
 
     def words(self) -> str:
@@ -184,10 +179,10 @@ class _Judgement:
         wrong = [name for name in self.wrong() if name != "one motion"]
         over = [f"{h.nees_dof_truth_noise:.2f} over {name}" for name, h in self.spans]
         if not self.of_motions:
-            return f"{self.method}: {self.words()}; NEES/dof {', '.join(over)}."
+            return f"{self.c.method}: {self.words()}; NEES/dof {', '.join(over)}."
         then = f", not honest over {_listed(wrong)}" if wrong else ""
         figures = ", ".join((f"{_nees(self.c):.2f}", *over))
-        return f"{self.method}: {_per_motion(self.c, sized=True)} per motion{then}; NEES/dof {figures}."
+        return f"{self.c.method}: {_per_motion(self.c, sized=True)} per motion{then}; NEES/dof {figures}."
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -78,6 +78,12 @@ def scaled_root(C: Array) -> Array:
     return np.asarray(sigma[..., :, None] * root)
 
 
+def half_axes(C: Array) -> Array:
+    """(..., n, n) rows: the half axes of the 3-sigma ellipsoid of covariances (..., n, n)."""
+    values, vectors = np.linalg.eigh(C)
+    return np.asarray(3.0 * np.swapaxes(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :], -1, -2))
+
+
 def correlation(C: Array) -> Array:
     """Correlations (..., n, n) of covariances; NaN where a variance is unknown."""
     sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))

@@ -6,7 +6,7 @@ All positions are in the axes of the first camera, whose pose is made equal to t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from gpvo.accumulation import along
 from gpvo.dataset.build import build_run, observe, predictions_of
 from gpvo.dataset.errors import interpolate_truth
-from gpvo.evaluation.statements import corrected, statements
+from gpvo.evaluation.statements import corrected, plain_statement, predicted_statement, where_stated
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import position_in_world
 from gpvo.io.run import Run, read_run
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online.features import THESIS
@@ -89,8 +90,7 @@ def summed_v_t(log: VoLog, method: str) -> Array:
 
 def compounded(log: VoLog, errors: Sequence[MotionError]) -> Array:
     """(N, 3, 3) covariance of every position from the errors stated of every motion."""
-    R = log.trajectory()[:, :3, :3]
-    return R @ along(log.T_prev_cur, errors, log.parent)[1][:, :3, :3] @ np.swapaxes(R, 1, 2)
+    return position_in_world(log.trajectory(), along(log.T_prev_cur, errors, log.parent)[1])
 
 
 def mean_shift(log: VoLog, mean: Array) -> Array:
@@ -194,9 +194,7 @@ def job_of(
 
 
 def _joint(log: VoLog, method: str) -> Array:
-    # Of all that the records state, this method alone is wanted.
-    alone = [replace(r, covariances={method: r.covariances[method]} if r.covariances else {}, v_t={}) for r in log]
-    errors = next(s.errors for s in statements(VoLog(alone)) if s.method == method)
+    errors = plain_statement(log, method, where_stated(log.covariance(method))).errors
     assert errors is not None
     return compounded(log, errors)
 
@@ -216,9 +214,7 @@ def _motion(run: Run, model: ThesisModel) -> tuple[Array, Array]:
 
 
 def _learned(run: Run, predictor: Predictor) -> tuple[Array, Array]:
-    predictions = predictions_of(run, predictor)
-    bare = VoLog([replace(r, covariances={}, v_t={}) for r in run.log])
-    learned = next(s for s in statements(bare, predictions) if s.method == "learned")
+    learned = predicted_statement("learned", run.log, predictions_of(run, predictor))
     assert learned.errors is not None
     mean: Array = np.where([[r.status is Status.LOST] for r in run.log], 0.0, learned.mean)
     return mean_shift(run.log, mean), compounded(run.log, learned.errors)

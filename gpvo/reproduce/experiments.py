@@ -176,6 +176,8 @@ SENSITIVITY: tuple[Experiment, ...] = tuple(
     for p, m in SENSITIVITY_PX
 )  # fmt: skip
 
+ALL: tuple[Experiment, ...] = (*EXPERIMENTS, *SENSITIVITY)
+
 
 def printed(sigma_px: tuple[float, float]) -> tuple[float, float]:
     """The sigmas whose squares are what the thesis prints in place of squares."""
@@ -185,15 +187,12 @@ def printed(sigma_px: tuple[float, float]) -> tuple[float, float]:
 def sigma_pairs(flights: str, preset: str) -> tuple[tuple[float, float], ...]:
     """Every (pointing, matching) pair [px] that any experiment on a set of flights states; the thesis' odometry states
     what the thesis prints."""
-    wanted = [
-        e.sigma_px for e in (*EXPERIMENTS, *SENSITIVITY) if e.method == "pointing_matching" and e.flights == flights
-    ]
+    wanted = [e.sigma_px for e in ALL if e.method == "pointing_matching" and e.flights == flights]
     return tuple(dict.fromkeys(printed(pair) if preset == "thesis" else pair for pair in wanted))
 
 
 Mode = Literal["images", "points"]
 MODES: tuple[Mode, ...] = ("images", "points")
-ALL: tuple[Experiment, ...] = (*EXPERIMENTS, *SENSITIVITY)
 _RECORDINGS = "flown_paths"
 
 

@@ -6,14 +6,15 @@ from __future__ import annotations
 import base64
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from gpvo.files import markdown_table, replacing
+from gpvo.evaluation.plots import save
+from gpvo.files import markdown_table
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
@@ -24,9 +25,10 @@ _AXES = ("x: right", "y: down", "z: forward")
 _GREEN = "#2ca02c"
 MODES = {"images": "images", "points": "points only", "real": "real"}
 _THESIS = ("rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "residual_m", "residual_over_rmse")
-_OURS = (
-    "rmse_m", "final_error_m", "predicted_final_error_m", "ratio", "ratio_interval", "vector_residual_m",
-    "vector_over_rmse", "magnitude_residual_m", "magnitude_over_rmse", "coverage_3_sigma",
+_COLUMNS = (
+    "key", "table", "title", "mode", "seeds", "way", "rmse_m", "final_error_m", "predicted_final_error_m", "ratio",
+    "ratio_interval_low", "ratio_interval_high", "vector_residual_m", "vector_over_rmse", "magnitude_residual_m",
+    "magnitude_over_rmse", "coverage_3_sigma",
 )  # fmt: skip
 
 
@@ -44,49 +46,43 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """One line per row and way, every digit."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    ours = [c for name in _OURS for c in ((f"{name}_low", f"{name}_high") if name == "ratio_interval" else (name,))]
-    writer.writerow(["key", "table", "title", "mode", "seeds", "way", *ours, *(f"thesis_{n}" for n in _THESIS)])
+    writer.writerow([*_COLUMNS, *(f"thesis_{n}" for n in _THESIS)])
     for row in rows:
         thesis = row.get("thesis") or {}
         for way, found in row["ways"].items():
-            values: list[Any] = []
-            for name in _OURS:
-                values += (found[name] or [None, None]) if name == "ratio_interval" else [found[name]]
-            head = [row["key"], row["table"], row["title"], row["mode"], found["seeds"], way]
-            writer.writerow([*head, *values, *(thesis.get(n) for n in _THESIS)])
+            low, high = found["ratio_interval"] or (None, None)
+            known = {**row, **found, "way": way, "ratio_interval_low": low, "ratio_interval_high": high}
+            writer.writerow([*(known[name] for name in _COLUMNS), *(thesis.get(name) for name in _THESIS)])
     return stream.getvalue()
 
 
-def sections(document: Mapping[str, Any]) -> list[tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Titles and rows of the tables that have any."""
-    titles = {"rows": "Tables 4.1 to 4.6", "sensitivity": "Sensitivity to sigma_p and sigma_m", "real": "Real data"}
-    return [(title, document[key]) for key, title in titles.items() if document[key]]
+TABLES = {"rows": "Tables 4.1 to 4.6", "sensitivity": "Sensitivity to sigma_p and sigma_m", "real": "Real data"}
+REMARKS = {"errata": "Errata", "out_of_scope": "Out of scope", "failed": "Not flown"}
 
 
-def lists(document: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
-    """Titles and lines of the remarks that there are."""
-    titles = {"errata": "Errata", "out_of_scope": "Out of scope", "failed": "Not flown"}
+def present(document: Mapping[str, Any], titles: Mapping[str, str]) -> list[tuple[str, Sequence[Any]]]:
+    """Titles and entries of those lists of the document that hold any."""
     return [(title, document[key]) for key, title in titles.items() if document[key]]
 
 
 def as_markdown(document: Mapping[str, Any]) -> str:
     """All tables of the document."""
-    parts = ["# The thesis' experiments, reproduced", ""]
-    parts += [f"* {line}" for line in document["notes"]]
-    for title, rows in sections(document):
-        parts += ["", f"## {title}", "", *markdown_table(HEADS, [line for row in rows for line in cells(row)])]
-    parts += ["", "## What is asked of the full model", ""]
-    parts += markdown_table(
-        ("row", "flights", "target", "value", "met"),
-        [(t["key"], MODES[t["mode"]], t["target"], number(t["value"]), verdict(t["met"])) for t in document["targets"]],
-    )
+    parts = ["# The thesis' experiments, reproduced", "", *(f"* {line}" for line in document["notes"])]
+
+    def add(title: str, lines: Iterable[str]) -> None:
+        parts.extend(["", f"## {title}", "", *lines])
+
+    for title, rows in present(document, TABLES):
+        add(title, markdown_table(HEADS, [line for row in rows for line in cells(row)]))
+    told = [
+        (t["key"], MODES[t["mode"]], t["target"], number(t["value"]), verdict(t["met"])) for t in document["targets"]
+    ]
+    add("What is asked of the full model", markdown_table(("row", "flights", "target", "value", "met"), told))
     if document["claims"]:
-        parts += ["", "## The thesis' claims", ""]
-        parts += markdown_table(
-            ("claim", "verdict", "evidence"), [(c["claim"], c["verdict"], c["evidence"]) for c in document["claims"]]
-        )
-    for title, lines in lists(document):
-        parts += ["", f"## {title}", "", *(f"* {line}" for line in lines)]
+        head = ("claim", "verdict", "evidence")
+        add("The thesis' claims", markdown_table(head, [[c[name] for name in head] for c in document["claims"]]))
+    for title, lines in present(document, REMARKS):
+        add(title, (f"* {line}" for line in lines))
     return "\n".join(parts) + "\n"
 
 
@@ -104,12 +100,12 @@ def as_page(document: Mapping[str, Any], folder: Path) -> str:
 
     return environment.get_template("reproduce.html").render(
         result=document,
-        groups=[(title, [line for row in rows for line in cells(row)]) for title, rows in sections(document)],
+        groups=[(title, [line for row in rows for line in cells(row)]) for title, rows in present(document, TABLES)],
         heads=HEADS,
         modes=MODES,
         verdict=verdict,
         pictures=[{**f, "data": embedded(f["file"])} for f in document["figures"]],
-        lists=lists(document),
+        lists=present(document, REMARKS),
     )
 
 
@@ -151,8 +147,7 @@ def draw(cells: Sequence[Cell], studied: Studies | None, store: Store, out: Path
     def keep(name: str, title: str, figure: Figure) -> None:
         path = out / "figures" / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})
+        save(figure, path, dpi=100, metadata={"Software": None})
         drawn.append({"file": f"figures/{name}.png", "title": title})
 
     simulated: dict[tuple[str, str], list[Cell]] = {}

@@ -209,10 +209,10 @@ def test_thinning_loses_no_peak():
 
 
 def test_views_are_no_mirror_images(evaluation):
-    to_plane, _ = panels.level(evaluation)
+    to_plane, _ = panels.level(evaluation.T_world_first)
     assert np.linalg.det(to_plane) == pytest.approx(1.0)
     T = np.tile(np.eye(4), (len(evaluation.T_true), 1, 1))
-    to_plane, names = panels.level(replace(evaluation, T_true=T))
+    to_plane, names = panels.level(replace(evaluation, T_true=T).T_world_first)
     assert names[0] == "forward z"
     assert np.linalg.det(to_plane) == pytest.approx(1.0)
 

@@ -14,7 +14,7 @@ from gpvo.online.predictor import Predictor
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import StereoFrame, VoLog
 from gpvo.vo.odometry import StereoOdometry
-from rendered_clip import pinhole, render_clip, wander
+from rendered_clip import write_pairs
 from test_wires import WIRES, check
 from wire_peers import ROOT, ends, live, place, reader, running
 
@@ -24,13 +24,7 @@ PAIRS = 24
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file for ``bench.live_peers pictures``."""
-    camera = pinhole(752, 480, 0.11)
-    rendered = render_clip(camera, wander(PAIRS))
-    pairs = np.array([[f.left, f.right] for f in rendered.frames], dtype=np.uint8)
-    path = tmp_path_factory.mktemp("clip") / "clip.npz"
-    np.savez(path, pairs=pairs, f=camera.fx_px, cx=camera.cx_px, cy=camera.cy_px, baseline_m=camera.baseline_m)
-    return path
+    return write_pairs(tmp_path_factory.mktemp("clip") / "clip.npz", PAIRS)
 
 
 def offline(clip: Path, stamps: list[int]) -> list[Odometry]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from gpvo.cameras.models import PinholeRadtan
@@ -67,3 +68,11 @@ def wander(count: int, rate_hz: float = 20.0, speed_mps: float = 0.8, seed: int 
     motion = wandering(low, high, 4 + count / rate_hz, speed_mps, rng, 0.0).motion(rate_hz)
     T_world_body = se3.from_rt(motion.R_world_body, motion.position_m)[-count:]
     return T_world_body @ se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
+
+
+def write_pairs(path: Path, count: int) -> Path:
+    """A file of ``count`` pairs of EuRoC's size, for ``bench.live_peers pictures``."""
+    camera = pinhole(752, 480, 0.11)
+    pairs = np.array([[f.left, f.right] for f in render_clip(camera, wander(count)).frames], dtype=np.uint8)
+    np.savez(path, pairs=pairs, f=camera.fx_px, cx=camera.cx_px, cy=camera.cy_px, baseline_m=camera.baseline_m)
+    return path
