@@ -63,7 +63,7 @@ class GeometricPolicy:
         covariance = record.covariances.get(self.name)
         if covariance is None or not is_positive_definite(covariance):
             return None
-        return MotionError.independent(np.asarray(covariance)[None], dt_s=record.dt_s)
+        return MotionError.independent(covariance, dt_s=record.dt_s).row(None)
 
 
 @dataclass(frozen=True)
