@@ -234,40 +234,31 @@ def _member(
     failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
     counts = {**timeline.counts, "rejected": failed}
     scores = metrics.without_truth(nis, failed)
-    if flight.has_truth:
-        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores, start.world_tilt)
-    return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, start.note)
+    run = FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, start.note)
+    return replace(run, scores=_score(flight, run, start.world_tilt)) if flight.has_truth else run
 
 
-def _score(
-    flight: Flight,
-    t_ns: NDArray[np.int64],
-    T_imu: Array,
-    T_cam: Array,
-    covariance: Array,
-    known: metrics.Scores,
-    world_tilt: Array,
-) -> metrics.Scores:
-    """What is ``known`` without truth, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns
-    all attitudes alike, and positions about the start."""
+def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
+    """The run's, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns all attitudes alike,
+    and positions about the start."""
     index = {r.t_ns: i for i, r in enumerate(flight.records)}
-    rows = np.array([index[int(t)] for t in t_ns])
+    rows = np.array([index[t] for t in run.t_ns.tolist()])
     valid = np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]
     assert flight.T_world_cam is not None
     truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
-    est, imu, C = T_cam[valid], T_imu[valid], covariance[valid]
+    est, imu, C = run.T_world_cam[valid], run.T_world_imu[valid], run.covariance[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
     path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
-    counted = t_ns[valid] > t_ns[0]
+    counted = run.t_ns[valid] > run.t_ns[0]
     finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
-    lever, R = se3.skew(imu[finite, :3, 3] - T_imu[0, :3, 3]), imu[finite, :3, :3]
+    lever, R = se3.skew(imu[finite, :3, 3] - run.T_world_imu[0, :3, 3]), imu[finite, :3, :3]
     own[0] = own[0] + lever @ world_tilt @ np.swapaxes(lever, 1, 2)
     own[1] = own[1] + np.swapaxes(R, 1, 2) @ world_tilt @ R
     position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])
     attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9] + own[1])
     return replace(
-        known,
+        run.scores,
         ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),
         final_error_m=float(error[-1]),
         drift_percent=float(100.0 * error[-1] / path) if path > _SHORTEST_PATH_M else float("nan"),
