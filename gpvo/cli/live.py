@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +16,27 @@ if TYPE_CHECKING:
     from gpvo.io.foreign import ForeignLog
     from gpvo.live.stereo_stage import StereoSettings
     from gpvo.types import Vehicle
+
+
+@dataclass(frozen=True)
+class WireOptions:
+    """The transport of a running system."""
+
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False
+    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False
+    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False
+    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False
+    address: Annotated[
+        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
+    ] = None
+    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0
+
+    def chosen(self) -> str | None:
+        """Name of the transport, None without one. GpvoError where there are several."""
+        names = [name for name in ("zenoh", "dds", "ros2", "ros1") if getattr(self, name)]
+        if len(names) > 1:
+            raise GpvoError(f"--{' and --'.join(names)} are mutually exclusive", cure="choose one")
+        return names[0] if names else None
 
 
 def live(
@@ -33,21 +55,14 @@ def live(
     truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
     replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False,
-    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False,
-    address: Annotated[
-        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
-    ] = None,
-    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0,
+    wire: WireOptions = WireOptions(),
     mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
     px4: Annotated[
         bool, typer.Option("--px4", help="Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS.")
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Write a new bag at the end: .bag, .mcap or a ROS 2 folder."),
+        typer.Option("-o", "--out", help="Write a new bag, in parts until the end: .bag, .mcap or a ROS 2 folder."),
     ] = None,
     topic: Annotated[str, typer.Option(help="Topic on which the odometry is published.")] = "/gpvo/odometry",
     pose_topic: Annotated[str | None, typer.Option(help="Also publish PoseWithCovarianceStamped here.")] = None,
@@ -98,9 +113,9 @@ def live(
             base_frame=base_frame,
             replay=replay,
             fast=fast,
-            wire=_one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1),
-            address=address,
-            domain=domain,
+            wire=wire.chosen(),
+            address=wire.address,
+            domain=wire.domain,
             mavlink=mavlink,
             px4=px4,
             out=out,
@@ -138,13 +153,8 @@ def doctor(
         str,
         typer.Option(help="Fit a fixed transform between bag and truth, as gpvo import does."),
     ] = "none",
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Listen over Zenoh.")] = False,
-    dds: Annotated[bool, typer.Option("--dds", help="Listen over DDS.")] = False,
-    ros2: Annotated[bool, typer.Option("--ros2", help="Listen through rclpy.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="Listen through rospy.")] = False,
+    wire: WireOptions = WireOptions(),
     odometry_type: Annotated[str, typer.Option(help="Type of a topic: odometry, pose, or pose_stamped.")] = "odometry",
-    address: Annotated[str | None, typer.Option(help="Zenoh router.")] = None,
-    domain: Annotated[int, typer.Option(help="ROS domain id.", min=0, max=232)] = 0,
     seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
     json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
@@ -156,14 +166,14 @@ def doctor(
     from gpvo.live.doctor import examine_bag, examine_topic
     from gpvo.live.job import POSE_TYPE_NAMES
 
-    wire = _one_wire(zenoh=zenoh, dds=dds, ros2=ros2, ros1=ros1)
+    listening = wire.chosen()
     one_of("--align", align, ("none", "rotation", "transform"))
-    if truth is not None and wire is not None:
+    if truth is not None and listening is not None:
         raise GpvoError(
             "--truth judges a bag, not a running topic", cure="record it first, or use gpvo live --truth TOPIC"
         )
     judged = {}
-    if wire is None:
+    if listening is None:
         found = examine_bag(Path(source), topic)
         if truth is not None:
             if truth_topic is None and truth.exists() and truth.samefile(source):
@@ -172,7 +182,7 @@ def doctor(
             judged = {t: _nees_of_bag(Path(source), t, given, align) for t in found if t != truth_topic}
     else:
         kind = POSE_TYPE_NAMES[one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)]
-        found = {source: examine_topic(wire, source, kind, seconds, address, domain)}
+        found = {source: examine_topic(listening, source, kind, seconds, wire.address, wire.domain)}
     if json_:
         rows = [
             {"topic": t, "findings": [f.__dict__ for f in findings], "nees": judged.get(t)}
@@ -187,13 +197,6 @@ def doctor(
                 say(f"  {line}")
         for line in _lines(judged[name]) if name in judged else ():
             say(f"  {line}")
-
-
-def _one_wire(**given: bool) -> str | None:
-    chosen = [name for name, on in given.items() if on]
-    if len(chosen) > 1:
-        raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
-    return chosen[0] if chosen else None
 
 
 def _nees_of_bag(bag: Path, topic: str, truth: ForeignLog, align: str) -> dict[str, Any]:
