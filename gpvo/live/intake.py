@@ -172,10 +172,7 @@ def arrivals(
 def replay(path: Path, topics: Iterable[str], stop: threading.Event, *, fast: bool = False) -> Iterator[Arrival]:
     """Messages of the named topics until ``stop``; they arrive when they were recorded.
 
-    Raises
-    ------
-    SourceError
-        Where the bag cannot be read or lacks a topic.
+    Raises SourceError where the bag cannot be read or lacks a topic.
     """
     wanted = set(topics)
     start, first = time.monotonic_ns(), None
