@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters.plausible import usable
-from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V
+from gpvo.filters.propagation import BA, BG, TH, Nominal, V
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
@@ -162,10 +162,6 @@ def heading(R_world_imu: Array, up_imu: Array) -> float:
 
 
 def _diagonal(sigmas: StartSigmas, with_imu: bool) -> Array:
-    C = np.zeros((CORE, CORE))
-    C[P, P] = np.eye(3) * sigmas.position_m**2
-    C[V, V] = np.eye(3) * sigmas.velocity_mps**2
-    C[TH, TH] = np.eye(3) * sigmas.tilt_rad**2
-    C[BA, BA] = np.eye(3) * sigmas.acc_bias_mps2**2
-    C[BG, BG] = np.eye(3) * (sigmas.gyro_bias_radps if with_imu else sigmas.turn_rate_radps) ** 2
-    return C
+    rate = sigmas.gyro_bias_radps if with_imu else sigmas.turn_rate_radps
+    blocks = (sigmas.position_m, sigmas.velocity_mps, sigmas.tilt_rad, sigmas.acc_bias_mps2, rate)  # P, V, TH, BA, BG
+    return np.diag(np.repeat([sigma**2 for sigma in blocks], 3))

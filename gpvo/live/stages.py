@@ -163,10 +163,8 @@ class PoseStage:
         T_prev_cur = se3.inverse(before[1]) @ T_parent_cam
         dt_s = (t_ns - before[0]) * 1e-9
         stated = self._stated(message, self.T_body_cam @ T_prev_cur @ self._T_cam_body, dt_s, before[2], pose)
-        was_unknown, self._is_unknown = (
-            self._is_unknown,
-            IMPORTED in stated and is_turn_unknown(stated[IMPORTED][None])[0],
-        )
+        was_unknown = self._is_unknown
+        self._is_unknown = IMPORTED in stated and bool(is_turn_unknown(stated[IMPORTED][None])[0])
         if self._is_unknown:  # its pose is a placeholder, as in to_records
             T_prev_cur, self._last = np.eye(4), (t_ns, before[1], pose)
         status, reason = Status.OK, ""
@@ -232,8 +230,8 @@ def stated_covariance(holder: Any) -> Array | None:
 def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) -> VoRecord:
     """The unknown motion, of ``duration_s``, from the last message before a restart to the first after it."""
     t_prev_ns = record.t_ns - max(round(duration_s * 1e9), 1)
-    unknown = VoRecord(record.t_ns, t_prev_ns, Status.LOST, np.eye(4), reason="restart of the source")
-    return replace(unknown, covariances={method: covariance})
+    stated, reason = {method: covariance}, "restart of the source"
+    return VoRecord(record.t_ns, t_prev_ns, Status.LOST, np.eye(4), reason=reason, covariances=stated)
 
 
 class FrameTree:

@@ -95,9 +95,8 @@ def _imu(r: VoRecord, _: float) -> Sequence[float]:
 
 
 def _imu_axes(r: VoRecord, _: float) -> Sequence[float]:
-    nothing = np.full(3, np.nan)
-    acc, gyro = r.imu_acc_mean_mps2, r.imu_gyro_mean_radps
-    return (*(nothing if acc is None else acc), *(nothing if gyro is None else gyro))
+    means = (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps)
+    return [x for v in means for x in ((math.nan,) * 3 if v is None else v)]
 
 
 def _columns(listed: str) -> tuple[Feature, ...]:
