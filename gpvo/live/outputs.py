@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -121,31 +122,30 @@ class MavlinkOutput(Output):
 class FileOutput(Output):
     """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end.
 
-    Until then, what came in each half minute is a bag of its own in the folder ``<name>.parts`` beside it: nothing else
-    remains where the process is killed. Raises GpvoError at once where either exists: it may be the flight before a
-    restart.
+    Until then, what came in each half minute is a bag of its own in the folder ``<name>.parts`` beside it, by its first
+    stamp: nothing else remains where the process is killed. Raises GpvoError at once where the bag exists: it may be
+    the flight before a restart.
     """
 
     def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
-        self._path, self._topic, self._parts = path, topic, path.with_name(f"{path.name}.parts")
-        for place in (path, self._parts):
-            if place.exists():
-                raise GpvoError("already exists", where=place, cure="give another name or remove it")
+        if path.exists():
+            raise GpvoError("already exists", where=path, cure="give another name or remove it")
+        self._path, self._topic, self._folder = path, topic, path.with_name(f"{path.name}.parts")
         self._odometry: list[Odometry] = []
-        self._begun, self._begun_s = 0, time.monotonic()  # the part that has not been written: its first frame
+        self._begun, self._begun_s = 0, time.monotonic()  # of the part that is yet to be written
         self._writer = ThreadPoolExecutor(1)  # frames must not wait for the disk
-        self._written: Future[int] | None = None
+        self._parts: dict[Path, Future[int]] = {}
 
     def odometry(self, odometry: Odometry) -> None:
         """Keep one frame. GpvoError where the part before could not be written."""
         self._odometry.append(odometry)
         part = self._odometry[self._begun :] if time.monotonic() - self._begun_s >= PART_S else []
         if any(o.twist_body is not None for o in part):
-            before, place = self._written, self._parts / f"{self._begun:07}{self._path.suffix}"
-            self._written = self._writer.submit(ros.write_bag, place, part, self._topic)
+            before, place = list(self._parts.values()), self._folder / f"{part[0].t_ns}{self._path.suffix}"
+            self._parts[place] = self._writer.submit(ros.write_bag, place, part, self._topic)
             self._begun, self._begun_s = len(self._odometry), time.monotonic()
-            if before is not None and before.done():
-                before.result()
+            if before and before[-1].done():
+                before[-1].result()
 
     def close(self) -> None:
         """Write the bag; only warn where there is nothing to write, as when the end comes before the first image."""
@@ -154,4 +154,7 @@ class FileOutput(Output):
             warnings.warn(f"{self._path}: not written, because no frame had a motion", stacklevel=2)
         else:
             ros.write_bag(self._path, self._odometry, self._topic)
-            shutil.rmtree(self._parts, ignore_errors=True)
+            for place in self._parts:  # those of a process that was killed stay
+                shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+            with suppress(OSError):
+                self._folder.rmdir()
