@@ -33,7 +33,8 @@ class WireOptions:
 
     def chosen(self) -> str | None:
         """Name of the transport, None without one. GpvoError where there are several."""
-        names = [name for name in ("zenoh", "dds", "ros2", "ros1") if getattr(self, name)]
+        asked = {"zenoh": self.zenoh, "dds": self.dds, "ros2": self.ros2, "ros1": self.ros1}
+        names = [name for name, is_given in asked.items() if is_given]
         if len(names) > 1:
             raise GpvoError(f"--{' and --'.join(names)} are mutually exclusive", cure="choose one")
         return names[0] if names else None

@@ -60,7 +60,7 @@ class LiveSettings:
     engine: EngineSettings = field(default_factory=EngineSettings)
 
 
-def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) -> dict[str, Any]:
+def run_live(settings: LiveSettings) -> dict[str, Any]:
     """Run until the source ends or a signal comes; returns the counts.
 
     Raises GpvoError where an option, the model, the recording or the transport cannot be used; never for a bad message.
@@ -79,7 +79,7 @@ def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) 
     stop = threading.Event()
     try:
         with ending_by_signal(stop):
-            live = Live(settings, wire, tell or _tell)
+            live = Live(settings, wire, _tell)
             live.run(stop)
             return {"counts": live.close()}
     finally:

@@ -111,8 +111,8 @@ class MavlinkOutput(Output):
     """ODOMETRY, whose quality is the health, VISION_SPEED_ESTIMATE and HEARTBEAT to ``udp:HOST:PORT`` or
     ``serial:DEVICE:BAUD``."""
 
-    def __init__(self, address: str, system: int = 1) -> None:
-        self._link = Link(address, system)
+    def __init__(self, address: str) -> None:
+        self._link = Link(address)
 
     def odometry(self, odometry: Odometry) -> None:
         """Send one frame; a lost one with quality -1."""

@@ -73,9 +73,9 @@ def upper_triangle(covariance: Array | None) -> list[float]:
 class Sender:
     """Makes messages as the VIO component of the vehicle ``system``."""
 
-    def __init__(self, system: int = 1, component: int = COMPONENT) -> None:
+    def __init__(self, system: int = 1) -> None:
         self._dialect: Any = dialect()
-        self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
         self._next_beat_ns: int | None = None
 
     def odometry(self, odometry: Odometry) -> bytes:
