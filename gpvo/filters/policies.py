@@ -84,9 +84,3 @@ class LearnedPolicy:
         if not self.use_parts:
             error = MotionError.independent(error.covariance, error.mean, dt_s=error.dt_s, status=error.status)
         return error.row(None)
-
-
-def constant_from_errors(xi: Array) -> Array:
-    """Per-axis mean square (6,) of relative-motion errors (M, 6) of training runs."""
-    xi = np.asarray(xi, dtype=np.float64)
-    return (xi**2).mean(axis=0)
