@@ -150,7 +150,7 @@ def over_windows(T_prev_cur: Array, errors: Sequence[MotionError], windows: Sequ
     """
     order = sorted(range(len(windows)), key=lambda w: -len(windows[w]))
     used = sorted({k for window in windows for k in window})
-    T, batch, at = T_prev_cur[used], _stacked([errors[k] for k in used]), {k: i for i, k in enumerate(used)}
+    T, batch, at = T_prev_cur[used], stacked([errors[k] for k in used]), {k: i for i, k in enumerate(used)}
     pose, covariance = PoseError(len(windows)), np.empty((len(windows), 6, 6))
     for step in range(len(windows[order[0]])):
         going = [w for w in order if len(windows[w]) > step]
@@ -160,8 +160,8 @@ def over_windows(T_prev_cur: Array, errors: Sequence[MotionError], windows: Sequ
     return covariance
 
 
-def _stacked(errors: Sequence[MotionError]) -> MotionError:
-    """A batch of the errors; one without a persistent vector has a root of zero."""
+def stacked(errors: Sequence[MotionError]) -> MotionError:
+    """A batch of the errors, of the worst status among them; one without a persistent vector has a root of zero."""
     tau_s = max((e.persistent_tau_s for e in errors), key=len)
     none = np.zeros((6, len(tau_s)))
     return MotionError(
@@ -171,6 +171,7 @@ def _stacked(errors: Sequence[MotionError]) -> MotionError:
         persistent_root=np.array([e.persistent_root if len(e.persistent_tau_s) else none for e in errors]),
         persistent_tau_s=tau_s,
         dt_s=np.array([e.dt_s for e in errors]),
+        status=max((e.status for e in errors), key=lambda status: status.severity),
     )
 
 

@@ -43,7 +43,7 @@ def live(
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Write a new bag at the end: .bag, .mcap or a ROS 2 folder."),
+        typer.Option("-o", "--out", help="Write a new bag, in parts until the end: .bag, .mcap or a ROS 2 folder."),
     ] = None,
     topic: Annotated[str, typer.Option(help="Topic on which the odometry is published.")] = "/gpvo/odometry",
     pose_topic: Annotated[str | None, typer.Option(help="Also publish PoseWithCovarianceStamped here.")] = None,

@@ -12,7 +12,6 @@ from gpvo.dataset.build import predictions_of
 from gpvo.dataset.doubtful import without_wandering_truth
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.errors import GpvoError
-from gpvo.filters.policies import constant_from_errors
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE
 from gpvo.filters.run import Flight, vertical_in_world
 from gpvo.filters.sanity import require_sane
@@ -84,7 +83,7 @@ def constants_of(runs: Sequence[Run]) -> Constants:
         errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
         if not len(errors.index):
             raise GpvoError("has no motion with ground truth at both ends", where=run.path)
-        squares.append(constant_from_errors(errors.xi))
+        squares.append((errors.xi**2).mean(axis=0))
         dt.append(float(np.median(errors.dt_s)))
     return Constants(np.mean(squares, axis=0), float(np.median(dt)))
 

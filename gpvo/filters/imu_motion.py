@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 
 from gpvo.filters.run import Flight
 from gpvo.geometry import se3
+from gpvo.stats.series import integral, interpolated
 from gpvo.types import Array, ImuLog, VoRecord
 
 MIN_ROTATIONS = 10
@@ -47,16 +49,15 @@ class Rotations:
         self.vo: Array = se3.so3_log(T) @ R_imu_cam.T
         self._ends = [np.array([(getattr(r, n) - imu.t_ns[0]) * 1e-9 for r in used]) for n in ("t_ns", "t_prev_ns")]
         self._t = (imu.t_ns - imu.t_ns[0]) * 1e-9
-        steps = 0.5 * (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) * np.diff(self._t)[:, None]
-        self._turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._turned = integral(imu.gyro_radps, self._t)
 
     def __len__(self) -> int:
         return len(self.vo)
 
     def gyro(self, late_s: float = 0.0) -> Array:
         """(M, 3) of the integrated gyroscope [rad], its stamps taken to be late by ``late_s``."""
-        at = [np.stack([np.interp(e + late_s, self._t, axis) for axis in self._turned.T], axis=1) for e in self._ends]
-        return at[0] - at[1]
+        end, start = (interpolated(t_s + late_s, self._t, self._turned) for t_s in self._ends)
+        return end - start
 
 
 def about_their_means(vo: Array, gyro: Array) -> tuple[Array, Array]:
@@ -89,19 +90,15 @@ def jerks(flight: Flight, imu: ImuLog, window_s: float) -> tuple[Array, Array]:
     """
     R_cam_imu = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3].T
     t_imu = (imu.t_ns - imu.t_ns[0]) * 1e-9
-    areas = 0.5 * (imu.acc_mps2[1:] + imu.acc_mps2[:-1]) * np.diff(t_imu)[:, None]
-    impulse = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
+    impulse = integral(imu.acc_mps2, t_imu)
     found = []
     for window in _unbroken(flight.records, window_s):
         t = np.array([(r.t_ns - imu.t_ns[0]) * 1e-9 for r in window])
         if t[0] < 0 or t[-1] > t_imu[-1] or len(t) < _MIN_POINTS:
             continue
-        chain = [np.eye(4)]
-        for record in window[1:]:
-            chain.append(chain[-1] @ record.T_prev_cur)
-        T = np.array(chain)
+        T = np.array(list(accumulate((r.T_prev_cur for r in window[1:]), np.matmul, initial=np.eye(4))))
         middle = 0.5 * (t[1:] + t[:-1])
-        felt = np.stack([np.diff(np.interp(t, t_imu, impulse[:, i])) for i in range(3)], axis=1) / np.diff(t)[:, None]
+        felt = np.diff(interpolated(t, t_imu, impulse), axis=0) / np.diff(t)[:, None]
         force = (T[1:, :3, :3] @ (R_cam_imu @ felt.T).T[:, :, None])[:, :, 0]
         found.append((6.0 * np.polyfit(t - t[0], T[:, :3, 3], 3)[0], np.polyfit(middle - t[0], force, 1)[0]))
     jerk, slope = (np.array([f[i] for f in found]).reshape(-1, 3) for i in (0, 1))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gpvo.accumulation import carry, from_start
 from gpvo.filters import kernels
-from gpvo.filters.propagation import TH, P
+from gpvo.filters.propagation import TH, P, each
 from gpvo.geometry import se3
 from gpvo.types import Array, MotionError
 
@@ -107,8 +107,7 @@ class Innovation:
 
     def of_member(self, b: int) -> Innovation:
         """The same of one member."""
-        one = slice(b, b + 1)
-        return Innovation(**{name: getattr(self, name)[one] for name in self.__dataclass_fields__})
+        return each(self, lambda values: values[b : b + 1])
 
 
 def chi2_cdf(x: float, dof: int) -> float:

@@ -63,7 +63,7 @@ class GeometricPolicy:
         covariance = record.covariances.get(self.name)
         if covariance is None or not is_positive_definite(covariance):
             return None
-        return MotionError.independent(np.asarray(covariance)[None], dt_s=record.dt_s)
+        return MotionError.independent(covariance, dt_s=record.dt_s).row(None)
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,3 @@ class LearnedPolicy:
         if not self.use_parts:
             error = MotionError.independent(error.covariance, error.mean, dt_s=error.dt_s, status=error.status)
         return error.row(None)
-
-
-def constant_from_errors(xi: Array) -> Array:
-    """Per-axis mean square (6,) of relative-motion errors (M, 6) of training runs."""
-    xi = np.asarray(xi, dtype=np.float64)
-    return (xi**2).mean(axis=0)

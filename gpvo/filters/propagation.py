@@ -15,14 +15,15 @@ Euler rule and here for the trapezoid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from gpvo.filters import kernels
 from gpvo.geometry import se3
-from gpvo.types import Array, ImuNoise, VoRecord
+from gpvo.types import Array, ImuNoise, VoRecord, field_names
 
 P, V, TH, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 CORE = 15
@@ -34,6 +35,14 @@ DEFAULT_IMU_NOISE = ImuNoise(
     gyro_walk_radps2_sqrthz=2e-5,
     acc_walk_mps3_sqrthz=3e-3,
 )
+
+
+_Arrays = TypeVar("_Arrays")
+
+
+def each(arrays: _Arrays, change: Callable[[Array], Array]) -> _Arrays:
+    """A dataclass of arrays with each of them changed."""
+    return type(arrays)(**{name: change(getattr(arrays, name)) for name in field_names(type(arrays))})
 
 
 @dataclass
@@ -49,11 +58,11 @@ class Nominal:
 
     def of_member(self, b: int) -> Nominal:
         """That of one member, (1, ...)."""
-        return Nominal(*(getattr(self, name)[b : b + 1] for name in self.__dataclass_fields__))
+        return each(self, lambda values: values[b : b + 1])
 
     def copy(self) -> Nominal:
         """An independent copy."""
-        return Nominal(*(getattr(self, name).copy() for name in self.__dataclass_fields__))
+        return each(self, lambda values: values.copy())
 
 
 @dataclass(frozen=True)

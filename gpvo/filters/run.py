@@ -15,10 +15,11 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
 from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, Nominal, constant_velocity_noise
-from gpvo.filters.start import Start, StartSigmas, StaticTest, from_rest, from_truth, heading
+from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_noise, each
+from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, heading
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
+from gpvo.stats.series import integral, interpolated
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
@@ -121,12 +122,11 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     if options.init == "static":
         if flight.imu is None:
             raise GpvoError("a static start needs an IMU", where=flight.name, cure="use --init truth")
-        still = StaticTest(sigmas=options.sigmas)
+        rest = from_rest(flight.imu, t0, options.sigmas)
         if not flight.has_truth:
-            return from_rest(flight.imu, t0, still), None
-        rest = from_rest(flight.imu, t0, still).nominal.R_world_imu[0]
-        yaw = heading(flight.T_world_imu[k, :3, :3], rest.T @ np.array([0.0, 0.0, 1.0]))
-        return from_rest(flight.imu, t0, still, yaw_rad=yaw, position=flight.T_world_imu[k, :3, 3]), None
+            return rest, None
+        T, up = flight.T_world_imu[k], rest.nominal.R_world_imu[0, 2]
+        return from_rest(flight.imu, t0, options.sigmas, yaw_rad=heading(T[:3, :3], up), position=T[:3, 3]), None
     if not flight.has_truth:
         raise GpvoError("--init truth needs ground truth for the frames", where=flight.name, cure="use --init static")
     valid = np.flatnonzero(flight.known)
@@ -169,11 +169,10 @@ def vertical_in_world(
     """
     imu = cleaned(imu)
     t_s, imu_s = (t_ns - t_ns[0]) * 1e-9, (imu.t_ns - t_ns[0]) * 1e-9
-    force = np.stack([np.interp(t_s, imu_s, along) for along in imu.acc_mps2.T], axis=1)
+    force = interpolated(t_s, imu_s, imu.acc_mps2)
     R = T_world_imu[:, :3, :3]
     rates = np.concatenate([R @ force[:, :, None], R], axis=2)  # (N, 3, 4) in the world: specific force, bias per unit
-    dt_s = np.diff(t_s)[:, None, None]
-    summed = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(0.5 * (rates[1:] + rates[:-1]) * dt_s, axis=0)])
+    summed = integral(rates.reshape(-1, 12), t_s).reshape(-1, 3, 4)
     summed[:, :, 0] -= np.gradient(T_world_imu[:, :3, 3], t_s, axis=0)
     count = int(np.clip(t_s[-1] / _STRETCH_S, 1, _STRETCHES))
     ends = np.unique(np.searchsorted(t_s, np.linspace(0.0, t_s[-1], count + 1)))
@@ -200,16 +199,13 @@ def make_filter(
     flight: Flight, start: Start, gravity: Array | None, batch: int, options: FuseOptions
 ) -> ErrorStateFilter:
     """A filter of ``batch`` equal members at the start."""
-    nominal = Nominal(
-        *(np.repeat(getattr(start.nominal, name), batch, axis=0) for name in start.nominal.__dataclass_fields__)
-    )
-    with_imu = flight.imu is not None
+    imu = flight.imu
     return ErrorStateFilter(
-        nominal,
+        each(start.nominal, lambda values: np.repeat(values, batch, axis=0)),
         start.covariance,
         T_imu_cam=flight.T_imu_cam,
-        imu_noise=(flight.imu.noise or DEFAULT_IMU_NOISE) if flight.imu is not None else None,
-        motion_noise=None if with_imu else constant_velocity_noise(flight.records),
+        imu_noise=None if imu is None else imu.noise or DEFAULT_IMU_NOISE,
+        motion_noise=None if imu is not None else constant_velocity_noise(flight.records),
         gravity_world=gravity,
     )
 
@@ -232,28 +228,14 @@ def fuse_flight(
         history_s=options.history_s,
     )
     steps: dict[int, Step] = {}
-    samples = _Samples(flight.imu)
+    imu = flight.imu
+    samples = iter(()) if imu is None else zip(imu.t_ns.tolist(), imu.gyro_radps, imu.acc_mps2)
     for record in records:
-        samples.feed(timeline, record.t_ns)
+        while not timeline.reaches(record.t_ns) and (sample := next(samples, None)):
+            timeline.add_imu(*sample)
         for step in timeline.add_vo(record, flight.predictions.get(record.t_ns)):
             steps[step.t_ns] = step
     return [_member(flight, policy.name, b, steps, timeline, start) for b in range(batch)]
-
-
-class _Samples:
-    """Hands IMU samples over up to the first one past a stamp, which interpolation needs."""
-
-    def __init__(self, imu: ImuLog | None) -> None:
-        self.imu, self.next = imu, 0
-
-    def feed(self, timeline: Timeline, t_ns: int) -> None:
-        imu = self.imu
-        if imu is None:
-            return
-        while self.next < len(imu.t_ns) and ((until_ns := timeline.imu_until_ns) is None or until_ns < t_ns):
-            i = self.next
-            timeline.add_imu(int(imu.t_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
-            self.next += 1
 
 
 def _member(
@@ -274,40 +256,31 @@ def _member(
     failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
     counts = {**timeline.counts, "rejected": failed}
     scores = metrics.without_truth(nis, failed)
-    if flight.has_truth:
-        scores = _score(flight, t_ns, T_imu, T_cam, covariance, scores, start.world_tilt)
-    return FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, start.note)
+    run = FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, start.note)
+    return replace(run, scores=_score(flight, run, start.world_tilt)) if flight.has_truth else run
 
 
-def _score(
-    flight: Flight,
-    t_ns: NDArray[np.int64],
-    T_imu: Array,
-    T_cam: Array,
-    covariance: Array,
-    known: metrics.Scores,
-    world_tilt: Array,
-) -> metrics.Scores:
-    """What is ``known`` without truth, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns
-    all attitudes alike, and positions about the start."""
+def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
+    """The run's, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns all attitudes alike,
+    and positions about the start."""
     index = {r.t_ns: i for i, r in enumerate(flight.records)}
-    rows = np.array([index[int(t)] for t in t_ns])
+    rows = np.array([index[t] for t in run.t_ns.tolist()])
     valid = np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]
     assert flight.T_world_cam is not None
     truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
-    est, imu, C = T_cam[valid], T_imu[valid], covariance[valid]
+    est, imu, C = run.T_world_cam[valid], run.T_world_imu[valid], run.covariance[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
     path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
-    counted = t_ns[valid] > t_ns[0]
+    counted = run.t_ns[valid] > run.t_ns[0]
     finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
-    lever, R = se3.skew(imu[finite, :3, 3] - T_imu[0, :3, 3]), imu[finite, :3, :3]
+    lever, R = se3.skew(imu[finite, :3, 3] - run.T_world_imu[0, :3, 3]), imu[finite, :3, :3]
     own[0] = own[0] + lever @ world_tilt @ np.swapaxes(lever, 1, 2)
     own[1] = own[1] + np.swapaxes(R, 1, 2) @ world_tilt @ R
     position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])
     attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9] + own[1])
     return replace(
-        known,
+        run.scores,
         ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),
         final_error_m=float(error[-1]),
         drift_percent=float(100.0 * error[-1] / path) if path > _SHORTEST_PATH_M else float("nan"),

@@ -31,6 +31,7 @@ _RELABELLINGS = sorted(
     (np.eye(3)[list(p)] * np.array(s)[:, None] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)),
     key=lambda M: -np.trace(M),
 )
+_AXES_WINDOW_S = 10.0
 _WINDOWS_S, _MIN_WINDOWS = (2.0, 1.4, 1.0, 0.7), 5  # the first lengths of which a flight holds so many
 
 
@@ -238,14 +239,14 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         yield Finding("gyro_axes", text, "the IMU's axes are swapped, or T_imu_cam is wrong")
 
 
-def _accelerometer_axes(imu: ImuLog, window_s: float = 10.0) -> Iterator[Finding]:
+def _accelerometer_axes(imu: ImuLog) -> Iterator[Finding]:
     """Gravity stays put while the gyroscope says how the IMU turns; renamed axes let it wander."""
     t = (imu.t_ns - imu.t_ns[0]) * 1e-9
     stride = max(1, round(0.02 / max(float(np.median(np.diff(t))), 1e-6)))
     constancy = np.zeros(len(_RELABELLINGS))
     total = 0.0
-    for begin in np.arange(0.0, max(t[-1] - 0.5 * window_s, 1e-9), window_s):
-        rows = np.flatnonzero((t >= begin) & (t < begin + window_s))[::stride]
+    for begin in np.arange(0.0, max(t[-1] - 0.5 * _AXES_WINDOW_S, 1e-9), _AXES_WINDOW_S):
+        rows = np.flatnonzero((t >= begin) & (t < begin + _AXES_WINDOW_S))[::stride]
         if len(rows) < 20:
             continue
         R = np.eye(3)

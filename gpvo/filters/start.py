@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.filters.plausible import usable
-from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V
+from gpvo.filters.propagation import BA, BG, TH, Nominal, V
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 _SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
+_REST_S, _REST_SAMPLES = 0.5, 10  # that the vehicle must be at rest for, and IMU samples within that show it
+_MOST_GYRO_STD_RADPS, _MOST_ACC_STD_MPS2, _MOST_GYRO_MEAN_RADPS = 0.05, 0.5, 0.1  # of an IMU at rest
 
 
 @dataclass(frozen=True)
@@ -44,17 +46,6 @@ class Start:
     covariance: Array
     note: str = ""
     world_tilt: Array = field(default_factory=lambda: np.zeros((3, 3)))
-
-
-@dataclass(frozen=True)
-class StaticTest:
-    """When an IMU counts as at rest: limits on the spread over the window, and on the mean rate."""
-
-    window_s: float = 0.5
-    gyro_std_radps: float = 0.05
-    acc_std_mps2: float = 0.5
-    gyro_mean_radps: float = 0.1
-    sigmas: StartSigmas = field(default_factory=StartSigmas)
 
 
 def _member(p: Array, v: Array, R: Array, ba: Array, bg: Array) -> Nominal:
@@ -107,23 +98,21 @@ def _slope_weights(t_s: Array) -> Array:
 
 
 def from_rest(
-    imu: ImuLog, t_ns: int, test: StaticTest | None = None, *, yaw_rad: float = 0.0, position: Array | None = None
+    imu: ImuLog, t_ns: int, sigmas: StartSigmas | None = None, *, yaw_rad: float = 0.0, position: Array | None = None
 ) -> Start:
     """Start from a vehicle at rest at ``t_ns``: tilt from gravity, gyroscope bias from the mean rate.
 
     An accelerometer bias tilts the horizon by bias / g; the covariance carries that correlation. Raises
     ``GpvoError`` where the IMU says that the vehicle moves.
     """
-    test = test or StaticTest()
-    sigmas, span = test.sigmas, round(test.window_s * 1e9)
-    good = usable(imu)
+    sigmas, span, good = sigmas or StartSigmas(), round(_REST_S * 1e9), usable(imu)
     window = good & (imu.t_ns >= t_ns) & (imu.t_ns <= t_ns + span)
     before = good & (imu.t_ns >= t_ns - span) & (imu.t_ns <= t_ns)
-    window = before if before.sum() >= 10 else window
-    if window.sum() < 10:
-        raise GpvoError(f"a static start needs 10 IMU samples within {test.window_s} s of the first frame")
+    window = before if before.sum() >= _REST_SAMPLES else window
+    if window.sum() < _REST_SAMPLES:
+        raise GpvoError(f"a static start needs {_REST_SAMPLES} IMU samples within {_REST_S} s of the first frame")
     gyro, acc = imu.gyro_radps[window], imu.acc_mps2[window]
-    _require_rest(gyro, acc, test)
+    _require_rest(gyro, acc)
 
     f = acc.mean(axis=0)
     up = f / np.linalg.norm(f)
@@ -144,11 +133,11 @@ def from_rest(
     return Start(_member(origin, np.zeros(3), R, np.zeros(3), gyro.mean(axis=0)), C, note)
 
 
-def _require_rest(gyro: Array, acc: Array, test: StaticTest) -> None:
+def _require_rest(gyro: Array, acc: Array) -> None:
     limits = (
-        ("gyroscope spread", gyro.std(axis=0).max(), test.gyro_std_radps, "rad/s"),
-        ("accelerometer spread", acc.std(axis=0).max(), test.acc_std_mps2, "m/s^2"),
-        ("mean turn rate", np.abs(gyro.mean(axis=0)).max(), test.gyro_mean_radps, "rad/s"),
+        ("gyroscope spread", gyro.std(axis=0).max(), _MOST_GYRO_STD_RADPS, "rad/s"),
+        ("accelerometer spread", acc.std(axis=0).max(), _MOST_ACC_STD_MPS2, "m/s^2"),
+        ("mean turn rate", np.abs(gyro.mean(axis=0)).max(), _MOST_GYRO_MEAN_RADPS, "rad/s"),
     )
     reasons = ", ".join(f"{what} {value:.2g} {unit}" for what, value, limit, unit in limits if value > limit)
     if reasons:
@@ -173,10 +162,6 @@ def heading(R_world_imu: Array, up_imu: Array) -> float:
 
 
 def _diagonal(sigmas: StartSigmas, with_imu: bool) -> Array:
-    C = np.zeros((CORE, CORE))
-    C[P, P] = np.eye(3) * sigmas.position_m**2
-    C[V, V] = np.eye(3) * sigmas.velocity_mps**2
-    C[TH, TH] = np.eye(3) * sigmas.tilt_rad**2
-    C[BA, BA] = np.eye(3) * sigmas.acc_bias_mps2**2
-    C[BG, BG] = np.eye(3) * (sigmas.gyro_bias_radps if with_imu else sigmas.turn_rate_radps) ** 2
-    return C
+    rate = sigmas.gyro_bias_radps if with_imu else sigmas.turn_rate_radps
+    blocks = (sigmas.position_m, sigmas.velocity_mps, sigmas.tilt_rad, sigmas.acc_bias_mps2, rate)  # P, V, TH, BA, BG
+    return np.diag(np.repeat([sigma**2 for sigma in blocks], 3))

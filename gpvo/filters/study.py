@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gpvo.accumulation import stacked
 from gpvo.errors import GpvoError
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import (
@@ -218,7 +219,7 @@ def _cell(value: float, digits: int, width: int) -> str:
 
 
 @dataclass(frozen=True)
-class _Stacked:
+class _SideBySide:
     """The noises of several policies, one member each, by the records' stamps."""
 
     noises: Mapping[int, MotionError]
@@ -243,8 +244,8 @@ def fuse_side_by_side(
     together = _alike(stated)
     out: dict[str, FusedRun] = {}
     if len(together) > 1:
-        noises = {t: _stack([stated[name][t] for name in together]) for t in stated[together[0]]}
-        fused = fuse_flight(flight, _Stacked(noises), options, batch=len(together))
+        noises = {t: stacked([stated[name][t].row(0) for name in together]) for t in stated[together[0]]}
+        fused = fuse_flight(flight, _SideBySide(noises), options, batch=len(together))
         out = {name: replace(run, policy=name) for name, run in zip(together, fused, strict=True)}
     for name in stated:
         if name not in out:
@@ -271,18 +272,3 @@ def _alike(stated: Mapping[str, Mapping[int, MotionError]]) -> list[str]:
             shared |= own
             names.append(name)
     return names
-
-
-def _stack(noises: Sequence[MotionError]) -> MotionError:
-    """One member each; what persists for some has no part in the error of the others."""
-    tau_s = next((n.persistent_tau_s for n in noises if len(n.persistent_tau_s)), np.zeros(0))
-    roots = (n.persistent_root if len(n.persistent_tau_s) else np.zeros((1, 6, len(tau_s))) for n in noises)
-    return MotionError(
-        mean=np.concatenate([n.mean for n in noises]),
-        jitter=np.concatenate([n.jitter for n in noises]),
-        white=np.concatenate([n.white for n in noises]),
-        persistent_root=np.concatenate(list(roots)),
-        persistent_tau_s=tau_s,
-        dt_s=noises[0].dt_s,
-        status=max((n.status for n in noises), key=lambda status: status.severity),
-    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate, Innovation, Wait
 from gpvo.filters.plausible import ImuGuard
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import BG, CORE, TH, Nominal, V
+from gpvo.filters.propagation import CORE, TH, Nominal, P, V
 from gpvo.online.observer import LONGEST_STEP_S, follows
 from gpvo.stats.series import Doubt
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
@@ -41,11 +41,9 @@ class Step:
 
     def of_member(self, b: int) -> Step:
         """What it did to one member."""
-        nominal, covariance = self.nominal.of_member(b), self.covariance[b : b + 1]
-        if self.innovation is None:
-            return replace(self, nominal=nominal, covariance=covariance)
-        innovation = self.innovation.of_member(b)
-        return Step(self.t_ns, _outcome(innovation), innovation, nominal, covariance)
+        innovation = None if self.innovation is None else self.innovation.of_member(b)
+        outcome = self.outcome if innovation is None else _outcome(innovation)
+        return Step(self.t_ns, outcome, innovation, self.nominal.of_member(b), self.covariance[b : b + 1])
 
 
 @dataclass(frozen=True)
@@ -119,10 +117,9 @@ class Timeline:
         self._imu_t.append(int(t_ns))
         self._imu.append(sample)
 
-    @property
-    def imu_until_ns(self) -> int | None:
-        """Stamp of the newest IMU sample that was taken, None before there is one."""
-        return self._imu_t[-1] if self._imu_t else None
+    def reaches(self, t_ns: int) -> bool:
+        """Whether an IMU sample at or past ``t_ns`` was taken: what comes before can be interpolated."""
+        return bool(self._imu_t) and self._imu_t[-1] >= t_ns
 
     def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
         """Take one VO record; returns the steps done, more than one where later records were used again."""
@@ -258,10 +255,10 @@ class Timeline:
         """
         last_ns = self._imu_t[i - 1] if i > 0 else start_ns
         age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
-        usual = self._usual_ns * 1e-9
-        if age[1] < _GAP_S or age[1] < _GAP_FACTOR * usual:
+        shortest = max(_GAP_S, _GAP_FACTOR * (self._usual_ns * 1e-9))
+        if age[1] < shortest:
             return
-        begun = age[0] if age[0] >= max(_GAP_S, _GAP_FACTOR * usual) else 0.0
+        begun = age[0] if age[0] >= shortest else 0.0
         counts["imu_gaps"] += 1
         near = np.array(self._imu[max(0, i - 100) : i + 100])
         spread = np.maximum(near.std(axis=0), np.abs(near[-1] - near[0]))
@@ -270,8 +267,7 @@ class Timeline:
         variances = np.zeros(CORE)
         variances[TH] = spread[:3].max() ** 2 * grown
         variances[V] = spread[3:].max() ** 2 * grown
-        variances[:3] = (0.5 * spread[3:].max() * dt * dt) ** 2
-        variances[BG] = 0.0
+        variances[P] = (0.5 * spread[3:].max() * dt * dt) ** 2
         filter.add_uncertainty(variances)
 
     def _drop_imu_before(self, t_ns: int) -> None:

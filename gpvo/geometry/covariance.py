@@ -16,6 +16,11 @@ def symmetrise(C: Array) -> Array:
     return 0.5 * (C + np.swapaxes(C, -1, -2))
 
 
+def variances(C: Array) -> Array:
+    """(..., n) of covariances (..., n, n)."""
+    return np.asarray(np.diagonal(C, axis1=-2, axis2=-1))
+
+
 def is_symmetric(C: Array) -> bool:
     """Whether one (n, n) matrix is symmetric to rounding: of an element, or of those that were summed up to it."""
     size = np.abs(C)
@@ -39,7 +44,7 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     """(N,) which of (N, n, n) symmetric matrices are finite and positive definite, or semidefinite, up to rounding:
     whatever the axes' units, as it is their correlations that are judged."""
     C = np.asarray(C, dtype=np.float64)
-    variance: Array = np.diagonal(C, axis1=1, axis2=2)
+    variance = variances(C)
     with np.errstate(all="ignore"):
         positive = (variance >= 0) if semi else (variance > 1 / LARGEST)
         good: NDArray[np.bool_] = np.asarray((np.abs(C) < LARGEST).all(axis=(1, 2)) & positive.all(axis=1))
@@ -71,7 +76,7 @@ def scaled_root(C: Array) -> Array:
     the axes' units.
     """
     C = symmetrise(C)
-    sigma = np.sqrt(np.maximum(np.diagonal(C, axis1=-2, axis2=-1), 0.0))
+    sigma = np.sqrt(np.maximum(variances(C), 0.0))
     unit = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(C / (unit[..., :, None] * unit[..., None, :]))
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ np.swapaxes(vectors, -1, -2)
@@ -86,7 +91,7 @@ def half_axes(C: Array) -> Array:
 
 def correlation(C: Array) -> Array:
     """Correlations (..., n, n) of covariances; NaN where a variance is unknown."""
-    sigma = np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
+    sigma = np.sqrt(variances(C))
     return np.asarray(C / (sigma[..., :, None] * sigma[..., None, :]))
 
 

@@ -11,14 +11,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite
+from gpvo.geometry.covariance import is_positive_definite, variances
 from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
 from gpvo.live.intake import Mailbox, arrivals
 from gpvo.live.job import WIRES, open_wire
@@ -37,13 +39,7 @@ _DEPTH = 10_000  # messages of a live topic that may wait
 
 
 def examine_bag(path: Path, topic: str | None = None) -> dict[str, list[Finding]]:
-    """Findings of a topic, or of every topic that holds poses.
-
-    Raises
-    ------
-    SourceError
-        Where the path is no bag, or has no such topic.
-    """
+    """Findings of a topic, or of every topic that holds poses. SourceError for what is no bag, or has no such topic."""
     if not path.exists() or not is_bag(path):
         raise SourceError("is not a bag", where=path, cure=f"for a running topic add --{', --'.join(WIRES)}")
     with open_bag(path) as reader:
@@ -78,34 +74,43 @@ def examine_topic(
 
 def examine(stated: Stated) -> list[Finding]:
     """Everything that is wrong with a recording, worst first; empty for a good one."""
-    found = [*_stamps(stated), *_frames(stated), *_poses(stated)]
+    return list(_findings(stated))
+
+
+def _findings(stated: Stated) -> Iterator[Finding]:
+    motions = _motions(stated)
+    yield from _stamps(stated)
+    yield from _frames(stated)
+    yield from _poses(stated)
+    if motions is not None:
+        _, steps, dt = motions
+        yield from _jumps(steps, dt)
     if stated.pose is None and stated.twist is None:
-        found.append(Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR))
+        yield Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR)
     for name, C in (("pose", stated.pose), ("twist", stated.twist)):
         if C is not None:
-            found += _matrices(name, C)
-    found += _pose_against_twist(stated)
-    return found
+            yield from _matrices(name, C)
+    if motions is not None:
+        yield from _pose_against_twist(stated, *motions)
 
 
-def _matrices(name: str, C: Array) -> list[Finding]:
+def _matrices(name: str, C: Array) -> Iterator[Finding]:
     """Findings about each matrix on its own."""
     if not np.isfinite(C).all():
         share = float(1 - np.isfinite(C).all(axis=(1, 2)).mean())
         text = "robot_localization does not check, so its state becomes NaN; ArduPilot checks only element 0 for NaN"
-        return [Finding(f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text, share)]
-    D = np.diagonal(C, axis1=1, axis2=2)
+        yield Finding(f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text, share)
+        return
+    D, symmetric = variances(C), _symmetric(C)
     zero = (C == 0).all(axis=(1, 2))
     if zero.all():
         text = f"{_RL_FLOOR}; {_PX4_FLOOR}; {_AP_FLOOR}; {_ZERO_FALLBACK}"
-        return [
-            Finding(f"{name}-zero", f"the {name}'s covariance is zero throughout: 'unknown' stated as certain", text)
-        ]
-    found = []
-    if zero.any() or (D == 0).any():
+        yield Finding(f"{name}-zero", f"the {name}'s covariance is zero throughout: 'unknown' stated as certain", text)
+        return
+    if (D == 0).any():
         share = float((D == 0).any(axis=1).mean())
         what = f"variances of the {name} are exactly zero"
-        found.append(Finding(f"{name}-some-zero", what, f"{_RL_FLOOR}; {_ZERO_FALLBACK}", share))
+        yield Finding(f"{name}-some-zero", what, f"{_RL_FLOOR}; {_ZERO_FALLBACK}", share)
     checks: list[tuple[str, str, Any, str]] = [
         ("negative", "variances of the {} are negative", (D < 0).any(axis=1),
          "robot_localization takes the absolute value; PX4 and ArduPilot take their floors; Cholesky fails elsewhere"),
@@ -114,207 +119,190 @@ def _matrices(name: str, C: Array) -> list[Finding]:
         ("huge", "variances of the {} are above 1e3 (9999, 1e6: 'unknown' or 'lost')", (D > _HUGE).any(axis=1),
          "no filter knows the flag: robot_localization fuses it with almost no weight and its correlations blow up; "
          "ArduPilot clamps it at 100 m and 1.5 rad and goes on fusing"),
-        ("asymmetric", "the {}'s covariance is not symmetric", ~_symmetric(C),
+        ("asymmetric", "the {}'s covariance is not symmetric", ~symmetric,
          "filters read different halves: PX4 and ArduPilot the diagonal, robot_localization all of it"),
     ]  # fmt: skip
     for code, what, bad, text in checks:
         if bad.any():
-            found.append(Finding(f"{name}-{code}", what.format(name), text, float(bad.mean())))
-    known = [f.code.rpartition("-")[2] for f in found]
-    if not {"zero", "negative", "asymmetric"} & set(known):
+            yield Finding(f"{name}-{code}", what.format(name), text, float(bad.mean()))
+    if (D > 0).all() and symmetric.all():
         bad = np.array([not is_positive_definite(c) for c in C])
         if bad.any():
             text = "its correlations are impossible: robot_localization's gain goes wrong, Cholesky factorisation fails"
             what = f"the {name}'s covariance is not positive definite"
-            found.append(Finding(f"{name}-not-positive", what, text, float(bad.mean())))
+            yield Finding(f"{name}-not-positive", what, text, float(bad.mean()))
     if np.ptp(C, axis=0).max() == 0.0:
         text = "every frame has the same weight, in bad light and in good: a gate passes bad frames and drops good ones"
-        found.append(Finding(f"{name}-constant", f"the {name}'s covariance never changes", text))
+        yield Finding(f"{name}-constant", f"the {name}'s covariance never changes", text)
     elif len(np.unique(D.round(12), axis=0)) <= 4 < len(D) // 4:
         text = "a few levels only (such as a tracker's confidence): most of what the source knows is lost"
-        found.append(Finding(f"{name}-levels", f"the {name}'s covariance takes four values or fewer", text))
-    return found
+        yield Finding(f"{name}-levels", f"the {name}'s covariance takes four values or fewer", text)
 
 
-def _symmetric(C: Array) -> np.ndarray:
+def _symmetric(C: Array) -> NDArray[np.bool_]:
     scale = np.abs(C).max(axis=(1, 2))[:, None, None]
     return np.asarray((np.abs(C - np.swapaxes(C, 1, 2)) <= 1e-6 * scale).all(axis=(1, 2)))
 
 
-def _stamps(s: Stated) -> list[Finding]:
-    out, steps = [], np.diff(s.t_ns)
+def _stamps(s: Stated) -> Iterator[Finding]:
+    steps = np.diff(s.t_ns)
     if (s.t_ns == 0).any():
         text = "every consumer dates the measurement to the epoch and drops it"
-        out.append(Finding("stamp-zero", "stamps are zero", text))
+        yield Finding("stamp-zero", "stamps are zero", text)
     elif (steps < 0).any():
         text = "robot_localization drops or replays them; PX4 and ArduPilot use them as they are"
-        out.append(Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean())))
+        yield Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean()))
     if (steps == 0).any() and not (s.t_ns == 0).any():
         text = "the same measurement is fused twice: the filter becomes overconfident"
-        out.append(Finding("stamp-repeated", "stamps repeat", text, float((steps == 0).mean())))
+        yield Finding("stamp-repeated", "stamps repeat", text, float((steps == 0).mean()))
     good = steps[steps > 0]
     if len(good) and good.max() > 10 * np.median(good):
         what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"
         text = "motion across a gap was not measured: the first message after it must say so"
-        out.append(Finding("stamp-gap", what, text))
-    return out
+        yield Finding("stamp-gap", what, text)
 
 
-def _frames(s: Stated) -> list[Finding]:
-    out, text = [], "robot_localization cannot transform it and drops every message"
+def _frames(s: Stated) -> Iterator[Finding]:
+    text = "robot_localization cannot transform it and drops every message"
     if len(s.frames) > 1:
-        out.append(Finding("frame-changes", f"frames change: {s.frames}", text))
+        yield Finding("frame-changes", f"frames change: {s.frames}", text)
     frame, child = s.frames[0]
     if not frame or not child:
-        out.append(Finding("frame-empty", f"frame_id '{frame}', child_frame_id '{child}'", text))
+        yield Finding("frame-empty", f"frame_id '{frame}', child_frame_id '{child}'", text)
     elif frame == child:
         text = "pose and twist lose their meaning"
-        out.append(Finding("frame-same", f"frame_id and child_frame_id are both '{frame}'", text))
+        yield Finding("frame-same", f"frame_id and child_frame_id are both '{frame}'", text)
     elif "optical" in child:
         text = "twist and rotations are in axes with z forward: robot_localization needs TF to base_link"
-        out.append(Finding("frame-optical", f"child_frame_id is '{child}', an optical frame", text))
-    return out
+        yield Finding("frame-optical", f"child_frame_id is '{child}', an optical frame", text)
 
 
-def _poses(s: Stated) -> list[Finding]:
-    out = []
+def _poses(s: Stated) -> Iterator[Finding]:
     bad = ~np.isfinite(s.T).all(axis=(1, 2))
     if bad.any():
         what = "poses hold NaN, or absurdly large numbers"
-        out.append(Finding("pose-not-finite", what, "robot_localization drops them", float(bad.mean())))
+        yield Finding("pose-not-finite", what, "robot_localization drops them", float(bad.mean()))
     off = np.abs(s.quaternion_norm - 1.0) > 1e-2
     if (off & ~bad).any():
         text = "robot_localization normalises with a warning, PX4 rejects the attitude"
-        out.append(Finding("quaternion-norm", "quaternions are not of unit length", text, float(off.mean())))
-    motion = _motions(s)
-    if motion is None:
-        return out
-    steps, dt = motion
+        yield Finding("quaternion-norm", "quaternions are not of unit length", text, float(off.mean()))
+
+
+def _jumps(steps: Array, dt: Array) -> Iterator[Finding]:
     speed = np.linalg.norm(steps[:, :3], axis=1) / dt
-    usual = float(np.median(speed))
-    jumps = speed > max(20 * usual, 20.0)
+    jumps = speed > max(20 * float(np.median(speed)), 20.0)
     if jumps.any():
         size = float(np.linalg.norm(steps[jumps][:, :3], axis=1).max())
         what = f"{int(jumps.sum())} jumps of the pose, up to {size:.2g} m"
         text = "odometry must be continuous (REP 105): a differential pose fuses the jump as speed"
-        out.append(Finding("pose-jump", what, text))
-    return out
+        yield Finding("pose-jump", what, text)
 
 
-def _motions(s: Stated) -> tuple[Array, Array] | None:
-    """(M, 6) motions in the axes of the moving frame, and their durations; the stamps must grow."""
+def _motions(s: Stated) -> tuple[NDArray[np.intp], Array, Array] | None:
+    """Between messages whose stamps grow: indices (M,) of those where a motion ends, motions (M, 6) in the axes of the
+    moving frame, and their durations (M,) [s]; None of fewer than ten."""
     dt = np.diff(s.t_ns) * 1e-9
-    good = (dt > 0) & np.isfinite(s.T[1:]).all(axis=(1, 2)) & np.isfinite(s.T[:-1]).all(axis=(1, 2))
-    if good.sum() < ENOUGH:
+    whole = np.asarray(np.isfinite(s.T).all(axis=(1, 2)))
+    (start,) = np.nonzero((dt > 0) & whole[1:] & whole[:-1])
+    if len(start) < ENOUGH:
         return None
-    return se3.log((se3.inverse(s.T[:-1]) @ s.T[1:])[good]), dt[good]
+    return start + 1, se3.log(se3.inverse(s.T[start]) @ s.T[start + 1]), dt[start]
 
 
-def _pose_against_twist(s: Stated) -> list[Finding]:
+def _pose_against_twist(s: Stated, end: NDArray[np.intp], steps: Array, dt: Array) -> Iterator[Finding]:
     """What shows only when one part of the message is compared with another."""
-    out: list[Finding] = []
-    motion = _motions(s)
-    if motion is None:
-        return out
-    steps, dt = motion
     if s.v is not None and np.isfinite(s.v).all():
-        out += _twist_against_motion(s, steps, dt)
+        yield from _twist_against_motion(s.v[end], s.T[end, :3, :3], steps / dt[:, None])
+    found: list[Finding] = []
     for name, C in (("pose", s.pose), ("twist", s.twist)):
         if C is not None and np.isfinite(C).all():
-            out += _turned(name, C, s.T[:, :3, :3])
-            out += _blocks(name, C) if (np.diagonal(C, axis1=1, axis2=2) > 0).all() else []
-    if not any(f.code == "pose-swapped" for f in out):
-        out += _heading(s)
+            found += [*_turned(name, C, s.T[:, :3, :3]), *_blocks(name, C)]
+    yield from found
+    if not any(f.code == "pose-swapped" for f in found):
+        yield from _heading(s)
     if s.pose is not None and s.twist is not None:
-        out += _growth(s)
-    return out
+        yield from _growth(s.pose, s.twist, np.diff(s.t_ns) * 1e-9)
 
 
 def _usable(C: Array) -> bool:
-    return bool(np.isfinite(C).all() and (np.diagonal(C, axis1=1, axis2=2) > 0).all() and np.ptp(C, axis=0).max() > 0)
+    return bool(np.isfinite(C).all() and (variances(C) > 0).all() and np.ptp(C, axis=0).max() > 0)
 
 
-def _twist_against_motion(s: Stated, steps: Array, dt: Array) -> list[Finding]:
-    assert s.v is not None
-    moved, said = steps / dt[:, None], s.v[1:][-len(steps) :]
-    if len(said) != len(moved) or np.linalg.norm(moved[:, :3], axis=1).mean() < 0.05:
-        return []
+def _twist_against_motion(said: Array, R: Array, moved: Array) -> Iterator[Finding]:
+    """Twists (M, 6) at attitudes ``R`` (M, 3, 3), and velocities (M, 6) from the poses."""
+    size = float(np.linalg.norm(moved[:, :3], axis=1).mean())
+    if size < 0.05:
+        return
     if not said.any():
         text = "a filter that fuses the twist is told to stand still"
-        return [Finding("twist-empty", "the twist is zero while the pose moves", text)]
-    R = s.T[1:, :3, :3][-len(steps) :]
+        yield Finding("twist-empty", "the twist is zero while the pose moves", text)
+        return
     in_parent = np.einsum("nij,nj->ni", R, moved[:, :3])
     own, other = (float(np.linalg.norm(said[:, :3] - m, axis=1).mean()) for m in (moved[:, :3], in_parent))
-    size = float(np.linalg.norm(moved[:, :3], axis=1).mean())
     if other < 0.5 * own and own > 0.2 * size:
         text = (
             "robot_localization rotates it once more by the heading; MAVLink receivers take it to be in the body frame"
         )
-        return [Finding("twist-in-parent", "the twist is in frame_id's axes, not in child_frame_id's", text)]
+        yield Finding("twist-in-parent", "the twist is in frame_id's axes, not in child_frame_id's", text)
+        return
     ratio = float(np.linalg.norm(said[:, :3], axis=1).mean()) / size
     if not 0.5 < ratio < 2.0:
         text = "the twist is per frame, in another unit, or on another clock"
-        return [Finding("twist-scale", f"the twist is {ratio:.3g} times the motion of the pose", text)]
-    return []
+        yield Finding("twist-scale", f"the twist is {ratio:.3g} times the motion of the pose", text)
 
 
-def _blocks(name: str, C: Array) -> list[Finding]:
+def _blocks(name: str, C: Array) -> Iterator[Finding]:
     """Rotation before translation: radians squared where metres squared belong."""
-    D = np.median(np.diagonal(C, axis1=1, axis2=2), axis=0)
+    D = np.median(variances(C), axis=0)
     first, second = D[:3].mean(), D[3:].mean()
-    if second > 100 * first and 0.05 < second < _HUGE:
+    if (variances(C) > 0).all() and second > 100 * first and 0.05 < second < _HUGE:
         seen = f"{first:.2g} m^2 before {second:.2g} rad^2"
         what = f"the {name}'s blocks look swapped: {seen} (order is translation first)"
-        return [Finding(f"{name}-swapped", what, _SWAPPED)]
-    return []
+        yield Finding(f"{name}-swapped", what, _SWAPPED)
 
 
-def _heading(s: Stated) -> list[Finding]:
+def _heading(s: Stated) -> Iterator[Finding]:
     """A wrong heading carries the position off with it: the position's variance grows with the distance travelled.
 
     If the heading's error is a random walk, the position's variance across the path is a third of the heading's
     variance times the distance squared; a hundredth of the sum over the axes is out of the question.
     """
     if s.pose is None or not _usable(s.pose) or not np.isfinite(s.T[[0, -1]]).all():
-        return []
-    D = np.diagonal(s.pose, axis1=1, axis2=2)
+        return
+    D = variances(s.pose)
     gained = D[-1] - D[0]
     way_m = float(np.linalg.norm(s.T[-1, :3, 3] - s.T[0, :3, 3]))
     if gained[3:].min() > 0 and way_m > 1.0 and gained[:3].sum() < 0.01 * gained[3:].sum() * way_m**2:
         what = f"the rotation's variance grows by {gained[3:].sum():.2g} rad^2 over {way_m:.0f} m, the position's by"
-        return [Finding("pose-swapped", f"{what} {gained[:3].sum():.2g} m^2 only: blocks swapped?", _SWAPPED)]
-    return []
+        yield Finding("pose-swapped", f"{what} {gained[:3].sum():.2g} m^2 only: blocks swapped?", _SWAPPED)
 
 
-def _turned(name: str, C: Array, R: Array) -> list[Finding]:
+def _turned(name: str, C: Array, R: Array) -> Iterator[Finding]:
     """Variances rotated like the components of a vector, ``R d`` instead of ``R diag(d) R^T``."""
     off = C[:, ~np.eye(6, dtype=bool)]
-    d = np.diagonal(C, axis1=1, axis2=2)[:, :3]
+    d = variances(C)[:, :3]
     good = np.isfinite(R).all(axis=(1, 2))
     if off.any() or good.sum() < ENOUGH or np.ptp(np.abs(d), axis=0).max() < 1e-2 * np.abs(d).max():
-        return []
+        return
     for turn in (R, np.swapaxes(R, 1, 2)):
         back = np.einsum("nij,nj->ni", turn[good], d[good])
         if np.ptp(back, axis=0).max() < 1e-6 * np.abs(back).max():
             text = "a body that turns makes them negative or wrong for every consumer; rotate them by R C R^T"
-            return [Finding(f"{name}-turned", f"the {name}'s variances are rotated as if they were a vector", text)]
-    return []
+            yield Finding(f"{name}-turned", f"the {name}'s variances are rotated as if they were a vector", text)
+            return
 
 
-def _growth(s: Stated) -> list[Finding]:
+def _growth(pose: Array, twist: Array, dt: Array) -> Iterator[Finding]:
     """Over the recording, a pose's covariance should grow by about what the twist's says."""
-    assert s.pose is not None
-    assert s.twist is not None
-    if np.array_equal(s.pose, s.twist) and s.pose.any():
+    if np.array_equal(pose, twist) and pose.any():
         text = "one of them is wrong: the pose's is in m^2 and rad^2, the twist's in their squares per second"
-        return [Finding("pose-equals-twist", "pose and twist state the same covariance", text)]
-    if not (_usable(s.pose) and _usable(s.twist)):
-        return []
-    pose, twist = (np.diagonal(C, axis1=1, axis2=2) for C in (s.pose, s.twist))
-    dt = np.diff(s.t_ns) * 1e-9
-    gained, walked = float((pose[-1] - pose[0])[3:].sum()), float((twist[1:, 3:] * dt[:, None] ** 2).sum())
+        yield Finding("pose-equals-twist", "pose and twist state the same covariance", text)
+        return
+    if not (_usable(pose) and _usable(twist)):
+        return
+    gained = float((variances(pose)[-1] - variances(pose)[0])[3:].sum())
+    walked = float((variances(twist)[1:, 3:] * dt[:, None] ** 2).sum())
     if gained > 0 and not _LEAST < gained / walked < _MOST:
         text = "fuse only one of them: the other is far off (a covariance per frame is not per second)"
         what = f"the rotation's variance in the pose grows {gained / walked:.1g} times as much as the twist's says"
-        return [Finding("pose-against-twist", what, text)]
-    return []
+        yield Finding("pose-against-twist", what, text)

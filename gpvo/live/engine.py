@@ -54,16 +54,18 @@ class Health:
 
 
 class Output(Protocol):
-    """Where results go."""
+    """Where results go. One that has nothing to do with health, or at the end, inherits that."""
 
     def odometry(self, odometry: Odometry) -> None:
         """One frame; of a lost one ``twist_body`` is None."""
 
     def health(self, health: Health) -> None:
         """About once a second, and whenever the level changes."""
+        return
 
     def close(self) -> None:
         """Nothing follows."""
+        return
 
 
 @dataclass(frozen=True)
@@ -246,10 +248,12 @@ class Engine:
         due = now_s - self._reported[0] >= _HEALTH_S
         if due:
             self._misfit = self._misfits()
-        problems = [*self._silence(), *self._misfit]
+        silence = self._silence()
+        problems = [*silence, *self._misfit]
         for text in problems:
             self._warn(text)
-        level = 2 if self._is_bad(problems) else 1 if problems or self._is_weak() else 0
+        status = None if self.last is None else self.last.status
+        level = 2 if silence or status is Status.LOST else 1 if problems or status is Status.DEGRADED else 0
         if due or level != self._reported[1]:
             self._reported = (now_s, level)
             report = self._health(level, problems)
@@ -280,12 +284,6 @@ class Engine:
             share = 100 * float(np.mean(self._inside))
             out.append(f"only {share:.0f} % of the last motions lie inside the model's training domain")
         return out + self.stage.problems()
-
-    def _is_bad(self, problems: list[str]) -> bool:
-        return (self.last is not None and self.last.status is Status.LOST) or any("no usable" in p for p in problems)
-
-    def _is_weak(self) -> bool:
-        return self.last is not None and self.last.status is Status.DEGRADED
 
     def _warn(self, text: str) -> None:
         kind = text.split(":")[0][:40]

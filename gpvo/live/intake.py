@@ -27,7 +27,7 @@ AHEAD_S = 10.0
 """The same of a stamp ahead of the last: after so long a silence nothing of before holds."""
 _CONFIRM = 3
 _WINDOW = 51
-_LONGEST_WAIT_S = 0.1
+_LONGEST_WAIT_S, _TIMEOUT_S = 0.1, 0.2
 
 
 @dataclass(frozen=True)
@@ -148,15 +148,11 @@ class Mailbox:
 
 
 def arrivals(
-    mailbox: Mailbox,
-    decode: Callable[[str, bytes], Any],
-    stop: threading.Event,
-    counts: Counter[str],
-    timeout_s: float = 0.2,
+    mailbox: Mailbox, decode: Callable[[str, bytes], Any], stop: threading.Event, counts: Counter[str]
 ) -> Iterator[Arrival | None]:
-    """Decoded messages until ``stop``; None where nothing came for ``timeout_s``. What cannot be decoded is counted."""
+    """Decoded messages until ``stop``; None where nothing came for 0.2 s. What cannot be decoded is counted."""
     while not stop.is_set():
-        raw = mailbox.get(timeout_s)
+        raw = mailbox.get(_TIMEOUT_S)
         if raw is None:
             yield None
             continue
@@ -172,10 +168,7 @@ def arrivals(
 def replay(path: Path, topics: Iterable[str], stop: threading.Event, *, fast: bool = False) -> Iterator[Arrival]:
     """Messages of the named topics until ``stop``; they arrive when they were recorded.
 
-    Raises
-    ------
-    SourceError
-        Where the bag cannot be read or lacks a topic.
+    Raises SourceError where the bag cannot be read or lacks a topic.
     """
     wanted = set(topics)
     start, first = time.monotonic_ns(), None

@@ -60,13 +60,10 @@ class LiveSettings:
     engine: EngineSettings = field(default_factory=EngineSettings)
 
 
-def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) -> dict[str, Any]:
+def run_live(settings: LiveSettings) -> dict[str, Any]:
     """Run until the source ends or a signal comes; returns the counts.
 
-    Raises
-    ------
-    GpvoError
-        Where an option, the model, the recording or the transport cannot be used; never for a bad message.
+    Raises GpvoError where an option, the model, the recording or the transport cannot be used; never for a bad message.
     """
     if settings.wire is None and settings.replay is None:
         raise GpvoError("there is no source", cure=f"give --replay BAG, or one of --{', --'.join(WIRES)}")
@@ -82,7 +79,7 @@ def run_live(settings: LiveSettings, tell: Callable[[str], None] | None = None) 
     stop = threading.Event()
     try:
         with ending_by_signal(stop):
-            live = Live(settings, wire, tell or _tell)
+            live = Live(settings, wire, _tell)
             live.run(stop)
             return {"counts": live.close()}
     finally:
@@ -101,13 +98,9 @@ def _refuse_idle(settings: LiveSettings, names: tuple[str, ...], cure: str) -> N
 class Live:
     """Engine and outputs of ``settings`` over an open ``wire`` (none: a recording), subscribed but not yet running.
 
-    Whatever can be refused is refused here. A managed node of ROS 2 is configured when it holds one of these, active
-    between ``start`` and ``stop``, and cleaned up by ``close``.
-
-    Raises
-    ------
-    GpvoError
-        Where an option, the model, the calibration or the recording cannot be used.
+    Whatever can be refused is refused here: an option, the model, the calibration or the recording, by GpvoError. A
+    managed node of ROS 2 is configured when it holds one of these, active between ``start`` and ``stop``, and cleaned
+    up by ``close``.
     """
 
     def __init__(self, settings: LiveSettings, wire: Wire | None, tell: Callable[[str], None]) -> None:
@@ -212,7 +205,9 @@ def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
             raise GpvoError("--stereo and --odometry are mutually exclusive", cure="choose one")
         if settings.stereo[0] == settings.stereo[1]:
             raise GpvoError(f"left and right are the same topic '{settings.stereo[0]}'", cure="name two topics")
-        rig = None if settings.calibration is None else read_stereo_yaml(settings.calibration)
+        path = settings.calibration
+        is_kitti = path is not None and path.suffix.lower() == ".txt"  # which does not state the size of the images
+        rig = path if path is None or is_kitti else read_stereo_yaml(path)
         return StereoStage(*settings.stereo, settings.imu, rig, settings.vo)
     if settings.vo != StereoSettings():
         raise GpvoError("the odometry was given settings, but no images to run on", cure="add --stereo LEFT RIGHT")
@@ -233,7 +228,7 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
         return {stage.topic: settings.pose_type, **truth}
     assert isinstance(stage, StereoStage)
     images = {t: IMAGE_TYPES["compressed" in t] for t in (stage.left, stage.right)}
-    infos = {} if stage.camera is not None else {info_topic(t): INFO_TYPE for t in images}
+    infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
     return {**images, **infos, **({stage.imu: IMU_TYPE} if stage.imu else {}), **truth}
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from gpvo.dataset.errors import interpolation_sigma, motion_targets
-from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.bag_reader import stamp_ns
 from gpvo.live.intake import Sequence, StampWatch
+from gpvo.live.stages import read_pose, stated_covariance
 from gpvo.types import Array, Prediction, TruthLog, VoRecord
 
 _MOTIONS, _POSES = 500, 5000
@@ -48,16 +48,14 @@ class LateTruth:
 
     def take(self, message: Any, T_body_cam: Array) -> Iterator[tuple[int, Array]]:
         """Stamps and errors ``xi`` (6,) of the motions that a message of truth makes known; NaN where it cannot say."""
-        t_ns, row = stamp_ns(message), pose_of(message)
-        norm = float(np.linalg.norm(row[3:]))
-        if not np.isfinite(row).all() or abs(norm - 1.0) > 0.1:
+        t_ns, T_world_body = stamp_ns(message), read_pose(message)
+        if T_world_body is None:
             return
         seen = self._watch.see(t_ns)
         if seen.dropped:
             return
         if seen is Sequence.RESTART:
             self._poses.clear()
-        T_world_body = se3.from_quaternion(row[None, :3], row[None, 3:])[0]
         self._poses.append((t_ns, T_world_body @ T_body_cam, *_variances(message)))
         ready = []
         while self._waiting and self._waiting[0][0].t_ns <= t_ns:
@@ -79,9 +77,7 @@ class LateTruth:
 
 def _variances(message: Any) -> tuple[float, float]:
     """Largest variance of position [m^2] and rotation [rad^2] that is stated; zeros where none is."""
-    flat = getattr(getattr(message, "pose", None), "covariance", None)
-    if flat is None or np.size(flat) != 36:
+    C = stated_covariance(getattr(message, "pose", None))
+    if C is None or not is_positive_definite(C):
         return 0.0, 0.0
-    C = np.asarray(flat, dtype=np.float64).reshape(6, 6)
-    d = np.diagonal(C)
-    return (float(d[:3].max()), float(d[3:].max())) if is_positive_definite(C) else (0.0, 0.0)
+    return float(C.diagonal()[:3].max()), float(C.diagonal()[3:].max())

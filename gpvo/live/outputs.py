@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from gpvo.errors import GpvoError
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE
-from gpvo.live.engine import Health
+from gpvo.live.engine import Health, Output
 from gpvo.publish import ros
 from gpvo.publish.mavlink import Link
 from gpvo.publish.odometry import Odometry
 
+PART_S = 30.0
+"""How often what has come for a bag is written to a part of it."""
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 Send = Callable[[bytes], None]
 
@@ -51,7 +57,7 @@ def decode(wire: Wire, data: bytes, msgtype: str) -> Any:
     return deserialise(data, msgtype)
 
 
-class WireOutput:
+class WireOutput(Output):
     """``nav_msgs/Odometry`` on ``topic`` and ``/diagnostics``; ``PoseWithCovarianceStamped`` on ``pose_topic``.
 
     Lost frames are not sent: a receiver would fuse them. The diagnostics say that they are missing.
@@ -85,12 +91,12 @@ class WireOutput:
         header = t["std_msgs/msg/Header"](**numbered, stamp=stamp, frame_id="")
         self._send_health(encode(self._wire, t[DIAGNOSTICS](header=header, status=[status])))
 
-    def close(self) -> None:
-        """The wire is closed by whoever opened it."""
 
+class Px4Output(Output):
+    """``px4_msgs/VehicleOdometry`` for a flight controller that listens by uXRCE-DDS; a lost frame is NaN.
 
-class Px4Output:
-    """``px4_msgs/VehicleOdometry`` for a flight controller that listens by uXRCE-DDS; a lost frame is NaN."""
+    The message's quality is what it says of health.
+    """
 
     def __init__(self, wire: Wire) -> None:
         ros.register_px4(wire.store)
@@ -100,54 +106,55 @@ class Px4Output:
         """Send one frame."""
         self._send(encode(self._wire, ros.vehicle_odometry(odometry, self._wire.store.types)))
 
-    def health(self, health: Health) -> None:
-        """It is carried as the message's quality."""
 
-    def close(self) -> None:
-        """The wire is closed by whoever opened it."""
+class MavlinkOutput(Output):
+    """ODOMETRY, whose quality is the health, VISION_SPEED_ESTIMATE and HEARTBEAT to ``udp:HOST:PORT`` or
+    ``serial:DEVICE:BAUD``."""
 
-
-class MavlinkOutput:
-    """ODOMETRY, VISION_SPEED_ESTIMATE and HEARTBEAT to ``udp:HOST:PORT`` or ``serial:DEVICE:BAUD``."""
-
-    def __init__(self, address: str, system: int = 1) -> None:
-        self._link = Link(address, system)
+    def __init__(self, address: str) -> None:
+        self._link = Link(address)
 
     def odometry(self, odometry: Odometry) -> None:
         """Send one frame; a lost one with quality -1."""
         self._link.send(odometry)
 
-    def health(self, health: Health) -> None:
-        """MAVLink carries it as ODOMETRY's quality."""
 
-    def close(self) -> None:
-        """A datagram needs no farewell."""
-
-
-class FileOutput:
+class FileOutput(Output):
     """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end.
 
-    Raises GpvoError at once where something lies there: it may be the flight before a restart.
+    Until then, what came in each half minute is a bag of its own in the folder ``<name>.parts`` beside it, by its first
+    stamp: nothing else remains where the process is killed. Raises GpvoError at once where the bag exists: it may be
+    the flight before a restart.
     """
 
     def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
         if path.exists():
             raise GpvoError("already exists", where=path, cure="give another name or remove it")
-        self._path, self._topic = path, topic
+        self._path, self._topic, self._folder = path, topic, path.with_name(f"{path.name}.parts")
         self._odometry: list[Odometry] = []
+        self._begun, self._begun_s = 0, time.monotonic()  # of the part that is yet to be written
+        self._writer = ThreadPoolExecutor(1)  # frames must not wait for the disk
+        self._parts: dict[Path, Future[int]] = {}
 
     def odometry(self, odometry: Odometry) -> None:
-        """Keep one frame."""
+        """Keep one frame. GpvoError where the part before could not be written."""
         self._odometry.append(odometry)
-
-    def health(self, health: Health) -> None:
-        """A bag of odometry holds none."""
+        part = self._odometry[self._begun :] if time.monotonic() - self._begun_s >= PART_S else []
+        if any(o.twist_body is not None for o in part):
+            before, place = list(self._parts.values()), self._folder / f"{part[0].t_ns}{self._path.suffix}"
+            self._parts[place] = self._writer.submit(ros.write_bag, place, part, self._topic)
+            self._begun, self._begun_s = len(self._odometry), time.monotonic()
+            if before and before[-1].done():
+                before[-1].result()
 
     def close(self) -> None:
         """Write the bag; only warn where there is nothing to write, as when the end comes before the first image."""
+        self._writer.shutdown()
         if all(o.twist_body is None for o in self._odometry):
             warnings.warn(f"{self._path}: not written, because no frame had a motion", stacklevel=2)
-        elif self._path.suffix == ".bag":
-            ros.write_ros1(self._path, self._odometry, self._topic)
         else:
-            ros.write_ros2(self._path, self._odometry, self._topic, mcap=self._path.suffix == ".mcap")
+            ros.write_bag(self._path, self._odometry, self._topic)
+            for place in self._parts:  # those of a process that was killed stay
+                shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+            with suppress(OSError):
+                self._folder.rmdir()

@@ -125,9 +125,8 @@ class PoseStage:
         """One record, unless the message is late, repeated, absurd or of another clock."""
         if arrival.topic != self.topic:
             return
-        message, row = arrival.message, pose_of(arrival.message)
-        norm = float(np.linalg.norm(row[3:]))
-        if not np.isfinite(row).all() or abs(norm - 1.0) > 0.1 or np.abs(row[:3]).max() > _MAX_M:
+        message, T_parent_body = arrival.message, read_pose(arrival.message, _MAX_M)
+        if T_parent_body is None:
             self.counts["absurd"] += 1
             return
         t_ns = stamp_ns(message)
@@ -140,7 +139,6 @@ class PoseStage:
         if not self._is_placed:
             self._place(np.eye(4) if is_optical(moving_frame(message)) else T_FLU_OPTICAL)
             self._is_placed = True
-        T_parent_body = se3.from_quaternion(row[None, :3], row[None, 3:] / norm)[0]
         begins = self._last is None
         record = self._record(t_ns, T_parent_body @ self.T_body_cam, message, seen)
         child = str(getattr(message, "child_frame_id", "")) or "base_link"
@@ -156,17 +154,17 @@ class PoseStage:
         return []
 
     def _record(self, t_ns: int, T_parent_cam: Array, message: Any, seen: Sequence) -> VoRecord:
-        before, pose = self._last, _pose_covariance(message, T_parent_cam @ self._T_cam_body)
+        before, pose = self._last, stated_covariance(getattr(message, "pose", None))
+        if pose is not None:  # in the body's axes
+            pose = rotate_covariance((T_parent_cam @ self._T_cam_body)[:3, :3].T, pose)
         self._last = (t_ns, T_parent_cam, pose)
         if before is None:
             return VoRecord(t_ns, t_ns, Status.START, np.eye(4))
         T_prev_cur = se3.inverse(before[1]) @ T_parent_cam
         dt_s = (t_ns - before[0]) * 1e-9
         stated = self._stated(message, self.T_body_cam @ T_prev_cur @ self._T_cam_body, dt_s, before[2], pose)
-        was_unknown, self._is_unknown = (
-            self._is_unknown,
-            IMPORTED in stated and is_turn_unknown(stated[IMPORTED][None])[0],
-        )
+        was_unknown = self._is_unknown
+        self._is_unknown = IMPORTED in stated and bool(is_turn_unknown(stated[IMPORTED][None])[0])
         if self._is_unknown:  # its pose is a placeholder, as in to_records
             T_prev_cur, self._last = np.eye(4), (t_ns, before[1], pose)
         status, reason = Status.OK, ""
@@ -185,7 +183,7 @@ class PoseStage:
     ) -> dict[str, Array]:
         """What is stated of the body's motion, or else of its poses, in the camera's axes."""
         self._moved, self._motions = self._moved + se3.log(T_body_prev_cur) ** 2, self._motions + 1
-        twist = _matrix(getattr(message, "twist", None))
+        twist = stated_covariance(getattr(message, "twist", None))
         if twist is not None and (of_velocity := self._of_camera(twist)) is not None:
             return {IMPORTED: of_velocity * dt_s**2}
         if before is None or now is None:
@@ -210,13 +208,17 @@ class PoseStage:
         return symmetrise(change_body(self._T_cam_body, C)) if is_positive_definite(C) else None
 
 
-def _pose_covariance(message: Any, T_parent_body: Array) -> Array | None:
-    """(6, 6) in the body's axes, None where none is stated."""
-    C = _matrix(getattr(message, "pose", None))
-    return None if C is None else rotate_covariance(T_parent_body[:3, :3].T, C)
+def read_pose(message: Any, farthest_m: float = FARTHEST_M) -> Array | None:
+    """The pose or transform (4, 4) of a message; None where it is not finite, too far away, or no rotation."""
+    row = pose_of(message)
+    norm = float(np.linalg.norm(row[3:]))
+    # Comparisons with NaN are false.
+    if not (np.abs(row[:3]).max() <= farthest_m and abs(norm - 1.0) <= 0.1):
+        return None
+    return se3.from_quaternion(row[:3], row[3:] / norm)
 
 
-def _matrix(holder: Any) -> Array | None:
+def stated_covariance(holder: Any) -> Array | None:
     """The (6, 6) covariance of a PoseWithCovariance or TwistWithCovariance, zeros too; None where it is not one."""
     flat = getattr(holder, "covariance", None)
     if flat is None or np.size(flat) != 36:
@@ -228,8 +230,8 @@ def _matrix(holder: Any) -> Array | None:
 def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) -> VoRecord:
     """The unknown motion, of ``duration_s``, from the last message before a restart to the first after it."""
     t_prev_ns = record.t_ns - max(round(duration_s * 1e9), 1)
-    unknown = VoRecord(record.t_ns, t_prev_ns, Status.LOST, np.eye(4), reason="restart of the source")
-    return replace(unknown, covariances={method: covariance})
+    stated, reason = {method: covariance}, "restart of the source"
+    return VoRecord(record.t_ns, t_prev_ns, Status.LOST, np.eye(4), reason=reason, covariances=stated)
 
 
 class FrameTree:
@@ -246,13 +248,12 @@ class FrameTree:
         """The transforms of one message."""
         for transform in message.transforms:
             parent, child = _frame_name(transform.header.frame_id), _frame_name(transform.child_frame_id)
-            row = pose_of(transform)
-            good = np.isfinite(row).all() and abs(np.linalg.norm(row[3:]) - 1.0) < 0.1
+            T_parent_child = read_pose(transform)
             is_full = child not in self._places and len(self._places) >= _MOST_FRAMES
-            if not good or np.abs(row[:3]).max() > FARTHEST_M or parent == child or is_full:
+            if T_parent_child is None or parent == child or is_full:
                 self.refused += 1
-                continue
-            self._places[child] = (parent, se3.from_quaternion(row[:3], row[3:]))
+            else:
+                self._places[child] = (parent, T_parent_child)
 
     def transform(self, target: str, source: str) -> Array | None:
         """T_target_source (4, 4); None where no chain of transforms joins the two frames."""
@@ -264,9 +265,8 @@ class FrameTree:
         """The frame itself and all above it, nearest first, with T_ancestor_frame."""
         T, out = np.eye(4), {name: np.eye(4)}
         while name in self._places and self._places[name][0] not in out:
-            name, T_parent = self._places[name][0], self._places[name][1]
-            T = T_parent @ T
-            out[name] = T
+            name, T_parent = self._places[name]
+            out[name] = T = T_parent @ T
         return out
 
 

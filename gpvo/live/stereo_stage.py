@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.cameras.readers import CameraInfo, rig_from_camera_info
+from gpvo.cameras.readers import CameraInfo, read_projections, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.io.bag_images import PairQueue, decode_message
@@ -51,8 +51,9 @@ class StereoSettings:
 class StereoStage:
     """Pairs of images through :class:`gpvo.vo.odometry.StereoOdometry`, with an IMU where one is named.
 
-    ``rig``: the calibration; without it pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits
-    for the first IMU sample after it, or for the next pair.
+    ``rig``: the calibration, or the file of one that does not state the size of the images, as KITTI's: it is read when
+    the first pair tells. Without one pairs, ten at most, wait for CameraInfo beside the image topics. A pair waits for
+    the first IMU sample after it, or for the next pair.
 
     Raises GpvoError if a file of the ``settings`` cannot be used, or does not fit the ``rig``.
     """
@@ -62,7 +63,7 @@ class StereoStage:
         left: str,
         right: str,
         imu: str | None = None,
-        rig: StereoRig | None = None,
+        rig: StereoRig | Path | None = None,
         settings: StereoSettings | None = None,
     ) -> None:
         self.settings = settings or StereoSettings()
@@ -81,8 +82,12 @@ class StereoStage:
         self.camera: StereoCamera | None = None
         self.T_body_cam, self.T_source_cam = T_FLU_OPTICAL, np.eye(4)
         self._shift_ns = 0
-        if rig is not None:
+        self._without_size: Path | None = None
+        if isinstance(rig, StereoRig):
             self._calibrate(rig)
+        elif rig is not None:
+            read_projections(rig)  # a file that cannot be read is refused at once
+            self._without_size = rig
         self.reset()
 
     def reset(self) -> None:
@@ -104,6 +109,7 @@ class StereoStage:
             pair = self._pairs.push(topic, message)
             self.counts["unpaired"] += self._report.missing - missing
             if pair is not None:
+                self._take_size(pair[1])
                 if self._rectifier is not None:
                     yield from self.flush()
                 elif len(self._waiting) == _PAIRS_KEPT:
@@ -164,13 +170,24 @@ class StereoStage:
         self._odometry, self._t_last_ns = None, 0
 
     def _take_info(self, topic: str, message: Any) -> None:
-        if self._rectifier is not None:
+        if not self.wants_info:
             return
         self._infos[topic] = camera_info_of(message, topic, topic)
         names = [info_topic(t) for t in (self.left, self.right)]
         if all(n in self._infos for n in names):
             rectified = all("rect" in t for t in (self.left, self.right))
             self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
+
+    @property
+    def wants_info(self) -> bool:
+        """Whether the calibration is still to come, by CameraInfo."""
+        return self.camera is None and self._without_size is None
+
+    def _take_size(self, message: Any) -> None:
+        if self._without_size is not None and (image := decode_message(message)) is not None:
+            height, width = image.shape
+            self._calibrate(read_stereo_yaml(self._without_size, size=(width, height)))
+            self._without_size = None
 
     def _calibrate(self, rig: StereoRig) -> None:
         if self._masks is not None:

@@ -89,24 +89,14 @@ def _finite(r: VoRecord, method: str) -> Array | None:
     return C if C is not None and np.isfinite(C).all() else None
 
 
-def _image(r: VoRecord, _: float) -> Sequence[float]:
-    return r.brightness, r.contrast, r.sharpness, r.noise_level
-
-
-def _norm(v: Array | None) -> float:
-    return math.nan if v is None else math.hypot(*v)
-
-
 def _imu(r: VoRecord, _: float) -> Sequence[float]:
-    return tuple(
-        _norm(v) for v in (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps, r.imu_acc_std_mps2, r.imu_gyro_std_radps)
-    )
+    vectors = (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps, r.imu_acc_std_mps2, r.imu_gyro_std_radps)
+    return [math.nan if v is None else math.hypot(*v) for v in vectors]
 
 
 def _imu_axes(r: VoRecord, _: float) -> Sequence[float]:
-    nothing = np.full(3, np.nan)
-    acc, gyro = r.imu_acc_mean_mps2, r.imu_gyro_mean_radps
-    return (*(nothing if acc is None else acc), *(nothing if gyro is None else gyro))
+    means = (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps)
+    return [x for v in means for x in ((math.nan,) * 3 if v is None else v)]
 
 
 def _columns(listed: str) -> tuple[Feature, ...]:
@@ -140,7 +130,7 @@ BUILT_IN = (
     FeatureGroup(
         "image",
         _columns("brightness [0..1], contrast [0..1], sharpness [log10], noise_level [0..1]"),
-        _stateless(_image),
+        _stateless(lambda r, _: (r.brightness, r.contrast, r.sharpness, r.noise_level)),
     ),
     FeatureGroup(
         "trend",

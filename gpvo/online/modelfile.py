@@ -83,7 +83,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
     _check_document(document, path)
     if _digest(arrays, document["header"]) != document["digest"]:
         raise ModelError("the content does not match its digest", where=path, cure="copy or train the model again")
-    return arrays, document["printable"]
+    return arrays, _printable(document["header"])
 
 
 def _check_document(document: Any, path: Path) -> None:
@@ -92,7 +92,6 @@ def _check_document(document: Any, path: Path) -> None:
     check_version("schema", document.get("schema"), SCHEMA, path)
     if not isinstance(document.get("header"), dict) or not isinstance(document.get("digest"), str):
         raise ModelError("has a damaged header", where=path)
-    document["printable"] = _printable(document["header"])
     _check_header(document["header"], path)
 
 

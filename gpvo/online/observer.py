@@ -161,7 +161,7 @@ def joined(motions: list[VoRecord]) -> VoRecord:
         last,
         t_prev_ns=motions[0].t_prev_ns,
         T_prev_cur=T,
-        status=Status(status),
+        status=status,
         covariances=covariances,
         v_t={},
         **known,

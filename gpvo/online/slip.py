@@ -89,7 +89,8 @@ class SlipDetector:
         if self._anchor is None or abs(middle_s - self._anchor[0]) > _PATIENCE_S:
             self._anchor = (middle_s, now)
             return record
-        change = _rates(middle_s, now, self._anchor)
+        before_s, before = self._anchor
+        change = lengths(((now - before) / max(middle_s - before_s, _LEAST_STEP_S)).tolist())
         disagreement = self._gyro_disagreement(record, now)
         problem = self._problem(record, change, disagreement)
         if problem:
@@ -128,12 +129,6 @@ def _unflagged(record: VoRecord) -> VoRecord:
     if record.status is not Status.LOST or not found:
         return record
     return replace(record, status=Status.DEGRADED if before else Status.OK, reason=before.removesuffix("; "))
-
-
-def _rates(middle_s: float, now: Array, before: tuple[float, Array]) -> tuple[float, float]:
-    """Linear and angular acceleration implied by two velocities and the times they belong to, over 30 ms at least."""
-    step_s = max(middle_s - before[0], _LEAST_STEP_S)
-    return lengths(((now - before[1]) / step_s).tolist())
 
 
 def flag_slips(log: VoLog) -> VoLog:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpvo.errors import GpvoError
+from gpvo.geometry.covariance import variances
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 
@@ -52,8 +53,8 @@ FUSIONCORE_FALLBACK = (0.1, 0.02)
 
 def fusioncore_sigmas(covariance: Array) -> Array:
     """(6,) standard deviations that FusionCore's gate and update use: of the diagonal alone, zeros replaced."""
-    variances = np.diagonal(covariance)
-    return np.where(variances > 0, np.sqrt(np.maximum(variances, 0.0)), np.repeat(FUSIONCORE_FALLBACK, 3))
+    variance = variances(covariance)
+    return np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.repeat(FUSIONCORE_FALLBACK, 3))
 
 
 @dataclass(frozen=True)
@@ -89,18 +90,14 @@ def check(odometry: Sequence[Odometry], consumer: str) -> list[Verdict]:
     return checks[consumer](pose, np.array([o.twist_covariance for o in good], dtype=np.float64))
 
 
-def _variances(covariances: Array) -> Array:
-    return np.diagonal(covariances, axis1=1, axis2=2)
-
-
 def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
     pairs = (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad"))
-    smallest = ((quantity, np.sqrt(_variances(C)).min(axis=1), unit) for quantity, C, unit in pairs)
+    smallest = ((quantity, np.sqrt(variances(C)).min(axis=1), unit) for quantity, C, unit in pairs)
     return [_verdict(q, "variance floor", 1e-9, sigma, unit, floor=1e-9**0.5) for q, sigma, unit in smallest]
 
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
-    p, pose, twist = Px4Parameters(), np.sqrt(_variances(pose)), np.sqrt(_variances(twist))
+    p, pose, twist = Px4Parameters(), np.sqrt(variances(pose)), np.sqrt(variances(twist))
     out = []
     for quantity, name, sigma, unit in (
         ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
@@ -130,7 +127,7 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
-    p, pose, twist = ArduPilotParameters(), _variances(pose), _variances(twist)
+    p, pose, twist = ArduPilotParameters(), variances(pose), variances(twist)
     out = []
     for quantity, name, old, new, unit in (
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
@@ -168,11 +165,8 @@ def _verdict(
     usual level and its low end matters; a pose's grows from nothing, so its middle does."""
     predicted = _percentiles(sigma)
     hidden = 100.0 * float((sigma < (value if floor is None else floor)).mean())
-    advice = ""
-    if hidden > 1.0 and floor is None:
-        wanted = float(np.quantile(sigma, typical))
-        if wanted >= value:
-            return Verdict(quantity, name, value, hidden, predicted, unit)
+    advice, wanted = "", float(np.quantile(sigma, typical))
+    if hidden > 1.0 and floor is None and wanted < value:
         advice = f"Set {name} to {max(wanted, minimum):.2g}"
         if wanted < minimum:
             advice += f", the smallest it accepts; a sigma of {wanted:.2g} {unit} stays hidden"

@@ -18,7 +18,7 @@ from gpvo.online.base import motion_noise, positions
 from gpvo.online.division import LEAST_LEFT
 from gpvo.online.estimate import DURATIONS_S, LEAST_VAR, LN_LARGEST, ErrorModel
 from gpvo.online.predictor import Predictor
-from gpvo.online.stored import LARGEST
+from gpvo.online.stored import LARGEST, Stored
 from gpvo.publish.onnx import to_onnx
 
 SUFFIXES = {"onnx": ".onnx", "c": ".h"}
@@ -153,39 +153,33 @@ def _constants(model: ErrorModel) -> list[str]:
     return [
         *(f"#define GPVO_{key} {value}" for key, value in sizes.items()),
         "",
-        *_array("centre", domain.centre),
-        *_array("scale", domain.scale),
-        *_array("low", domain.low),
+        *_arrays(domain, "centre", "scale", "low"),
         *_array("high_edge", domain.high),
-        *_array("least", domain.least),
-        *_array("most", domain.most),
-        *_array("whitening", domain.whitening),
+        *_arrays(domain, "least", "most", "whitening"),
         *_array("missing", domain.charge_of_missing),
         *_array("absent", model.absent),
         *_array("input", model.inputs, "int"),
         *_array("base_column", columns, "int"),
         *_array("by_velocity", by_velocity),
         *_array("by_acceleration", by_acceleration),
-        *_array("theta", model.base.theta),
-        *_array("theta_plain", model.base.theta_plain),
-        *_array("usual_rate_var", model.velocities.usual_rate_var),
-        *_array("factor", model.factor),
-        *_array("high", model.high),
-        *_array("correlation", model.division.correlation),
-        *_array("share", model.division.share),
-        *_array("growth", model.division.growth),
-        *_array("level", model.division.level),
-        *_array("calibration_patterns", model.division.calibration_patterns),
+        *_arrays(model.base, "theta", "theta_plain"),
+        *_arrays(model.velocities, "usual_rate_var"),
+        *_arrays(model, "factor", "high"),
+        *_arrays(model.division, "correlation", "share", "growth", "level", "calibration_patterns"),
         *_array("gp_centre", gp.centre),
         *_array("lengthscale", gp.lengthscale),
         *_array("point", gp.points),
-        *_array("offset", gp.offset),
-        *_array("signal_var", gp.signal_var),
+        *_arrays(gp, "offset", "signal_var"),
         *_array("kernel_weight", gp.weights @ gp.projection),
         *_array("reduction", gp.reduction, "float"),
         *_array("projection", gp.projection, "float"),
         "",
     ]
+
+
+def _arrays(holder: Stored, *names: str) -> list[str]:
+    """Those that are called in C as they are here."""
+    return [line for name in names for line in _array(name, getattr(holder, name))]
 
 
 def _array(name: str, values: ArrayLike, kind: str = "double") -> list[str]:

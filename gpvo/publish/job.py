@@ -158,10 +158,7 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
     kind = settings.to or "bag"
     out = settings.out or Path(f"{run.name}_{kind}")
     ros1 = kind == "bag" and out.suffix.lower() == ".bag"
-    if ros1:
-        count = ros.write_ros1(out, odometry, settings.topic)
-    else:
-        count = ros.write_ros2(out, odometry, settings.topic, mcap=kind == "mcap")
+    count = ros.write_bag(out, odometry, settings.topic, "mcap" if kind == "mcap" else "ros1" if ros1 else "sqlite3")
     rate_hz = 1.0 / float(np.median(np.diff([o.t_ns for o in odometry])) * 1e-9)
     parameters = out.with_name(f"{out.stem}_robot_localization.yaml")
     text = ros.robot_localization_yaml(settings.topic, rate_hz=max(30.0, rate_hz), ros1=ros1)

@@ -72,9 +72,9 @@ def upper_triangle(covariance: Array | None) -> list[float]:
 class Sender:
     """Makes messages as the VIO component of the vehicle ``system``."""
 
-    def __init__(self, system: int = 1, component: int = COMPONENT) -> None:
+    def __init__(self, system: int = 1) -> None:
         self._dialect: Any = dialect()
-        self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._link: Any = self._dialect.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
         self._next_beat_ns: int | None = None
 
     def odometry(self, odometry: Odometry) -> bytes:
@@ -150,28 +150,19 @@ class Sender:
         return packed
 
 
-def stream(odometry: Iterable[Odometry], sender: Sender, emit: Callable[[int, bytes], None]) -> int:
-    """Hand ``emit(t_ns, bytes)`` every message of a run: speed, odometry and a heartbeat a second; returns frames."""
-    count = 0
-    for item in odometry:
-        for message in sender.due(item):
-            emit(item.t_ns, message)
-        count += 1
-    return count
-
-
 def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
     """Write a telemetry log: every message after its time, 8 bytes big-endian microseconds. Returns frames."""
     path = Path(path)
     if path.is_dir():
         raise GpvoError("is a folder, and a telemetry log is a file", where=path, cure="choose another -o")
     path.parent.mkdir(parents=True, exist_ok=True)
+    sender, count = Sender(system), 0
     with replacing(path) as temporary, temporary.open("wb") as file:
-
-        def emit(t_ns: int, message: bytes) -> None:
-            file.write(struct.pack(">Q", t_ns // 1000) + message)
-
-        return stream(odometry, Sender(system), emit)
+        for item in odometry:
+            for message in sender.due(item):
+                file.write(struct.pack(">Q", item.t_ns // 1000) + message)
+            count += 1
+    return count
 
 
 @dataclass

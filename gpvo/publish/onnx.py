@@ -59,8 +59,8 @@ class _Graph:
         self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(value, dtype=dtype), name))
         return name
 
-    def __call__(self, op: str, *inputs: str | float, out: str | None = None, **attributes: Any) -> str:
-        """One node; numbers become constants."""
+    def __call__(self, op: str, *inputs: ArrayLike, out: str | None = None, **attributes: Any) -> str:
+        """One node; numbers and arrays become constants."""
         name = out or f"v{len(self._nodes)}"
         named = [i if isinstance(i, str) else self.constant(i) for i in inputs]
         self._nodes.append(self._onnx.helper.make_node(op, named, [name], **attributes))
@@ -114,7 +114,7 @@ def _predict(g: _Graph, model: ErrorModel) -> None:
     near = g.expand(in_domain, 1)
     growth = g.expand(g("Pow", g("Add", distance, 1.0), float(model.outside_power[0])), 1)
     known = g("Mul", base, g("Exp", g("Sub", log_noise, g("Mul", spread, 0.5))))
-    short = g("Max", g("Sub", g.constant(model.high), log_noise), 0.0)
+    short = g("Max", g("Sub", model.high, log_noise), 0.0)
     cautious = g("Add", log_noise, g("Mul", g("Sub", 1.0, near), short))
     more = g("Mul", g("Sub", 1.0, near), g("Max", g("Sub", plain, base), 0.0))
     noise = g("Mul", g("Add", base, more), g("Exp", cautious))
@@ -130,7 +130,7 @@ def _predict(g: _Graph, model: ErrorModel) -> None:
     covariance = g.add(*parts, out="covariance")
     ln_det = g.add(*(g("Log", pivot) for pivot in _pivots(g, covariance)))
     g("Mul", base, 0.0, out="mean")
-    precision = g("Exp", g("Div", g("Sub", g.constant(model.typical_ln_det[0]), ln_det), 12.0))
+    precision = g("Exp", g("Div", g("Sub", model.typical_ln_det[0], ln_det), 12.0))
     g("Mul", g("Min", precision, 1.0), in_domain, out="confidence")
 
 
@@ -140,14 +140,14 @@ def _locate(g: _Graph, model: ErrorModel, base: str) -> tuple[str, str, str]:
     squared_dt = g.expand(g("Mul", g.dt, g.dt), 1)
     noise = g.add(g("MatMul", base, by_velocity), g("Div", g("MatMul", base, by_acceleration), squared_dt))
     known = g.add(g("Div", noise, squared_dt), 1.0)
-    u = g("Div", g("Sub", "features", g.constant(domain.centre)), g.constant(domain.scale))
+    u = g("Div", g("Sub", "features", domain.centre), domain.scale)
     present = g.known("features")
     u = g("Where", present, u, 0.0)
-    inside = g("Min", g("Max", u, g.constant(domain.low)), g.constant(domain.high))
-    away = g("Sub", u, g("Min", g("Max", u, g.constant(domain.least)), g.constant(domain.most)))
+    inside = g("Min", g("Max", u, domain.low), domain.high)
+    away = g("Sub", u, g("Min", g("Max", u, domain.least), domain.most))
     charged = g("Where", present, 0.0, g.constant(domain.charge_of_missing))
     beyond = g.sum(g("Add", g("Div", g("Mul", away, away), known), charged), 1)
-    white = g("MatMul", inside, g.constant(domain.whitening))
+    white = g("MatMul", inside, domain.whitening)
     joint = g("Max", g("Sub", g("Sqrt", g.sum(g("Mul", white, white), 1)), float(domain.radius[0])), 0.0)
     squared = g("Add", beyond, g("Mul", joint, joint))
     distance = g("Sqrt", squared, out="distance")
@@ -157,24 +157,24 @@ def _locate(g: _Graph, model: ErrorModel, base: str) -> tuple[str, str, str]:
 def _log_ratio(g: _Graph, model: ErrorModel, inputs: str) -> tuple[str, str]:
     """Log of the variance over the base, and the variance of that log; ``ProjectedGP.evaluate``."""
     gp = model.gp
-    u = g("Div", g("Sub", inputs, g.constant(gp.centre)), g.constant(gp.lengthscale))
-    cross = g("MatMul", u, g.constant(gp.points.T))
+    u = g("Div", g("Sub", inputs, gp.centre), gp.lengthscale)
+    cross = g("MatMul", u, gp.points.T)
     norms = g("Mul", g.expand(g.sum(g("Mul", u, u), 1), 1), 0.5)
-    k = g("Exp", g("Min", g("Sub", g("Sub", cross, norms), g.constant(0.5 * (gp.points**2).sum(1))), 0.0))
-    z = g("MatMul", k, g.constant(gp.projection.T))
-    explained = g("MatMul", g("Mul", z, z), g.constant(gp.reduction.T))
-    mean = g("Add", g("MatMul", z, g.constant(gp.weights.T)), g.constant(gp.offset))
-    return mean, g("Max", g("Sub", g.constant(gp.signal_var), explained), 0.0)
+    k = g("Exp", g("Min", g("Sub", g("Sub", cross, norms), 0.5 * (gp.points**2).sum(1)), 0.0))
+    z = g("MatMul", k, gp.projection.T)
+    explained = g("MatMul", g("Mul", z, z), gp.reduction.T)
+    mean = g("Add", g("MatMul", z, gp.weights.T), gp.offset)
+    return mean, g("Max", g("Sub", gp.signal_var, explained), 0.0)
 
 
 def _limit(g: _Graph, model: ErrorModel) -> str:
     """(N, 6): no motion is more wrong than VO's and the usual one are long."""
     at = positions(model.columns, model.base.columns)[:6]
     rate = g.take("features", at, axis=1)
-    rate = g("Where", g.known(rate), rate, g.constant(model.absent[:6]))
+    rate = g("Where", g.known(rate), rate, model.absent[:6])
     dt = g.expand(g.dt, 1)
-    moved = g("Mul", g("Add", g("Mul", rate, rate), g.constant(model.velocities.usual_rate_var)), g("Mul", dt, dt))
-    return g("MatMul", moved, g.constant(np.kron(np.eye(2), np.ones((3, 3)))))
+    moved = g("Mul", g("Add", g("Mul", rate, rate), model.velocities.usual_rate_var), g("Mul", dt, dt))
+    return g("MatMul", moved, np.kron(np.eye(2), np.ones((3, 3))))
 
 
 def _within(g: _Graph, variance: str, limit: str) -> str:
@@ -187,20 +187,20 @@ def _base(g: _Graph, model: ErrorModel, theta: Array) -> str:
     domain = model.domain
     at = positions(model.columns, model.base.columns)
     columns = g.take("features", at, axis=1)
-    columns = g("Where", g.known(columns), columns, g.constant(model.absent))
+    columns = g("Where", g.known(columns), columns, model.absent)
     dt = g.expand(g.dt, 1)
     moved = [g("Mul", g.take(columns, part, axis=1), dt) for part in ([0, 1, 2], [3, 4, 5])]
     squared = [g.expand(g.sum(g("Mul", part, part), 1), 1) for part in moved]
-    terms = [g("Mul", squared[i], g.constant(theta[:, 2 + i])) for i in range(2)]
+    terms = [g("Mul", squared[i], theta[:, 2 + i]) for i in range(2)]
     if len(at) >= 12:
         least = g.constant((domain.centre + domain.scale * domain.low)[at][6:])
         known = g("Exp", g("Min", g("Max", g.take(columns, np.arange(6, len(at)), axis=1), least), LN_LARGEST))
         geometry = g.take(known, np.arange(6), axis=1)
-        terms.append(g("Mul", geometry, g.constant(theta[:, 0])))
+        terms.append(g("Mul", geometry, theta[:, 0]))
         if len(at) > 12:
             noise = g.take(known, [6], axis=1)
             at_residual = g("Mul", geometry, g("Mul", noise, noise))
-            terms.append(g("Mul", at_residual, g.constant(theta[:, 4])))
+            terms.append(g("Mul", at_residual, theta[:, 4]))
     return g.add(*terms, g.constant(theta[:, 1]))
 
 
@@ -210,7 +210,7 @@ def _correlations(g: _Graph, model: ErrorModel) -> list[str]:
     flat = g("Reshape", "geometry", g.constant([-1, 36], np.int64))
     both = g("Mul", g("Add", "geometry", g("Transpose", "geometry", perm=[0, 2, 1])), 0.5)
     own = g("Div", both, g.outer(g("Sqrt", g.take(flat, np.arange(6) * 7, axis=1))))
-    pivots = _pivots(g, g("Add", own, g.constant(1e-6 * np.eye(6))))
+    pivots = _pivots(g, g("Add", own, 1e-6 * np.eye(6)))
     definite = g("Cast", g("Greater", g("Concat", *(g.expand(p, 1) for p in pivots), axis=1), 0.0), to=_INT64)
     definite = g("Equal", g("ReduceMin", definite, axes=[1], keepdims=0), g.constant(1, np.int64))
     known = g.expand(g.expand(definite, 1), 1)
@@ -218,9 +218,9 @@ def _correlations(g: _Graph, model: ErrorModel) -> list[str]:
     out = []
     for i, R in enumerate(model.division.correlation):
         typical = g.constant(R)
-        mixed = g("Add", own, g.constant(R * (1.0 - weight))) if weight > 0 and i < 2 else typical
+        mixed = g("Add", own, R * (1.0 - weight)) if weight > 0 and i < 2 else typical
         chosen = g("Mul", g("Where", known, mixed, typical), 1.0 - 1e-6)
-        out.append(g("Add", chosen, g.constant(1e-6 * np.eye(6))))
+        out.append(g("Add", chosen, 1e-6 * np.eye(6)))
     return out
 
 
@@ -228,7 +228,7 @@ def _of_calibration(g: _Graph, model: ErrorModel, variance: str) -> tuple[str, s
     """Its root (N, 6, 6) and what is left of the variance (N, 6); ``gpvo.online.division.of_calibration``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:6], axis=1)
     patterns = np.transpose(model.division.calibration_patterns, (2, 1, 0)).reshape(6, 36)
-    flat = g("MatMul", g("Where", g.known(v), v, 0.0), g.constant(patterns))
+    flat = g("MatMul", g("Where", g.known(v), v, 0.0), patterns)
     root = g("Reshape", flat, g.constant([-1, 6, 6], np.int64))
     left = g("Div", variance, g("Add", variance, g.sum(g("Mul", root, root), 2)))
     rest = g("Mul", variance, g("Max", left, LEAST_LEFT))
@@ -242,15 +242,14 @@ def _shares(g: _Graph, model: ErrorModel, variance: str) -> list[str]:
     known = g("Equal", g("ReduceMin", g("Cast", there, to=_INT64), axes=[1]), g.constant(1, np.int64))
     v = g("Where", there, v, 0.0)
     speed = g("Sqrt", g.expand(g.sum(g("Mul", v, v), 1), 1))
-    ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), g.constant(model.division.ln_speed))
+    ratio = g("Sub", g("Log", g("Max", speed, 1e-9)), model.division.ln_speed)
     faster = g("Where", known, g("Max", g("Min", ratio, LN_FASTEST), 0.0), 0.0)
-    by_speed = g("Mul", faster, g.constant(model.division.growth[0]))
-    above = g("Sub", g("Log", variance), g.constant(model.division.level))
-    above = g("Mul", above, g.constant(model.division.growth[1]))
+    by_speed = g("Mul", faster, model.division.growth[0])
+    above = g("Mul", g("Sub", g("Log", variance), model.division.level), model.division.growth[1])
     by_noise = g("Max", g("Min", above, 60.0), -60.0)
     jitter = g.constant(model.division.share[0])
-    white = g("Mul", g("Exp", by_speed), g.constant(model.division.share[1]))
-    bias = g("Mul", g("Exp", g("Add", by_speed, by_noise)), g.constant(model.division.share[2]))
+    white = g("Mul", g("Exp", by_speed), model.division.share[1])
+    bias = g("Mul", g("Exp", g("Add", by_speed, by_noise)), model.division.share[2])
     whole = g.add(jitter, white, bias)
     return [g("Div", part, whole) for part in (jitter, white, bias)]
 

@@ -13,7 +13,7 @@ import shutil
 import sqlite3
 import tempfile
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -82,45 +82,16 @@ def check_topic(topic: str) -> str:
     return topic
 
 
-def write_ros1(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC) -> int:
-    """Write a ROS 1 bag; returns the number of messages."""
+def write_bag(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, kind: str | None = None) -> int:
+    """Write every frame that has a motion, in place of a bag of ``topic`` alone; returns the number of messages.
 
-    def fill(temporary: Path) -> int:
-        return _fill(Ros1Writer(temporary), odometry, topic, Stores.ROS1_NOETIC)
-
-    return _replacing(Path(path), topic, fill)
-
-
-def write_ros2(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, *, mcap: bool = False) -> int:
-    """Write a ROS 2 bag folder, sqlite3 or MCAP; returns the number of messages."""
-    if Path(path).is_file():
+    ``kind``: a file for ``ros1``, a ROS 2 bag folder for ``sqlite3`` and ``mcap``; by default as the suffix says.
+    Raises GpvoError where something else lies there, or nothing can be written.
+    """
+    path = Path(path)
+    kind = kind or {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "sqlite3")
+    if kind != "ros1" and path.is_file():
         raise GpvoError("is a file, and a ROS 2 bag is a folder", where=path, cure="choose another -o")
-    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
-
-    def fill(temporary: Path) -> int:
-        writer = Ros2Writer(temporary, version=9, storage_plugin=plugin)
-        return _fill(writer, odometry, topic, Stores.ROS2_HUMBLE)
-
-    return _replacing(Path(path), topic, fill)
-
-
-def _fill(closed: Any, odometry: Iterable[Odometry], topic: str, kind: Stores) -> int:
-    """Open a writer of bags of a kind, and write every frame that has a motion."""
-    store, count = get_typestore(kind), 0
-    ros1 = kind is Stores.ROS1_NOETIC
-    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
-    with closed as writer:
-        connection = writer.add_connection(topic, _TYPE, typestore=store)
-        for item in odometry:
-            if item.twist_body is not None:
-                message = odometry_message(item, store.types, seq=count if ros1 else None)
-                writer.write(connection, item.t_ns, serialize(message, _TYPE))
-                count += 1
-    return count
-
-
-def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
-    """Write beside the target and move it there when done."""
     if path.exists() and not _holds_only(path, topic):
         raise GpvoError(f"exists, and is not a bag of {topic} alone", where=path, cure="choose another -o")
     holder: Path | None = None
@@ -128,7 +99,7 @@ def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         holder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         # A bag's files carry its name inside, so the temporary one has the same name in a folder of its own.
-        count = fill(holder / path.name)
+        count = _fill(holder / path.name, odometry, topic, kind)
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(holder / path.name, path)
@@ -137,6 +108,21 @@ def _replacing(path: Path, topic: str, fill: Callable[[Path], int]) -> int:
     finally:
         if holder is not None:
             shutil.rmtree(holder, ignore_errors=True)
+    return count
+
+
+def _fill(path: Path, odometry: Iterable[Odometry], topic: str, kind: str) -> int:
+    ros1, count = kind == "ros1", 0
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    opened: Any = Ros1Writer(path) if ros1 else Ros2Writer(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    with opened as writer:
+        connection = writer.add_connection(topic, _TYPE, typestore=store)
+        for item in odometry:
+            if item.twist_body is not None:
+                message = odometry_message(item, store.types, seq=count if ros1 else None)
+                writer.write(connection, item.t_ns, serialize(message, _TYPE))
+                count += 1
     return count
 
 

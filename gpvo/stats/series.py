@@ -1,5 +1,5 @@
-"""Series: sums over windows, correlation in time (autocorrelation and Allan deviation), what in them is odd; and
-intervals for means, of one series or over sequences.
+"""Series: sums over windows, integrals, correlation in time (autocorrelation and Allan deviation), what in them is odd;
+and intervals for means, of one series or over sequences.
 
 D. W. Allan, "Statistics of atomic frequency standards" (1966); overlapping estimator as in IEEE Std 952-1997, annex C.
 Moving blocks on a circle: D. Politis, J. Romano, "A circular block-resampling procedure for stationary data" (1992).
@@ -25,6 +25,17 @@ def moving_sums(values: Array, m: int) -> Array:
     """(n - m + 1, ...) sums over every m consecutive rows of values (n, ...)."""
     total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     return np.asarray(total[m:] - total[:-m])
+
+
+def integral(values: Array, t_s: Array) -> Array:
+    """(n, d) integral of values (n, d) from the first time to each of ``t_s`` (n,), by the trapezoidal rule."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def interpolated(at_s: Array, t_s: Array, values: Array) -> Array:
+    """(m, d) at the times ``at_s`` (m,) between values (n, d) at ``t_s`` (n,), held beyond the ends."""
+    return np.stack([np.interp(at_s, t_s, column) for column in values.T], axis=1)
 
 
 def autocorrelation(values: Array, max_lag: int) -> Array:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.publish.odometry import Odometry
-from gpvo.publish.ros import TOPIC, write_ros1
+from gpvo.publish.ros import TOPIC, write_bag
 from ros1_tools import SYSTEM_PYTHON, environment, needs_rosbag, needs_rospy, ros_master
 
 READ = """
@@ -25,7 +25,7 @@ for topic, m, t in rosbag.Bag(sys.argv[1]).read_messages():
 @pytest.fixture(scope="module")
 def bag(odometry: list[Odometry], tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("ros1") / "odometry.bag"
-    write_ros1(path, odometry)
+    write_bag(path, odometry)
     return path
 
 

@@ -10,7 +10,7 @@ import yaml
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.publish.odometry import Odometry
-from gpvo.publish.ros import TOPIC, robot_localization_yaml, write_ros1, write_ros2
+from gpvo.publish.ros import TOPIC, robot_localization_yaml, write_bag
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
 def test_every_number_comes_back(odometry: list[Odometry], tmp_path: Path, kind: str) -> None:
     path = tmp_path / ("odometry.bag" if kind == "ros1" else "odometry")
-    count = write_ros1(path, odometry) if kind == "ros1" else write_ros2(path, odometry, mcap=kind == "mcap")
+    count = write_bag(path, odometry, kind=kind)
     tracked = [o for o in odometry if o.twist_body is not None]
     assert count == len(tracked) < len(odometry)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
@@ -40,16 +40,16 @@ def test_every_number_comes_back(odometry: list[Odometry], tmp_path: Path, kind:
 
 
 def test_an_old_bag_is_replaced_and_nothing_else(odometry: list[Odometry], tmp_path: Path) -> None:
-    write_ros2(tmp_path / "bag", odometry)
-    assert write_ros2(tmp_path / "bag", odometry[:10], mcap=True) == 9
+    write_bag(tmp_path / "bag", odometry)
+    assert write_bag(tmp_path / "bag", odometry[:10], kind="mcap") == 9
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.jpg").write_bytes(b"")
     with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
-        write_ros2(tmp_path / "photos", odometry)
-    for name, write in (("flight", write_ros2), ("flight.bag", write_ros1)):
-        write(tmp_path / name, odometry, "/camera/odometry")  # a recording
+        write_bag(tmp_path / "photos", odometry)
+    for name in ("flight", "flight.bag"):
+        write_bag(tmp_path / name, odometry, "/camera/odometry")  # a recording
         with pytest.raises(GpvoError, match="not a bag of /gpvo/odometry alone"):
-            write(tmp_path / name, odometry)
+            write_bag(tmp_path / name, odometry)
 
 
 def test_yaml_fuses_the_twist_alone() -> None:

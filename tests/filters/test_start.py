@@ -12,7 +12,7 @@ from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
 from gpvo.filters.run import FuseOptions, begin, fuse_flight, vertical_in_world
-from gpvo.filters.start import StartSigmas, StaticTest, from_rest, from_truth, heading
+from gpvo.filters.start import StartSigmas, from_rest, from_truth, heading
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.types import ImuLog, TruthLog, VoLog
@@ -51,7 +51,7 @@ def test_static_start_refuses_a_moving_vehicle() -> None:
     with pytest.raises(GpvoError, match=r"not at rest.*turn rate"):
         from_rest(replace(imu, gyro_radps=imu.gyro_radps + 0.5), 0)
     with pytest.raises(GpvoError, match="10 IMU samples"):
-        from_rest(imu, 10**12, StaticTest())
+        from_rest(imu, 10**12)
 
 
 def test_truth_start_finds_velocity() -> None:

@@ -200,6 +200,19 @@ def test_a_type_without_a_covariance_says_so(good: list[Odometry]) -> None:
     assert np.isfinite(se3.log(stated.T)).all()
 
 
+def test_a_twist_is_compared_with_the_motion_that_ends_there() -> None:
+    """Of a body turned around that shakes, the twist of the message before is the motion in the parent's axes."""
+    n, dt_s = 40, 0.05
+    v = np.zeros((n, 6))
+    v[:, 0] = (-1.0) ** np.arange(n)
+    T = np.tile(se3.exp(np.array([0, 0, 0, 0, 0, np.pi])), (n, 1, 1))
+    T[:, 0, 3] = -np.cumsum(v[:, 0]) * dt_s
+    T[-1] = np.nan
+    t_ns = 10**18 + np.arange(n, dtype=np.int64) * round(dt_s * 1e9)
+    stated = Stated(t_ns, T, np.ones(n), (("odom", "base_link"),), None, None, v)
+    assert [f.code for f in examine(stated)] == ["pose-not-finite", "no-covariance"]
+
+
 def test_what_is_no_bag_and_no_topic_is_one_line() -> None:
     result = CliRunner().invoke(app, ["doctor", "no/such.bag"])
     assert result.exit_code != 0

@@ -18,6 +18,7 @@ from gpvo.geometry.covariance import is_positive_definite
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
+from gpvo.live import outputs
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival
 from gpvo.live.job import LiveSettings, run_live
@@ -270,6 +271,28 @@ def test_a_bag_replayed_by_the_command_is_the_same_in_a_bag(tmp_path: Path) -> N
     np.testing.assert_allclose(written.trajectory.T_world_body, T[1:], atol=1e-9)
     assert written.covariance is not None
     assert all(is_positive_definite(C) for C in written.covariance[1:])
+
+
+def test_a_flight_that_is_killed_remains_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outputs, "PART_S", 0.0)
+    arrivals, kept = flown(*flight(n=12)), Kept()
+    output = outputs.FileOutput(tmp_path / "out.mcap")
+    live = Engine(PoseStage(TOPIC), shim_predictor(), [output, kept])
+    for arrival in arrivals:
+        live.take(arrival)
+    output._writer.shutdown()  # the process would end here
+    parts = sorted((tmp_path / "out.mcap.parts").iterdir())
+    poses = [read_foreign(part).trajectory.T_world_body for part in parts]
+    np.testing.assert_allclose(np.concatenate(poses), [o.T_odom_body for o in kept.frames[1:]], atol=1e-9)
+    live.close()
+    assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
+    again = outputs.FileOutput(tmp_path / "again.bag")
+    (tmp_path / "again.bag.parts").mkdir()
+    (tmp_path / "again.bag.parts" / "1.bag").touch()  # of a process that was killed
+    for frame in kept.frames:
+        again.odometry(frame)
+    again.close()
+    assert sorted(p.name for p in tmp_path.rglob("*.bag")) == ["1.bag", "again.bag"]
 
 
 def test_status_lost_is_not_sent_but_reported() -> None:

@@ -22,7 +22,7 @@ from gpvo.io.bag_reader import messages, open_bag
 from gpvo.io.images import read_grey8
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, replay
-from gpvo.live.job import LiveSettings, run_live
+from gpvo.live.job import LiveSettings, make_stage, run_live, topics_in
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.types import StereoFrame, VoRecord
 from gpvo.vo.config import make_config
@@ -99,6 +99,34 @@ def test_real_pictures_and_a_source_that_starts_again(real_data: Path) -> None:
         assert list(stage.take(replace(arrivals[-2]))) == []
         assert list(stage.take(replace(arrivals[-1], message=message))) == []
     assert stage.counts["unreadable"] == 2
+
+
+def test_a_calibration_without_a_size_takes_that_of_the_first_pair(tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(0), tmp_path / "calib.txt"
+    row = "100 0 {0} {1} 0 100 {2} 0 0 0 1 0"
+    path.write_text(f"P0: {row.format(80, 0, 60)}\nP1: {row.format(80, -10, 60)}\n")
+    settings = LiveSettings(tmp_path / "m.gpvo", stereo=("/l", "/r"), calibration=path)
+    stage, image = make_stage(settings), rng.integers(0, 255, (120, 160), np.uint8)
+    assert set(topics_in(stage, settings)) == {"/l", "/r"}
+    maker = BagMaker(ros1=False)
+    for t in (0, 10**8):
+        for topic in ("/l", "/r"):
+            maker.image(topic, 10**18 + t, image)
+    arrivals = [Arrival(topic, m, t) for t, topic, m in maker.messages]
+    torn = replace(arrivals[0], message=replace(arrivals[0].message, encoding="?"))
+    taken = [t.record for a in (torn, arrivals[1], *arrivals) for t in stage.take(a)]
+    assert len(taken) == 2
+    assert stage.camera is not None
+    assert (stage.camera.width, stage.camera.height, stage.camera.baseline_m) == (160, 120, pytest.approx(0.1))
+    small = make_stage(settings)
+    maker.image("/l", 0, image[:30, :40])
+    maker.image("/r", 0, image[:30, :40])
+    left, right = (Arrival(topic, m, t) for t, topic, m in maker.messages[-2:])
+    assert list(small.take(left)) == []
+    with pytest.raises(GpvoError, match="far from the middle of the 40x30 images"):
+        list(small.take(right))
+    with pytest.raises(GpvoError, match=r"no\.txt"):
+        make_stage(replace(settings, calibration=tmp_path / "no.txt"))
 
 
 def test_settings_that_cannot_be_used_are_refused_at_the_start(tmp_path: Path, real_data: Path) -> None:
