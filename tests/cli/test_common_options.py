@@ -36,6 +36,23 @@ def test_every_command_is_in_one_group_and_has_the_common_options():
         assert {"--config", "--quiet", "--verbose", "-q", "-v"} <= words
 
 
+@pytest.mark.parametrize("at", ["typer", "gpvo.evaluation.evaluate"])
+def test_ctrl_c_is_one_line_while_the_command_line_loads_too(at: str):
+    script = """
+import sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == NAME:
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupting())
+from gpvo.__main__ import main
+sys.argv[1:] = ["evaluate", "runs/any"]
+main()
+""".replace("NAME", repr(at))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (130, "gpvo: interrupted\n")
+
+
 def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
     (tmp_path / "o.toml").write_text('[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
     config = ("--config", str(tmp_path / "o.toml"))
