@@ -60,11 +60,11 @@ def run(
 
     config = odometry.config(vehicle.bounds())
     options = flags.source_options(
-        size, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right, bits=bits,
+        size, kind=kind, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right, bits=bits,
         rate_hz=rate_hz, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic,
         imu_topic=imu_topic, truth_topic=truth_topic, truth_frame=truth_frame,
     )  # fmt: skip
-    sequence = open_source(source, kind=kind, **options)
+    sequence = open_source(source, **options)
     state = odometry.state(sequence.camera)
     predictor = None if model is None else Predictor.load(model)
     for problem in odometry_problems(predictor, asdict(config)) if predictor is not None else ():
@@ -86,7 +86,7 @@ def run(
 
         summary = runner.run(
             sequence, out, config, predictor, on_frame, keep_tracks=keep_tracks, overwrite=overwrite,
-            calibration_state=state,
+            calibration_state=state, options=options,
         )  # fmt: skip
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)
