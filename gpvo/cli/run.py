@@ -60,8 +60,8 @@ def run(
 
     config = odometry.config(vehicle.bounds())
     options = flags.source_options(
-        size, kind=kind, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right, bits=bits,
-        rate_hz=rate_hz, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic,
+        size, kind=kind, calibration=calibration, hfov_deg=hfov_deg, mask_left=mask_left, mask_right=mask_right,
+        bits=bits, rate_hz=rate_hz, tolerance_s=pair_tolerance, left_topic=left_topic, right_topic=right_topic,
         imu_topic=imu_topic, truth_topic=truth_topic, truth_frame=truth_frame,
     )  # fmt: skip
     sequence = open_source(source, **options)

@@ -162,8 +162,7 @@ def test_a_serial_line_that_takes_nothing_is_left_alone_for_a_second_and_one_tha
     device.symlink_to(os.ttyname(theirs))
     link = Link(f"serial:{device}:57600")
     with pytest.raises(GpvoError, match=r"cannot send to serial:.*ttyUSB0:57600"):
-        for _ in range(1000):
-            link.send(odometry[5])
+        [link.send(odometry[5]) for _ in range(1000)]
     start = time.perf_counter()
     with pytest.raises(GpvoError):
         link.send(odometry[5])

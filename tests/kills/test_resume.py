@@ -97,7 +97,14 @@ def test_the_same_bytes_after_breaking_off_twice(
 
         predictor = Predictor.load(MODEL)
         runner.run(
-            open_source(path), tmp_path / out, config, predictor, on_frame, keep_tracks=True, overwrite=False, options={}
+            open_source(path),
+            tmp_path / out,
+            config,
+            predictor,
+            on_frame,
+            keep_tracks=True,
+            overwrite=False,
+            options={},
         )
 
     def counted(self: StereoOdometry, frame: Any, imu: Any = None) -> Any:
