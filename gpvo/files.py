@@ -177,7 +177,7 @@ def _whole(text: str) -> int:
 def read_toml(path: Path) -> dict[str, Any]:
     """Settings of a file. Raises GpvoError where it cannot be read."""
     try:
-        return parse_toml(read_bounded(path, _MAX_TOML_BYTES).decode("utf-8"))
+        return parse_toml(read_bounded(path, _MAX_TOML_BYTES).decode("utf-8-sig"))
     except TooLarge:
         raise GpvoError("is larger than 200 kB, too large for settings", where=path) from None
     except (OSError, ValueError, RecursionError) as problem:

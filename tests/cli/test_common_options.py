@@ -54,7 +54,7 @@ main()
 
 
 def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
-    (tmp_path / "o.toml").write_text('[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
+    (tmp_path / "o.toml").write_text('\ufeff[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
     config = ("--config", str(tmp_path / "o.toml"))
     given = call("evaluate", UNSEEN, *config)
     assert "  5 m segments" in given.stdout, given.stderr
