@@ -140,6 +140,17 @@ def test_a_shell_completes_the_commands():
     assert done.stdout.split() == ["evaluate"]
 
 
+def test_a_narrow_terminal_breaks_no_number_and_a_closed_one_no_command():
+    show = "from gpvo.cli.output import new_table, show; table = new_table('method', *'abcdef')\n"
+    show += "table.add_row('triangulation', *6 * ['0.0719']); show(table)"
+    env = {**os.environ, "COLUMNS": "40"}
+    done = subprocess.run([sys.executable, "-c", show], capture_output=True, text=True, timeout=120, env=env)
+    assert done.stdout.count(" 0.0719") == 6
+    closed = 'exec "$0" -m gpvo evaluate "$1" >&-'
+    done = subprocess.run(["sh", "-c", closed, sys.executable, UNSEEN], stderr=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_tables_fit_80_columns():
     done = call("evaluate", UNSEEN, "--model", MODEL, "--truth-sigma", "0.01")
     rows = [
