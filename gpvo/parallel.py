@@ -27,8 +27,13 @@ def map_jobs(
     """``[function(*arguments) for arguments in jobs_arguments]``, in order, in parallel.
 
     ``backend`` "local": ``jobs`` processes (-1: all cores). "dask": the cluster at ``scheduler``, or one started here.
-    ``on_done`` is called once per result, for progress bars. Raises GpvoError where a process is killed.
+    ``on_done`` is called once per result, for progress bars. Raises GpvoError where a process is killed,
+    and for no jobs, or a scheduler of no cluster.
     """
+    if jobs == 0:
+        raise GpvoError("there are 0 jobs to do it", cure="give --jobs 1 or more, or -1: one per core")
+    if scheduler is not None and backend != "dask":
+        raise GpvoError("--scheduler has no effect without --backend dask", cure="add --backend dask")
     if backend == "dask":
         return _told(_on_dask(function, jobs_arguments, scheduler), on_done)
     if backend != "local":

@@ -88,3 +88,11 @@ def test_command(tmp_path):
 def test_a_worker_that_is_killed_is_one_line():
     with pytest.raises(GpvoError, match="a worker process was killed.*fewer --jobs"):
         map_jobs(os._exit, [(9,), (9,)], jobs=2)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [({"jobs": 0}, "0 jobs.*--jobs 1"), ({"scheduler": "tcp://x"}, "--backend dask")]
+)
+def test_workers_that_cannot_be_are_one_line(given, told):
+    with pytest.raises(GpvoError, match=told):
+        map_jobs(abs, [(-1,), (2,)], **given)
