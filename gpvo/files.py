@@ -10,7 +10,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,13 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def is_writable(path: Path) -> bool:
+    """Whether a file can be made under this name, whose folder is made."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return path.parent.is_dir() and os.access(path.parent, os.W_OK)
 
 
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
