@@ -154,7 +154,8 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
     wanted = [int(f) for f in numbers("--frames", frames, "give numbers, separated by commas")]
     run = read_run(runs[0])
-    options = {k: tuple(v) if isinstance(v, list) else v for k, v in run.meta.get("options", {}).items()}
+    opened: dict[str, Any] = run.meta.get("options", {})
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in opened.items()}
     return match_pictures(open_source(sequence, **options), config_of(runs[0]), wanted, run.log)
 
 
