@@ -13,15 +13,21 @@ def main() -> None:
     """Run the command line; where it is not installed (``pip install --no-deps``), say so in one line."""
     # OpenCV reads this as it is loaded: a second guard behind the sizes that image headers state.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # whoever started this has closed it
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     try:
-        from gpvo.cli import main as run
-    except ModuleNotFoundError as error:
-        if error.name not in ("typer", "rich"):
-            raise
-        print(f"gpvo: the command line needs the package '{error.name}' (pip install typer rich)", file=sys.stderr)
-        sys.exit(2)
-    try:
+        try:
+            from gpvo.cli import main as run
+        except ModuleNotFoundError as error:
+            if error.name not in ("typer", "rich"):
+                raise
+            print(f"gpvo: the command line needs the package '{error.name}' (pip install typer rich)", file=sys.stderr)
+            sys.exit(2)
         run()
+    except KeyboardInterrupt:  # also while all this is loaded
+        print("gpvo: interrupted", file=sys.stderr)
+        sys.exit(130)
     finally:  # all is written: Ctrl-C while Python winds down its worker processes would print a traceback
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

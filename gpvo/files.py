@@ -10,7 +10,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,13 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def is_writable(path: Path) -> bool:
+    """Whether a file can be made under this name, whose folder is made."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return path.parent.is_dir() and os.access(path.parent, os.W_OK)
 
 
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
@@ -177,7 +184,7 @@ def _whole(text: str) -> int:
 def read_toml(path: Path) -> dict[str, Any]:
     """Settings of a file. Raises GpvoError where it cannot be read."""
     try:
-        return parse_toml(read_bounded(path, _MAX_TOML_BYTES).decode("utf-8"))
+        return parse_toml(read_bounded(path, _MAX_TOML_BYTES).decode("utf-8-sig"))
     except TooLarge:
         raise GpvoError("is larger than 200 kB, too large for settings", where=path) from None
     except (OSError, ValueError, RecursionError) as problem:

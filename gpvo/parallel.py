@@ -6,6 +6,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from itertools import starmap
 from typing import Any, TypeVar
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 from gpvo.errors import GpvoError, require
 
 T = TypeVar("T")
+_KILLED = "a worker process was killed, as when memory runs out"
 
 
 def map_jobs(
@@ -27,8 +29,13 @@ def map_jobs(
     """``[function(*arguments) for arguments in jobs_arguments]``, in order, in parallel.
 
     ``backend`` "local": ``jobs`` processes (-1: all cores). "dask": the cluster at ``scheduler``, or one started here.
-    ``on_done`` is called once per result, for progress bars.
+    ``on_done`` is called once per result, for progress bars. Raises GpvoError where a process is killed,
+    and for no jobs, or a scheduler of no cluster.
     """
+    if jobs == 0:
+        raise GpvoError("there are 0 jobs to do it", cure="give --jobs 1 or more, or -1: one per core")
+    if scheduler is not None and backend != "dask":
+        raise GpvoError("--scheduler has no effect without --backend dask", cure="add --backend dask")
     if backend == "dask":
         return _told(_on_dask(function, jobs_arguments, scheduler), on_done)
     if backend != "local":
@@ -41,7 +48,10 @@ def map_jobs(
     with warnings.catch_warnings():
         # A process that has grown is renewed between two jobs: nothing is lost, and nothing is to be done about it.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        return _told(Parallel(n_jobs=jobs, return_as="generator")(calls), on_done)
+        try:
+            return _told(Parallel(n_jobs=jobs, return_as="generator")(calls), on_done)
+        except BrokenProcessPool:
+            raise GpvoError(_KILLED, cure="run it again, with fewer --jobs") from None
 
 
 def _told(results: Iterable[Any], on_done: Callable[[], None]) -> list[Any]:
@@ -56,7 +66,7 @@ def _on_dask(
     function: Callable[..., Any], jobs_arguments: Sequence[tuple[Any, ...]], scheduler: str | None
 ) -> list[Any]:
     require("distributed")
-    from distributed import Client
+    from distributed import Client, KilledWorker
 
     try:
         client = Client(scheduler, timeout="10s") if scheduler else Client(processes=True, dashboard_address=None)
@@ -64,7 +74,10 @@ def _on_dask(
         raise GpvoError(f"no Dask scheduler answers: {problem}", where=scheduler, cure="run 'dask scheduler'") from None
     with client:
         futures = [client.submit(function, *arguments, pure=False) for arguments in jobs_arguments]
-        return list(client.gather(futures))
+        try:
+            return list(client.gather(futures))
+        except KilledWorker:
+            raise GpvoError(_KILLED, cure="run it again, with fewer workers") from None
 
 
 def prefetched(items: Iterable[T], depth: int = 2) -> Iterator[T]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
-from gpvo.files import read_toml, write_json
+from gpvo.files import plain, read_toml, write_json
 from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
 from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
@@ -60,7 +60,7 @@ def run(
     calibration_state: RigState | None = None,
     amend: Callable[[VoRecord], VoRecord] | None = None,
     meta: Mapping[str, object] | None = None,
-    resume: str | None = None,
+    options: Mapping[str, object] | None = None,
 ) -> RunSummary:
     """Run stereo VO over a source and write the run folder ``out``.
 
@@ -68,13 +68,15 @@ def run(
     what odometry saw. ``overwrite``: whether a finished run in ``out`` is replaced, once this one is whole.
     ``calibration_state``: what is known of the calibration's errors. ``amend`` may complete a record before it is
     written; ``meta``: further keys of ``run.json``. An interrupted run leaves a folder that can be read up to its last
-    complete chunk. ``resume``: the options that the source was opened with, in words. A run of the same source, options
-    and settings that broke off in ``out`` is resumed, and ends with the same bytes apart from times; None begins anew.
-    Raises SourceError if the source holds no frames, or its left and right images look swapped.
+    complete chunk. ``options``: those that the source was opened with, kept in ``run.json``. A run of the same source,
+    options and settings that broke off in ``out`` is resumed, and ends with the same bytes apart from times; None
+    begins anew. Raises SourceError if the source holds no frames, or its left and right images look swapped.
     """
     config = config or VoConfig()
     known: dict[str, object] = {"source": str(source.name), "source_format": source.format, "kind": source.kind}
     known |= {"vehicle": asdict(config.vehicle), **(meta or {})}
+    if options:
+        known["options"] = options = plain(options, lambda path: str(Path(str(path)).resolve()))
     if predictor is not None:
         known["model_digest"] = predictor.digest
         predictor.reset(source.camera, vehicle=config.vehicle)
@@ -83,7 +85,7 @@ def run(
     recorder = TrackRecorder() if keep_tracks else None
     odometry = StereoOdometry(source.camera, config, source.mask, calibration_state)
     of_model = "" if predictor is None else predictor.digest
-    key = None if resume is None else digest_of(resume, of_model, keep_tracks, odometry, *_content(source))
+    key = None if options is None else digest_of(options, of_model, keep_tracks, odometry, *_content(source))
     with (
         RunWriter(
             out,

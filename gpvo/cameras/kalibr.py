@@ -53,7 +53,7 @@ for _tag in ("tag:yaml.org,2002:opencv-matrix", "!opencv-matrix"):
 def calibration_text(path: Path) -> str:
     """The text of a file. Raises CalibrationError where it cannot be read, or is too large for a calibration."""
     try:
-        return read_bounded(path, _MAX_BYTES).decode("utf-8", errors="replace").replace("\r\n", "\n")
+        return read_bounded(path, _MAX_BYTES).decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
     except TooLarge:
         raise CalibrationError("too large for a calibration", where=path) from None
     except OSError as error:
@@ -67,8 +67,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises CalibrationError where the file is missing, too large, not YAML or not a mapping.
     """
     text = calibration_text(path)
-    # A leading directive without the document marker, a byte order mark, and tabs are what these files suffer from.
-    text = re.sub(r"\A\ufeff?\s*%YAML[: ][^\n]*\n(---[^\n]*\n)?", "", text).expandtabs(4)
+    # A leading directive without the document marker, and tabs, are what these files suffer from.
+    text = re.sub(r"\A\s*%YAML[: ][^\n]*\n(---[^\n]*\n)?", "", text).expandtabs(4)
     try:
         document = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
@@ -115,15 +115,13 @@ def read_camchain(path: Path, *, left: str = "cam0", right: str = "cam1") -> Ste
             raise CalibrationError(f"has no block '{name}' (cameras found: {found})", where=path, cure=cure)
         blocks[name] = document[name]
     T_left_imu, T_right_imu = (_cam_imu(blocks[n], f"{path}: {n}") for n in (left, right))
-    shift = blocks[left].get("timeshift_cam_imu", 0.0)
-    if not isinstance(shift, (int, float)) or not np.isfinite(shift):
-        raise CalibrationError("timeshift_cam_imu is not a number", where=path)
+    shift_s = get_numbers({"timeshift_cam_imu": 0.0, **blocks[left]}, "timeshift_cam_imu", 1, path)[0]
     return StereoRig(
         left=_lens(blocks[left], f"{path}: {left}"),
         right=_lens(blocks[right], f"{path}: {right}"),
         T_right_left=_right_left(document, left, right, T_left_imu, T_right_imu, path),
         T_imu_left=None if T_left_imu is None else se3.inverse(T_left_imu),
-        timeshift_cam_imu_s=float(shift),
+        timeshift_cam_imu_s=shift_s,
         where=str(path),
     )
 
@@ -172,7 +170,8 @@ def make_lens(
     if name in ("radtan", "radial-tangential", "plumb-bob", "rational-polynomial", "none", ""):
         # The rational model with zeros beyond the fifth coefficient is the common one.
         if any(distortion[5:]):
-            raise CalibrationError("more than five distortion coefficients are not supported", where=where)
+            cure = "calibrate with five (radtan), or rectify the images"
+            raise CalibrationError("more than five distortion coefficients are not supported", where=where, cure=cure)
         return PinholeRadtan(fx, fy, cx, cy, width, height, (*distortion, *[0.0] * 5)[:5])
     if name in ("equidistant", "fisheye", "kannala-brandt", "kannala-brandt4"):
         if len(distortion) < 4 or any(distortion[4:]):
@@ -191,10 +190,13 @@ def _lens(block: dict[str, Any], where: str) -> CameraModel:
         raise CalibrationError(f"camera model '{model}' is not supported", where=where, cure=cure)
     distortion = []
     distortion_model = str(block.get("distortion_model", "none"))
+    # As EuRoC spells it, or as Kalibr does.
+    key = "distortion_coefficients" if "distortion_coefficients" in block else "distortion_coeffs"
     if distortion_model != "none":
-        # As EuRoC spells it, or as Kalibr does.
-        key = "distortion_coefficients" if "distortion_coefficients" in block else "distortion_coeffs"
         distortion = get_numbers(block, key, (4, 5), where)
+    elif key in block and "distortion_model" not in block:
+        cure = "add 'distortion_model: radtan' or 'equidistant'"
+        raise CalibrationError(f"holds '{key}' of no distortion_model", where=where, cure=cure)
     intrinsics = get_numbers(block, "intrinsics", 4, where)
     return make_lens(distortion_model, intrinsics, distortion, (int(width), int(height)), where)
 

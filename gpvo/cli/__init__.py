@@ -83,6 +83,7 @@ for command in (
 
 
 _ANY_CLICK_ERROR: Any = typer.BadParameter.__mro__[1]
+_CTRL_C = 130  # what typer makes of a KeyboardInterrupt
 
 
 def main() -> None:
@@ -90,7 +91,10 @@ def main() -> None:
     warnings.showwarning = lambda message, *_: print(f"gpvo: {printable(message)}", file=sys.stderr)
     try:
         _refuse_control_characters(sys.argv[1:])
-        sys.exit(app(standalone_mode=False) or 0)
+        code = app(standalone_mode=False) or 0
+        if code == _CTRL_C:
+            raise KeyboardInterrupt
+        sys.exit(code)
     except _ANY_CLICK_ERROR as error:
         if error.ctx is not None and not sys.argv[1:]:
             error.show()  # the help of a command without arguments
@@ -107,9 +111,8 @@ def main() -> None:
     except OSError as error:  # a full disk, a folder in place of a file; a broken pipe has ended inside quietly
         place = f"{error.filename}: " if error.filename else ""
         _fail(place + " ".join((error.strerror or str(error)).split()))
-    except (KeyboardInterrupt, typer.Abort):
-        print("gpvo: interrupted", file=sys.stderr)
-        sys.exit(130)
+    except typer.Abort:
+        raise KeyboardInterrupt from None
 
 
 def _refuse_control_characters(arguments: list[str]) -> None:

@@ -91,7 +91,7 @@ def evaluate(
     from gpvo.evaluation.document import document, pooled
     from gpvo.evaluation.evaluate import distinct
 
-    settings = twin_options.asked(ctx, twins, seed)
+    settings = twin_options.asked(ctx, twins, seed, "seed")
     if settings is not None:
         documents, found = _with_twins(*_loaded(runs, judge), judge.model, judge.options(), settings)
     else:
@@ -156,7 +156,10 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
     if sequence is None or len(runs) != 1:
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
     wanted = [int(f) for f in numbers("--frames", frames, "give numbers, separated by commas")]
-    return match_pictures(open_source(sequence), config_of(runs[0]), wanted, read_run(runs[0]).log)
+    run = read_run(runs[0])
+    opened: dict[str, Any] = run.meta.get("options", {})
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in opened.items()}
+    return match_pictures(open_source(sequence, **options), config_of(runs[0]), wanted, run.log)
 
 
 def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:

@@ -48,7 +48,7 @@ def fuse(
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
-    judging = twin_options.asked(ctx, twins, seed)
+    judging = twin_options.asked(ctx, twins, seed, "seed")
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
     if plot is not None:

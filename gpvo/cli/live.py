@@ -166,7 +166,8 @@ def doctor(
         print_json({"schema": 1, "source": source, "topics": rows})
         return
     for name, findings in found.items():
-        print(f"{printable(name)}: {len(findings) or 'nothing'} found")
+        count = f"{len(findings)} fault{'s' * (len(findings) > 1)}" if findings else "nothing"
+        print(f"{printable(name)}: {count} found")
         for finding in findings:
             for line in str(finding).splitlines():
                 say(f"  {line}")

@@ -68,10 +68,13 @@ def say(text: str) -> None:
 
 
 def show(what: str | Table) -> None:
-    """Print a table or a line, as wide as the terminal, 80 columns in a pipe."""
+    """Print a table or a line, as wide as the terminal, 80 columns in a pipe; a table never narrower than those, where
+    its numbers would break."""
     from rich.console import Console
+    from rich.table import Table
 
-    Console(highlight=False, markup=False).print(what)
+    width = max(Console().width, 80) if isinstance(what, Table) else None
+    Console(width=width, highlight=False, markup=False).print(what)
 
 
 def new_table(*columns: str) -> Table:

@@ -50,7 +50,8 @@ def run(
     from gpvo.dataset.check import ENOUGH_INSIDE, odometry_problems
 
     config = odometry.config(vehicle.bounds())
-    sequence = open_source(source, kind=kind, **reading.given())
+    options = reading.given() | ({} if kind is None else {"kind": kind})
+    sequence = open_source(source, **options)
     state = odometry.state(sequence.camera)
     predictor = None if model is None else Predictor.load(model)
     for problem in odometry_problems(predictor, asdict(config)) if predictor is not None else ():
@@ -72,7 +73,7 @@ def run(
 
         summary = runner.run(
             sequence, out, config, predictor, on_frame, keep_tracks=keep_tracks, overwrite=overwrite,
-            calibration_state=state,
+            calibration_state=state, options=options,
         )  # fmt: skip
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)

@@ -51,11 +51,14 @@ class TwinOptions:
         name, sigma = read_tolerance(self.tolerance)
         return TwinSettings(self.replicates, sigma, name, seed, None if self.gap is None else read_gap(self.gap))
 
-    def asked(self, ctx: typer.Context, twins: bool, seed: int) -> TwinSettings | None:
-        """:meth:`settings` with ``--twins``, else None. Raises GpvoError for a flag that has no effect without it."""
+    def asked(self, ctx: typer.Context, twins: bool, seed: int, *others: str) -> TwinSettings | None:
+        """:meth:`settings` with ``--twins``, else None.
+
+        Raises GpvoError for one of these flags, or of the ``others``, that has no effect without it.
+        """
         if twins:
             return self.settings(seed)
-        if idle := [f.name for f in fields(self) if is_given(ctx, f.name)]:
+        if idle := [name for name in (*(f.name for f in fields(self)), *others) if is_given(ctx, name)]:
             raise GpvoError(f"--{idle[0]} has no effect without --twins", cure="add --twins")
         return None
 

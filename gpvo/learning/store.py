@@ -3,16 +3,14 @@ those of a model with new flights added, and sets larger than memory."""
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
 from gpvo.dataset.table import CHUNK_ROWS, StoredSets, read_sets, write_sets
 from gpvo.errors import ModelError
-from gpvo.files import write_text
+from gpvo.files import is_writable, write_text
 from gpvo.io.run_read import Run
 from gpvo.learning.card import model_card, stated_against_actual
 from gpvo.learning.config import TrainConfig
@@ -42,9 +40,7 @@ def folds_path(model: Path) -> Path:
 
 def check_writable(path: Path) -> None:
     """Make the folder of ``path``. Raise ModelError, before any work, if no model can be written there."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+    if path.is_dir() or not is_writable(path):
         raise ModelError("cannot be written", where=path, cure="name a file in a writable folder")
 
 

@@ -25,7 +25,8 @@ BACK_S = 1.0
 """A stamp further back than this is no late message but another clock, if the next ones agree."""
 AHEAD_S = 10.0
 """The same of a stamp ahead of the last: after so long a silence nothing of before holds."""
-_CONFIRM = 3
+CONFIRM = 3
+"""Messages in a row by which what looked wrong is believed."""
 _WINDOW = 51
 _LONGEST_WAIT_S, _TIMEOUT_S = 0.1, 0.2
 
@@ -66,7 +67,7 @@ class StampWatch:
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._doubt: Doubt[int] = Doubt(_CONFIRM)
+        self._doubt: Doubt[int] = Doubt(CONFIRM)
         self._steps: deque[int] = deque(maxlen=_WINDOW)
         self._gaps: list[int] = []
 
@@ -97,7 +98,7 @@ class StampWatch:
             self._steps.append(step)
             return Sequence.NEXT
         self._gaps.append(step)
-        if len(self._gaps) >= _CONFIRM:
+        if len(self._gaps) >= CONFIRM:
             # Not gaps: this is the rate now.
             self._steps = deque(self._gaps, maxlen=_WINDOW)
             self._gaps.clear()

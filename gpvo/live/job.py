@@ -72,6 +72,7 @@ def run_live(settings: LiveSettings) -> dict[str, Any]:
         (settings.wire == "zenoh", ("address",), "add --zenoh"),
         (settings.wire in ("zenoh", "dds"), ("domain",), "add --zenoh or --dds"),
         (settings.wire, ("pose_topic",), f"add one of --{', --'.join(WIRES)}"),
+        (settings.replay is None, ("depth",), "a recording has no queue"),
     ):
         if not is_used:
             _refuse_idle(settings, names, cure)

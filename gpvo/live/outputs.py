@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gpvo.errors import GpvoError
+from gpvo.files import is_writable
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE
 from gpvo.live.engine import Health, Output
 from gpvo.publish import ros
@@ -123,13 +124,18 @@ class FileOutput(Output):
     """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end.
 
     Until then, what came in each half minute is a bag of its own in the folder ``<name>.parts`` beside it, by its first
-    stamp: nothing else remains where the process is killed. Raises GpvoError at once where the bag exists: it may be
-    the flight before a restart.
+    stamp: nothing else remains where the process is killed. Raises GpvoError at once where the bag exists, as it may be
+    the flight before a restart, and where nothing can be written or the suffix is of another kind of file.
     """
 
     def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
         if path.exists():
             raise GpvoError("already exists", where=path, cure="give another name or remove it")
+        if path.suffix not in ("", ".bag", ".mcap"):
+            cure = "end it in .bag or .mcap, or name a folder"
+            raise GpvoError("its suffix does not tell what to write", where=path, cure=cure)
+        if not is_writable(path):
+            raise GpvoError("cannot be written", where=path, cure="name a file in a writable folder")
         self._path, self._topic, self._folder = path, topic, path.with_name(f"{path.name}.parts")
         self._odometry: list[Odometry] = []
         self._begun, self._begun_s = 0, time.monotonic()  # of the part that is yet to be written

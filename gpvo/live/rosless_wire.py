@@ -59,12 +59,15 @@ class ZenohWire:
         is_listening = address is not None and address.startswith("listen:")
         place = (address or "tcp/127.0.0.1:7447").removeprefix("listen:")
         config.insert_json5("mode", json.dumps("router" if is_listening else "client"))
-        config.insert_json5(f"{'listen' if is_listening else 'connect'}/endpoints", json.dumps([place]))
         config.insert_json5("scouting/multicast/enabled", "false")
+        try:
+            config.insert_json5(f"{'listen' if is_listening else 'connect'}/endpoints", json.dumps([place]))
+        except zenoh.ZError:
+            raise GpvoError(f"'{place}' is not an address of Zenoh", cure="give tcp/HOST:PORT") from None
         try:
             self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:
-            reason = str(error).splitlines()[0][:120]
+            reason = str(error).splitlines()[0].partition(" at /")[0]  # what follows is where Zenoh was built
             raise GpvoError(f"no Zenoh at {place}: {reason}", cure="start rmw_zenohd, or give --address") from None
         self._encoding = zenoh.Encoding("application/cdr")
         zid = self._session.zid()

@@ -27,8 +27,9 @@ from gpvo.io.bag_reader import pose_of, stamp_ns
 from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, is_optical, moving_frame
 from gpvo.io.stated import is_turn_unknown
 from gpvo.io.trajectory import FARTHEST_M
-from gpvo.live.intake import Arrival, Sequence, StampWatch
+from gpvo.live.intake import CONFIRM, Arrival, Sequence, StampWatch
 from gpvo.stats.consistency import SEEN
+from gpvo.stats.series import Doubt
 from gpvo.types import IMPORTED, IMPORTED_POSE, Array, Status, StereoCamera, VoRecord
 
 _MAX_M, _MAX_MPS, _MAX_RADPS = 1e7, 300.0, 50.0
@@ -116,19 +117,30 @@ class PoseStage:
     def reset(self) -> None:
         """Begin anew with the next message."""
         self._watch = StampWatch()
+        self._frames: tuple[str, str] | None = None
+        self._doubt: Doubt[tuple[str, str]] = Doubt(CONFIRM)
         self._last: tuple[int, Array, Array | None] | None = None  # stamp, T_parent_cam, covariance of the pose
         self._is_unknown = False
         self._growth: deque[bool] = deque(maxlen=200)
         self._moved, self._motions = np.zeros(6), 0  # sum of the squared motions of the body by axis, and their count
 
     def take(self, arrival: Arrival) -> Iterator[Taken]:
-        """One record, unless the message is late, repeated, absurd or of another clock."""
+        """One record, unless the message is late, repeated, absurd, of another clock or between other frames."""
         if arrival.topic != self.topic:
             return
         message, T_parent_body = arrival.message, read_pose(arrival.message, _MAX_M)
         if T_parent_body is None:
             self.counts["absurd"] += 1
             return
+        frames = str(message.header.frame_id), str(getattr(message, "child_frame_id", ""))
+        if frames == (self._frames or frames):
+            self._doubt.clear()
+        elif self._doubt.is_settled_by(frames, lambda before, now: before == now):
+            self._last = None
+        else:
+            self.counts["other_frames"] += 1
+            return
+        self._frames = frames
         t_ns = stamp_ns(message)
         seen = self._watch.see(t_ns)
         self.counts[seen.value] += 1
@@ -141,9 +153,7 @@ class PoseStage:
             self._is_placed = True
         begins = self._last is None
         record = self._record(t_ns, T_parent_body @ self.T_body_cam, message, seen)
-        child = str(getattr(message, "child_frame_id", "")) or "base_link"
-        frame = str(message.header.frame_id) or "odom"
-        yield Taken(record, begins, arrival.received_ns, T_parent_body, frame, child)
+        yield Taken(record, begins, arrival.received_ns, T_parent_body, frames[0] or "odom", frames[1] or "base_link")
 
     def flush(self) -> Iterator[Taken]:
         """Nothing: a pose waits for nothing."""

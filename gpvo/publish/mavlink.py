@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import socket
 import struct
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,6 +30,8 @@ COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _LOCAL_FRD, _BODY_FRD, _ESTIMATOR_VISION = 20, 12, 2
 # ``in_domain`` three training standard deviations outside: there the model knows nothing of use.
 _OUTSIDE_BELOW = 0.01
+# A line that takes nothing must not hold up what goes elsewhere: it is given this long, and not before that long again.
+_WAIT_S, _AGAIN_S = 0.1, 1.0
 
 
 def dialect() -> ModuleType:
@@ -183,9 +187,12 @@ class Link:
         self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))
 
     def send(self, odometry: Odometry) -> None:
-        """Send one frame now, and a heartbeat where one is due."""
-        for message in self.sender.due(odometry):
-            self._send(message)
+        """Send one frame now, and a heartbeat where one is due. Raises GpvoError where the link is down."""
+        try:
+            for message in self.sender.due(odometry):
+                self._send(message)
+        except OSError as error:
+            raise GpvoError(f"cannot send to {self.address}: {error.strerror or error}") from None
 
 
 def _udp(host: str, port: int) -> Callable[[bytes], object]:
@@ -203,7 +210,25 @@ def _serial(device: str, baud: int) -> Callable[[bytes], object]:
     except ImportError:
         raise MissingExtraError("pyserial", "mavlink") from None
     try:
-        port = serial.Serial(device, baud)
+        port = serial.Serial(device, baud, write_timeout=_WAIT_S)
     except (OSError, ValueError) as error:
         raise GpvoError(f"cannot open {device}: {error}") from None
-    return lambda data: port.write(data)
+    again_s = -inf
+
+    def send(data: bytes) -> None:
+        nonlocal again_s
+        if time.monotonic() < again_s:
+            raise OSError("it has just failed")
+        try:
+            if not port.is_open:
+                port.open()
+            port.write(data)
+        except OSError as error:
+            again_s = time.monotonic() + _AGAIN_S
+            if isinstance(error, serial.SerialTimeoutException):  # what waits is out of date
+                port.reset_output_buffer()
+            else:  # it may be plugged in again
+                port.close()
+            raise
+
+    return send

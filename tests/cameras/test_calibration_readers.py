@@ -59,11 +59,11 @@ def test_chain_alone(write):
     assert camchain_topics(write(camchain())) == ("/cam0/image_raw", None)
 
 
-@pytest.mark.parametrize("key", ["T_cam_imu", "T_imu_cam"])
-def test_either_direction_to_the_imu(write, key):
+@pytest.mark.parametrize(("key", "shift"), [("T_cam_imu", "0.005"), ("T_imu_cam", "5e-3")])
+def test_either_direction_to_the_imu(write, key, shift):
     T_right_imu = T_RIGHT_LEFT @ T_LEFT_IMU
     T = [m if key == "T_cam_imu" else se3.inverse(m) for m in (T_LEFT_IMU, T_right_imu)]
-    text = camchain(f"  {key}: {rows(T[0])}\n  timeshift_cam_imu: 0.005\n", f"  {key}: {rows(T[1])}\n", chain=None)
+    text = camchain(f"  {key}: {rows(T[0])}\n  timeshift_cam_imu: {shift}\n", f"  {key}: {rows(T[1])}\n", chain=None)
     rig = read_camchain(write(text))
     np.testing.assert_allclose(rig.T_right_left, T_RIGHT_LEFT, atol=1e-9)
     np.testing.assert_allclose(rig.T_imu_left, se3.inverse(T_LEFT_IMU), atol=1e-9)
@@ -111,6 +111,7 @@ def test_headers_that_yaml_refuses(write, head):
         (camchain().replace("[190.0, 191.0, 255.0, 256.0]", "[190.0, 191.0, 255.0]"), "'intrinsics' holds 3 numbers"),
         (camchain().replace("190.0", ".nan"), "finite"),
         (camchain().replace("resolution", "solution"), "lacks the key 'resolution'"),
+        (camchain().replace("  distortion_model: equidistant\n", ""), "'distortion_coeffs' of no distortion_model"),
     ],
 )
 def test_bad_files_in_one_line(write, text, reason):
@@ -169,8 +170,9 @@ P3: 7.2e+02 0 6.1e+02 -3.4e+02 0 7.2e+02 1.7e+02 2.2e+00 0 0 1 2.7e-03
 """
 
 
-def test_kitti_pairs(write):
-    path = write(KITTI, "calib.txt")
+@pytest.mark.parametrize("head", ["", "\ufeff"])
+def test_kitti_pairs(write, head):
+    path = write(head + KITTI, "calib.txt")
     grey = read_kitti_calib(path, left=0, right=1, size=(1241, 376))
     assert grey.is_rectified
     assert grey.baseline_m == pytest.approx(387 / 720)

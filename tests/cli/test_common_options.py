@@ -36,8 +36,25 @@ def test_every_command_is_in_one_group_and_has_the_common_options():
         assert {"--config", "--quiet", "--verbose", "-q", "-v"} <= words
 
 
+@pytest.mark.parametrize("at", ["typer", "gpvo.evaluation.evaluate"])
+def test_ctrl_c_is_one_line_while_the_command_line_loads_too(at: str):
+    script = """
+import sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == NAME:
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupting())
+from gpvo.__main__ import main
+sys.argv[1:] = ["evaluate", "runs/any"]
+main()
+""".replace("NAME", repr(at))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (130, "gpvo: interrupted\n")
+
+
 def test_a_file_gives_options_and_the_line_replaces_them(tmp_path: Path):
-    (tmp_path / "o.toml").write_text('[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
+    (tmp_path / "o.toml").write_text('\ufeff[evaluate]\nsegments = "5"\njson = false\n[train]\nseed = 3\n')
     config = ("--config", str(tmp_path / "o.toml"))
     given = call("evaluate", UNSEEN, *config)
     assert "  5 m segments" in given.stdout, given.stderr
@@ -121,6 +138,17 @@ def test_a_shell_completes_the_commands():
     assert gpvo is not None
     done = subprocess.run([gpvo], capture_output=True, text=True, timeout=60, env=env)
     assert done.stdout.split() == ["evaluate"]
+
+
+def test_a_narrow_terminal_breaks_no_number_and_a_closed_one_no_command():
+    show = "from gpvo.cli.output import new_table, show; table = new_table('method', *'abcdef')\n"
+    show += "table.add_row('triangulation', *6 * ['0.0719']); show(table)"
+    env = {**os.environ, "COLUMNS": "40"}
+    done = subprocess.run([sys.executable, "-c", show], capture_output=True, text=True, timeout=120, env=env)
+    assert done.stdout.count(" 0.0719") == 6
+    closed = 'exec "$0" -m gpvo evaluate "$1" >&-'
+    done = subprocess.run(["sh", "-c", closed, sys.executable, UNSEEN], stderr=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_tables_fit_80_columns():

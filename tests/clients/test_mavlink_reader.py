@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import time
+import tty
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,6 +148,37 @@ def test_udp(odometry: list[Odometry]) -> None:
 def test_a_bad_address_is_one_line(address: str) -> None:
     with pytest.raises(GpvoError):
         Link(address)
+
+
+def test_a_serial_line_that_takes_nothing_is_left_alone_for_a_second_and_one_that_comes_back_is_used(
+    odometry: list[Odometry], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("serial")
+    clock = [time.monotonic()]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    device = tmp_path / "ttyUSB0"
+    device.symlink_to(os.ttyname(theirs))
+    link = Link(f"serial:{device}:57600")
+    with pytest.raises(GpvoError, match=r"cannot send to serial:.*ttyUSB0:57600"):
+        [link.send(odometry[5]) for _ in range(1000)]
+    start = time.perf_counter()
+    with pytest.raises(GpvoError):
+        link.send(odometry[5])
+    assert time.perf_counter() - start < 0.05
+    os.close(ours)
+    os.close(theirs)
+    clock[0] += 2.0
+    with pytest.raises(GpvoError):  # unplugged
+        link.send(odometry[5])
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    device.unlink()
+    device.symlink_to(os.ttyname(theirs))
+    clock[0] += 2.0
+    link.send(odometry[5])
+    assert os.read(ours, 1) == b"\xfd"
 
 
 def test_a_heartbeat_a_second_also_after_the_clock_of_the_odometry_went_back(odometry: list[Odometry]) -> None:

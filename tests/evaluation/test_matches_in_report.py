@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from gpvo import cli
 from gpvo.sim.points import simulate_points
+from sequences import camchain_yaml, grey, write_image
 
 
 def main(*words: object) -> int:
@@ -56,3 +57,21 @@ def test_the_sequence_of_another_run(flight: Path, capsys: pytest.CaptureFixture
         assert main("report", flight / "run", "-o", page, *frames, "--sequence", flight / f"{name}.npz") == 2
         assert told in capsys.readouterr().err
         assert not page.exists()
+
+
+def test_the_sequence_is_opened_as_for_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With its calibration, size and rate, also where the run was made from another folder."""
+    for side in ("left", "right"):
+        for k in range(4):
+            write_image(tmp_path / "seq" / side / f"{k}.png", grey(k))
+    (tmp_path / "rig.yaml").write_text(camchain_yaml())
+    monkeypatch.chdir(tmp_path)
+    opened = ["--calibration", "rig.yaml", "--size", "96x80", "--rate-hz", 10]
+    assert main("run", "seq", "-o", "run", *opened) == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    words = ["report", "../run", "-o", "page.html", "--frames", 2, "--sequence", "../seq"]
+    assert main(*words) == 0, capsys.readouterr().err
+    assert "<figcaption>frame 2: " in Path("page.html").read_text()

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from gpvo import runner
+from gpvo import cli, runner
 from gpvo.errors import SourceError
 from gpvo.io import open_source
 from gpvo.io.run import RunWriter, read_run
@@ -97,7 +97,14 @@ def test_the_same_bytes_after_breaking_off_twice(
 
         predictor = Predictor.load(MODEL)
         runner.run(
-            open_source(path), tmp_path / out, config, predictor, on_frame, keep_tracks=True, overwrite=False, resume=""
+            open_source(path),
+            tmp_path / out,
+            config,
+            predictor,
+            on_frame,
+            keep_tracks=True,
+            overwrite=False,
+            options={},
         )
 
     def counted(self: StereoOdometry, frame: Any, imu: Any = None) -> Any:
@@ -138,16 +145,36 @@ def test_another_source_setting_or_code_begins_anew(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(StereoOdometry, "step", lambda *a: (went.append(True), step(*a))[1])
     made: list[int] = []
     for known in (
-        {"resume": ""},
-        {"resume": ""},
-        {"resume": "other"},
-        {"resume": "other", "keep_tracks": True},
-        {"resume": "other", "config": runner.VoConfig(sigma_px=2.0)},
+        {"options": {}},
+        {"options": {}},
+        {"options": {"bits": 12}},
+        {"options": {"bits": 12}, "keep_tracks": True},
+        {"options": {"bits": 12}, "config": runner.VoConfig(sigma_px=2.0)},
         {},
     ):
         went.clear()
         made.append(broken(**known))
     assert made == [13, 3, 13, 13, 13, 13]
+
+
+def test_the_command_resumes_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
+    monkeypatch.setattr("sys.argv", ["gpvo", "run", str(tracks(tmp_path)), "-o", str(tmp_path / "run")])
+    went: list[bool] = []
+    step = StereoOdometry.step
+
+    def stopping(*given: Any) -> Any:
+        went.append(True)
+        if len(went) == 13:
+            raise KeyboardInterrupt
+        return step(*given)
+
+    monkeypatch.setattr(StereoOdometry, "step", stopping)
+    for stop in (KeyboardInterrupt, SystemExit):
+        with pytest.raises(stop) as end:
+            cli.main()
+    assert end.value.code == 0
+    assert len(went) == 13 + len(read_run(tmp_path / "run").log) - 10
 
 
 def test_a_source_that_changed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +195,7 @@ def broken_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        runner.run(open_source(path), tmp_path / "run", on_frame=stop, resume="")
+        runner.run(open_source(path), tmp_path / "run", on_frame=stop, options={})
     return path
 
 
@@ -187,7 +214,7 @@ def test_chunks_with_motions_that_cannot_be_are_not_gone_on_with(
     monkeypatch.setattr(StereoOdometry, "step", lambda *a: (went.append(1), step(*a))[1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        runner.run(open_source(path), tmp_path / "run", resume="")
+        runner.run(open_source(path), tmp_path / "run", options={})
     assert len(went) == len(read_run(tmp_path / "run").log)
 
 
@@ -199,5 +226,5 @@ def test_a_state_that_cannot_be_is_refused_in_one_line(tmp_path: Path, monkeypat
     made_by["tuple"][0]["fields"]["_state"]["fields"]["t_last_ns"] = "x"
     np.savez(state, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), data=data)
     with pytest.raises(SourceError, match=r"run: cannot be resumed: [A-Z]") as refusal:
-        runner.run(open_source(path), tmp_path / "run", resume="")
+        runner.run(open_source(path), tmp_path / "run", options={})
     assert "\n" not in str(refusal.value)

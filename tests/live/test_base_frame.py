@@ -183,5 +183,8 @@ def test_the_topic_is_also_that_of_the_bag_and_what_lies_there_is_refused_before
         assert list(reader.topics) == ["/foo/odom"]
     with pytest.raises(GpvoError, match=r"out\.mcap: already exists \(give another name or remove it\)"):
         Live(settings, None, print)
+    for name, told in (("out.txt", "suffix.*end it in .bag or .mcap"), ("vio.gpvo/out.bag", "cannot be written")):
+        with pytest.raises(GpvoError, match=told):
+            Live(replace(settings, out=tmp_path / name), None, print)
     with pytest.raises(GpvoError, match="not a valid ROS name"):
         Live(replace(settings, topic="bad topic"), None, print)

@@ -179,6 +179,15 @@ def test_nothing_is_found_in_a_good_bag(seed: int, tmp_path: Path) -> None:
     assert result.stdout.splitlines()[-1].endswith("nothing found")
 
 
+def test_what_was_found_is_counted(good: list[Odometry], tmp_path: Path) -> None:
+    constant = [replace(o, pose_covariance=np.eye(6)) for o in good]
+    for count, part in ((1, {}), (2, {"twist_covariance": 2 * np.eye(6)})):
+        bag = bag_of([replace(o, **part) for o in constant], tmp_path / f"bag{count}")
+        lines = CliRunner().invoke(app, ["doctor", str(bag)]).stdout.splitlines()
+        assert sum(line.startswith("  ") and line[2] != " " for line in lines) == count, lines
+        assert lines[0].endswith(": 1 fault found" if count == 1 else ": 2 faults found")
+
+
 def test_wheel_odometry_of_two_robots_is_constant_and_says_the_same_twice(real_data: Path) -> None:
     """Both recordings are real, and neither is good: their drivers publish one covariance for ever."""
     for name in ("rl_test1.bag", "rl_test2.bag"):

@@ -254,6 +254,32 @@ def test_one_corrupt_stamp_is_one_message_and_three_that_agree_are_another_clock
     assert watch.see(4 * SECOND - 1) is Sequence.LATE
 
 
+def _in_frames(arrival: Arrival, parent: str, child: str) -> Arrival:
+    header = replace(arrival.message.header, frame_id=parent)
+    return replace(arrival, message=replace(arrival.message, header=header, child_frame_id=child))
+
+
+def test_two_publishers_on_one_topic_are_not_mixed_and_other_frames_for_good_are_a_restart(
+    recording: list[Arrival],
+) -> None:
+    live, kept, _ = engine()
+    for k, arrival in enumerate(recording):
+        if k < 50:
+            live.take(arrival)
+            far = _in_frames(arrival, "map", "lidar")
+            live.take(_placed(far, se3.exp(np.full(6, 2.0)) @ _pose(far)))
+        else:
+            live.take(_in_frames(arrival, "map", "imu"))
+    assert live.stage.counts["other_frames"] == 50 + 2
+    assert (live.counts["restarts"], live.counts["frames_start"], live.counts["frames_ok"]) == (
+        1,
+        2,
+        len(recording) - 4,
+    )
+    assert {(o.frame_id, o.child_frame_id) for o in kept.frames[:50]} == {("odom", "base_link")}
+    assert {(o.frame_id, o.child_frame_id) for o in kept.frames[50:]} == {("map", "imu")}
+
+
 def test_a_full_mailbox_drops_the_oldest_and_counts_them() -> None:
     box = Mailbox(depth=3)
     for k in range(10):

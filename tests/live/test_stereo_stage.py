@@ -154,6 +154,7 @@ def test_a_folder_of_images_is_no_bag(tmp_path: Path) -> None:
     ({"odometry": "/o", "address": "tcp/h:1", "domain": 3}, "--address would be ignored .*--zenoh"),
     ({"odometry": "/o", "domain": 3}, "--domain would be ignored"), ({"pose_topic": "/p"}, "--pose-topic would"),
     ({"replay": None, "wire": "dds", "fast": True}, "--fast would be ignored"),
+    ({"odometry": "/o", "depth": 50}, "--depth would be ignored .*recording"),
 ])  # fmt: skip
 def test_options_that_nothing_would_read_are_refused(given: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match=said):

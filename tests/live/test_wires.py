@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gpvo.errors import GpvoError
 from gpvo.live.intake import Arrival
+from gpvo.live.job import open_wire
 from gpvo.publish.odometry import Odometry
 from ros1_tools import SYSTEM_PYTHON, needs_live_ros1, with_gpvo
 from shim_bags import TOPIC, engine, flight, flown, save_model
@@ -123,3 +125,12 @@ def test_without_a_master_ros_1_is_one_line() -> None:
     run = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
     assert run.returncode == 2
     assert "no ROS master at 'http://localhost:1'" in run.stderr
+
+
+@needs_zenoh
+@pytest.mark.parametrize("address", ["127.0.0.1", "tcp/127.0.0.1:1"])
+def test_an_address_without_zenoh_is_one_line_that_names_it(address: str) -> None:
+    with pytest.raises(GpvoError, match=f"{address}.*(start|give)") as told:
+        open_wire("zenoh", address)
+    assert ".rs:" not in str(told.value)
+    assert "cargo" not in str(told.value)

@@ -1,10 +1,12 @@
 """Campaigns and the command."""
 
 import json
+import os
 
 import pytest
 from gpvo.cli import simulate as command
 from gpvo.errors import GpvoError
+from gpvo.parallel import map_jobs
 from gpvo.sim import scenario as sc
 from typer.testing import CliRunner
 
@@ -81,3 +83,16 @@ def test_command(tmp_path):
     made = run(app, ["simulate", "room-t265", "--points", "-o", str(out), "--duration", "5", "--json"])
     assert json.loads(made.output)["flights"][0]["frames"] == 101
     assert out.is_file()
+
+
+def test_a_worker_that_is_killed_is_one_line():
+    with pytest.raises(GpvoError, match="a worker process was killed.*fewer --jobs"):
+        map_jobs(os._exit, [(9,), (9,)], jobs=2)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [({"jobs": 0}, "0 jobs.*--jobs 1"), ({"scheduler": "tcp://x"}, "--backend dask")]
+)
+def test_workers_that_cannot_be_are_one_line(given, told):
+    with pytest.raises(GpvoError, match=told):
+        map_jobs(abs, [(-1,), (2,)], **given)

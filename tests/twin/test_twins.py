@@ -269,6 +269,9 @@ def test_evaluate_by_twins_with_and_without_truth(flown, blind):
 def test_options_of_twins_without_twins_are_refused(command, flown, tmp_path):
     with pytest.raises(GpvoError, match=r"--gap has no effect without --twins"):
         gpvo(command, flown[0] / "run", "--gap", "drives", *(["-o", tmp_path / "m.gpvo"] * (command == "train")))
+    if command != "train":  # which draws by it too
+        with pytest.raises(GpvoError, match=r"--seed has no effect without --twins"):
+            gpvo(command, flown[0] / "run", "--seed", 3)
 
 
 @pytest.mark.slow
