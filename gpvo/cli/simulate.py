@@ -51,7 +51,7 @@ def simulate(
     ] = False,
     jobs: Annotated[int, typer.Option(help="Flights to simulate in parallel with --seeds; -1 for one per core.")] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Threads per flight; they do not change the result.")] = 2,
-    backend: Annotated[str, typer.Option(help="joblib, or dask.")] = "joblib",
+    backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
     preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the images (PNG).")] = None,
     list_: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
@@ -90,6 +90,7 @@ def simulate(
         if seeds is None:
             flights = [_one(chosen, stated_seed(scenario) if seed is None else seed, target, points, threads)]
         else:
+            backend = "local" if backend == "joblib" else backend  # its name until 2026
             flights = fly_campaign(
                 chosen, _seeds(seeds), target, points=points, jobs=jobs, backend=backend, scheduler=scheduler
             )

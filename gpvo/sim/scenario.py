@@ -237,20 +237,17 @@ def fly_campaign(
     *,
     points: bool = False,
     jobs: int = 1,
-    backend: str = "joblib",
+    backend: str = "local",
     scheduler: str | None = None,
 ) -> list[Flight]:
     """Simulate every seed into ``out/seed_N`` (``out/seed_N.npz`` for points); one failure does not stop the others.
 
     Raises GpvoError for an unknown backend; MissingExtraError for ``dask`` without the extra.
     """
-    if backend not in ("joblib", "dask"):
-        raise GpvoError(f"unknown backend '{backend}'", cure="choose joblib or dask")
     suffix = ".npz" if points else ""
     tasks = [(scenario, seed, out / f"seed_{seed}{suffix}", points) for seed in seeds]
     out.mkdir(parents=True, exist_ok=True)
-    where = "local" if backend == "joblib" else backend
-    return map_jobs(fly_one, tasks, jobs=jobs, backend=where, scheduler=scheduler)
+    return map_jobs(fly_one, tasks, jobs=jobs, backend=backend, scheduler=scheduler)
 
 
 def fly_one(scenario: Scenario, seed: int, out: Path, points: bool = False) -> Flight:

@@ -47,7 +47,7 @@ def test_one_failure_does_not_stop_the_others(tmp_path, monkeypatch):
 
 
 def test_unknown_backend(tmp_path):
-    with pytest.raises(GpvoError, match="joblib or dask"):
+    with pytest.raises(GpvoError, match="local or dask"):
         sc.fly_campaign(sc.load_scenario("tunnel"), [0], tmp_path, backend="slurm")
 
 
