@@ -197,7 +197,7 @@ def read_broken_run(path: Path) -> None:
     from gpvo.io import open_source
     from gpvo.io.run import read_run
 
-    runner.run(open_source(path / "source.npz"), path / "run", keep_tracks=True, overwrite=False, resume="")
+    runner.run(open_source(path / "source.npz"), path / "run", keep_tracks=True, overwrite=False, options={})
     assert np.isfinite(read_run(path / "run").log.trajectory()).all(), "a trajectory that is none"
 
 

@@ -115,7 +115,7 @@ def _broken(path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "RunWriter", partial(RunWriter, chunk=2))
         with pytest.raises(KeyboardInterrupt):
-            runner.run(open_source(source), path / "run", on_frame=stop, keep_tracks=True, resume="")
+            runner.run(open_source(source), path / "run", on_frame=stop, keep_tracks=True, options={})
     assert (path / "run" / "chunks" / "state.npz").is_file()
 
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gpvo.accumulation import PoseError, adjoints_to_end, along, carry, frame_jitter, persistence, persistent_sum
-from gpvo.evaluation.forecast import _Flight, _sum_up
+from gpvo.evaluation.forecast import _sum_up
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
 from gpvo.filters.propagation import CORE, Nominal
@@ -180,7 +180,7 @@ def test_a_forecast_states_what_adds_up(seed: int) -> None:
         epistemic=np.zeros((len(rows), 6)), confidence=np.ones(len(rows)), in_domain=np.ones(len(rows)),
     )  # fmt: skip
     plan = SimpleNamespace(T_world_cam=made.poses)
-    covariance, _, _ = _sum_up(_Flight(np.array(made.parent), said, spans), plan)
+    covariance, _, _ = _sum_up(np.array(made.parent), said, plan)
     _, stated = along(made.T_prev_cur, made.errors, made.parent)
     for C, expected in zip(covariance[1:], stated[1:]):
         _assert_same(C, expected)
