@@ -28,8 +28,7 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
     if not path.exists():
         raise SourceError("no such file or folder", where=path)
     if kind is None and path.suffix.lower() in (".safetensors", ".gpvo"):
-        return _model(path)  # before imports that a vehicle's computer need not have
-
+        return _model(path)
     if kind is None:
         if is_run(path):
             return _run(path)

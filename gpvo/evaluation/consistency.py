@@ -13,7 +13,7 @@ from gpvo.accumulation import PoseError, over_windows
 from gpvo.dataset.errors import MotionErrors, drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import compound
+from gpvo.geometry.covariance import compound, variances
 from gpvo.learning.methods import score
 from gpvo.stats.consistency import (
     BLOCKS,
@@ -209,7 +209,7 @@ def horizon(
         drift = drift_variance(np.einsum("nji,nj->ni", T_true[ends, :3, :3], moved), e[:, :3])
         # The white noise of two poses is in the variance of a displacement, too.
         noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
-    z2 = (e**2 / np.diagonal(C + noise, axis1=1, axis2=2)).mean(axis=0)
+    z2 = (e**2 / variances(C + noise)).mean(axis=0)
     plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + noise))
     return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(chains))
 

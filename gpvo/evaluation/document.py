@@ -15,6 +15,7 @@ from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.trajectory import nees_document
 from gpvo.evaluation.verdict import verdict
 from gpvo.files import write_csv, write_text
+from gpvo.geometry.covariance import variances
 from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import METHODS
 from gpvo.online.features import AXES
@@ -179,7 +180,7 @@ def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
     columns: dict[str, Any] = {"t_s": log.t_ns[rows] * 1e-9, "dt_s": e.errors.dt_s}
     columns |= {f"error_{a}": e.errors.xi[:, i] for i, a in enumerate(AXES)}
     for s in e.statements:
-        sigma = np.sqrt(np.diagonal(s.covariance[rows], axis1=1, axis2=2))
+        sigma = np.sqrt(variances(s.covariance[rows]))
         columns |= {f"{s.method}_sigma_{a}": sigma[:, i] for i, a in enumerate(AXES[: s.dof])}
     write_csv(paths[2], columns)
     scores = _scores(run_document(e)["methods"])

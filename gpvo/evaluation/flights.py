@@ -13,9 +13,9 @@ from gpvo.dataset.doubtful import without_wandering_truth
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.errors import GpvoError
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE
-from gpvo.filters.run import Flight, vertical_in_world
+from gpvo.filters.run import Flight
 from gpvo.filters.sanity import require_sane
-from gpvo.filters.start import StartSigmas, slope_sigma
+from gpvo.filters.start import StartSigmas, slope_sigma, tilt_of, vertical_in_world
 from gpvo.filters.study import Constants
 from gpvo.geometry import se3
 from gpvo.io.run import Run
@@ -111,9 +111,8 @@ def on_smooth_path(twin: Flight, seed: Sequence[int]) -> Flight:
     T_world_imu, t_s = twin.T_world_imu, (t_ns - t_ns[0]) * 1e-9
     if imu is not None:
         up, _ = vertical_in_world(imu, t_ns, T_world_imu, StartSigmas().acc_bias_mps2)
-        tilt = np.cross(up, [0.0, 0.0, 1.0])
-        turn = np.arctan2(np.linalg.norm(tilt), up[2]) * tilt / max(float(np.linalg.norm(tilt)), 1e-12)
-        T_world_imu = se3.exp(np.append(np.zeros(3), turn)) @ T_world_imu
+        off_rad, axis = tilt_of(up)
+        T_world_imu = se3.exp(np.append(np.zeros(3), -off_rad * axis)) @ T_world_imu
     path = smooth_path(t_s, T_world_imu)
     T_world_cam = se3.from_rt(path.attitude(t_s), path.position(t_s))
     if twin.T_imu_cam is not None:

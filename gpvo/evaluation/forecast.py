@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gpvo.accumulation import along
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import position_in_world, symmetrise
+from gpvo.geometry.covariance import position_in_world, symmetrise, variances
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.trajectory import Trajectory, read_tum
 from gpvo.learning.sample import TrainingSample
@@ -124,7 +124,7 @@ class Forecast:
     @property
     def position_sigma_m(self) -> Array:
         """(N, 3) standard deviation per axis of the plan's world [m]."""
-        return np.sqrt(np.diagonal(self.position_covariance, axis1=1, axis2=2))
+        return np.sqrt(variances(self.position_covariance))
 
     @property
     def sigma_m(self) -> Array:

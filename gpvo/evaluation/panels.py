@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.statements import Statement
-from gpvo.geometry.covariance import half_axes
+from gpvo.geometry.covariance import half_axes, variances
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.stats import consistency
 from gpvo.stats.series import allan_deviation, autocorrelation
@@ -120,7 +120,7 @@ def stated(e: Evaluation) -> list[Panel]:
     for name, block in (("translation [mm]", slice(0, 3)), ("rotation [mrad]", slice(3, 6))):
         lines = []
         for s in (s for s in e.statements if s.errors is not None):
-            sigma = np.sqrt(np.diagonal(s.covariance, axis1=1, axis2=2)[:, block].mean(axis=1))
+            sigma = np.sqrt(variances(s.covariance)[:, block].mean(axis=1))
             lines.append(_of_method(e, s, e.t_s[keep], 1e3 * sigma[keep]))
         if lines:
             panels.append(_panel("", "time [s]", name, lines, log="y"))
@@ -133,7 +133,7 @@ def reliability(e: Evaluation) -> list[Panel]:
         return []
     lines = []
     for s, error, C, _ in _stated_errors(e):
-        z = np.abs(error) / np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+        z = np.abs(error) / np.sqrt(variances(C))
         lines.append(_of_method(e, s, _LEVELS, np.array([(z <= width).mean() for width in _HALF_WIDTHS])))
     lines.append({**_line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
     return [_panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])]

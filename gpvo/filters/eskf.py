@@ -37,6 +37,7 @@ from gpvo.filters.propagation import (
     imu_step,
     process_noise,
 )
+from gpvo.geometry.covariance import variances
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
@@ -230,7 +231,7 @@ class ErrorStateFilter:
 
     def _doubt(self, factor: Array) -> None:
         """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,), within reason."""
-        variance = np.diagonal(self.P, axis1=1, axis2=2)
+        variance = variances(self.P)
         room = np.minimum(_MOST_SPEED_VAR / variance[:, V].max(axis=1), _MOST_ANGLE_VAR / variance[:, TH].max(axis=1))
         D = np.ones((self.batch, JOINT))
         for block in (V, TH, BA, BG, me.CLONE_TH):

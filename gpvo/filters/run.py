@@ -13,21 +13,16 @@ from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate
-from gpvo.filters.plausible import cleaned, usable
+from gpvo.filters.plausible import usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_noise, each
-from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, heading
+from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, heading, tilt_of, vertical_in_world
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
-from gpvo.stats.series import integral, interpolated
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
 _LEVEL_SIGMAS = 3.0
-_STRETCH_S, _STRETCHES = 1.0, 15  # that the vertical is measured over: at least so long, at most so many
-_ROUNDS, _HUBER = 10, 2.0  # of reweighting; a stretch further off, in sigmas of its three axes together, counts less
-_MEDIAN_OF_NORM = 1.54  # of three standard normal numbers
-_LEAST_NOISE_MPS2 = 1e-4
 _SHORTEST_PATH_M = 0.1  # of which a drift is a part
 _IMU_MARGIN_NS = 100_000_000  # that an IMU log begins after or ends before the images is usual
 
@@ -146,53 +141,13 @@ def _aligned_with_gravity(
     t_ns = np.array([flight.records[i].t_ns for i in valid])
     up, tilt = vertical_in_world(flight.imu, t_ns, flight.T_world_imu[valid], sigmas.acc_bias_mps2)
     tilt = tilt + sigmas.tilt_rad**2 * (np.eye(3) - np.outer(up, up))
-    off = np.cross([0.0, 0.0, 1.0], up)
-    off_rad = float(np.arctan2(np.linalg.norm(off), up[2]))
-    axis = off / max(float(np.linalg.norm(off)), np.finfo(float).tiny)
+    off_rad, axis = tilt_of(up)
     if off_rad <= _LEVEL_SIGMAS * np.sqrt(axis @ tilt @ axis):
         return start, None
     R, C = start.nominal.R_world_imu[0], start.covariance.copy()
     C[TH, TH] += R.T @ tilt @ R
     note = f"{start.note}; truth's z axis is {np.rad2deg(off_rad):.1f} deg from up: gravity measured from the IMU"
     return Start(start.nominal, C, note, tilt), -STANDARD_GRAVITY_MPS2 * up
-
-
-def vertical_in_world(
-    imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array, acc_bias_mps2: float
-) -> tuple[Array, Array]:
-    """Unit vector (3,) of the vertical, and the covariance (3, 3) of the angles [rad] about the world's axes by which
-    it may be wrong, where a bias of the accelerometer has this standard deviation.
-
-    Over a stretch, the mean specific force in the world less the mean acceleration is gravity's reaction plus the bias,
-    turned as the vehicle was on average: what turns with it is bias, the rest is up. Least squares over many stretches
-    with Huber's weights, which readings of a failing IMU do not move far.
-    """
-    imu = cleaned(imu)
-    t_s, imu_s = (t_ns - t_ns[0]) * 1e-9, (imu.t_ns - t_ns[0]) * 1e-9
-    force = interpolated(t_s, imu_s, imu.acc_mps2)
-    R = T_world_imu[:, :3, :3]
-    rates = np.concatenate([R @ force[:, :, None], R], axis=2)  # (N, 3, 4) in the world: specific force, bias per unit
-    summed = integral(rates.reshape(-1, 12), t_s).reshape(-1, 3, 4)
-    summed[:, :, 0] -= np.gradient(T_world_imu[:, :3, 3], t_s, axis=0)
-    count = int(np.clip(t_s[-1] / _STRETCH_S, 1, _STRETCHES))
-    ends = np.unique(np.searchsorted(t_s, np.linspace(0.0, t_s[-1], count + 1)))
-    means = np.diff(summed[ends], axis=0) / np.diff(t_s[ends])[:, None, None]
-    seen, turned = means[:, :, 0], means[:, :, 1:]
-    X = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)
-    prior = np.diag(np.repeat([0.0, acc_bias_mps2**-2], 3))
-    x = np.append(np.median(seen, axis=0), np.zeros(3))
-    free = seen.size - 3.0
-    for _ in range(_ROUNDS):
-        off = np.linalg.norm(seen - X @ x, axis=1)
-        sigma = max(float(np.median(off)) / _MEDIAN_OF_NORM * np.sqrt(seen.size / max(free, 1.0)), _LEAST_NOISE_MPS2)
-        weight = sigma**-2 / np.maximum(off / (_HUBER * sigma), 1.0)
-        fitted = np.einsum("n,nij,nik->jk", weight, X, X)
-        C = np.linalg.inv(fitted + prior)
-        x = C @ np.einsum("n,nij,ni->j", weight, X, seen)
-        free = seen.size - float(np.trace(C @ fitted))  # the prior fits what the stretches leave open
-    up, g = x[:3] / np.linalg.norm(x[:3]), float(np.linalg.norm(x[:3]))
-    turn = se3.skew(up) / g  # an error of the vector turns it by up x error / g
-    return up, turn @ C[:3, :3] @ turn.T
 
 
 def make_filter(

@@ -8,12 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
-from gpvo.filters.plausible import usable
+from gpvo.filters.plausible import cleaned, usable
 from gpvo.filters.propagation import BA, BG, TH, Nominal, V
 from gpvo.geometry import se3
+from gpvo.stats.series import integral, interpolated
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog
 
 _SLOPE_POSES = 5  # true poses that the velocity at the start is taken from
+_STRETCH_S, _STRETCHES = 1.0, 15  # that the vertical is measured over: at least so long, at most so many
+_ROUNDS, _HUBER = 10, 2.0  # of reweighting; a stretch further off, in sigmas of its three axes together, counts less
+_MEDIAN_OF_NORM = 1.54  # of three standard normal numbers
+_LEAST_NOISE_MPS2 = 1e-4
 _REST_S, _REST_SAMPLES = 0.5, 10  # that the vehicle must be at rest for, and IMU samples within that show it
 _MOST_GYRO_STD_RADPS, _MOST_ACC_STD_MPS2, _MOST_GYRO_MEAN_RADPS = 0.05, 0.5, 0.1  # of an IMU at rest
 
@@ -159,6 +164,51 @@ def _leveled(up_imu: Array, yaw_rad: float) -> Array:
 def heading(R_world_imu: Array, up_imu: Array) -> float:
     """The yaw [rad] that :func:`from_rest` needs to agree with a known attitude."""
     return float(se3.so3_log(R_world_imu @ _leveled(up_imu, 0.0).T)[2])
+
+
+def vertical_in_world(
+    imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array, acc_bias_mps2: float
+) -> tuple[Array, Array]:
+    """Unit vector (3,) of the vertical, and the covariance (3, 3) of the angles [rad] about the world's axes by which
+    it may be wrong, where a bias of the accelerometer has this standard deviation.
+
+    Over a stretch, the mean specific force in the world less the mean acceleration is gravity's reaction plus the bias,
+    turned as the vehicle was on average: what turns with it is bias, the rest is up. Least squares over many stretches
+    with Huber's weights, which readings of a failing IMU do not move far.
+    """
+    imu = cleaned(imu)
+    t_s, imu_s = (t_ns - t_ns[0]) * 1e-9, (imu.t_ns - t_ns[0]) * 1e-9
+    force = interpolated(t_s, imu_s, imu.acc_mps2)
+    R = T_world_imu[:, :3, :3]
+    rates = np.concatenate([R @ force[:, :, None], R], axis=2)  # (N, 3, 4) in the world: specific force, bias per unit
+    summed = integral(rates.reshape(-1, 12), t_s).reshape(-1, 3, 4)
+    summed[:, :, 0] -= np.gradient(T_world_imu[:, :3, 3], t_s, axis=0)
+    count = int(np.clip(t_s[-1] / _STRETCH_S, 1, _STRETCHES))
+    ends = np.unique(np.searchsorted(t_s, np.linspace(0.0, t_s[-1], count + 1)))
+    means = np.diff(summed[ends], axis=0) / np.diff(t_s[ends])[:, None, None]
+    seen, turned = means[:, :, 0], means[:, :, 1:]
+    X = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)
+    prior = np.diag(np.repeat([0.0, acc_bias_mps2**-2], 3))
+    x = np.append(np.median(seen, axis=0), np.zeros(3))
+    free = seen.size - 3.0
+    for _ in range(_ROUNDS):
+        off = np.linalg.norm(seen - X @ x, axis=1)
+        sigma = max(float(np.median(off)) / _MEDIAN_OF_NORM * np.sqrt(seen.size / max(free, 1.0)), _LEAST_NOISE_MPS2)
+        weight = sigma**-2 / np.maximum(off / (_HUBER * sigma), 1.0)
+        fitted = np.einsum("n,nij,nik->jk", weight, X, X)
+        C = np.linalg.inv(fitted + prior)
+        x = C @ np.einsum("n,nij,ni->j", weight, X, seen)
+        free = seen.size - float(np.trace(C @ fitted))  # the prior fits what the stretches leave open
+    up, g = x[:3] / np.linalg.norm(x[:3]), float(np.linalg.norm(x[:3]))
+    turn = se3.skew(up) / g  # an error of the vector turns it by up x error / g
+    return up, turn @ C[:3, :3] @ turn.T
+
+
+def tilt_of(up: Array) -> tuple[float, Array]:
+    """Angle [rad] from z to a unit vector (3,), and the axis (3,) about which to turn; zeros where there is none."""
+    across = np.cross([0.0, 0.0, 1.0], up)
+    sine = float(np.linalg.norm(across))
+    return float(np.arctan2(sine, up[2])), across / max(sine, np.finfo(float).tiny)
 
 
 def _diagonal(sigmas: StartSigmas, with_imu: bool) -> Array:

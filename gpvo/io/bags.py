@@ -220,11 +220,12 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
     """
     sizes: list[tuple[int, int]] = []
     for topic in (topics.left, topics.right):
-        first = [message for _, message in islice(messages(reader, [topic]), 20)]
-        stamps = [stamp_ns(message) for message in first]
-        image = next((i for i in map(decode_message, first) if i is not None), None)
+        stamps, image = [], None
+        for _, message in islice(messages(reader, [topic]), 20):  # one by one: each may be large
+            stamps.append(stamp_ns(message))
+            image = decode_message(message) if image is None else image
         if image is None:
-            encoding = getattr(first[-1], "encoding", getattr(first[-1], "format", "?"))
+            encoding = getattr(message, "encoding", getattr(message, "format", "?"))
             raise SourceError(f"no readable image on '{topic}' (encoding '{encoding}')", where=path)
         sizes.append((image.shape[1], image.shape[0]))
         if stamps[0] == 0:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import variances
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
 from gpvo.io.foreign_csv import Table, is_number, names_other_columns, read_table
@@ -236,7 +237,7 @@ def definite_in_plane(covariance: Array, still: NDArray[np.bool_], variance: Arr
     A robot in a plane has three such axes; drivers state zero for them, or a constant, which does not grow. They get
     ``variance`` (N, 6), by default their own, but at least ``SEEN`` squared.
     """
-    own = np.diagonal(covariance, axis1=1, axis2=2)
+    own = variances(covariance)
     variance = own if variance is None else variance
     empty = still & ~still.all() & (own <= np.maximum(_GROWS * variance, _GROWS_SEEN * SEEN**2))
     filled = np.where(empty[:, :, None] | empty[:, None], 0.0, covariance)

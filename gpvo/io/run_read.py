@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import CalibrationError, SourceError, printable
 from gpvo.files import read_json, read_toml
-from gpvo.geometry.covariance import are_positive_definite
+from gpvo.geometry.covariance import are_positive_definite, variances
 from gpvo.io import run_table
 from gpvo.io.parquet import read_columns
 from gpvo.types import (
@@ -113,7 +113,7 @@ def read_predictions(path: str | Path) -> list[Prediction]:
     if not np.isfinite(numbers).all():
         raise SourceError("holds a prediction that is not finite", where=p)
     covariance = np.array([q.covariance for q in predictions])
-    if max(np.abs(numbers).max(), np.diagonal(covariance, axis1=1, axis2=2).max()) > _LARGEST:
+    if max(np.abs(numbers).max(), variances(covariance).max()) > _LARGEST:
         raise SourceError(f"holds a prediction beyond {_LARGEST:g}", where=p, cure="make it again with 'gpvo predict'")
     if not all(q.nu > 2.0 for q in predictions):
         raise SourceError("holds a prediction without a second moment: its 'nu' is not above 2", where=p)

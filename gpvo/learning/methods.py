@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.dataset.build import TrainingSet
+from gpvo.geometry.covariance import variances
 from gpvo.stats.consistency import (
     BLOCKS,
     counted_axes,
@@ -118,7 +119,7 @@ def score(
     counted = counted_axes(axes, d)
     per_block = nees_by_block((error - mean)[:, :d], covariance, counted)
     residual, covariance = (error - mean)[:, counted], marginal(covariance, counted)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    sigma = np.sqrt(variances(covariance))
     crps, level = crps_gaussian(residual, sigma), coverage(residual, sigma)
     return {
         "nees_dof": {n: None if n not in per_block else float(per_block[n].mean()) for n in BLOCKS},
@@ -139,7 +140,7 @@ def score(
 def stated_and_actual(error: Array, mean: Array, covariance: Array) -> dict[str, list[tuple[float, float]]]:
     """By kind of axis, over tenths of the motions by rising stated variance: the root mean stated variance and the root
     mean squared error of an axis [m or rad]. Arguments as in :func:`score`, (n, 6) and (n, 6, 6)."""
-    variance, square = np.diagonal(covariance, axis1=1, axis2=2), (error - mean) ** 2
+    variance, square = variances(covariance), (error - mean) ** 2
     out = {}
     for kind, block in (("translation_m", slice(0, 3)), ("rotation_rad", slice(3, 6))):
         order = np.argsort(variance[:, block].sum(1), kind="stable")

@@ -18,6 +18,7 @@ from gpvo import __version__
 from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
+from gpvo.geometry.covariance import variances
 from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
@@ -234,7 +235,7 @@ def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Arr
     gross = (length > SLIP_MEDIANS * np.median(length)) & (length > SLIP_SIGMAS * stated)
     gross_lost = lost_length > SLIP_MEDIANS * np.median(length)
     dt_s = learned.model.dt_s
-    rate_var = np.diagonal(estimate.covariance, axis1=1, axis2=2).mean(axis=0) / dt_s**2
+    rate_var = variances(estimate.covariance).mean(axis=0) / dt_s**2
     velocities = learned.model.velocities
     lost_var = [velocities.lost_variance(dt_s, dt_s, dt_s, np.zeros(6), rate_var, jump) for jump in s.lost_jump]
     learned_all = np.concatenate(

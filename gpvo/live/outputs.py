@@ -145,13 +145,19 @@ class FileOutput(Output):
     def odometry(self, odometry: Odometry) -> None:
         """Keep one frame. GpvoError where the part before could not be written."""
         self._odometry.append(odometry)
-        part = self._odometry[self._begun :] if time.monotonic() - self._begun_s >= PART_S else []
-        if any(o.twist_body is not None for o in part):
-            before, place = list(self._parts.values()), self._folder / f"{part[0].t_ns}{self._path.suffix}"
-            self._parts[place] = self._writer.submit(ros.write_bag, place, part, self._topic)
-            self._begun, self._begun_s = len(self._odometry), time.monotonic()
-            if before and before[-1].done():
-                before[-1].result()
+        if time.monotonic() - self._begun_s >= PART_S:
+            self._begun_s = time.monotonic()
+            self._write_part()
+
+    def _write_part(self) -> None:
+        part = self._odometry[self._begun :]
+        if all(o.twist_body is None for o in part):
+            return
+        before, place = list(self._parts.values()), self._folder / f"{part[0].t_ns}{self._path.suffix}"
+        self._parts[place] = self._writer.submit(ros.write_bag, place, part, self._topic)
+        self._begun = len(self._odometry)
+        if before and before[-1].done():
+            before[-1].result()
 
     def close(self) -> None:
         """Write the bag; only warn where there is nothing to write, as when the end comes before the first image."""

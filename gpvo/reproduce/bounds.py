@@ -19,7 +19,7 @@ from gpvo.dataset.errors import interpolate_truth
 from gpvo.evaluation.statements import corrected, plain_statement, predicted_statement, where_stated
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import position_in_world
+from gpvo.geometry.covariance import position_in_world, variances
 from gpvo.io.run import Run, read_run
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online.features import THESIS
@@ -48,7 +48,7 @@ class Bounds:
     @property
     def sigma_m(self) -> Array:
         """(N, 3) stated standard deviations."""
-        return np.sqrt(np.diagonal(self.covariance_m2, axis1=1, axis2=2))
+        return np.sqrt(variances(self.covariance_m2))
 
     @property
     def predicted_m(self) -> Array:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.filters.policies import LearnedPolicy
-from gpvo.filters.run import Flight, fuse_flight, vertical_in_world
+from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight
+from gpvo.filters.start import vertical_in_world
 from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.types import Status, VoRecord

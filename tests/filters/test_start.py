@@ -11,8 +11,8 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
-from gpvo.filters.run import FuseOptions, begin, fuse_flight, vertical_in_world
-from gpvo.filters.start import StartSigmas, from_rest, from_truth, heading
+from gpvo.filters.run import FuseOptions, begin, fuse_flight
+from gpvo.filters.start import StartSigmas, from_rest, from_truth, heading, vertical_in_world
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
 from gpvo.types import ImuLog, TruthLog, VoLog
