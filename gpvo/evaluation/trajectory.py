@@ -210,8 +210,11 @@ def pose_consistency(log: VoLog, T_est: Array, T_true: Array, known: NDArray[np.
 def aligned(T_est: Array, T_true: Array, covariance: Array) -> Array:
     """Poses (N, 4, 4), moved as one body to where their squared errors over the covariances (N, 6, 6) are least.
 
-    Gauss-Newton, from the better of two starts: by positions alone, and by orientations with the mean position.
+    Gauss-Newton, from the better of two starts: by positions alone, and by orientations with the mean position. About
+    the middle of the path: turns about an origin thousands of kilometres off, as of UTM, drown in their translations.
     """
+    middle = T_true[:, :3, 3].mean(axis=0)
+    T_true = se3.from_rt(T_true[:, :3, :3], T_true[:, :3, 3] - middle)
     turn = se3.orthonormalise((T_true @ se3.inverse(T_est)).mean(axis=0))[:3, :3]
     p_est, p_true = T_est[:, :3, 3], T_true[:, :3, 3]
     starts = (umeyama(p_est, p_true), (turn, p_true.mean(axis=0) - turn @ p_est.mean(axis=0)))
@@ -232,7 +235,7 @@ def aligned(T_est: Array, T_true: Array, covariance: Array) -> Array:
         if not (now := cost(candidate)) < least:
             break
         best, least = candidate, now
-    return best
+    return se3.from_rt(best[:, :3, :3], best[:, :3, 3] + middle)
 
 
 def nees_document(found: PoseConsistency | Consistency | None) -> dict[str, object] | None:

@@ -94,6 +94,27 @@ def test_it_is_one_where_positions_do_not_tell_the_rotation_and_where_errors_gro
     assert np.mean(by_block, axis=0) == pytest.approx(np.ones(3), abs=bound)
 
 
+def test_it_is_the_same_wherever_the_truth_has_its_origin() -> None:
+    """As in UTM coordinates, for odometry that is certain at its start."""
+    rng, step = np.random.default_rng(0), np.diag([0.01] * 3 + [0.002] * 3) ** 2
+    motion = se3.exp(np.array([0.0, 0.02, 0.5, 0.005, 0.02, 0.0]))
+    T_true, T_est, C = [np.eye(4)], [np.eye(4)], [1e-2 * step]
+    back = se3.adjoint(se3.inverse(motion))
+    for _ in range(300):
+        T_true.append(T_true[-1] @ motion)
+        T_est.append(T_est[-1] @ motion @ se3.exp(rng.multivariate_normal(np.zeros(6), step)))
+        C.append(back @ C[-1] @ back.T + step)
+    log = VoLog(
+        [VoRecord(k, max(k - 1, 0), Status.OK, np.eye(4), covariances={IMPORTED_POSE: c}) for k, c in enumerate(C)]
+    )
+    found = []
+    for origin_m in (0.0, 5e6):
+        world = se3.from_rt(np.eye(3), origin_m * np.array([0.1, 1.0, 0.0]))
+        poses = pose_consistency(log, np.array(T_est), world @ np.array(T_true), np.ones(301, bool))
+        found.append([poses.nees_dof[b].mean for b in ("position", "orientation", "joint")])
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
 def test_it_shows_by_how_much_a_statement_is_wrong() -> None:
     known = np.ones(N + 1, bool)
     right, bold = (pose_consistency(*filtered(0, f), known) for f in (1.0, 0.25))
