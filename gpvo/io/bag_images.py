@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.images import Image8, decode_grey8, to_grey8
+from gpvo.io.images import Image8, decode_stored, to_grey8
 from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import no_pair
 
@@ -41,22 +41,32 @@ _WAITING = 12
 
 def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
     """A sensor_msgs Image or CompressedImage as (H, W) uint8; None where it is damaged or of unknown encoding."""
-    raw = np.asarray(message.data, dtype=np.uint8)
-    if not hasattr(message, "encoding"):
-        return decode_grey8(raw, depth)
-    name = str(message.encoding).lower()
+    if hasattr(message, "encoding"):
+        name, (pixels, bgr) = str(message.encoding).lower(), _raw_pixels(message)
+    else:
+        # Of image_transport, "bayer_rggb8; png compressed": it compresses the mosaic of a colour filter as it is.
+        name, bgr = str(message.format).partition(";")[0].strip().lower(), True
+        pixels = decode_stored(np.asarray(message.data, dtype=np.uint8))
+    if pixels is None:
+        return None
+    pattern = _BAYER.get(name.rstrip("0123456789"))
+    if pattern is not None and pixels[0, 0].size == 1:
+        pixels = np.asarray(cv2.cvtColor(pixels, pattern))
+    return to_grey8(pixels, bgr=bgr, depth=depth)
+
+
+def _raw_pixels(message: Any) -> tuple[NDArray[Any] | None, bool]:
+    """Pixels (H, W, channels) of an Image, None as above, and whether blue comes first."""
+    raw, name = np.asarray(message.data, dtype=np.uint8), str(message.encoding).lower()
     stride, first = _LUMA.get(name, (1, 0))
     kind, channels, bgr = ("u1", 1, True) if name in _LUMA else _ENCODINGS.get(name, ("", 0, True))
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * int(kind[1:] or 0) * stride
     if not 0 < height <= 16384 or not 0 < width <= 16384 or not 0 < row <= step or len(raw) < height * step:
-        return None
+        return None, bgr
     packed = np.ascontiguousarray(raw[: height * step].reshape(height, step)[:, first:row:stride])
     pixels: NDArray[Any] = packed.view((">" if message.is_bigendian else "<") + kind)
-    pixels = pixels.astype(kind, copy=False).reshape(height, width, channels)
-    if name.startswith("bayer_"):
-        pixels = np.asarray(cv2.cvtColor(pixels, _BAYER[name.rstrip("0123456789")]))
-    return to_grey8(pixels, bgr=bgr, depth=depth)
+    return pixels.astype(kind, copy=False).reshape(height, width, channels), bgr
 
 
 class PairQueue:

@@ -43,8 +43,12 @@ SWAPPED = "left and right images are swapped: matched points have negative dispa
 Image8 = NDArray[np.uint8]
 
 
-def to_grey8(image: NDArray[Any], *, bgr: bool = True, depth: Depth | None = None) -> Image8:
-    """(H, W) uint8 from a grey or colour image of 8 or 16 bit."""
+def to_grey8(image: NDArray[Any], *, bgr: bool = True, depth: Depth | None = None) -> Image8 | None:
+    """(H, W) uint8 from a grey or colour image of 8 or 16 bit; None for other samples, which ``depth`` is told."""
+    if image.dtype not in (np.uint8, np.uint16):
+        if depth is not None:
+            depth.refused = f"its samples are {image.dtype}, of no known range: save the images as 8 or 16 bit"
+        return None
     if image.ndim == 3:
         channels = image.shape[2]
         if channels == 1:
@@ -69,7 +73,14 @@ def read_grey8(path: Path, depth: Depth | None = None) -> Image8 | None:
 
 
 def decode_grey8(raw: NDArray[np.uint8], depth: Depth | None = None) -> Image8 | None:
-    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8; None where they are no image, or claim to be larger than any.
+    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8: :func:`to_grey8` of :func:`decode_stored`."""
+    image = decode_stored(raw)
+    return None if image is None else to_grey8(image, depth=depth)
+
+
+def decode_stored(raw: NDArray[np.uint8]) -> NDArray[Any] | None:
+    """Encoded bytes as (H, W) or (H, W, channels), blue first; None where they are no image, or claim to be larger than
+    any.
 
     As stored, not turned by an Exif orientation: that is what the calibration and the size in the header are of.
     """
@@ -79,14 +90,11 @@ def decode_grey8(raw: NDArray[np.uint8], depth: Depth | None = None) -> Image8 |
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        image = cv2.imdecode(raw, _AS_STORED)
+        return cv2.imdecode(raw, _AS_STORED)
     except cv2.error:
         return None
     finally:
         cv2.utils.logging.setLogLevel(level)
-    if image is None or image.dtype not in (np.uint8, np.uint16):
-        return None
-    return to_grey8(image, depth=depth)
 
 
 @dataclass(frozen=True)
@@ -189,7 +197,7 @@ class ImageSource(ABC):
                 is_any_good = True
                 yield StereoFrame(t_ns, left, right)
         if not is_any_good:
-            raise SourceError(problem, where=self.path)
+            raise SourceError(problem, where=self.path, cure=self.depth.refused or None)
 
 
 class FileSource(ImageSource):

@@ -61,7 +61,7 @@ class SourceReport:
 
 class Depth:
     """Depth of 16-bit images: ``bits``, the lower ones of the 16 that samples fill, and ``most``, the largest sample so
-    far.
+    far. ``refused``: what is wrong with images whose samples are of another kind, empty where there were none.
 
     Raises SourceError where ``bits`` is not from 8 to 16.
     """
@@ -69,7 +69,7 @@ class Depth:
     def __init__(self, bits: int = 16) -> None:
         if not 8 <= bits <= 16:
             raise SourceError(f"images of {bits} bits are not possible", cure="give 8 to 16")
-        self.bits, self.most = bits, 0
+        self.bits, self.most, self.refused = bits, 0, ""
 
     def to8(self, samples: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """Samples of any shape in 8 bit."""
@@ -80,7 +80,9 @@ class Depth:
         return np.asarray(np.minimum((samples.astype(np.uint32) + half) >> shift, 255), dtype=np.uint8)
 
     def doubt(self) -> str:
-        """What the largest sample says against ``bits``; empty for nothing."""
+        """What the samples say against ``bits``; empty for nothing."""
+        if self.refused:
+            return self.refused
         if self.most >> self.bits:
             held = f"samples reach {self.most}, more than {self.bits} bits hold"
             return f"{held}: brighter ones are clipped (--bits {self.most.bit_length()})"

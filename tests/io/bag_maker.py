@@ -45,9 +45,9 @@ class BagMaker:
         )  # fmt: skip
         self.add(topic, message, t_ns + delay_ns)
 
-    def compressed(self, topic: str, t_ns: int, image: np.ndarray) -> None:
+    def compressed(self, topic: str, t_ns: int, image: np.ndarray, encoding: str = "png") -> None:
         data = cv2.imencode(".png", image)[1].ravel()
-        message = self.type("sensor_msgs/msg/CompressedImage")(header=self.header(t_ns), format="png", data=data)
+        message = self.type("sensor_msgs/msg/CompressedImage")(header=self.header(t_ns), format=encoding, data=data)
         self.add(topic, message, t_ns)
 
     def camera_info(self, topic: str, t_ns: int, tx: float) -> None:

@@ -572,6 +572,15 @@ def test_kitti_poses_of_another_length(tmp_path):
         open_source(path)
 
 
+def test_samples_of_no_known_range_are_named(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 4)
+    for file in path.rglob("*.png"):
+        seq.write_image(file.with_suffix(".tiff"), np.full((seq.HEIGHT, seq.WIDTH), 0.5, np.float32))
+        file.unlink()
+    with pytest.raises(SourceError, match="no readable image pair.*samples are float32, .*8 or 16 bit"):
+        list(open_source(path))
+
+
 def test_all_images_unreadable(tmp_path):
     path = seq.write_folder(tmp_path / "s")
     for file in path.rglob("*.png"):
