@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
-from gpvo.io.stamps import UNITS_NS, check_interval, likely_unit, text_lines, text_to_ns
+from gpvo.io.stamps import UNITS_NS, check_interval, integer_ns, likely_unit, text_lines, text_to_ns
 from gpvo.types import COUNT_FIELDS, FLOAT_FIELDS, Array
 
 _POSE = ("p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w")
@@ -23,7 +23,7 @@ TARGETS = (*_STAMPS, *_POSE, *_COV, *COUNT_FIELDS, *FLOAT_FIELDS)
 
 _STAMP_NAMES = {
     *("t", "time", "timestamp", "stamp", "sec", "secs"),
-    *(f"{name}_{unit}" for name in ("time", "timestamp", "stamp") for unit in UNITS_NS),
+    *(f"{name}_{unit}" for name in ("time", "timestamp", "stamp") for unit in (*UNITS_NS, "sec", "secs")),
 }
 _OPENVINS = {
     **{f"p{a}{b}": f"cov_{i}{j}" for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j},
@@ -63,7 +63,8 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     """Read a CSV with a header line (comma, semicolon, tab or blanks between), or as VINS-Fusion writes it, without.
 
     ``mapping`` gives column name -> target (one of :data:`TARGETS`) and goes before what the names suggest. A stamp is
-    in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds. Raises
+    in the unit of its target or name; where only a guess says seconds, 16 digits and more are nanoseconds. ROS's
+    nanoseconds beyond whole seconds are added where their column stands beside. Raises
     SourceError, naming file and line, or the column that is wanted.
     """
     lines = _lines(path)
@@ -79,6 +80,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
     stamp = next(s for s in _STAMPS if s in targets)
     is_stated = stamp in mapping.values()
     column = header[targets[stamp]]
+    rest = _rest_of_seconds(header, column) if stamp == "t_s" else None
     for number, fields in lines:
         if len(rows) >= _MAX_ROWS:
             raise SourceError(f"has more than {_MAX_ROWS} rows", where=path)
@@ -86,7 +88,7 @@ def read_table(path: Path, mapping: Mapping[str, str]) -> Table:
             raise SourceError(f"line {number} holds {len(fields)} fields, the header {len(header)}", where=path)
         text = fields[targets[stamp]]
         try:
-            stamps.append(_stamp(text, stamp[2:], is_stated))
+            stamps.append(_stamp(text, stamp[2:], is_stated) + (0 if rest is None else integer_ns(fields[rest])))
         except ValueError as error:
             unit = likely_unit(text)
             cure = None if unit is None or f"t_{unit}" == stamp else _unit_cure(column, unit)
@@ -178,7 +180,8 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
         if column not in header:
             raise SourceError(f"has no column '{column}' (there are: {', '.join(header)})", where=path)
     found: dict[str, int] = {mapping[c]: header.index(c) for c in mapping}
-    for index, column in enumerate(header):
+    # The sensor's time, of the header of a ROS message, before that of recording.
+    for index, column in sorted(enumerate(header), key=lambda c: "header" not in c[1].lower()):
         guess = None if column in mapping else _suggest(column)
         if guess is None or (guess in _STAMPS and found.keys() & _STAMPS):
             continue
@@ -204,10 +207,21 @@ def _is_plain(column: str) -> bool:
     return re.fullmatch(r"[a-z]*_?[xyzw]", column.strip().lower().replace(".", "_")) is not None
 
 
+def _plain(column: str) -> str:
+    """The name of a column in small letters with underscores, without a unit in brackets."""
+    return re.sub(r"[./]", "_", re.sub(r"[\[(].*?[\])]", "", column).strip().lower()).lstrip("#%").strip("_")
+
+
+def _rest_of_seconds(header: list[str], column: str) -> int | None:
+    """Index of the column of nanoseconds beyond the whole seconds of another, as ROS has them; None without one."""
+    base, is_seconds = re.subn(r"secs?$", "", _plain(column))
+    wanted = {base + rest for rest in ("nsec", "nsecs", "nanosec", "nanosecs")} if is_seconds else {}
+    return next((index for index, name in enumerate(header) if _plain(name) in wanted), None)
+
+
 def _suggest(column: str) -> str | None:
     """What a column name means to most people."""
-    unit = re.search(r"[\[(](.*?)[\])]", column)
-    name = re.sub(r"[\[(].*?[\])]", "", column).strip().lower().replace(".", "_").lstrip("#%").strip("_")
+    unit, name = re.search(r"[\[(](.*?)[\])]", column), re.sub(r"^.*header_(?=stamp)", "", _plain(column))
     if name in TARGETS:
         return name
     if name in _STAMP_NAMES:

@@ -48,6 +48,7 @@ def _csv(path, header, extra=(), separator=",", stamp="{}"):
             ",",
         ),
         ("stamp,pos_x,pos_y,pos_z,quat_x,quat_y,quat_z,quat_w", ","),
+        ("__time,/o/pose/position/x,/o/pose/position/y,/o/pose/position/z,/o/q/x,/o/q/y,/o/q/z,/o/q/w", ","),
     ],
 )
 def test_columns_by_name(tmp_path, header, separator):
@@ -55,6 +56,23 @@ def test_columns_by_name(tmp_path, header, separator):
     np.testing.assert_array_equal(log.t_ns, T_NS)
     np.testing.assert_allclose(log.trajectory.T_world_body, POSES, atol=1e-12)
     assert log.covariance is None
+
+
+@pytest.mark.parametrize("stamp", ["field.header.stamp", "header.stamp.secs,header.stamp.nsecs", "sec,nanosec"])
+def test_the_time_of_the_sensor_goes_before_that_of_recording(tmp_path, stamp):
+    """As ``rostopic echo -p``, bagpy and copies of ROS 2's fields write them."""
+    path = _csv(tmp_path / "a.csv", "time,x,y,z,qx,qy,qz,qw")
+    lines = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    rows = [f"time,seq,{stamp},x,y,z,qx,qy,qz,qw"] if "header" in stamp else [f"seq,{stamp},x,y,z,qx,qy,qz,qw"]
+    for k, (t_ns, *pose) in enumerate(lines):
+        own = [t_ns] if "," not in stamp else [str(int(t_ns) // 10**9), str(int(t_ns) % 10**9)]
+        recorded = [str(int(t_ns) + 7_000_000 * (k % 3))] if "header" in stamp else []
+        rows.append(",".join([*recorded, str(k), *own, *pose]))
+    path.write_text("\n".join(rows))
+    np.testing.assert_array_equal(read_foreign(path).t_ns, T_NS)
+    if "header" in stamp:
+        recorded = read_foreign(path, mapping={"time": "t_ns"}).t_ns
+        np.testing.assert_array_equal(recorded - T_NS, 7_000_000 * (np.arange(N) % 3))
 
 
 def test_columns_by_mapping_with_counts_and_covariance(tmp_path):
