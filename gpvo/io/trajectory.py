@@ -3,6 +3,7 @@ IMU samples beside them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,10 +85,10 @@ def read_kitti_poses(path: str | Path) -> Array:
         values = _floats(p, number, fields, _REMOVE_OF_KITTI)
         if len(values) != 12:
             raise SourceError(f"line {number} holds {len(values)} numbers, expected 12 (a 3x4 matrix)", where=p)
-        out.append(values.reshape(3, 4))
+        out.append(values)
     if not out:
         raise SourceError("holds no poses", where=p)
-    M = np.stack(out)
+    M = np.array(out).reshape(-1, 3, 4)
     R = M[:, :, :3]
     deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((deviation > _UNIT_TOLERANCE) | (np.linalg.det(R) < 0))
@@ -133,15 +134,15 @@ def _fields(path: Path, separator: str | None) -> Iterator[tuple[int, list[str]]
             yield number, [f.strip() for f in text.split(separator)]
 
 
-def _floats(path: Path, number: int, fields: list[str], cure: str = REMOVE) -> Array:
+def _floats(path: Path, number: int, fields: list[str], cure: str = REMOVE) -> list[float]:
     try:
-        values = np.array([float(f) for f in fields])
+        values = [float(f) for f in fields]
     except ValueError:
         raise SourceError(f"line {number} holds something that is not a number", where=path) from None
-    if (np.abs(values) > FARTHEST_M).any() and np.isfinite(values).all():
-        raise SourceError(f"line {number} holds {np.abs(values).max():.3g}: no position on Earth", where=path)
-    if not np.isfinite(values).all():
+    if not all(map(math.isfinite, values)):
         raise SourceError(f"line {number} holds NaN or infinity", where=path, cure=cure)
+    if (largest := max(map(abs, values))) > FARTHEST_M:
+        raise SourceError(f"line {number} holds {largest:.3g}: no position on Earth", where=path)
     return values
 
 
