@@ -28,6 +28,7 @@ from gpvo.types import COUNT_FIELDS, IMPORTED, IMPORTED_POSE, Array, Status, VoL
 
 GAP_STEPS = 10  # Logs of keyframes are irregular, but not by so much.
 UNKNOWN_RAD = 1.0
+_UNUSUAL_S = 0.99  # between frames: milliseconds that count from zero, read as seconds, look like slow frames
 _LEAST_MOTIONS, _SLOW, _TIMES_SEEN = 50, 0.02, 3.0  # what covariances of poses are told by
 HEADER = "# gpvo-stated 1"
 _LINES = (
@@ -120,6 +121,10 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
         notes.append(f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}")
     if cov is not None and (bad := int((np.isfinite(cov).all(axis=(1, 2)) & ~are_positive_definite(cov))[1:].sum())):
         notes.append(f"{bad} of {len(motions)} covariances are not positive definite and were left out")
+    if len(steps) and not log.is_counted and (usual_s := float(np.median(steps)) * 1e-9) > _UNUSUAL_S:
+        notes.append(
+            f"its frames are {usual_s:.3g} s apart as read: are the stamps milliseconds, or numbers of frames?"
+        )
     records = [VoRecord(int(t[0]), int(t[0]), Status.START, np.eye(4), **_fields(log, 0))]
     for k, motion in enumerate(motions, 1):
         said = _fields(log, k) | {"reason": lost.get(k, "")}

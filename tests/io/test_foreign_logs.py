@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,16 @@ def test_columns_by_name(tmp_path, header, separator):
     np.testing.assert_array_equal(log.t_ns, T_NS)
     np.testing.assert_allclose(log.trajectory.T_world_body, POSES, atol=1e-12)
     assert log.covariance is None
+
+
+@pytest.mark.parametrize(
+    ("step", "doubt"), [("20", "20 s apart .*milliseconds"), ("1", "numbers of frames"), ("0.5", "")]
+)
+def test_stamps_that_are_hardly_seconds_are_remarked(tmp_path, step, doubt):
+    lines = (f"{float(step) * k:g} {0.1 * k} 0 0 0 0 0 1" for k in range(50))
+    (tmp_path / "a.tum").write_text("\n".join(lines))
+    notes = to_records(read_foreign(tmp_path / "a.tum"))[1]
+    assert re.search(doubt, notes[0]) if doubt else not notes
 
 
 @pytest.mark.parametrize("stamp", ["field.header.stamp", "header.stamp.secs,header.stamp.nsecs", "sec,nanosec"])
