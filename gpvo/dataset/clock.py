@@ -17,8 +17,9 @@ from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog
 
-# With clocks that overlap, offsets beyond this are a mistake of the search, not of the clocks.
-MAX_OFFSET_S = 5.0
+# With clocks that overlap, offsets beyond this are mistakes of the search, not of the clocks: unless they leave of both
+# turns and distances less than this share unexplained of what smaller ones do.
+_MAX_OFFSET_S, _LESS_UNEXPLAINED = 5.0, 0.25
 _WINDOW_S = 0.25
 _MIN_OVERLAP_S = 3.0
 _MIN_CORRELATION = 0.3
@@ -81,15 +82,15 @@ def _coarse(log: TruthLog, truth: TruthLog, step_s: float, window_s: float) -> f
     window = max(1, round(window_s / step_s))
     a, a_first = _on_grid(log, step_s, window)
     b, b_first = _on_grid(truth, step_s, window)
-    score = np.zeros(a.shape[1] + b.shape[1] - 1)
-    for x, y in zip(a, b, strict=True):
-        score = np.maximum(score, _correlation(x, y, round(_MIN_OVERLAP_S / step_s)))
+    by_kind = [_correlation(x, y, round(_MIN_OVERLAP_S / step_s)) for x, y in zip(a, b, strict=True)]
+    score = np.maximum.reduce(by_kind)
     # Lag k: sample i of the log meets sample i + k of the truth.
     lag = np.arange(score.size) - (a.shape[1] - 1)
     offset = (b_first - a_first) * 1e-9 + lag * step_s
-    overlapping = log.t_ns[0] <= truth.t_ns[-1] and truth.t_ns[0] <= log.t_ns[-1]
-    if overlapping:
-        score = np.where(np.abs(offset) <= MAX_OFFSET_S, score, -1.0)
+    if log.t_ns[0] <= truth.t_ns[-1] and truth.t_ns[0] <= log.t_ns[-1]:
+        near = np.abs(offset) <= _MAX_OFFSET_S
+        unexplained = _LESS_UNEXPLAINED * (1 - score[near].max(initial=0.0) ** 2)
+        score = np.where(near | (np.minimum.reduce(by_kind) > np.sqrt(1 - unexplained)), score, -1.0)
     best = int(np.argmax(score))
     if score[best] < _MIN_CORRELATION:
         raise GpvoError(

@@ -69,6 +69,13 @@ def test_clocks_that_share_nothing():
     assert estimate_time_offset(log_of(s + 1e6, path(s)), truth) == pytest.approx(-1e6, abs=4e-3)
 
 
+@pytest.mark.parametrize("offset", [7.0, -20.0])
+def test_clocks_that_overlap_and_differ_by_much(offset):
+    s = np.arange(0, 40, 0.05)
+    truth = truth_of(np.arange(-5, 50, 0.01))
+    assert estimate_time_offset(log_of(s - offset, path(s)), truth) == pytest.approx(offset, abs=4e-3)
+
+
 def test_slips_do_not_move_it():
     s = np.arange(0, 40, 0.05)
     poses = path(s)
