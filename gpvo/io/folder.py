@@ -77,7 +77,8 @@ class FolderSource(FileSource):
 
 
 def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGE_SUFFIXES
+    """By its ending; macOS leaves a file ``._NAME`` beside each on foreign disks."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def _list_pairs(path: Path, rate_hz: float | None, tolerance_s: float, known: SourceReport) -> list[PairFiles]:

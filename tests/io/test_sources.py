@@ -572,6 +572,15 @@ def test_kitti_poses_of_another_length(tmp_path):
         open_source(path)
 
 
+def test_what_a_mac_leaves_beside_images_is_no_image(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 4)
+    for file in list(path.rglob("*.png")):
+        file.with_name(f"._{file.name}").write_bytes(b"\x00\x05\x16\x07")
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 3]
+    assert source.report.duplicate == 0
+
+
 def test_samples_of_no_known_range_are_named(tmp_path):
     path = seq.write_folder(tmp_path / "s", 4)
     for file in path.rglob("*.png"):
