@@ -283,6 +283,8 @@ def require_tables(path: Path) -> None:
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         if file.suffix.lower() != ".db3":
             continue
+        if found := set(str(file)) & set("#%?"):  # rosbags opens databases by an address, in which these have a meaning
+            raise SourceError(f"its path holds '{min(found)}'", where=file, cure="rename the file or folder")
         database = sqlite3.connect(f"{file.resolve().as_uri()}?immutable=1", uri=True)
         try:
             other = " AND ".join(["sql NOT LIKE ?"] * len(_ALLOWED))

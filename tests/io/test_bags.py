@@ -116,6 +116,14 @@ def test_bayer_patterns(pattern, red, bits):
         np.testing.assert_allclose(decode_message(message)[4:-4, 4:-4], 0.299 * 200, atol=2)
 
 
+@pytest.mark.parametrize("name", ["a#1", "a%20b", "a?"])
+def test_a_database_that_rosbags_cannot_open_by_its_name(tmp_path, name):
+    maker = stereo_bag(False, 3)
+    path = maker.write(tmp_path / "plain").rename(tmp_path / name)
+    with pytest.raises(SourceError, match=r"its path holds '.'.*rename"):
+        open_source(path)
+
+
 def test_a_bag_of_colour_images(tmp_path):
     maker = BagMaker(ros1=True)
     for k, t in enumerate(seq.stamps(3)):
