@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, field
+from functools import partial, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,10 @@ from gpvo.types import Array, VoLog
 
 BY_MODEL = "prediction"
 """The last reason of a motion whose status is the model's and not the odometry's."""
+
+UNITS = {"translation_m": "translation", "rotation_rad": "rotation"}
+"""Names of scores in the unit of a block of the error, and the block."""
+_SCORED = ("nees_dof_median", "coverage", "nll_per_dim", "nll_stated_per_dim", "nees_dof_median_stated", "crps")
 
 HORIZONS_M = (1.0, 10.0, 100.0)
 _MAX_WINDOWS = 60
@@ -57,38 +61,37 @@ class Horizon:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Of one method on one run; None where it cannot be computed.
+    """Of one method on one run; None where it cannot be computed, and of a method that says nothing.
 
     ``nees_dof`` by block of the error, with a block-bootstrap interval; ``nees_dof_truth_noise``: the same with the
     truth's own noise added to what the method says. ``coverage``: per axis at 1, 2, 3 sigma, averaged over the axes.
     ``nll_per_dim`` is that of a Gaussian, ``nll_stated_per_dim`` that of the stated Student-t, which expects a median
-    of ``nees_dof_median_stated``. ``energy_*``, ``correlation_gain_nats`` and the quartiles ``*_by_difficulty``: see
+    of ``nees_dof_median_stated``. ``energy``, ``correlation_gain_nats`` and the quartiles ``by_difficulty``: see
     :mod:`gpvo.stats.consistency`.
     ``one_second`` and ``horizons`` (1, 10, 100 m of path) are of windows without lost frames. ``axes``: those that
     count, of 0 to 5, :func:`gpvo.stats.consistency.seen_axes`; a block without any has no score.
     """
 
     method: str
-    count: int
-    axes: tuple[int, ...]
-    nees_dof: dict[str, Interval | None]
-    nees_dof_median: dict[str, float | None]
-    nees_dof_truth_noise: dict[str, float | None]
-    coverage: tuple[float, ...]
-    nll_per_dim: float | None
-    nll_stated_per_dim: float | None
-    nees_dof_median_stated: float
-    crps_translation_m: float | None
-    crps_rotation_rad: float | None
-    energy_translation_m: float | None
-    energy_rotation_rad: float | None
-    correlation_gain_nats: float
-    nees_dof_by_difficulty: tuple[float, ...]
-    coverage_by_difficulty: tuple[float, ...]
-    predicted_final_error_m: float | None
-    predicted_final_error_independent_m: float | None
-    one_second: Horizon | None
-    horizons: tuple[Horizon, ...]
+    count: int = 0
+    axes: tuple[int, ...] = ()
+    nees_dof: dict[str, Interval | None] = field(default_factory=partial(dict.fromkeys, BLOCKS))
+    nees_dof_median: dict[str, float | None] = field(default_factory=partial(dict.fromkeys, BLOCKS))
+    nees_dof_truth_noise: dict[str, float | None] = field(default_factory=partial(dict.fromkeys, BLOCKS))
+    coverage: dict[str, float | None] = field(default_factory=partial(dict.fromkeys, "123"))
+    nll_per_dim: float | None = None
+    nll_stated_per_dim: float | None = None
+    nees_dof_median_stated: float | None = None
+    crps: dict[str, float | None] = field(default_factory=partial(dict.fromkeys, UNITS))
+    energy: dict[str, float | None] = field(default_factory=partial(dict.fromkeys, UNITS))
+    correlation_gain_nats: float | None = None
+    by_difficulty: dict[str, list[float] | None] = field(
+        default_factory=partial(dict.fromkeys, ("nees_dof", "coverage"))
+    )
+    predicted_final_error_m: float | None = None
+    predicted_final_error_independent_m: float | None = None
+    one_second: Horizon | None = None
+    horizons: tuple[Horizon, ...] = ()
 
 
 def truth_noise(T_true: Array, sigma: Array) -> Array:
@@ -119,7 +122,7 @@ def consistency(
     noise = truth_noise(errors.T_true[stated], noise_sigma)[:, :d, :d]
     per_block, with_noise = nees_by_block(e, C, axes), nees_by_block(e, C + noise, axes)
     scores = score(errors.xi[stated], statement.mean[index], C, statement.nu, axes)
-    energy = {n: _energy(e, C, axes[np.isin(axes, BLOCKS[n])]) for n in ("translation", "rotation")}
+    energy = {unit: _energy(e, C, axes[np.isin(axes, BLOCKS[block])]) for unit, block in UNITS.items()}
     e, C = e[:, axes], marginal(C, axes)
     quartiles = by_difficulty(e, C)
     final, independent = _final_errors(statement, log, known)
@@ -133,19 +136,11 @@ def consistency(
         count=int(stated.sum()),
         axes=tuple(axes.tolist()),
         nees_dof={n: block_bootstrap(per_block[n]) if n in per_block else None for n in BLOCKS},
-        nees_dof_median=scores["nees_dof_median"],
         nees_dof_truth_noise={n: float(with_noise[n].mean()) if n in with_noise else None for n in BLOCKS},
-        coverage=tuple(scores["coverage"].values()),
-        nll_per_dim=scores["nll_per_dim"],
-        nll_stated_per_dim=scores["nll_stated_per_dim"],
-        nees_dof_median_stated=scores["nees_dof_median_stated"],
-        crps_translation_m=scores["crps"]["translation_m"],
-        crps_rotation_rad=scores["crps"]["rotation_rad"],
-        energy_translation_m=energy["translation"],
-        energy_rotation_rad=energy["rotation"],
+        **{name: scores[name] for name in _SCORED},
+        energy=energy,
         correlation_gain_nats=float(correlation_gain(e, C).mean()),
-        nees_dof_by_difficulty=tuple(quartiles[0].tolist()),
-        coverage_by_difficulty=tuple(quartiles[1].tolist()),
+        by_difficulty={"nees_dof": quartiles[0].tolist(), "coverage": quartiles[1].tolist()},
         predicted_final_error_m=final,
         predicted_final_error_independent_m=independent,
         one_second=over(progress[1], 1.0) if d == 6 else None,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.evaluation.consistency import HORIZONS_M, Consistency, Horizon
+from gpvo.evaluation.consistency import HORIZONS_M, UNITS, Consistency, Horizon
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.trajectory import nees_document
 from gpvo.evaluation.verdict import verdict
@@ -19,11 +19,8 @@ from gpvo.geometry.covariance import variances
 from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import METHODS
 from gpvo.online.features import AXES
-from gpvo.stats.consistency import BLOCKS
 from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import Array, Status
-
-_UNITS = ("translation_m", "rotation_rad")
 
 
 def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
@@ -120,7 +117,10 @@ def run_document(e: Evaluation) -> dict[str, Any]:
         "segments": [asdict(s) for s in t.segments],
         "poses": nees_document(e.poses),
         "verdict": asdict(verdict(e)),
-        "methods": {m: _method_document(e.consistency.get(m)) for m in dict.fromkeys((*METHODS, *e.consistency))},
+        "methods": {
+            m: _method_document(e.consistency.get(m) or Consistency(m))
+            for m in dict.fromkeys((*METHODS, *e.consistency))
+        },
     }
 
 
@@ -134,35 +134,15 @@ def _horizon(h: Horizon | None) -> dict[str, Any]:
     return {k: getattr(h, k, None) for k in keys} | {"count": 0 if h is None else h.count}
 
 
-def _method_document(c: Consistency | None) -> dict[str, Any]:
-    """Scores of one method; of one that says nothing the same entries, all None."""
-
-    def of(name: str) -> Any:
-        return getattr(c, name, None)
-
-    def by_block(name: str) -> dict[str, Any]:
-        return of(name) or dict.fromkeys(BLOCKS)
-
-    return {
-        "axes": None if c is None else [AXES[k] for k in c.axes],
-        "nees_dof": {b: i and i.mean for b, i in by_block("nees_dof").items()},
-        "nees_dof_interval": {b: i and [i.low, i.high] for b, i in by_block("nees_dof").items()},
-        "nees_dof_median": by_block("nees_dof_median"),
-        "nees_dof_truth_noise": by_block("nees_dof_truth_noise"),
-        "coverage": dict(zip("123", of("coverage") or [None] * 3, strict=True)),
-        "nll_per_dim": of("nll_per_dim"),
-        "nll_stated_per_dim": of("nll_stated_per_dim"),
-        "nees_dof_median_stated": of("nees_dof_median_stated"),
-        "crps": {unit: of(f"crps_{unit}") for unit in _UNITS},
-        "energy": {unit: of(f"energy_{unit}") for unit in _UNITS},
-        "correlation_gain_nats": of("correlation_gain_nats"),
-        "by_difficulty": {name: of(f"{name}_by_difficulty") for name in ("nees_dof", "coverage")},
-        "predicted_final_error_m": of("predicted_final_error_m"),
-        "predicted_final_error_independent_m": of("predicted_final_error_independent_m"),
-        "one_second": _horizon(of("one_second")),
-        "horizons": [
-            {"length_m": m, **_horizon(h)} for m, h in itertools.zip_longest(HORIZONS_M, of("horizons") or ())
-        ],
+def _method_document(c: Consistency) -> dict[str, Any]:
+    """Scores of one method; the same entries of one that says nothing."""
+    plain = {name: value for name, value in vars(c).items() if name not in ("method", "count")}
+    return plain | {
+        "axes": [AXES[k] for k in c.axes] or None,
+        "nees_dof": {b: i and i.mean for b, i in c.nees_dof.items()},
+        "nees_dof_interval": {b: i and [i.low, i.high] for b, i in c.nees_dof.items()},
+        "one_second": _horizon(c.one_second),
+        "horizons": [{"length_m": m, **_horizon(h)} for m, h in itertools.zip_longest(HORIZONS_M, c.horizons)],
     }
 
 
@@ -199,7 +179,7 @@ def _scores(methods: Mapping[str, Any]) -> dict[str, list[Any]]:
         row = {"method": method, "nees": m["nees_dof"]["joint"], "nees_median": m["nees_dof_median"]["joint"]}
         row |= {"nees_1s": m["one_second"]["nees_dof_truth_noise"], **over, "nll": m["nll_per_dim"]}
         row |= {f"within_{k}_sigma": share for k, share in m["coverage"].items()}
-        row |= {f"energy_{unit}": m["energy"][unit] for unit in ("translation_m", "rotation_rad")}
+        row |= {f"energy_{unit}": m["energy"][unit] for unit in UNITS}
         for key, value in row.items():
             out.setdefault(key, []).append(value)
     return out

@@ -39,7 +39,7 @@ def test_an_honest_covariance_scores_one(honest):
         # The truth of a simulation has no noise of its own.
         assert c.nees_dof_truth_noise[block] == pytest.approx(interval.mean)
         assert 0.7 < c.nees_dof_median[block] < 1.0
-    np.testing.assert_allclose(c.coverage, [0.6827, 0.9545, 0.9973], atol=0.02)
+    np.testing.assert_allclose(list(c.coverage.values()), [0.6827, 0.9545, 0.9973], atol=0.02)
 
 
 def test_an_honest_covariance_is_honest_over_every_horizon(honest):
@@ -60,8 +60,8 @@ def test_nll_and_crps_of_an_honest_covariance(honest):
     assert c.nll_per_dim == pytest.approx(entropy, abs=0.03)
     sigma = np.sqrt(np.diagonal(C))
     # The mean CRPS of N(0, s^2) at its own draws is s / sqrt(pi).
-    assert c.crps_translation_m == pytest.approx(sigma[:3].mean() / np.sqrt(np.pi), rel=0.05)
-    assert c.crps_rotation_rad == pytest.approx(sigma[3:].mean() / np.sqrt(np.pi), rel=0.05)
+    assert c.crps["translation_m"] == pytest.approx(sigma[:3].mean() / np.sqrt(np.pi), rel=0.05)
+    assert c.crps["rotation_rad"] == pytest.approx(sigma[3:].mean() / np.sqrt(np.pi), rel=0.05)
 
 
 def test_translation_only_speaks_of_translation_alone(honest):
@@ -70,7 +70,7 @@ def test_translation_only_speaks_of_translation_alone(honest):
     assert c.nees_dof["rotation"] is None
     assert c.nees_dof["joint"] is None
     assert c.nll_per_dim is None
-    assert c.crps_rotation_rad is None
+    assert c.crps["rotation_rad"] is None
     assert c.one_second is None
     assert c.horizons == ()
     assert c.predicted_final_error_m is None
@@ -91,7 +91,7 @@ def test_an_overconfident_covariance_scores_by_its_factor():
     small = [replace(r, covariances={m: C / 9 for m, C in r.covariances.items()}) for r in log]
     one, nine = _scores(log, truth)["triangulation"], _scores(VoLog(small), truth)["triangulation"]
     assert nine.nees_dof["joint"].mean == pytest.approx(9 * one.nees_dof["joint"].mean)
-    assert nine.coverage[2] == pytest.approx(one.coverage[0])
+    assert nine.coverage["3"] == pytest.approx(one.coverage["1"])
     assert nine.predicted_final_error_m == pytest.approx(one.predicted_final_error_m / 3)
 
 

@@ -57,7 +57,7 @@ def test_a_lost_motion_is_charged_with_its_length(written) -> None:
     found = score_sequence(folder / "triangulation" / "hall.txt", folder / "truth" / "hall.txt")
     T = evaluation.T_true
     lost = [se3.log(se3.inverse(T[39]) @ T[k]) for k in (40, 41)]
-    of_run = evaluation.consistency["triangulation"].energy_translation_m
+    of_run = evaluation.consistency["triangulation"].energy["translation_m"]
     expected = (of_run * (N - 2) + sum(float(np.linalg.norm(xi[:3])) for xi in lost)) / N
     assert found.energy_translation_m == pytest.approx(expected, rel=1e-4)
 

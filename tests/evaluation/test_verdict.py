@@ -212,9 +212,9 @@ def test_axes_on_which_odometry_and_truth_never_differ_are_not_judged(unseen_var
     # 1,800 squared normal values: 0.033 is one standard deviation.
     assert c.nees_dof["joint"].mean == pytest.approx(1.0, abs=0.14)
     assert c.horizons[1].nees_dof == pytest.approx(1.0, abs=0.7)
-    assert c.coverage[0] == pytest.approx(0.683, abs=0.05)
-    assert c.energy_rotation_rad is not None
-    assert c.energy_rotation_rad < 5e-4
+    assert c.coverage["1"] == pytest.approx(0.683, abs=0.05)
+    assert c.energy["rotation_rad"] is not None
+    assert c.energy["rotation_rad"] < 5e-4
     told = verdict(found)
     assert told.colour == "green"
     assert any("never differ in y, rx and rz of the camera" in line for line in told.lines)
