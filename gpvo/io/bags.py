@@ -98,7 +98,7 @@ class BagSource(ImageSource):
             rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics)
             for size, lens, topic in zip(sizes, (rig.left, rig.right), (self._topics.left, self._topics.right)):
                 check_size(f"images on '{topic}' are", size, lens, path)
-        super().__init__(path, path.stem, rig, **options)
+        super().__init__(path, path.stem if path.is_file() else path.resolve().name, rig, **options)
         self.span_ns = span
         self._tolerance_ns = tolerance_ns(tolerance_s)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)

@@ -216,7 +216,7 @@ class KittiSource(FileSource):
             raise SourceError("no readable left image", where=path)
         is_yaml, size = calib.suffix.lower() in (".yaml", ".yml"), first[1]
         rig = read_stereo_yaml(calib, size=size) if is_yaml else read_kitti_calib(calib, left, right, size)
-        super().__init__(path, path.name, rig, pairs, known, **options)
+        super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         # Poses are of camera 0, whose place only KITTI's own file tells.
         T_cam0_left = left_camera_offset(own if own.is_file() else calib, left)
         self.truth = self._read_truth(path, stamps, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)

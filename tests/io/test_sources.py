@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import sequences as seq
+from bag_maker import stereo_bag
 from gpvo.cameras.readers import read_kitti_calib
 from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.errors import CalibrationError, GpvoError, SourceError
@@ -579,6 +580,13 @@ def test_what_a_mac_leaves_beside_images_is_no_image(tmp_path):
     source = open_source(path)
     assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 3]
     assert source.report.duplicate == 0
+
+
+def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path, monkeypatch):
+    bag = stereo_bag(False, 3).write(tmp_path / "flight_2024.05.06")
+    for path in (seq.write_kitti(tmp_path / "03"), seq.write_folder(tmp_path / "hall"), bag):
+        monkeypatch.chdir(path)
+        assert [open_source(p).name for p in (".", path)] == [path.name] * 2
 
 
 def test_samples_of_no_known_range_are_named(tmp_path):
