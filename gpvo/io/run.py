@@ -81,7 +81,7 @@ class RunWriter:
         chunk: int = 100,
         resume: str | None = None,
     ) -> None:
-        self._target = Path(path)
+        self._target = Path(path).resolve()  # "." has no name, and a link would be replaced in place of its folder
         self._meta, self._chunk, self._state = dict(meta or {}), chunk, _State()
         self._lock = run_folder.claim(self._target)
         self.path = self._target
@@ -213,7 +213,7 @@ class RunWriter:
             self.path / "run.json",
             {
                 "schema": SCHEMA,
-                "name": self._target.resolve().name,
+                "name": self._target.name,
                 **self._meta,
                 "complete": complete,
                 "frames": state.records_total,

@@ -171,6 +171,19 @@ def test_a_run_that_was_killed_while_it_began_is_begun_anew(tmp_path, monkeypatc
     assert len(read_run(tmp_path / "run").log) == 10
 
 
+def test_a_finished_run_is_replaced_by_whatever_path_it_is_named(tmp_path, monkeypatch):
+    log = VoLog(make_records(20), CAMERA)
+    run = tmp_path / "run"
+    write_run(run, log)
+    (tmp_path / "latest").symlink_to(run, target_is_directory=True)
+    for path in (".", "../run", tmp_path / "latest", run / ".." / "run"):
+        monkeypatch.chdir(run)
+        write_run(path, VoLog(log.records[:10]))
+        assert len(read_run(run).log) == 10
+        write_run(run, log)
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["latest", "run"]
+
+
 def test_foreign_folder_is_not_overwritten(tmp_path):
     (tmp_path / "precious.txt").write_text("mine")
     with pytest.raises(SourceError, match="not a run"):
