@@ -70,7 +70,8 @@ def _raw_pixels(message: Any) -> tuple[NDArray[Any] | None, bool]:
 
 
 class PairQueue:
-    """Pairs the messages of two image topics as they come in, by stamps that agree to ``tolerance_ns``.
+    """Pairs the messages of two image topics as they come in, by stamps that agree to ``tolerance_ns``, and to half the
+    usual interval: what is further off belongs to a neighbour, whose partner was lost.
 
     A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
     ``nearest_ns``: the closest that two stamps of both sides ever were.
@@ -79,6 +80,7 @@ class PairQueue:
     def __init__(self, left: str, tolerance_ns: int, report: SourceReport) -> None:
         self._left, self._tolerance_ns, self._report = left, tolerance_ns, report
         self._waiting: dict[bool, deque[tuple[int, Any]]] = {True: deque(), False: deque()}
+        self._stamps: dict[bool, deque[int]] = {side: deque(maxlen=_WAITING) for side in (True, False)}
         self.nearest_ns: float = np.inf
 
     def push(self, topic: str, message: Any) -> tuple[int, Any, Any] | None:
@@ -87,7 +89,9 @@ class PairQueue:
         t = stamp_ns(message)
         own, others = self._waiting[is_left], self._waiting[not is_left]
         self.nearest_ns = min([self.nearest_ns, *(abs(s - t) for s, _ in others)])
-        match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= self._tolerance_ns), None)
+        self._stamps[is_left].append(t)
+        reach_ns = self._reach_ns()
+        match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= reach_ns), None)
         if match is None:
             own.append((t, message))
             if len(own) > _WAITING:
@@ -97,6 +101,10 @@ class PairQueue:
         _drop(own, len(own), self._report)
         s, other = others.popleft()
         return (t, message, other) if is_left else (s, other, message)
+
+    def _reach_ns(self) -> float:
+        steps = np.concatenate([np.diff(np.unique(stamps)) for stamps in self._stamps.values()])
+        return min(self._tolerance_ns, 0.5 * float(np.median(steps))) if len(steps) > 2 else self._tolerance_ns
 
     def clear(self) -> None:
         """Count what still waits as missing, and forget it."""

@@ -11,9 +11,10 @@ from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
-from gpvo.io.bag_images import decode_message
-from gpvo.io.bag_reader import pose_of
+from gpvo.io.bag_images import decode_message, pair_streams
+from gpvo.io.bag_reader import pose_of, stamp_ns
 from gpvo.io.foreign import read_foreign
+from gpvo.io.source import SourceReport
 from gpvo.io.stated import to_records
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
@@ -65,6 +66,20 @@ def test_cameras_that_never_meet(tmp_path):
     path = _write(tmp_path, "ros1")
     with pytest.raises(SourceError, match=r"no pair within 0\.1 ms; the nearest are 0\.3 ms apart .*--pair-tolerance"):
         list(open_source(path, tolerance_s=1e-4))
+
+
+def test_a_wide_tolerance_joins_no_neighbours_where_an_image_is_lost():
+    """At 30 Hz with the right camera 5 ms behind; 40 ms are allowed."""
+    maker, rng = BagMaker(ros1=False), np.random.default_rng(0)
+    for k in range(300):
+        for side, late_ns in (("left", 0), ("right", 5_000_000)):
+            if rng.random() > 0.03:
+                maker.image(side, seq.START_NS + k * 33_333_333 + late_ns, GREY, "mono8")
+    stream = [(topic, message) for _, topic, message in sorted(maker.messages, key=lambda m: m[0])]
+    pairs = list(pair_streams(stream, "left", 40_000_000, SourceReport(), "bag"))
+    apart = [stamp_ns(right) - t_ns for t_ns, _, right in pairs]
+    assert len(pairs) > 270
+    assert set(apart) == {5_000_000}
 
 
 GREY = np.random.default_rng(0).integers(20, 235, (24, 32), dtype=np.uint8)
