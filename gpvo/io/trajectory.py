@@ -270,6 +270,7 @@ def read_imu_csv(
             raise SourceError(f"line {number}: expected t[ns] and six finite numbers, gyro first", where=path) from None
     if not stamps:
         raise SourceError("holds no IMU samples", where=path)
+    check_interval(stamps, path, lambda _: "write them as nanoseconds", is_stated=True)
     return make_imu(np.array(stamps, dtype=np.int64), np.array(rows), shift_s=shift_s, noise=noise, remark=remark)
 
 

@@ -303,6 +303,14 @@ def test_names_in_seconds(tmp_path, name):
     assert len(seq.frames_of(open_source(path))) == 30
 
 
+def test_imu_stamps_of_another_unit_are_refused(tmp_path):
+    path = seq.write_folder(tmp_path / "s", 4)
+    rows = [f"{t // 1000},0.1,0,0,0,0,9.8" for t in seq.stamps(4)]
+    (path / "imu.csv").write_text("\n".join(rows))
+    with pytest.raises(SourceError, match="imu.csv: the stamps look like microseconds.*nanoseconds"):
+        open_source(path)
+
+
 def test_folder_with_truth_and_imu(tmp_path):
     path = seq.write_folder(tmp_path / "s")
     euroc = seq.write_euroc(tmp_path / "e")
