@@ -48,6 +48,8 @@ def test_files_alone_give_the_scores_of_evaluate(written) -> None:
     assert found.nees_dof == pytest.approx(of_run.nees_dof["joint"].mean, rel=1e-4)
     assert found.nll_per_dim == pytest.approx(of_run.nll_per_dim, abs=1e-4)
     assert found.correlation_gain_nats == pytest.approx(of_run.correlation_gain_nats, abs=1e-4)
+    assert found.nees_dof_by_difficulty == pytest.approx(of_run.by_difficulty["nees_dof"], rel=1e-3)
+    assert found.coverage_by_difficulty == pytest.approx(of_run.by_difficulty["coverage"], abs=0.02)
     assert found.nees_dof_over["1m"] == pytest.approx(of_run.horizons[0].nees_dof, rel=1e-4)
     assert found.ate_rmse_m == pytest.approx(evaluation.trajectory.ate_rmse_m, rel=1e-4)
 
