@@ -16,6 +16,7 @@ from gpvo.stats import student_t
 from gpvo.types import Array
 
 _SQRT2 = math.sqrt(2.0)
+_AT_ONCE = 1000
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
@@ -116,12 +117,17 @@ def energy_score(error: Array, covariance: Array, *, draws: int = 256, seed: int
     By antithetic draws, the same for all rows. A statement of C = 0 scores the length of the error.
     """
     error, covariance = _checked(error, covariance)
-    half = np.random.default_rng(seed).standard_normal((draws // 2, error.shape[-1]))
-    z = np.concatenate([half, -half])
-    x = np.swapaxes(np.linalg.cholesky(covariance) @ z.T, -1, -2)  # (..., draws, d)
-    to_error = np.linalg.norm(x - error[..., None, :], axis=-1).mean(axis=-1)
-    # Differences of independent draws are draws of twice the covariance.
-    return np.asarray(to_error - np.linalg.norm(x, axis=-1).mean(axis=-1) / _SQRT2)
+    d = error.shape[-1]
+    half = np.random.default_rng(seed).standard_normal((draws // 2, d))
+    z, out = np.concatenate([half, -half]), np.empty(error.shape[:-1])
+    rows, spreads, scores = error.reshape(-1, d), covariance.reshape(-1, d, d), out.reshape(-1)
+    for k in range(0, len(rows), _AT_ONCE):  # draws of a million rows fill no memory
+        part = slice(k, k + _AT_ONCE)
+        x = np.swapaxes(np.linalg.cholesky(spreads[part]) @ z.T, -1, -2)  # (rows, draws, d)
+        to_error = np.linalg.norm(x - rows[part, None, :], axis=-1).mean(axis=-1)
+        # Differences of independent draws are draws of twice the covariance.
+        scores[part] = to_error - np.linalg.norm(x, axis=-1).mean(axis=-1) / _SQRT2
+    return out
 
 
 def correlation_gain(error: Array, covariance: Array) -> Array:

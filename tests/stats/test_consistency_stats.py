@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from gpvo.stats.consistency import (
@@ -93,6 +95,17 @@ def test_the_energy_score_is_proper_and_of_no_width_the_length():
     assert right < min(bold, timid)
     sure = energy_score(e[:100], 1e-18 * C[:100])
     np.testing.assert_allclose(sure, np.linalg.norm(e[:100], axis=1), rtol=1e-6)
+
+
+def test_the_energy_scores_of_many_errors_fill_no_memory():
+    e, C = _drawn(3, seed=4)
+    tracemalloc.start()
+    many = energy_score(e, C)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e3 * N  # bytes; all draws of one error take 6,144
+    np.testing.assert_array_equal(many[7000:7010], energy_score(e[7000:7010], C[7000:7010]))
+    assert energy_score(e[0], C[0]) == many[0]
 
 
 def test_right_correlations_gain_and_wrong_ones_lose():
