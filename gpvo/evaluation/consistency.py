@@ -214,11 +214,16 @@ def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float)
     stride, t_next = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS), float(progress[0])
     parent, usable = log.parent, log.usable
     leads_on = np.append(parent[1:] == np.arange(len(parent) - 1), False)  # whether the next motion starts there
-    # Nothing is long enough behind the last of these; without the cut a short run costs the square of its frames.
-    for start in np.flatnonzero(progress[-1] - progress >= span * _HAIR).tolist():
-        if progress[start] < t_next or not known[start]:
+    # A run would cost the square of its frames without these cuts: a window ends where odometry measures first beyond
+    # its length, and what stops one start stops all between.
+    measured = np.flatnonzero(usable)
+    end = np.searchsorted(measured, np.searchsorted(progress, progress + span * _HAIR))
+    starts, stops = np.flatnonzero(leads_on & known & np.append(known[measured], False)[end]), 0
+    for start in starts.tolist():
+        if start < stops or progress[start] < t_next:
             continue
-        chain = _window(start, parent, usable, leads_on, progress, span)
+        chain, last = _window(start, parent, usable, leads_on, progress, span)
+        stops = start if chain else last
         if chain and known[chain[-1]]:
             t_next = float(progress[start]) + stride
             yield chain
@@ -227,8 +232,9 @@ def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float)
 def _window(
     start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], leads_on: NDArray[np.bool_], progress: Array,
     span: float,
-) -> list[int]:  # fmt: skip
-    """The chain of motions from frame ``start`` over at least ``span``; empty where it is broken or too short."""
+) -> tuple[list[int], int]:  # fmt: skip
+    """The chain of motions from frame ``start`` over at least ``span``, empty where it is broken or too short; and the
+    frame that ends it."""
     chain: list[int] = []
     here = start
     for k in range(start + 1, len(parent)):
@@ -237,9 +243,9 @@ def _window(
         done = usable[k] and progress[k] - progress[start] >= span * _HAIR
         if done or leads_on[k]:
             if not usable[k]:
-                return []
+                return [], k
             chain.append(k)
             here = k
         if done:
-            return chain
-    return []
+            return chain, k
+    return [], len(parent)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
+from gpvo.evaluation import consistency as module
 from gpvo.evaluation.consistency import Consistency, consistency, truth_noise
 from gpvo.evaluation.statements import statements
 from gpvo.geometry import se3
@@ -161,3 +162,20 @@ def test_final_error_is_stated_between_the_first_and_the_last_frame_with_truth()
     cut = VoLog([replace(log.records[20], t_prev_ns=log.records[20].t_ns, T_prev_cur=np.eye(4)), *log.records[21:81]])
     assert part == pytest.approx(_scores(cut, inner)["triangulation"].predicted_final_error_m)
     assert part < 0.8 * whole
+
+
+@pytest.mark.parametrize("what", ["lost frames", "gaps of the truth"])
+def test_windows_that_cannot_be_are_not_looked_through_from_every_frame(monkeypatch, what):
+    """Of 50 s in a log that is lost every 20 s, and in one whose truth comes and goes."""
+    n, starts = 4000, []
+    usable, known = np.arange(n) > 0, np.ones(n, bool)
+    if what == "lost frames":
+        usable[400::400] = False
+    else:
+        known = np.arange(n) // 700 % 2 == 0
+    log, looked = SimpleNamespace(parent=np.arange(n) - 1, usable=usable), module._window
+    monkeypatch.setattr(module, "_window", lambda start, *known: starts.append(start) or looked(start, *known))
+    windows = list(module._windows(log, known, np.arange(n) / 20, 50.0))
+    assert bool(windows) == (what == "gaps of the truth")
+    assert all(known[w[0] - 1] and known[w[-1]] and len(w) == 1000 for w in windows)
+    assert len(starts) < 20
