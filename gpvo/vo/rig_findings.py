@@ -103,20 +103,25 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
     except (KeyError, TypeError, ValueError):
         raise SourceError("is not a calibration state", where=path, cure=f"give the {STATE_FILE} of a run") from None
     n = len(np.unique(place))
-    fits = 0 < n == len(place) and read_mean.shape == (n,) and read_covariance.shape == (n, n) and 0 <= probability <= 1
-    # Comparisons with NaN are false.
-    if not fits or not np.abs(read_mean).max() <= 0.2 or not np.abs(read_covariance).max() <= 1e3:
-        raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
+    if not (0 < n == len(place) and read_mean.shape == (n,) and read_covariance.shape == (n, n)):
+        raise SourceError("is not a calibration state", where=path, cure=f"give the {STATE_FILE} of a run")
+    if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):
+        raise SourceError("belongs to another camera, size or calibration", where=path, cure="use it with its own rig")
     # Of terms that a file does not name, nothing is known.
     state = RigState.prior(camera)
     mean, covariance = state.mean.copy(), state.covariance.copy()
     covariance[place], covariance[:, place] = 0.0, 0.0
     mean[place], covariance[np.ix_(place, place)] = read_mean, 0.5 * (read_covariance + read_covariance.T)
-    covariance += 1e-14 * np.eye(len(mean))
-    if np.linalg.eigvalsh(covariance)[0] <= 0:
+    uncertain = bool(covariance.any())  # else the calibration is right beyond doubt
+    covariance += 1e-14 * uncertain * np.eye(len(mean))
+    # At half the width of the image all terms displace alike, however narrow the view.
+    reach = np.tile((0.5 * camera.width / camera.fx_px) ** ORDER, 2)
+    at_border = covariance * np.outer(reach, reach)
+    # Comparisons with NaN are false.
+    if not (np.abs(mean * reach).max() <= 0.2 and np.abs(at_border).max() <= 1e3 and 0 <= probability <= 1):
+        raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
+    if uncertain and np.linalg.eigvalsh(at_border)[0] <= 0:
         raise SourceError("its covariance is not positive definite", where=path)
-    if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):
-        raise SourceError("belongs to another camera, size or calibration", where=path, cure="use it with its own rig")
     return RigState(mean, covariance, probability)
 
 

@@ -122,6 +122,19 @@ def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(flown):
     assert np.sqrt(np.mean((x - 2e-3) ** 2)) == pytest.approx(3e-4, rel=1e-3)
 
 
+def test_a_run_without_self_calibration_has_twins_turned_by_the_tolerance(flown, tmp_path):
+    run(open_source(flown[0] / "flight.npz"), tmp_path / "run", VoConfig(self_calibration=False), keep_tracks=True)
+    original = estimate(tmp_path / "run")
+    assert not original.rig.covariance.any()
+    settings, rad = TwinSettings(tolerance=Tolerance(rotation_rad=1e-3)), 1e-3
+    # Over eight twins the draws have unit size exactly; a turn about the horizontal axis moves rows by f.
+    rows = [
+        np.median(np.concatenate([(f.uv_right - f.uv_left)[:, 1] for f in twin_source(original, settings, k).frames]))
+        for k in range(8)
+    ]
+    assert np.sqrt(np.mean(np.square(rows))) == pytest.approx(rad * original.seen.camera.fy_px, rel=0.2)
+
+
 @pytest.mark.slow
 def test_ratios_of_real_errors_to_those_that_twins_predict(flown, tmp_path):
     folder, real, _ = flown

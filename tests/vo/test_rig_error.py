@@ -170,6 +170,27 @@ def test_state_file_round_trip_and_hostile_ones(tmp_path: Path) -> None:
             read_state(path, CAMERA)
 
 
+@pytest.mark.parametrize("hfov_deg", [5.0, 15.0, 28.0, 150.0])
+def test_the_state_of_any_field_of_view_is_read_again(hfov_deg: float, tmp_path: Path) -> None:
+    """Thirty rigs drawn from the prior: terms of high order are large numbers where the view is narrow."""
+    f = CAMERA.cx_px / np.tan(np.deg2rad(hfov_deg / 2))
+    camera, rng = replace(CAMERA, fx_px=f, fy_px=f), np.random.default_rng(0)
+    covariance = prior_covariance(camera)
+    for _ in range(30):
+        mean = 0.3 * np.linalg.cholesky(covariance) @ rng.standard_normal(2 * N_TERMS)
+        write_json(tmp_path / "state.json", document(RigState(mean, 0.01 * covariance, 1.0), camera))
+        assert np.allclose(read_state(tmp_path / "state.json", camera).mean, mean)
+    write_json(tmp_path / "state.json", document(RigError(camera).state, camera))
+    read_state(tmp_path / "state.json", camera)
+
+
+def test_an_exact_calibration_is_read_again_as_exact(tmp_path: Path) -> None:
+    write_json(tmp_path / "state.json", document(RigState.exact(), CAMERA))
+    state = read_state(tmp_path / "state.json", CAMERA)
+    assert not state.covariance.any()
+    assert not RigError(CAMERA, state).state.covariance.any()
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
     state = RigState(_turn(axis, 3e-3), np.eye(2 * N_TERMS), 1.0)
