@@ -90,6 +90,16 @@ def test_frames_without_tracks_stay_without(flown):
     assert any(len(twin_source(original, TwinSettings(), 0).frames[k].track) == 0 for k in dark)
 
 
+def test_a_run_that_is_lost_for_most_of_its_time_has_twins(tmp_path):
+    flight = simulate_points("tunnel-clean", seed=3, duration_s=4.0, tracks=80, dark=(1.0, 3.5), rest_s=0.0)
+    run(open_source(flight.save(tmp_path / "flight.npz")), tmp_path / "run", keep_tracks=True)
+    original = estimate(tmp_path / "run")
+    usable = original.run.log.usable
+    assert usable.mean() < 0.5
+    # White noise of 0.15 px, as the flight has, give or take its own 15 %.
+    assert np.nanmedian(original.structure.sigma_px[usable]) == pytest.approx(0.15, rel=0.4)
+
+
 def test_each_twin_draws_its_own_rig(flown):
     original = estimate(flown[0] / "run")
     wide = TwinSettings(tolerance=Tolerance(baseline=0.05))
