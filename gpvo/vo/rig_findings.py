@@ -23,6 +23,7 @@ from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 STATE_FILE = "calibration_state.json"
 _WORTH_PX = 0.2  # at half the width of the image; below, no one would calibrate anew
 _SIGMAS = 4.0
+_STEP = 1e-5  # of numeric derivatives [rad, -]
 
 
 def _power(name: str, n: int) -> str:
@@ -130,14 +131,29 @@ def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRi
 
     What none of them explains (lens distortion) remains: :func:`explained_px`.
     """
-    p = _explanation(state, camera)[0]
-    R_rect = np.eye(3) if rig.is_rectified else rectifying_rotations(rig.T_right_left)[1]
-    T = rig.T_right_left.copy()
-    T[:3] = R_rect.T @ se3.so3_exp(p[:3]) @ R_rect @ T[:3]
-    r, scale = rig.right, 1.0 + p[3]
-    intrinsics = [r.fx_px * scale, r.fy_px * scale, r.cx_px + p[4] * r.fx_px, r.cy_px + p[5] * r.fy_px]
-    right = _lens(r.kind, intrinsics, [float(k) for k in r.distortion], (r.width, r.height), rig.where)
+    turn, right = _changed(rig, _explanation(rig, state, camera)[0])
+    R_rect, T = _rectifying(rig), rig.T_right_left.copy()
+    T[:3] = R_rect.T @ turn @ R_rect @ T[:3]
     return replace(rig, right=right, T_right_left=T)
+
+
+def _rectifying(rig: StereoRig) -> Array:
+    """(3, 3) axes of the right camera to rectified ones."""
+    return np.eye(3) if rig.is_rectified else rectifying_rotations(rig.T_right_left)[1]
+
+
+def _changed(rig: StereoRig, p: Array) -> tuple[Array, CameraModel]:
+    """The turn (3, 3) of the right camera, in rectified axes, and its lens, for ``p`` (6,): rotation, focal length and
+    centre."""
+    r, scale = rig.right, 1.0 + p[3]
+    lens = replace(
+        r,
+        fx_px=r.fx_px * scale,
+        fy_px=r.fy_px * scale,
+        cx_px=r.cx_px + p[4] * r.fx_px,
+        cy_px=r.cy_px + p[5] * r.fy_px,
+    )
+    return se3.so3_exp(p[:3]), lens
 
 
 def _lens(
@@ -149,22 +165,34 @@ def _lens(
     return make_lens(model, intrinsics_px, distortion, (width, height), where)
 
 
-def explained_px(state: RigState, camera: StereoCamera) -> tuple[float, float]:
+def explained_px(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple[float, float]:
     """Displacement that was found, and what of it :func:`corrected` leaves: rms over the image [px]."""
-    _, *displacements = _explanation(state, camera)
+    _, *displacements = _explanation(rig, state, camera)
     found_px, left_px = (camera.fx_px * math.sqrt(2 * np.mean(d**2)) for d in displacements)
     return found_px, left_px
 
 
-def _explanation(state: RigState, camera: StereoCamera) -> tuple[Array, Array, Array]:
+def _explanation(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple[Array, Array, Array]:
     """(6,) rotation, focal length and centre that fit best; displacements dx, then dy, over the image, and what is left
-    of them."""
+    of them.
+
+    To first order, by what each does to the raw image: the focal length of a fisheye does not scale the rectified one.
+    """
     v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
     x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
-    o, z = np.ones_like(x), np.zeros_like(x)
-    found = (state.mean.reshape(2, N_TERMS) @ terms(x, y)).ravel()
-    by_x, by_y = [-x * y, 1 + x * x, -y, x, o, z], [-(1 + y * y), x * y, x, y, z, o]
-    by = np.hstack([by_x, by_y]).T
+    R_rect = _rectifying(rig)
+    raw, seen = rig.right.project(np.column_stack([x, y, np.ones_like(x)]) @ R_rect)
+
+    def meant(p: Array) -> Array:
+        """(2, n) places in a rectified image of what is seen at the raw pixels."""
+        turn, lens = _changed(rig, p)
+        X, Y, Z = (lens.unproject(raw[seen]) @ R_rect.T @ turn).T
+        return np.stack([X / Z, Y / Z])
+
+    by = np.stack([(meant(-e) - meant(e)).ravel() for e in _STEP * np.eye(6)], axis=1) / (2 * _STEP)
+    found = (state.mean.reshape(2, N_TERMS) @ terms(x[seen], y[seen])).ravel()
+    known = np.isfinite(by).all(axis=1)
+    by, found = by[known], found[known]
     p = np.linalg.lstsq(by, found, rcond=None)[0]
     return p, found, found - by @ p
 
