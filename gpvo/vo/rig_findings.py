@@ -193,7 +193,7 @@ def _explanation(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple
     found = (state.mean.reshape(2, N_TERMS) @ terms(x[seen], y[seen])).ravel()
     known = np.isfinite(by).all(axis=1)
     by, found = by[known], found[known]
-    p = np.linalg.lstsq(by, found, rcond=None)[0]
+    p = np.asarray(np.linalg.lstsq(by, found, rcond=None)[0], np.float64)
     return p, found, found - by @ p
 
 
