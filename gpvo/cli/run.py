@@ -117,9 +117,9 @@ def calibration(
         raise SourceError("holds no camera: it was not made by gpvo run", where=run)
     state = read_state(run, camera)
     found = document(state, camera)
-    found_px, left_px = explained_px(state, camera)
+    rig = rig_of(read_json(run / "rig.json").get("calibration"), camera)
+    found_px, left_px = explained_px(rig, state, camera)
     if out is not None:
-        rig = rig_of(read_json(run / "rig.json").get("calibration"), camera)
         write_text(out, camchain(corrected(rig, state, camera) if found["findings"] else rig))
     if json_:
         print_json({"run": str(run), **found, "found_px": found_px, "unexplained_px": left_px})

@@ -151,7 +151,7 @@ def hover(at: Array, yaw_rad: float, duration_s: float) -> Path3:
 def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float = 3.0) -> Path3:
     """Flight through points (N, 3) [m] on a cubic spline, the nose along it; it slows down and hovers at the last.
 
-    Raises GpvoError for fewer than two points, or two equal ones in a row.
+    Raises GpvoError for fewer than two points, two equal ones in a row, or a way that turns back on the spot.
     """
     corners = np.asarray(points, float).reshape(-1, 3)
     chord = path_length_m(corners)
@@ -159,7 +159,15 @@ def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float 
         raise GpvoError("waypoints need at least two places, none twice in a row", cure="waypoints = [[x, y, z], ...]")
     curve = make_interp_spline(chord, corners, k=min(3, len(corners) - 1))
     fine = np.linspace(0.0, chord[-1], max(2000, int(50 * chord[-1])))
-    along = path_length_m(curve(fine))
+    way = curve(fine)
+    steps = np.diff(way, axis=0)
+    if (back := (steps[1:] * steps[:-1]).sum(axis=1) <= 0).any():
+        x, y, z = way[1 + int(back.argmax())]
+        cure = "put another place beside the turn"
+        raise GpvoError(
+            f"the way through the waypoints turns back on the spot at ({x:.1f}, {y:.1f}, {z:.1f}) m", cure=cure
+        )
+    along = path_length_m(way)
     at_arc = CubicSpline(along, fine)
     t = knots(duration_s)
     u = at_arc(soft_end(speed_mps * smooth_start(t, rest_s), along[-1], 0.5 * speed_mps))
@@ -169,7 +177,7 @@ def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float 
 
 def soft_end(distance: Array, limit: float, width: float) -> Array:
     """The same distance as long as it is far from ``limit`` [m], which it approaches smoothly and never passes."""
-    width = min(width, 0.2 * limit)
+    width = max(min(width, 0.2 * limit), 1e-9)
     left = width * np.logaddexp(0.0, (limit - np.asarray(distance)) / width)
     return np.clip(width * np.logaddexp(0.0, limit / width) - left, 0.0, limit)
 

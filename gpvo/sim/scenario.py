@@ -220,7 +220,8 @@ def _validated(table: dict[str, Any], where: object) -> Scenario:
         )
     if scenario.path == "waypoints" and len(scenario.waypoints) < 2:
         raise GpvoError("path = waypoints needs at least two places", where=where, cure="waypoints = [[x, y, z], ...]")
-    if scenario.late and scenario.late_s >= 1.0 / scenario.rate_hz:
+    # Frames lie on whole milliseconds: the shortest time between two.
+    if scenario.late and 1e3 * scenario.late_s >= 1e3 // scenario.rate_hz:
         raise GpvoError("late_s is longer than the time between frames", where=where)
     return scenario
 

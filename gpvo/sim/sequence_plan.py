@@ -259,7 +259,8 @@ def plan_frames(scenario: Scenario, episodes: tuple[Episode, ...], rng: np.rando
     out = []
     for k in range(count):
         t = k / scenario.rate_hz
-        inside = next((i for i, e in enumerate(episodes) if e.begin_s <= t < e.end_s), None)
+        # The blackout, which comes last, may lie over others.
+        inside = next((i for i in reversed(range(len(episodes))) if episodes[i].begin_s <= t < episodes[i].end_s), None)
         cause = "" if inside is None else episodes[inside].cause
         # A bare wall comes into view and leaves it, it does not change at once.
         edge_s = 0.0 if inside is None else min(t - episodes[inside].begin_s, episodes[inside].end_s - t)

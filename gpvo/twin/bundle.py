@@ -24,7 +24,7 @@ from gpvo.vo.points import no_farther_than, point_jacobian, triangulate, triangu
 
 # Rows of (u, v, d) residuals at unit noise of the four image coordinates.
 WHITEN = np.linalg.inv(np.linalg.cholesky(triangulation_pixel_covariance(1.0)))
-_MIN_DEPTH_M, _MIN_DISPARITY_PX = 0.05, 0.05
+_MIN_DISPARITY_PX = 0.05
 _PART = 100_000
 REACH = 20
 """Frames of a piece of a track."""
@@ -81,7 +81,7 @@ class Estimate:
         """(M, 3) each observation's landmark in its camera, never behind it."""
         T = self.T_world_cam[seen.frame]
         P: Array = np.einsum("mji,mj->mi", T[:, :3, :3], self.points_world[seen.track] - T[:, :3, 3])
-        P[:, 2] = np.maximum(P[:, 2], _MIN_DEPTH_M)
+        P[:, 2] = np.maximum(P[:, 2], _least_depth_m(seen.camera))
         return P
 
     def misfit_px(self, seen: Observations) -> Array:
@@ -92,7 +92,7 @@ class Estimate:
         """(N, 3) the landmarks in their own views."""
         T = se3.inverse(self.T_world_cam[seen.frame[chart.view]])
         P = transform(T, self.points_world)
-        P[:, 2] = np.maximum(P[:, 2], _MIN_DEPTH_M)
+        P[:, 2] = np.maximum(P[:, 2], _least_depth_m(seen.camera))
         return seen.camera.project(P)
 
     def moved(self, step_cam: Array, step_uvd: Array, chart: Chart, seen: Observations) -> Estimate:
@@ -100,6 +100,11 @@ class Estimate:
         uvd = no_farther_than(self.uvd(chart, seen) + step_uvd, _MIN_DISPARITY_PX)
         points = transform(self.T_world_cam[seen.frame[chart.view]], triangulate(uvd, seen.camera))
         return Estimate(self.T_world_cam @ se3.exp(step_cam), points)
+
+
+def _least_depth_m(camera: StereoCamera) -> float:
+    """Where a landmark is put that would come nearer, or behind the camera: half a baseline, 5 cm at most."""
+    return min(0.05, 0.5 * camera.baseline_m)
 
 
 def _projection_jacobian(P: Array, camera: StereoCamera) -> Array:

@@ -115,6 +115,7 @@ def without_loose_frames(structure: Structure, seen: Observations, t_ns: NDArray
 
 _EDGES_PX = (0.0, 10.0, 20.0, 40.0)
 _AGREE, _SURE = 0.1, 3.0
+_PAIRS = 1_000_000  # of observations at a time: an hour has a hundred million
 _LARGEST = 4.0  # whitened residuals count no more
 
 
@@ -136,29 +137,21 @@ class Neighbours:
         z = np.clip(z, -_LARGEST, _LARGEST)
         used = structure.weight > 0
         starts = np.searchsorted(seen.frame, np.arange(len(structure.T_world_cam) + 1))
+        n, parts, held = len(structure.points_world), [], 0
         pairs = [np.zeros((0, 2), np.int64)]
         for i, j in itertools.pairwise(starts):
             rows = i + np.flatnonzero(used[i:j])
             if len(rows) > 1:
                 near = cKDTree(seen.uvd[rows, :2]).query_pairs(2 * _EDGES_PX[-1], output_type="ndarray")
                 pairs.append(rows[near])
-        a, b = np.concatenate(pairs).T
-        n = len(structure.points_world)
-        tracks = np.sort(np.stack([seen.track[a], seen.track[b]]), axis=0)
-        key, place = np.unique(tracks[0] * n + tracks[1], return_inverse=True)
+                held += len(near)
+            if held > _PAIRS:
+                parts.append(_sums_of(np.concatenate(pairs), seen, z, n))
+                pairs, held = pairs[:1], 0
+        parts.append(_sums_of(np.concatenate(pairs), seen, z, n))
+        key, (count, distance, product, square) = _by_key(*(np.concatenate(p, axis=-1) for p in zip(*parts)))
         first, second = np.divmod(key, max(n, 1))
-        count = np.maximum(np.bincount(place, minlength=len(key)), 1)
-
-        def summed(values: Array) -> Array:
-            return np.bincount(place, values, minlength=len(key)).astype(np.float64)
-
-        return cls(
-            first,
-            second,
-            summed(np.linalg.norm(seen.uvd[a, :2] - seen.uvd[b, :2], axis=1)) / count,
-            summed((z[a] * z[b]).sum(axis=1)),
-            summed(0.5 * ((z[a] ** 2).sum(axis=1) + (z[b] ** 2).sum(axis=1))),
-        )
+        return cls(first, second, distance / count, product, square)
 
     @property
     def reach_px(self) -> float:
@@ -171,6 +164,22 @@ class Neighbours:
                 break
             reach = high
         return reach
+
+
+def _by_key(key: NDArray[np.int64], values: Array) -> tuple[NDArray[np.int64], Array]:
+    """Distinct keys, and the rows of ``values`` (k, P) summed over equal ones."""
+    distinct, place = np.unique(key, return_inverse=True)
+    return distinct, np.stack([np.bincount(place, v, minlength=len(distinct)) for v in values]).astype(np.float64)
+
+
+def _sums_of(pairs: NDArray[np.int64], seen: Observations, z: Array, n: int) -> tuple[NDArray[np.int64], Array]:
+    """Of pairs (P, 2) of observations, by their two tracks of ``n``, as one key: their number, and the sums of their
+    distances, of the products of whitened residuals ``z`` and of the means of these squares."""
+    a, b = pairs.T
+    first, second = np.sort(np.stack([seen.track[a], seen.track[b]]), axis=0)
+    distance = np.linalg.norm(seen.uvd[a, :2] - seen.uvd[b, :2], axis=1)
+    square = 0.5 * ((z[a] ** 2).sum(axis=1) + (z[b] ** 2).sum(axis=1))
+    return _by_key(first * n + second, np.stack([np.ones(len(a)), distance, (z[a] * z[b]).sum(axis=1), square]))
 
 
 def draw_signs(count: int, neighbours: Neighbours, rng: np.random.Generator) -> Array:

@@ -66,7 +66,7 @@ def estimate(path: Path) -> Original:
         raise SourceError("its tracks do not match its frames", where=path / "tracks.parquet", cure="run it again")
     _, begins, track = np.unique(tracks.track, return_index=True, return_inverse=True)
     first = np.isin(np.arange(len(track)), begins)
-    _refuse_too_few(frame[tracks.is_inlier & ~first], len(t_ns), path)
+    _refuse_too_few(frame[tracks.is_inlier & ~first], path)
     repeats = np.array(["frozen" in r.reason for r in run.log])
     camera = run.log.camera
     rig = read_state(path, camera) if (path / STATE_FILE).is_file() else RigState.exact()
@@ -79,8 +79,9 @@ def estimate(path: Path) -> Original:
     return Original(run, config_of(path), rig, seen, structure, _noise(seen, structure), neighbours, first, repeats)
 
 
-def _refuse_too_few(frame: NDArray[np.int64], n_frames: int, path: Path) -> None:
-    usual = float(np.median(np.bincount(frame, minlength=n_frames)[1:])) if n_frames > 1 else 0.0
+def _refuse_too_few(frame: NDArray[np.int64], path: Path) -> None:
+    counts = np.bincount(frame)
+    usual = float(np.median(counts[counts > 0])) if len(frame) else 0.0
     if usual < MIN_POINTS:
         raise SourceError(
             f"its structure cannot be estimated: {usual:.0f} points per motion, {MIN_POINTS} are needed",

@@ -247,5 +247,11 @@ class TrackRecorder:
 
 
 def keys(uvd: Array) -> list[bytes]:
-    """What tells measurements (N, 3) apart: their bytes."""
-    return [row.tobytes() for row in np.ascontiguousarray(uvd, dtype=np.float64)]
+    """What tells measurements (N, 3) apart: their bytes; equal ones, as whole pixels may be, by their order."""
+    out: dict[bytes, None] = {}
+    for row in np.ascontiguousarray(uvd, dtype=np.float64):
+        key = row.tobytes()
+        while key in out:
+            key += b"+"
+        out[key] = None
+    return list(out)

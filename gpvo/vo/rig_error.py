@@ -125,11 +125,12 @@ class RigError:
 
     def __init__(self, camera: StereoCamera, known: RigState | None = None, *, learn: bool = True) -> None:
         self._camera = camera
-        self._learn = learn
         self._start = self.state = known or RigState.prior(camera)
+        # What is right beyond doubt stays so.
+        self._learn = learn and bool(self._start.covariance.any())
         # A state from a file is no calibration to return to.
         self._may_be_exact = known is None
-        if not learn:
+        if not self._learn:
             return
         precision = np.asarray(np.linalg.inv(self._start.covariance), np.float64)
         self._blocks = (_Blocks(precision[_DX, _DX]), _Blocks(precision[_DY, _DY]))

@@ -23,6 +23,7 @@ from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
 STATE_FILE = "calibration_state.json"
 _WORTH_PX = 0.2  # at half the width of the image; below, no one would calibrate anew
 _SIGMAS = 4.0
+_STEP = 1e-5  # of numeric derivatives [rad, -]
 
 
 def _power(name: str, n: int) -> str:
@@ -103,20 +104,25 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
     except (KeyError, TypeError, ValueError):
         raise SourceError("is not a calibration state", where=path, cure=f"give the {STATE_FILE} of a run") from None
     n = len(np.unique(place))
-    fits = 0 < n == len(place) and read_mean.shape == (n,) and read_covariance.shape == (n, n) and 0 <= probability <= 1
-    # Comparisons with NaN are false.
-    if not fits or not np.abs(read_mean).max() <= 0.2 or not np.abs(read_covariance).max() <= 1e3:
-        raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
+    if not (0 < n == len(place) and read_mean.shape == (n,) and read_covariance.shape == (n, n)):
+        raise SourceError("is not a calibration state", where=path, cure=f"give the {STATE_FILE} of a run")
+    if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):
+        raise SourceError("belongs to another camera, size or calibration", where=path, cure="use it with its own rig")
     # Of terms that a file does not name, nothing is known.
     state = RigState.prior(camera)
     mean, covariance = state.mean.copy(), state.covariance.copy()
     covariance[place], covariance[:, place] = 0.0, 0.0
     mean[place], covariance[np.ix_(place, place)] = read_mean, 0.5 * (read_covariance + read_covariance.T)
-    covariance += 1e-14 * np.eye(len(mean))
-    if np.linalg.eigvalsh(covariance)[0] <= 0:
+    uncertain = bool(covariance.any())  # else the calibration is right beyond doubt
+    covariance += 1e-14 * uncertain * np.eye(len(mean))
+    # At half the width of the image all terms displace alike, however narrow the view.
+    reach = np.tile((0.5 * camera.width / camera.fx_px) ** ORDER, 2)
+    at_border = covariance * np.outer(reach, reach)
+    # Comparisons with NaN are false.
+    if not (np.abs(mean * reach).max() <= 0.2 and np.abs(at_border).max() <= 1e3 and 0 <= probability <= 1):
+        raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
+    if uncertain and np.linalg.eigvalsh(at_border)[0] <= 0:
         raise SourceError("its covariance is not positive definite", where=path)
-    if of.shape != (6,) or not np.allclose(of, _camera_px(camera), rtol=1e-3):
-        raise SourceError("belongs to another camera, size or calibration", where=path, cure="use it with its own rig")
     return RigState(mean, covariance, probability)
 
 
@@ -125,14 +131,29 @@ def corrected(rig: StereoRig, state: RigState, camera: StereoCamera) -> StereoRi
 
     What none of them explains (lens distortion) remains: :func:`explained_px`.
     """
-    p = _explanation(state, camera)[0]
-    R_rect = np.eye(3) if rig.is_rectified else rectifying_rotations(rig.T_right_left)[1]
-    T = rig.T_right_left.copy()
-    T[:3] = R_rect.T @ se3.so3_exp(p[:3]) @ R_rect @ T[:3]
-    r, scale = rig.right, 1.0 + p[3]
-    intrinsics = [r.fx_px * scale, r.fy_px * scale, r.cx_px + p[4] * r.fx_px, r.cy_px + p[5] * r.fy_px]
-    right = _lens(r.kind, intrinsics, [float(k) for k in r.distortion], (r.width, r.height), rig.where)
+    turn, right = _changed(rig, _explanation(rig, state, camera)[0])
+    R_rect, T = _rectifying(rig), rig.T_right_left.copy()
+    T[:3] = R_rect.T @ turn @ R_rect @ T[:3]
     return replace(rig, right=right, T_right_left=T)
+
+
+def _rectifying(rig: StereoRig) -> Array:
+    """(3, 3) axes of the right camera to rectified ones."""
+    return np.eye(3) if rig.is_rectified else rectifying_rotations(rig.T_right_left)[1]
+
+
+def _changed(rig: StereoRig, p: Array) -> tuple[Array, CameraModel]:
+    """The turn (3, 3) of the right camera, in rectified axes, and its lens, for ``p`` (6,): rotation, focal length and
+    centre."""
+    r, scale = rig.right, 1.0 + p[3]
+    lens = replace(
+        r,
+        fx_px=r.fx_px * scale,
+        fy_px=r.fy_px * scale,
+        cx_px=r.cx_px + p[4] * r.fx_px,
+        cy_px=r.cy_px + p[5] * r.fy_px,
+    )
+    return se3.so3_exp(p[:3]), lens
 
 
 def _lens(
@@ -144,23 +165,35 @@ def _lens(
     return make_lens(model, intrinsics_px, distortion, (width, height), where)
 
 
-def explained_px(state: RigState, camera: StereoCamera) -> tuple[float, float]:
+def explained_px(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple[float, float]:
     """Displacement that was found, and what of it :func:`corrected` leaves: rms over the image [px]."""
-    _, *displacements = _explanation(state, camera)
+    _, *displacements = _explanation(rig, state, camera)
     found_px, left_px = (camera.fx_px * math.sqrt(2 * np.mean(d**2)) for d in displacements)
     return found_px, left_px
 
 
-def _explanation(state: RigState, camera: StereoCamera) -> tuple[Array, Array, Array]:
+def _explanation(rig: StereoRig, state: RigState, camera: StereoCamera) -> tuple[Array, Array, Array]:
     """(6,) rotation, focal length and centre that fit best; displacements dx, then dy, over the image, and what is left
-    of them."""
+    of them.
+
+    To first order, by what each does to the raw image: the focal length of a fisheye does not scale the rectified one.
+    """
     v, u = np.mgrid[0 : camera.height : 9j, 0 : camera.width : 13j]
     x, y = ((u - camera.cx_px) / camera.fx_px).ravel(), ((v - camera.cy_px) / camera.fy_px).ravel()
-    o, z = np.ones_like(x), np.zeros_like(x)
-    found = (state.mean.reshape(2, N_TERMS) @ terms(x, y)).ravel()
-    by_x, by_y = [-x * y, 1 + x * x, -y, x, o, z], [-(1 + y * y), x * y, x, y, z, o]
-    by = np.hstack([by_x, by_y]).T
-    p = np.linalg.lstsq(by, found, rcond=None)[0]
+    R_rect = _rectifying(rig)
+    raw, seen = rig.right.project(np.column_stack([x, y, np.ones_like(x)]) @ R_rect)
+
+    def meant(p: Array) -> Array:
+        """(2, n) places in a rectified image of what is seen at the raw pixels."""
+        turn, lens = _changed(rig, p)
+        X, Y, Z = (lens.unproject(raw[seen]) @ R_rect.T @ turn).T
+        return np.stack([X / Z, Y / Z])
+
+    by = np.stack([(meant(-e) - meant(e)).ravel() for e in _STEP * np.eye(6)], axis=1) / (2 * _STEP)
+    found = (state.mean.reshape(2, N_TERMS) @ terms(x[seen], y[seen])).ravel()
+    known = np.isfinite(by).all(axis=1)
+    by, found = by[known], found[known]
+    p = np.asarray(np.linalg.lstsq(by, found, rcond=None)[0], np.float64)
     return p, found, found - by @ p
 
 

@@ -76,6 +76,16 @@ def test_both_directions_are_refused(write):
         read_camchain(write(camchain(both)))
 
 
+def test_a_chain_of_half_the_baseline_is_caught_at_a_few_millimetres_too(write):
+    T_right_left = T_RIGHT_LEFT.copy()
+    T_right_left[:3, 3] *= 4e-3 / np.linalg.norm(T_right_left[:3, 3])
+    imu = [f"  T_cam_imu: {rows(m)}\n" for m in (T_LEFT_IMU, T_right_left @ T_LEFT_IMU)]
+    assert read_camchain(write(camchain(*imu, chain=T_right_left))).baseline_m == pytest.approx(4e-3)
+    T_right_left[:3, 3] *= 0.5
+    with pytest.raises(CalibrationError, match=r"disagree by 2\.0 mm"):
+        read_camchain(write(camchain(*imu, chain=T_right_left)))
+
+
 def test_chain_with_another_meaning_is_caught(write):
     """Published files have put the inverse, or camera-to-IMU values, under T_cn_cnm1."""
     imu = [f"  T_cam_imu: {rows(m)}\n" for m in (T_LEFT_IMU, T_RIGHT_LEFT @ T_LEFT_IMU)]

@@ -46,6 +46,7 @@ def test_the_others_fly_without_images_too(name):
         ({"camera": "gopro"}, "camera"),
         ({"calibration.focl": 0.1}, "calibration"),
         ({"late": 0.1, "late_s": 0.2}, "late_s"),
+        ({"late": 0.1, "late_s": 0.0065, "rate_hz": 150.0}, "late_s"),  # some frames are 6 ms apart
         ({"name.x": 1}, "not a table"),
     ],
 )

@@ -227,6 +227,15 @@ def test_episodes_reach_the_frames():
     assert 0.15 < len(bad) / len(plans) < 0.25
 
 
+def test_in_the_dark_nothing_else_is_seen():
+    scenario = load_scenario("tunnel", {"dark": (20.0, 40.0), "episodes_share": 0.4})
+    episodes = sequence_plan.plan_episodes(scenario, np.random.default_rng(1))
+    plans = sequence_plan.plan_frames(scenario, episodes, np.random.default_rng(2))
+    light = np.array([p.light for p in plans])
+    assert (light[400:800] == 0.0).all()
+    assert (np.delete(light, slice(400, 800)) > 0.0).all()
+
+
 @pytest.mark.slow
 def test_a_write_that_fails_is_one_line_and_leaves_nothing(tmp_path, tmp_path_factory):
     """The kernel refuses files above 100 kB: the first long table or image cannot be written whole."""

@@ -107,6 +107,19 @@ def test_waypoints_are_passed_and_the_end_is_reached():
     assert jumps < 0.1, "twice continuously differentiable"
 
 
+@pytest.mark.parametrize("turn_m", [3.0, 3.1])
+def test_waypoints_that_turn_back_on_the_spot_are_refused(turn_m):
+    with pytest.raises(GpvoError, match="turns back on the spot at"):
+        paths.waypoints(np.array([[0.0, 0, 1], [turn_m, 0, 1], [0, 0, 1]]), 12.0, 1.0)
+    assert paths.waypoints(np.array([[0.0, 0, 1], [turn_m, 0.5, 1], [0, 1.0, 1]]), 12.0, 1.0).duration_s == 12.0
+
+
+def test_waypoints_at_no_speed_stay_at_the_first():
+    motion = paths.waypoints(np.array([[0.0, 0, 1], [4, 0, 2]]), 5.0, 0.0).motion(100.0)
+    assert np.allclose(motion.position_m, [0.0, 0, 1])
+    assert np.isfinite(motion.rate_radps).all()
+
+
 @pytest.mark.parametrize("kind", ["along", "wander"])
 def test_agility_bends_tighter(kind):
     line = np.stack([np.arange(0, 60, 0.5), np.zeros(120), np.zeros(120)], 1)

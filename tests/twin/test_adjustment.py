@@ -1,5 +1,7 @@
 """Bundle adjustment against SciPy's least squares, and against what simulated tracks say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.geometry import se3
@@ -46,6 +48,18 @@ def test_plain_fit_is_that_of_scipy():
     poses = T[1:] @ se3.exp(oracle.x[: 6 * (len(T) - 1)].reshape(-1, 6))
     assert np.abs(se3.log(se3.inverse(poses) @ found.T_world_cam[1:])).max() < 1e-6
     assert (found.residual_px @ WHITEN.T).ravel() == pytest.approx(oracle.fun, abs=1e-4)
+
+
+@pytest.mark.parametrize("scale", [0.01, 30.0])
+def test_the_fit_has_no_scale_of_its_own(scale):
+    """A rig with a baseline of 1.2 mm among landmarks at 2 to 30 cm, as in an endoscope; and one of 3.6 m."""
+    T, _, seen = small_problem(np.random.default_rng(3))
+    camera = replace(CAMERA, baseline_m=scale * CAMERA.baseline_m)
+    scaled = T.copy()
+    scaled[:, :3, 3] *= scale
+    found, other = adjust(seen, T), adjust(replace(seen, camera=camera), scaled)
+    assert np.allclose(other.T_world_cam[:, :3, 3], scale * found.T_world_cam[:, :3, 3], atol=1e-5 * scale)
+    assert np.allclose(other.residual_px, found.residual_px, atol=1e-3)
 
 
 def test_outliers_are_left_out_and_frames_have_their_own_noise():

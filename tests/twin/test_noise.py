@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.twin import noise
 from gpvo.twin.bundle import Observations
-from gpvo.twin.noise import Neighbours, Structure, draw_signs
+from gpvo.twin.noise import Neighbours, Structure, _sums_of, draw_signs
 from gpvo.types import StereoCamera
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)
@@ -36,6 +37,25 @@ def flight(rng: np.random.Generator, length_px: float) -> tuple[Observations, St
 def test_how_far_residuals_agree(length_px, low, high):
     neighbours = Neighbours.of(*flight(np.random.default_rng(1), length_px))
     assert low <= neighbours.reach_px <= high
+
+
+def test_a_long_run_is_taken_in_parts(monkeypatch):
+    """An hour has a hundred million pairs, ten gigabytes; how many are held at once makes no difference."""
+    seen, structure = flight(np.random.default_rng(4), 6.0)
+    held = []
+
+    def sums_of(pairs, *others):
+        held.append(len(pairs))
+        return _sums_of(pairs, *others)
+
+    whole = Neighbours.of(seen, structure)
+    monkeypatch.setattr(noise, "_PAIRS", 2000)
+    monkeypatch.setattr(noise, "_sums_of", sums_of)
+    parts = Neighbours.of(seen, structure)
+    assert len(held) > 5
+    assert max(held) < 4000
+    for name in ("first", "second", "distance_px", "product", "square"):
+        assert np.allclose(getattr(parts, name), getattr(whole, name), rtol=1e-12, atol=1e-12)
 
 
 def test_signs_are_common_within_the_reach_and_free_beyond():

@@ -90,6 +90,16 @@ def test_frames_without_tracks_stay_without(flown):
     assert any(len(twin_source(original, TwinSettings(), 0).frames[k].track) == 0 for k in dark)
 
 
+def test_a_run_that_is_lost_for_most_of_its_time_has_twins(tmp_path):
+    flight = simulate_points("tunnel-clean", seed=3, duration_s=4.0, tracks=80, dark=(1.0, 3.5), rest_s=0.0)
+    run(open_source(flight.save(tmp_path / "flight.npz")), tmp_path / "run", keep_tracks=True)
+    original = estimate(tmp_path / "run")
+    usable = original.run.log.usable
+    assert usable.mean() < 0.5
+    # White noise of 0.15 px, as the flight has, give or take its own 15 %.
+    assert np.nanmedian(original.structure.sigma_px[usable]) == pytest.approx(0.15, rel=0.4)
+
+
 def test_each_twin_draws_its_own_rig(flown):
     original = estimate(flown[0] / "run")
     wide = TwinSettings(tolerance=Tolerance(baseline=0.05))
@@ -120,6 +130,19 @@ def test_the_rig_of_a_twin_is_wrong_as_odometry_found_it(flown):
     assert y == pytest.approx(1e-3, rel=1e-3)
     # Moment matching: over eight twins the draws have unit size exactly.
     assert np.sqrt(np.mean((x - 2e-3) ** 2)) == pytest.approx(3e-4, rel=1e-3)
+
+
+def test_a_run_without_self_calibration_has_twins_turned_by_the_tolerance(flown, tmp_path):
+    run(open_source(flown[0] / "flight.npz"), tmp_path / "run", VoConfig(self_calibration=False), keep_tracks=True)
+    original = estimate(tmp_path / "run")
+    assert not original.rig.covariance.any()
+    settings, rad = TwinSettings(tolerance=Tolerance(rotation_rad=1e-3)), 1e-3
+    # Over eight twins the draws have unit size exactly; a turn about the horizontal axis moves rows by f.
+    rows = [
+        np.median(np.concatenate([(f.uv_right - f.uv_left)[:, 1] for f in twin_source(original, settings, k).frames]))
+        for k in range(8)
+    ]
+    assert np.sqrt(np.mean(np.square(rows))) == pytest.approx(rad * original.seen.camera.fy_px, rel=0.2)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """What odometry saw, as the run folder keeps it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gpvo.errors import SourceError
@@ -31,6 +33,16 @@ def test_every_kept_track_is_a_piece_of_one_track_of_the_source(flight):
     assert known.mean() > 0.97
     for track in np.unique(kept.track[known]):
         assert len(set(owner[known & (kept.track == track)])) == 1
+
+
+def test_no_track_is_seen_twice_in_a_frame_of_whole_pixels(tmp_path):
+    """Corners of whole pixels fall upon each other: of 300 tracks, in about every frame two."""
+    drawn = simulate_points("tunnel-clean", seed=11, duration_s=3.0, tracks=300, rest_s=0.0)
+    whole = replace(drawn, uv_left=np.round(drawn.uv_left), uv_right=np.round(drawn.uv_right))
+    run(open_source(whole.save(tmp_path / "flight.npz")), tmp_path / "run", keep_tracks=True)
+    kept = read_tracks(tmp_path / "run")
+    assert np.unique(np.stack([kept.t_ns, kept.track]), axis=1).shape[1] == len(kept)
+    assert len(np.unique(np.c_[kept.t_ns, kept.uvd], axis=0)) < len(kept)
 
 
 def test_counts_agree_with_the_log(flight):

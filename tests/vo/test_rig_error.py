@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.cameras.kalibr import read_camchain, read_yaml
+from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import GpvoError
 from gpvo.files import write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
+from gpvo.sim.rig import camera_rig
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.motion import refine, whitened
-from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance
+from gpvo.vo.rig_error import N_TERMS, RigError, RigState, prior_covariance, terms
 from gpvo.vo.rig_findings import camchain, corrected, document, explained_px, findings, read_state, rig_of
 from gpvo.vo.sigmas import NoiseEstimator
 
@@ -170,6 +172,27 @@ def test_state_file_round_trip_and_hostile_ones(tmp_path: Path) -> None:
             read_state(path, CAMERA)
 
 
+@pytest.mark.parametrize("hfov_deg", [5.0, 15.0, 28.0, 150.0])
+def test_the_state_of_any_field_of_view_is_read_again(hfov_deg: float, tmp_path: Path) -> None:
+    """Thirty rigs drawn from the prior: terms of high order are large numbers where the view is narrow."""
+    f = CAMERA.cx_px / np.tan(np.deg2rad(hfov_deg / 2))
+    camera, rng = replace(CAMERA, fx_px=f, fy_px=f), np.random.default_rng(0)
+    covariance = prior_covariance(camera)
+    for _ in range(30):
+        mean = 0.3 * np.linalg.cholesky(covariance) @ rng.standard_normal(2 * N_TERMS)
+        write_json(tmp_path / "state.json", document(RigState(mean, 0.01 * covariance, 1.0), camera))
+        assert np.allclose(read_state(tmp_path / "state.json", camera).mean, mean)
+    write_json(tmp_path / "state.json", document(RigError(camera).state, camera))
+    read_state(tmp_path / "state.json", camera)
+
+
+def test_an_exact_calibration_is_read_again_as_exact(tmp_path: Path) -> None:
+    write_json(tmp_path / "state.json", document(RigState.exact(), CAMERA))
+    state = read_state(tmp_path / "state.json", CAMERA)
+    assert not state.covariance.any()
+    assert not RigError(CAMERA, state).state.covariance.any()
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
     state = RigState(_turn(axis, 3e-3), np.eye(2 * N_TERMS), 1.0)
@@ -185,9 +208,42 @@ def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
 def test_how_much_a_corrected_calibration_explains() -> None:
     """A turn to first order in whole, as of a bend of fourth order half."""
     for coefficients, least, most in ((_turn(1, 3e-3), 0.0, 1e-9), (np.eye(2 * N_TERMS)[10] * 1e-2, 0.3, 0.7)):
-        found_px, left_px = explained_px(RigState(coefficients, np.eye(2 * N_TERMS), 1.0), CAMERA)
+        found_px, left_px = explained_px(rig_of(None, CAMERA), RigState(coefficients, np.eye(2 * N_TERMS), 1.0), CAMERA)
         assert found_px > 0.5
         assert least <= left_px / found_px < most
+
+
+@pytest.mark.parametrize("name", ["pinhole", "euroc", "t265"])
+def test_a_corrected_calibration_fits_behind_any_lens(name: str) -> None:
+    """A right lens with a focal length 1 % too long and its centre 1 px off: disparities and rows, before and after."""
+    written = camera_rig(name)
+    lens = written.right
+    true = replace(lens, fx_px=1.01 * lens.fx_px, fy_px=1.01 * lens.fy_px, cx_px=lens.cx_px + 1, cy_px=lens.cy_px - 1)
+    c = Rectifier(written).camera
+    v, u = (f.ravel() for f in np.mgrid[60 : c.height - 60 : 9j, 60 : c.width - 60 : 12j])
+    places = np.column_stack([(u - c.cx_px) / c.fx_px, (v - c.cy_px) / c.fy_px, np.ones(len(u))])
+
+    def displacement(rig: StereoRig) -> tuple[Array, Array]:
+        """Where the rig's calibration puts points in the right image, and how far that is from where they are."""
+        R = Rectifier(rig).R_rect_right
+        ray = rig.right.unproject(true.project(places @ Rectifier(written).R_rect_right)[0])
+        meant = places @ Rectifier(written).R_rect_right @ written.T_right_left[:3, :3]  # in left axes
+        meant = meant @ rig.T_right_left[:3, :3].T @ R.T
+        seen = ray @ R.T
+        seen, meant = seen[:, :2] / seen[:, 2:], meant[:, :2] / meant[:, 2:]
+        return seen, seen - meant
+
+    seen, off = displacement(written)
+    coefficients = np.linalg.lstsq(terms(*seen.T).T, off, rcond=None)[0].T.ravel()
+    state = RigState(coefficients, 1e-12 * np.eye(2 * N_TERMS), 1.0)
+    before_px, after_px = (
+        c.fx_px * np.sqrt(2 * np.mean(displacement(r)[1] ** 2)) for r in (written, corrected(written, state, c))
+    )
+    found_px, left_px = explained_px(written, state, c)
+    assert before_px > 2.0
+    assert found_px > 2.0
+    assert after_px < 0.1 * before_px
+    assert left_px < 0.1 * found_px
 
 
 def test_corrected_camera_chain_keeps_the_imu(tmp_path: Path) -> None:
