@@ -38,7 +38,7 @@ from gpvo.types import Array, Prediction
 
 OnFit = Callable[[int, int], None]
 """Told how many fits of a training are done, of how many."""
-_UNSEEN = 0.5 * SEEN
+_UNSEEN, _STRETCH, _CLEARLY = 0.5 * SEEN, 10, 100.0
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
@@ -109,15 +109,38 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
             f"{1 / min(steps):.3g} Hz ({names[int(np.argmin(steps))]})",
             cure="train one model per rate, or with --target window:1s",
         )
+    _refuse_planar_among_others(sets)
     return _with_all_axes(sets)
 
 
+def _refuse_planar_among_others(sets: Sequence[TrainingSet]) -> None:
+    """No feature tells a robot in a plane from one that is not. One that never moved is no matter."""
+    rms = np.array([np.sqrt((s.Y**2).mean(axis=0)) for s in sets])
+    flat = (rms < SEEN) & (rms >= SEEN).any(axis=1, keepdims=True) & (rms.max(axis=0) > _CLEARLY * SEEN)
+    for s, axes in zip(sets, flat, strict=True):
+        if axes.any():
+            names, other = [AXES[k] for k in np.flatnonzero(axes)], sets[int(rms[:, axes].max(axis=1).argmax())].name
+            raise GpvoError(
+                f"log and truth never differ in {', '.join(names)} (planar?), but those of '{other}' do",
+                where=s.name,
+                cure="train one model for each kind of vehicle",
+            )
+
+
 def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
-    """Where errors of an axis are zero throughout, as of a robot in a plane, noise of ``_UNSEEN`` stands for what the
-    truth cannot show; seeded, so that the same rows give the same bytes."""
-    rms, rng = np.sqrt((np.concatenate([s.Y for s in sets]) ** 2).mean(axis=0)), np.random.default_rng(0)
-    quiet = rms < 0.1 * _UNSEEN
-    return [replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s for s in sets]
+    """Where errors of an axis are zero for ``_STRETCH`` motions, as at rest or of a robot in a plane, noise of
+    ``_UNSEEN`` stands for what the truth cannot show; seeded, so that the same rows give the same bytes."""
+    rng, out = np.random.default_rng(0), []
+    for s in sets:
+        blocks = np.array_split(s.Y, max(len(s) // _STRETCH, 1))
+        quiet = np.repeat([_quiet(b) for b in blocks], [len(b) for b in blocks], axis=0)
+        out.append(replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s)
+    return out
+
+
+def _quiet(Y: Array) -> NDArray[np.bool_]:
+    """(6,) on which axes errors (n, 6) are zero but for rounding."""
+    return np.asarray(np.sqrt((Y**2).mean(axis=0)) < 0.1 * _UNSEEN)
 
 
 def unseen_axes(sets: Sequence[TrainingSet]) -> list[str]:

@@ -617,3 +617,22 @@ def test_a_flight_that_begins_at_rest_is_learned_from() -> None:
     )
     assert np.isfinite(sigma).all()
     assert (np.median(sigma[80:], axis=0) < 3.0 * np.median(usual[80:], axis=0)).all()
+
+
+@pytest.mark.parametrize("rest", [slice(0, 80), slice(120, 240)])
+def test_a_flight_that_rests_is_learned_from_and_judged(rest: slice) -> None:
+    """At rest, neither odometry nor truth moves at all."""
+    (s,) = training_sets([1], n=240)
+    X, Y = s.X.copy(), s.Y.copy()
+    X[rest, [[s.columns.index(name)] for name in TWIST_COLUMNS]] = 0.0
+    Y[rest] = 0.0
+    trained = train_sets([replace(s, X=X, Y=Y)], QUICK)
+    assert len(trained.table["folds"]) == training.JUDGED_BLOCKS
+    assert trained.predictor().model.factor.max() < 10.0
+
+
+def test_a_robot_in_a_plane_and_one_that_is_not_have_a_model_each() -> None:
+    first, *others = training_sets(range(4), n=120)
+    flat = [replace(s, Y=np.where(np.isin(np.arange(6), [1, 3, 5]), 0.0, s.Y)) for s in others]
+    with pytest.raises(GpvoError, match="never differ in y, rx, rz .* but those of 'flight0' do"):
+        train_sets([first, *flat], QUICK)
