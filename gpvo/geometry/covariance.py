@@ -55,6 +55,13 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     return np.asarray(good & (least[:, 0] > -1e-9))
 
 
+def where_stated(C: Array) -> Array:
+    """(N, n, n) with NaN in place of what is no covariance: zeros, say, with which other software marks what it does
+    not know, or one that says that some error is impossible."""
+    stated = np.array([is_positive_definite(one) for one in C], dtype=bool)
+    return np.where(stated[:, None, None], C, np.nan)
+
+
 def upper(C: Array) -> Array:
     """(..., n (n + 1) / 2) elements of symmetric matrices (..., n, n) on and above the diagonal, row by row."""
     i, j = np.triu_indices(C.shape[-1])

@@ -18,7 +18,7 @@ from gpvo import __version__
 from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
 from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
-from gpvo.geometry.covariance import variances
+from gpvo.geometry.covariance import variances, where_stated
 from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
 from gpvo.learning.config import TrainConfig
@@ -110,7 +110,13 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
             cure="train one model per rate, or with --target window:1s",
         )
     _refuse_planar_among_others(sets)
-    return _with_all_axes(sets)
+    return [_where_stated(s) for s in _with_all_axes(sets)]
+
+
+def _where_stated(s: TrainingSet) -> TrainingSet:
+    """Without covariances that an error cannot be held against."""
+    covariances, v_t = ({m: where_stated(C) for m, C in of.items()} for of in (s.covariances, s.v_t))
+    return replace(s, covariances=covariances, v_t=v_t)
 
 
 def _refuse_planar_among_others(sets: Sequence[TrainingSet]) -> None:

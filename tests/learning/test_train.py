@@ -17,6 +17,7 @@ from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import open_source
 from gpvo.io.run import read_run, write_run
 from gpvo.learning import train as training
@@ -636,3 +637,15 @@ def test_a_robot_in_a_plane_and_one_that_is_not_have_a_model_each() -> None:
     flat = [replace(s, Y=np.where(np.isin(np.arange(6), [1, 3, 5]), 0.0, s.Y)) for s in others]
     with pytest.raises(GpvoError, match="never differ in y, rx, rz .* but those of 'flight0' do"):
         train_sets([first, *flat], QUICK)
+
+
+def test_covariances_that_call_some_error_impossible_are_not_held_against_errors() -> None:
+    """Axes that a lever arm ties together: a run folder may hold such, as they are semidefinite."""
+    sets = training_sets(range(3), n=120)
+    for s in sets:
+        C = s.covariances["pointing_matching"]
+        sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+        C[:60] = sigma[:60, :, None] * sigma[:60, None, :]
+    assert are_positive_definite(sets[0].covariances["pointing_matching"]).all()
+    mean = train_sets(sets, QUICK).table["mean"]
+    assert 0.5 < mean["pointing_matching_scaled"]["nees_dof"]["joint"] < 2.0
