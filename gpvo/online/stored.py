@@ -145,7 +145,7 @@ _ARRAYS: dict[str, ArraySpec] = {
     "domain.*": ArraySpec(("features",)),
     "thesis.columns": ArraySpec(("d",), low=0, high=3, kind="iu"),
     "thesis.spread": ArraySpec(("d",), low=_NARROWEST),
-    "thesis.scale": ArraySpec(("D",), low=0.0),
+    "thesis.scale": ArraySpec(("D",), low=_NARROWEST),
     "thesis.centre": ArraySpec(("d",)),
     "method.constant": ArraySpec((6, 6), semidefinite=True),
     "method.*.scale": ArraySpec((6,), low=0.0),
