@@ -595,6 +595,16 @@ def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path:
             save_model(_of_three(), path)
 
 
+def test_windows_of_path_take_as_long_as_the_vehicle_is_slow() -> None:
+    """Their durations are no rate of frames, which a flight could match or miss."""
+    runs = [make_run(seed, n=150, speed=speed) for seed, speed in enumerate((1.0, 1.0, 2.5))]
+    sets = [build(*run, name=str(k), target="length:1m") for k, run in enumerate(runs)]
+    trained = train_sets(sets, replace(QUICK, target="length:1m"), judge=False)
+    card = model_card(trained.header, trained.table, "m.gpvo")
+    assert "length:1m (length:1m)\n" in card
+    assert "frames/s" not in card
+
+
 @pytest.mark.parametrize("axes", [[5], [2, 3, 4], [0, 1, 2, 3, 4, 5]])
 def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int]) -> None:
     """A robot in a plane: its height, roll and pitch are zero in both."""
