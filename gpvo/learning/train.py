@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gpvo import __version__
 from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, ModelError
 from gpvo.files import read_json, write_json
 from gpvo.geometry.covariance import variances, where_stated
 from gpvo.io.run_read import Run
@@ -85,7 +85,20 @@ def train_sets(
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays(), **thesis.to_arrays()}
     header = _header(sets, config, learned, table)
     document = {"schema": 1, "model": None, "features": header["features"], **table}
-    return TrainedModel(arrays, header, document, sets)
+    return _loadable(TrainedModel(arrays, header, document, sets))
+
+
+def _loadable(trained: TrainedModel) -> TrainedModel:
+    """Itself; GpvoError, one line, where its file would be refused."""
+    try:
+        trained.predictor()
+    except ModelError as problem:
+        raise GpvoError(
+            f"no model explains errors that differ so much from run to run, or so much from what is stated:"
+            f" {problem.what}",
+            cure="'gpvo evaluate RUN' shows where odometry and truth differ; are all in metres?",
+        ) from None
+    return trained
 
 
 def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.cli.learn import _print_table, _train
-from gpvo.dataset.build import build, build_run
+from gpvo.dataset.build import TrainingSet, build, build_run
 from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
@@ -659,3 +659,26 @@ def test_covariances_that_call_some_error_impossible_are_not_held_against_errors
     assert are_positive_definite(sets[0].covariances["pointing_matching"]).all()
     mean = train_sets(sets, QUICK).table["mean"]
     assert 0.5 < mean["pointing_matching_scaled"]["nees_dof"]["joint"] < 2.0
+
+
+def _stated_smaller(s: TrainingSet, factor: float) -> TrainingSet:
+    columns = [k for k, name in enumerate(s.columns) if name.startswith("ln_var_pointing_matching")]
+    X = s.X.copy()
+    X[:, columns] += np.log(factor)
+    return replace(s, X=X, covariances={m: C * factor for m, C in s.covariances.items()})
+
+
+def test_however_little_odometry_states_the_model_can_be_loaded(tmp_path: Path) -> None:
+    sets = training_sets(range(3), n=120)
+    trained = train_sets([_stated_smaller(s, 1e-20) for s in sets], QUICK, judge=False)
+    save_model(trained, tmp_path / "m.gpvo")
+    plain = train_sets(sets, QUICK, judge=False)
+    assert trained.header["choices"]["base"] == "pointing_matching"
+    of_small = training.estimate_set(Predictor.load(tmp_path / "m.gpvo").model, _stated_smaller(sets[0], 1e-20))
+    np.testing.assert_allclose(of_small.sigma, training.estimate_set(plain.predictor().model, sets[0]).sigma, rtol=1e-6)
+
+
+def test_a_model_that_could_not_be_loaded_is_not_made() -> None:
+    sets = training_sets(range(4), n=120)
+    with pytest.raises(GpvoError, match="differ so much from run to run.*factor'"):
+        train_sets([replace(s, Y=s.Y * scale) for s, scale in zip(sets, (1.0, 1.0, 1e6, 1e6))], QUICK, judge=False)
