@@ -101,7 +101,7 @@ class ArraySpec:
             return "is empty"
         if array.dtype.kind == "f" and not self.gaps and not np.isfinite(array).all():
             return "holds a number that is not finite"
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             if (array < self.low).any() or (array > self.high).any():
                 return (
                     f"goes from {np.nanmin(array):.3g} to {np.nanmax(array):.3g}, outside {self.low:g} to {self.high:g}"
