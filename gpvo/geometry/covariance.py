@@ -29,7 +29,7 @@ def is_symmetric(C: Array) -> bool:
 
 def is_positive_definite(C: Array) -> bool:
     """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
-    C = np.asarray(C)
+    C = np.asarray(C, dtype=np.float64)
     # Comparisons with NaN are false.
     if not (np.abs(C).max() < LARGEST and np.diagonal(C).min() > 1 / LARGEST and is_symmetric(C)):
         return False
