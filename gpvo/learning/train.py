@@ -18,9 +18,10 @@ from gpvo import __version__
 from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
 from gpvo.errors import GpvoError, ModelError
 from gpvo.files import read_json, write_json
-from gpvo.geometry.covariance import variances, where_stated
+from gpvo.geometry.covariance import variances
 from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
+from gpvo.learning.checked import checked
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
@@ -32,13 +33,12 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import AXES, known_columns
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
-from gpvo.stats.consistency import SEEN, nees, seen_axes
+from gpvo.stats.consistency import nees, seen_axes
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, Prediction
 
 OnFit = Callable[[int, int], None]
 """Told how many fits of a training are done, of how many."""
-_UNSEEN, _STRETCH, _CLEARLY = 0.5 * SEEN, 10, 100.0
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
@@ -78,7 +78,7 @@ def train_sets(
     sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out."""
-    sets = _checked(sets, config.target)
+    sets = checked(sets, config.target)
     table = train_table(sets, config, on_fit) if judge else {}
     learned, thesis = fit_model(sets, config), fit_thesis(sets, seed=config.seed)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
@@ -99,68 +99,6 @@ def _loadable(trained: TrainedModel) -> TrainedModel:
             cure="'gpvo evaluate RUN' shows where odometry and truth differ; are all in metres?",
         ) from None
     return trained
-
-
-def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
-    if not sets:
-        raise GpvoError("there is no run to train on", cure="gpvo train RUN... -o MODEL")
-    other = next((s for s in sets if s.target != target), None)
-    if other is not None:
-        raise GpvoError(
-            f"holds rows of the target '{other.target}', not '{target}'",
-            where=other.name,
-            cure=f"--target {other.target}",
-        )
-    names = [s.name for s in sets]
-    if len(set(names)) < len(names):
-        sets = [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]
-    # A motion spans several frames where odometry kept its reference; the shortest ones span one. How long a window
-    # of path takes is a matter of speed.
-    steps = [float(np.quantile(s.dt_s, 0.1)) for s in sets]
-    if target == "frame" and max(steps) > 1.5 * min(steps):
-        raise GpvoError(
-            f"the runs differ in rate: {1 / max(steps):.3g} Hz ({names[int(np.argmax(steps))]}) and "
-            f"{1 / min(steps):.3g} Hz ({names[int(np.argmin(steps))]})",
-            cure="train one model per rate, or with --target window:1s",
-        )
-    _refuse_planar_among_others(sets)
-    return [_where_stated(s) for s in _with_all_axes(sets)]
-
-
-def _where_stated(s: TrainingSet) -> TrainingSet:
-    """Without covariances that an error cannot be held against."""
-    covariances, v_t = ({m: where_stated(C) for m, C in of.items()} for of in (s.covariances, s.v_t))
-    return replace(s, covariances=covariances, v_t=v_t)
-
-
-def _refuse_planar_among_others(sets: Sequence[TrainingSet]) -> None:
-    """No feature tells a robot in a plane from one that is not. One that never moved is no matter."""
-    rms = np.array([np.sqrt((s.Y**2).mean(axis=0)) for s in sets])
-    flat = (rms < SEEN) & (rms >= SEEN).any(axis=1, keepdims=True) & (rms.max(axis=0) > _CLEARLY * SEEN)
-    for s, axes in zip(sets, flat, strict=True):
-        if axes.any():
-            names, other = [AXES[k] for k in np.flatnonzero(axes)], sets[int(rms[:, axes].max(axis=1).argmax())].name
-            raise GpvoError(
-                f"log and truth never differ in {', '.join(names)} (planar?), but those of '{other}' do",
-                where=s.name,
-                cure="train one model for each kind of vehicle",
-            )
-
-
-def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
-    """Where errors of an axis are zero for ``_STRETCH`` motions, as at rest or of a robot in a plane, noise of
-    ``_UNSEEN`` stands for what the truth cannot show; seeded, so that the same rows give the same bytes."""
-    rng, out = np.random.default_rng(0), []
-    for s in sets:
-        blocks = np.array_split(s.Y, max(len(s) // _STRETCH, 1))
-        quiet = np.repeat([_quiet(b) for b in blocks], [len(b) for b in blocks], axis=0)
-        out.append(replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s)
-    return out
-
-
-def _quiet(Y: Array) -> NDArray[np.bool_]:
-    """(6,) on which axes errors (n, 6) are zero but for rounding."""
-    return np.asarray(np.sqrt((Y**2).mean(axis=0)) < 0.1 * _UNSEEN)
 
 
 def unseen_axes(sets: Sequence[TrainingSet]) -> list[str]:
