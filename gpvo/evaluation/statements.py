@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite
+from gpvo.geometry.covariance import where_stated
 from gpvo.learning.methods import simple_covariances
 from gpvo.learning.thesis import ThesisModel
 from gpvo.online.features import FeatureStream
@@ -68,12 +68,6 @@ def statements(
     if predictions:
         out.append(predicted_statement("learned", log, predictions))
     return out
-
-
-def where_stated(covariance: Array) -> Array:
-    """NaN in place of what is no covariance: zeros, say, with which other software marks what it does not know."""
-    stated = np.array([is_positive_definite(C) for C in covariance], dtype=bool)
-    return np.where(stated[:, None, None], covariance, np.nan)
 
 
 def _frames_bridged(log: VoLog) -> Array:

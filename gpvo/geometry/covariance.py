@@ -29,7 +29,7 @@ def is_symmetric(C: Array) -> bool:
 
 def is_positive_definite(C: Array) -> bool:
     """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
-    C = np.asarray(C)
+    C = np.asarray(C, dtype=np.float64)
     # Comparisons with NaN are false.
     if not (np.abs(C).max() < LARGEST and np.diagonal(C).min() > 1 / LARGEST and is_symmetric(C)):
         return False
@@ -53,6 +53,13 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
     good &= np.isfinite(R).all(axis=(1, 2))
     least = np.linalg.eigvalsh(symmetrise(np.where(good[:, None, None], R, np.eye(C.shape[1]))))
     return np.asarray(good & (least[:, 0] > -1e-9))
+
+
+def where_stated(C: Array) -> Array:
+    """(N, n, n) with NaN in place of what is no covariance: zeros, say, with which other software marks what it does
+    not know, or one that says that some error is impossible."""
+    stated = np.array([is_positive_definite(one) for one in C], dtype=bool)
+    return np.where(stated[:, None, None], C, np.nan)
 
 
 def upper(C: Array) -> Array:

@@ -269,12 +269,18 @@ def interpolate(T_a: Array, T_b: Array, fraction: Array) -> Array:
 
 
 def is_rigid(T: Array, farthest_m: float) -> bool:
-    """Whether one matrix (4, 4) is finite, a rotation to a thousandth, and no translation longer than that."""
+    """Whether one matrix (4, 4) is finite, a rotation to a thousandth, and no translation longer than that.
+
+    A mirror image is none, nor is a transposed pose, whose translation is in the last row.
+    """
     rows = T.tolist()
     # Comparisons with NaN are false.
     if not all(-farthest_m < value < farthest_m for row in rows for value in row):
         return False
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = rows
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), last = rows
+    mirrored = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0
+    if mirrored or max(map(abs, last[:3])) > 1e-9 or abs(last[3] - 1.0) > 1e-9:
+        return False
     # R^T R less the identity.
     deviation = (
         a * a + d * d + g * g - 1.0, b * b + e * e + h * h - 1.0, c * c + f * f + i * i - 1.0,

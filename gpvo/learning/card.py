@@ -54,7 +54,7 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             "Predicts the error covariance of stereo visual odometry, in the frame of the rectified left camera.",
             "",
             f"* trained on {_today()} with gpvo {h['versions']['gpvo']}",
-            f"* target: {h['target']} ({h['horizon']}), at {h['rate_hz']:.3g} Hz",
+            f"* target: {h['target']} ({h['horizon']})" + f", at {h['rate_hz']:.3g} Hz" * (h["target"] == "frame"),
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}): {inputs}",
         ]
@@ -71,7 +71,7 @@ def _today() -> str:
 def _unfit(h: Mapping[str, Any], table: Mapping[str, Any]) -> str:
     """Where the model must not be used, with examples."""
     camera, domain = h["camera"], h["training_domain"]
-    lines = [f"* At a rate other than {h['rate_hz']:.3g} frames/s."]
+    lines = [f"* At a rate other than {h['rate_hz']:.3g} frames/s."] if h["target"] == "frame" else []
     if camera is not None:
         lines.insert(0, f"* With a camera other than its own (focal length {_camera(camera)}).")
     speeds = [domain[c] for c in ("v_x_mps", "v_y_mps", "v_z_mps") if c in domain]

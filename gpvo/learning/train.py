@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from gpvo import __version__
 from gpvo.dataset.build import MIN_ROWS, MIN_SEQUENCES, TrainingSet, leave_one_out
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, ModelError
 from gpvo.files import read_json, write_json
 from gpvo.geometry.covariance import variances
 from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
+from gpvo.learning.checked import checked
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
@@ -32,13 +33,12 @@ from gpvo.online.estimate import ErrorModel
 from gpvo.online.features import AXES, known_columns
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
-from gpvo.stats.consistency import SEEN, nees, seen_axes
+from gpvo.stats.consistency import nees, seen_axes
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, Prediction
 
 OnFit = Callable[[int, int], None]
 """Told how many fits of a training are done, of how many."""
-_UNSEEN = 0.5 * SEEN
 JUDGED_BLOCKS = 3
 """Parts of a single sequence that are left out in turn."""
 SLIP_MEDIANS, SLIP_SIGMAS = 20.0, 5.0
@@ -78,46 +78,27 @@ def train_sets(
     sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
     """The same from training sets. ``judge`` False leaves the table out."""
-    sets = _checked(sets, config.target)
+    sets = checked(sets, config.target)
     table = train_table(sets, config, on_fit) if judge else {}
     learned, thesis = fit_model(sets, config), fit_thesis(sets, seed=config.seed)
     sample = draw_sample(sets, learned.model.columns, learned.model.base.method)
     arrays = {**learned.arrays, **method_arrays(sets), **sample.to_arrays(), **thesis.to_arrays()}
     header = _header(sets, config, learned, table)
     document = {"schema": 1, "model": None, "features": header["features"], **table}
-    return TrainedModel(arrays, header, document, sets)
+    return _loadable(TrainedModel(arrays, header, document, sets))
 
 
-def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
-    if not sets:
-        raise GpvoError("there is no run to train on", cure="gpvo train RUN... -o MODEL")
-    other = next((s for s in sets if s.target != target), None)
-    if other is not None:
+def _loadable(trained: TrainedModel) -> TrainedModel:
+    """Itself; GpvoError, one line, where its file would be refused."""
+    try:
+        trained.predictor()
+    except ModelError as problem:
         raise GpvoError(
-            f"holds rows of the target '{other.target}', not '{target}'",
-            where=other.name,
-            cure=f"--target {other.target}",
-        )
-    names = [s.name for s in sets]
-    if len(set(names)) < len(names):
-        sets = [replace(s, name=f"{s.name}#{i}") if names.count(s.name) > 1 else s for i, s in enumerate(sets)]
-    # A motion spans several frames where odometry kept its reference; the shortest ones span one.
-    steps = [float(np.quantile(s.dt_s, 0.1)) for s in sets]
-    if max(steps) > 1.5 * min(steps):
-        raise GpvoError(
-            f"the runs differ in rate: {1 / max(steps):.3g} Hz ({names[int(np.argmax(steps))]}) and "
-            f"{1 / min(steps):.3g} Hz ({names[int(np.argmin(steps))]})",
-            cure="train one model per rate, or with --target window:1s",
-        )
-    return _with_all_axes(sets)
-
-
-def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
-    """Where errors of an axis are zero throughout, as of a robot in a plane, noise of ``_UNSEEN`` stands for what the
-    truth cannot show; seeded, so that the same rows give the same bytes."""
-    rms, rng = np.sqrt((np.concatenate([s.Y for s in sets]) ** 2).mean(axis=0)), np.random.default_rng(0)
-    quiet = rms < 0.1 * _UNSEEN
-    return [replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s for s in sets]
+            f"no model explains errors that differ so much from run to run, or so much from what is stated:"
+            f" {problem.what}",
+            cure="'gpvo evaluate RUN' shows where odometry and truth differ; are all in metres?",
+        ) from None
+    return trained
 
 
 def unseen_axes(sets: Sequence[TrainingSet]) -> list[str]:

@@ -152,7 +152,8 @@ def joined(motions: list[VoRecord]) -> VoRecord:
         }
     status = max((r.status for r in motions), key=lambda s: s.severity)
     known: dict[str, Any] = {name: float(np.mean([getattr(r, name) for r in motions])) for name in FLOAT_FIELDS}
-    known |= {name: int(np.mean([getattr(r, name) for r in motions])) for name in COUNT_FIELDS}
+    counts = {name: [getattr(r, name) for r in motions] for name in COUNT_FIELDS}
+    known |= {name: int(np.mean(of)) if min(of) >= 0 else -1 for name, of in counts.items()}
     known |= {
         n: None if any(getattr(r, n) is None for r in motions) else np.mean([getattr(r, n) for r in motions], axis=0)
         for n in IMU_FIELDS

@@ -25,6 +25,7 @@ LARGEST = 1e12
 BASE = "base."
 """Prefix of the arrays in which the model with its GP held at the mean function, the base variance, differs."""
 _NARROWEST = 1e-12  # No standard deviation or length scale is smaller.
+_FACTOR = 1e40  # Of what other software states: as little as it likes.
 _Arrays = Mapping[str, NDArray[Any]]
 _Stored = TypeVar("_Stored", bound="Stored")
 
@@ -100,7 +101,7 @@ class ArraySpec:
             return "is empty"
         if array.dtype.kind == "f" and not self.gaps and not np.isfinite(array).all():
             return "holds a number that is not finite"
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             if (array < self.low).any() or (array > self.high).any():
                 return (
                     f"goes from {np.nanmin(array):.3g} to {np.nanmax(array):.3g}, outside {self.low:g} to {self.high:g}"
@@ -136,8 +137,8 @@ _ARRAYS: dict[str, ArraySpec] = {
     "calibration_patterns": ArraySpec((6, 6, 6), low=-1e6, high=1e6),
     "calibration_tau_s": ArraySpec((6,), low=_NARROWEST),
     "nu": ArraySpec((1,), low=0.0, high=1e6),
-    "theta": ArraySpec((6, 5), low=0.0),
-    "theta_plain": ArraySpec((6, 5), low=0.0),
+    "theta": ArraySpec((6, 5), low=0.0, high=_FACTOR),
+    "theta_plain": ArraySpec((6, 5), low=0.0, high=_FACTOR),
     "domain.scale": ArraySpec(("features",), low=_NARROWEST),
     "domain.whitening": ArraySpec(("features", "features")),
     "domain.radius": ArraySpec((1,), low=0.0),
@@ -145,10 +146,10 @@ _ARRAYS: dict[str, ArraySpec] = {
     "domain.*": ArraySpec(("features",)),
     "thesis.columns": ArraySpec(("d",), low=0, high=3, kind="iu"),
     "thesis.spread": ArraySpec(("d",), low=_NARROWEST),
-    "thesis.scale": ArraySpec(("D",), low=0.0),
+    "thesis.scale": ArraySpec(("D",), low=_NARROWEST),
     "thesis.centre": ArraySpec(("d",)),
     "method.constant": ArraySpec((6, 6), semidefinite=True),
-    "method.*.scale": ArraySpec((6,), low=0.0),
+    "method.*.scale": ArraySpec((6,), low=0.0, high=_FACTOR),
     "sample.X": ArraySpec(("n", "features"), gaps=True),
     "sample.sequence": ArraySpec(("n",), low=0, kind="iu"),
     "sample.dt_s": ArraySpec(("n",), low=1e-9),

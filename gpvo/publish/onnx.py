@@ -29,6 +29,9 @@ def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[s
     (N,). Outputs: ``mean`` (N, 6), ``covariance`` (N, 6, 6), its parts ``jitter``, ``white``, ``bias``, ``epistemic``
     (N, 6), ``in_domain``, ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names; the degrees
     of freedom ``nu``, 0 for a Gaussian, are among it. Raises MissingExtraError without the package onnx.
+
+    It is for motions that were measured: the error of a lost one is far larger, and depends on how fast the vehicle
+    was, which the graph does not know.
     """
     require("onnx")
     import onnx

@@ -197,9 +197,10 @@ static void gpvo_divide(int j, double variance, double faster, double part[3][6]
     part[2][j] = sqrt(variance * bias / whole);
 }
 
-/* The error of one motion. features: GPVO_N_FEATURES values in the order above, NAN where missing. geometry: 6x6
- * covariance by the model's geometric method for the correlations, or NULL. dt_s: duration of the motion; what is none, such as
- * 0, means the training's. Never fails; uses no heap and no state. */
+/* The error of one motion that was measured. One that odometry lost, or that no vehicle can make, is a guess whose error is
+ * far larger than this says, as it depends on how fast the vehicle was: leave it out. features: GPVO_N_FEATURES values in the
+ * order above, NAN where missing. geometry: 6x6 covariance by the model's geometric method for the correlations, or NULL. dt_s:
+ * duration of the motion; what is none, such as 0, means the training's. Never fails; uses no heap and no state. */
 static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
     double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], ratio[6], spread[6], base[6], plain[6], R[3][36], part[3][6], limit[2], distance, outside, growth;
     double duration = dt_s >= GPVO_SHORTEST_S && dt_s <= GPVO_LONGEST_S ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);

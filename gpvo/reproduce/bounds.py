@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from gpvo.accumulation import along
 from gpvo.dataset.build import build_run, observe, predictions_of
 from gpvo.dataset.errors import interpolate_truth
-from gpvo.evaluation.statements import corrected, plain_statement, predicted_statement, where_stated
+from gpvo.evaluation.statements import corrected, plain_statement, predicted_statement
 from gpvo.files import write_arrays
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import position_in_world, variances
+from gpvo.geometry.covariance import position_in_world, variances, where_stated
 from gpvo.io.run import Run, read_run
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online.features import THESIS

@@ -114,7 +114,7 @@ def crps_gaussian(error: Array, sigma: Array) -> Array:
 def energy_score(error: Array, covariance: Array, *, draws: int = 256, seed: int = 0) -> Array:
     """``E|X - e| - E|X - X'| / 2`` for X, X' ~ N(0, C): the CRPS of vectors, in the error's unit. (..., d) -> (...).
 
-    By antithetic draws, the same for all rows. A statement of C = 0 scores the length of the error.
+    By antithetic draws, the same for all rows.
     """
     error, covariance = _checked(error, covariance)
     d = error.shape[-1]

@@ -82,6 +82,12 @@ def test_orthonormalise_gives_back_a_rotation():
     np.testing.assert_allclose(mended, POSES, atol=1e-3)
 
 
+@pytest.mark.parametrize("wrong", [np.diag([1.0, -1.0, 1.0, 1.0]), -np.eye(4), POSES[0].T, np.diag([1.0, 1, 1, 0])])
+def test_mirror_images_and_transposed_poses_are_not_rigid(wrong):
+    assert all(se3.is_rigid(T, 100.0) for T in POSES)
+    assert not se3.is_rigid(wrong, 100.0)
+
+
 def test_transform_moves_points():
     points = np.random.default_rng(5).normal(size=(7, 3))
     expected = (POSES[0] @ np.column_stack([points, np.ones(7)]).T).T[:, :3]

@@ -31,3 +31,8 @@ def test_missing_or_misshapen_arrays_are_refused() -> None:
     ):
         with pytest.raises(ModelError, match=r"'thesis\.0\..*' has shape"):
             check_arrays(arrays | {f"thesis.0.{name}": values})
+
+
+def test_a_model_without_any_spread_is_refused() -> None:
+    with pytest.raises(ModelError, match="thesis.scale"):
+        check_arrays({"thesis.scale": np.zeros(3)})

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from gpvo.cli import app
 from gpvo.cli.learn import _print_table, _train
-from gpvo.dataset.build import build, build_run
+from gpvo.dataset.build import TrainingSet, build, build_run
 from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import open_source
 from gpvo.io.run import read_run, write_run
 from gpvo.learning import train as training
@@ -594,6 +595,16 @@ def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path:
             save_model(_of_three(), path)
 
 
+def test_windows_of_path_take_as_long_as_the_vehicle_is_slow() -> None:
+    """Their durations are no rate of frames, which a flight could match or miss."""
+    runs = [make_run(seed, n=150, speed=speed) for seed, speed in enumerate((1.0, 1.0, 2.5))]
+    sets = [build(*run, name=str(k), target="length:1m") for k, run in enumerate(runs)]
+    trained = train_sets(sets, replace(QUICK, target="length:1m"), judge=False)
+    card = model_card(trained.header, trained.table, "m.gpvo")
+    assert "length:1m (length:1m)\n" in card
+    assert "frames/s" not in card
+
+
 @pytest.mark.parametrize("axes", [[5], [2, 3, 4], [0, 1, 2, 3, 4, 5]])
 def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int]) -> None:
     """A robot in a plane: its height, roll and pitch are zero in both."""
@@ -617,3 +628,57 @@ def test_a_flight_that_begins_at_rest_is_learned_from() -> None:
     )
     assert np.isfinite(sigma).all()
     assert (np.median(sigma[80:], axis=0) < 3.0 * np.median(usual[80:], axis=0)).all()
+
+
+@pytest.mark.parametrize("rest", [slice(0, 80), slice(120, 240)])
+def test_a_flight_that_rests_is_learned_from_and_judged(rest: slice) -> None:
+    """At rest, neither odometry nor truth moves at all."""
+    (s,) = training_sets([1], n=240)
+    X, Y = s.X.copy(), s.Y.copy()
+    X[rest, [[s.columns.index(name)] for name in TWIST_COLUMNS]] = 0.0
+    Y[rest] = 0.0
+    trained = train_sets([replace(s, X=X, Y=Y)], QUICK)
+    assert len(trained.table["folds"]) == training.JUDGED_BLOCKS
+    assert trained.predictor().model.factor.max() < 10.0
+
+
+def test_a_robot_in_a_plane_and_one_that_is_not_have_a_model_each() -> None:
+    first, *others = training_sets(range(4), n=120)
+    flat = [replace(s, Y=np.where(np.isin(np.arange(6), [1, 3, 5]), 0.0, s.Y)) for s in others]
+    with pytest.raises(GpvoError, match="never differ in y, rx, rz .* but those of 'flight0' do"):
+        train_sets([first, *flat], QUICK)
+
+
+def test_covariances_that_call_some_error_impossible_are_not_held_against_errors() -> None:
+    """Axes that a lever arm ties together: a run folder may hold such, as they are semidefinite."""
+    sets = training_sets(range(3), n=120)
+    for s in sets:
+        C = s.covariances["pointing_matching"]
+        sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+        C[:60] = sigma[:60, :, None] * sigma[:60, None, :]
+    assert are_positive_definite(sets[0].covariances["pointing_matching"]).all()
+    mean = train_sets(sets, QUICK).table["mean"]
+    assert 0.5 < mean["pointing_matching_scaled"]["nees_dof"]["joint"] < 2.0
+
+
+def _stated_smaller(s: TrainingSet, factor: float) -> TrainingSet:
+    columns = [k for k, name in enumerate(s.columns) if name.startswith("ln_var_pointing_matching")]
+    X = s.X.copy()
+    X[:, columns] += np.log(factor)
+    return replace(s, X=X, covariances={m: C * factor for m, C in s.covariances.items()})
+
+
+def test_however_little_odometry_states_the_model_can_be_loaded(tmp_path: Path) -> None:
+    sets = training_sets(range(3), n=120)
+    trained = train_sets([_stated_smaller(s, 1e-20) for s in sets], QUICK, judge=False)
+    save_model(trained, tmp_path / "m.gpvo")
+    plain = train_sets(sets, QUICK, judge=False)
+    assert trained.header["choices"]["base"] == "pointing_matching"
+    of_small = training.estimate_set(Predictor.load(tmp_path / "m.gpvo").model, _stated_smaller(sets[0], 1e-20))
+    np.testing.assert_allclose(of_small.sigma, training.estimate_set(plain.predictor().model, sets[0]).sigma, rtol=1e-6)
+
+
+def test_a_model_that_could_not_be_loaded_is_not_made() -> None:
+    sets = training_sets(range(4), n=120)
+    with pytest.raises(GpvoError, match="differ so much from run to run.*factor'"):
+        train_sets([replace(s, Y=s.Y * scale) for s, scale in zip(sets, (1.0, 1.0, 1e6, 1e6))], QUICK, judge=False)

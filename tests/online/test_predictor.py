@@ -15,6 +15,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.division import divide, ln_faster
+from gpvo.online.observer import joined
 from gpvo.online.predictor import Predictor
 from gpvo.types import Status, VoLog
 from small_model import small_model, training_sets
@@ -354,3 +355,10 @@ def test_errors_add_up_at_rest_as_at_the_typical_speed_and_faster_above():
     np.testing.assert_allclose(white[:3], 0.3)
     np.testing.assert_allclose(white[3], 0.9 / 1.8)
     assert ln_faster(np.full((1, 3), np.nan), [0.0]) == 0.0
+
+
+def test_a_window_knows_a_count_if_all_its_motions_do(flight):
+    motions = flight[0].records[1:4]
+    counts = [r.n_inliers for r in motions]
+    assert joined(motions).n_inliers == sum(counts) // 3
+    assert joined([replace(motions[0], n_inliers=-1), *motions[1:]]).n_inliers == -1
