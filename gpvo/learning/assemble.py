@@ -110,7 +110,8 @@ class _Residuals:
         and the errors that remain without it."""
         if self.patterns is None:
             return None, self.variance, self.rows.error
-        twist, root, rest = self.rows.select(TWIST_COLUMNS), np.empty((len(self.fold), 6, 6)), self.variance.copy()
+        twist = self.rows.select(TWIST_COLUMNS) * self.rows.steps[:, None]
+        root, rest = np.empty((len(self.fold), 6, 6)), self.variance.copy()
         for k, patterns in enumerate(self.patterns.without):
             of = self.fold == k
             root[of], rest[of] = of_calibration(self.variance[of], patterns, twist[of])
@@ -133,10 +134,11 @@ class _Divided:
     def split(self, of: _Residuals) -> tuple[Array, ...]:
         """Covariances (n, 6, 6) of jitter and white noise, and the root (n, 6, 12) of bias and calibration, by what the
         other flights show."""
-        twist, out = of.rows.select(TWIST_COLUMNS), tuple(np.empty((len(of.fold), 6, k)) for k in (6, 6, 12))
+        twist, steps = of.rows.select(TWIST_COLUMNS), of.rows.steps
+        out = tuple(np.empty((len(of.fold), 6, k)) for k in (6, 6, 12))
         for k, division in enumerate(self.without):
             i = of.fold == k
-            e = division.split(of.variance[i], twist[i], None if of.geometry is None else of.geometry[i])
+            e = division.split(of.variance[i], twist[i], None if of.geometry is None else of.geometry[i], steps[i])
             for every, part in zip(out, (e.jitter, e.white, e.persistent_root)):
                 every[i] = part
         return out

@@ -42,7 +42,7 @@ class Patterns:
 def learn_patterns(rows: Rows, error: Array, variance: Array, fold: NDArray[np.int64]) -> Patterns | None:
     """From errors (n, 6) of a stated variance (n, 6), in folds (n,) of whole flights; None from fewer than four
     flights, or where no velocity is clear of VO's own error of it."""
-    twist = np.nan_to_num(rows.select(TWIST_COLUMNS))
+    twist = np.nan_to_num(rows.select(TWIST_COLUMNS)) * rows.steps[:, None]
     flights = [_sums(*x) for x in zip(*(rows.chains(v) for v in (error, variance, twist)))]
     flown = [f for f in flights if len(f.error)]
     clear = _clear(flown, rows.step_s) if len(flown) >= _LEAST_FLIGHTS else np.zeros(_D, dtype=bool)

@@ -50,6 +50,11 @@ class Rows:
         """(n, d) values of the named features."""
         return np.concatenate([s.select(names) for s in self.sets])
 
+    @property
+    def steps(self) -> Array:
+        """(n,) durations in usual ones."""
+        return self.dt_s / self.step_s
+
     def motions(self) -> Array:
         """(n, 4, 4) VO's motions ``T_prev_cur``; the identity where the velocity is unknown."""
         twist = self.select(TWIST_COLUMNS) * self.dt_s[:, None]

@@ -44,15 +44,16 @@ class Division(Stored):
         """(12,) time constants of the bias and of errors of calibration."""
         return np.concatenate([self.bias_tau_s, self.calibration_tau_s])
 
-    def split(self, variance: Array, twist: Array, geometry: Array | None) -> MotionError:
+    def split(self, variance: Array, twist: Array, geometry: Array | None, steps: Array) -> MotionError:
         """The errors of motions by their parts, without a mean, from variances (n, 6).
 
-        ``twist`` (n, 6): velocities. ``geometry`` (n, 6, 6): covariances, NaN where unknown. Pixel noise, which is
-        jitter and white, is correlated as the geometry says; the bias has its own pattern.
+        ``twist`` (n, 6): velocities. ``geometry`` (n, 6, 6): covariances, NaN where unknown. ``steps`` (n,): how long the
+        motions took, in usual durations. Pixel noise, which is jitter and white, is correlated as the geometry says;
+        the bias has its own pattern.
         """
         root, rest = np.zeros((len(variance), 6, 6)), variance
         if self._calibrated:
-            root, rest = of_calibration(variance, self.calibration_patterns, twist)
+            root, rest = of_calibration(variance, self.calibration_patterns, twist * steps[:, None])
         share = divide(self.share, self.growth, np.log(rest) - self.level, ln_faster(twist[:, :3], self.ln_speed))
         sigma = np.sqrt(share * rest[:, None, :])
         noise = self._correlations(len(variance), geometry) * sigma[:, :2, :, None] * sigma[:, :2, None, :]
@@ -105,8 +106,8 @@ def of_calibration(variance: Array, patterns: Array, twist: Array) -> tuple[Arra
 
     A wrong baseline, focal length or rectification makes errors that are linear in the motion and reverse with it: a
     scale that is 1 % off adds on the way out what it takes back on the way home. Each of ``patterns`` (P, D, 6) is one
-    way to be wrong, by its usual amount: the error of a motion at unit velocities. ``twist`` (n, 6) [m/s, rad/s];
-    unknown ones contribute nothing. However fast the motion, a millionth of the variance is left.
+    way to be wrong, by its usual amount: the error of a motion of the usual duration at unit velocities. ``twist`` (n, 6)
+    [m/s, rad/s]: velocities, times the duration over the usual one; unknown ones contribute nothing. However fast the motion, a millionth of the variance is left.
     """
     P, D, _ = patterns.shape
     known = np.where(np.isfinite(twist), twist, 0.0)

@@ -88,7 +88,7 @@ class ErrorModel(Stored):
         place = self._locate(X, base, duration)
         known, total = self._variances(place, base, plain)
         variance = within(total * self.factor, self.velocities.largest_error_var(columns[:, :6], duration))
-        stated = self.division.split(variance, self.twist(X), geometry)
+        stated = self.division.split(variance, self.twist(X), geometry, duration / self.dt_s)
         _, ln_det = np.linalg.slogdet(stated.covariance)
         # Ratio of the typical to the stated standard deviation, geometric mean over the axes.
         precision = np.minimum(np.exp((self.typical_ln_det - ln_det) / 12.0), 1.0)

@@ -231,7 +231,8 @@ def _of_calibration(g: _Graph, model: ErrorModel, variance: str) -> tuple[str, s
     """Its root (N, 6, 6) and what is left of the variance (N, 6); ``gpvo.online.division.of_calibration``."""
     v = g.take("features", positions(model.columns, model.base.columns)[:6], axis=1)
     patterns = np.transpose(model.division.calibration_patterns, (2, 1, 0)).reshape(6, 36)
-    flat = g("MatMul", g("Where", g.known(v), v, 0.0), patterns)
+    lasted = g("Mul", g("Where", g.known(v), v, 0.0), g.expand(g("Div", g.dt, model.dt_s), 1))
+    flat = g("MatMul", lasted, patterns)
     root = g("Reshape", flat, g.constant([-1, 6, 6], np.int64))
     left = g("Div", variance, g("Add", variance, g.sum(g("Mul", root, root), 2)))
     rest = g("Mul", variance, g("Max", left, LEAST_LEFT))

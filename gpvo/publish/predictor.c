@@ -169,14 +169,14 @@ static double gpvo_faster(const double *features) {
 }
 
 /* Row j of the root of what a wrong calibration makes, of a variance; returns what is left of it. */
-static double gpvo_of_calibration(const double *features, int j, double variance, double root[6]) {
-    double sum = 0.0, left;
+static double gpvo_of_calibration(const double *features, double dt_s, int j, double variance, double root[6]) {
+    double sum = 0.0, steps = dt_s / GPVO_DT_S, left;
     int i, p;
     for (p = 0; p < 6; ++p) {
         root[p] = 0.0;
         for (i = 0; i < 6; ++i) {
             double v = features[gpvo_base_column[i]];
-            if (gpvo_known(v)) root[p] += gpvo_calibration_patterns[(p * 6 + j) * 6 + i] * v;
+            if (gpvo_known(v)) root[p] += gpvo_calibration_patterns[(p * 6 + j) * 6 + i] * (v * steps);
         }
         sum += root[p] * root[p];
     }
@@ -223,7 +223,7 @@ static void gpvo_predict(const double *features, const double *geometry, double 
         total = (base[j] + outside * (plain[j] > base[j] ? plain[j] - base[j] : 0.0)) * exp(cautious) * growth;
         variance = gpvo_within(total * gpvo_factor[j], limit[j / 3]);
         out->epistemic[j] = variance * (1.0 - known / total);
-        gpvo_divide(j, gpvo_of_calibration(features, j, variance, out->calibration_root + j * 6), faster, part);
+        gpvo_divide(j, gpvo_of_calibration(features, duration, j, variance, out->calibration_root + j * 6), faster, part);
     }
     for (i = 0; i < 6; ++i)
         for (j = 0; j < 6; ++j) {
