@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo import __version__, runner
 from gpvo.dataset.build import leave_one_out
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, OutputError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run import is_finished, write_run
@@ -114,6 +114,8 @@ def attempt(run: RealRun, store: Store) -> str:
     try:
         if not is_finished(path):
             run.make(path, store)
+    except OutputError:
+        raise
     except GpvoError as error:
         return str(error)
     return ""
