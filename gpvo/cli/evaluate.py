@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
-from gpvo.cli.twin import Seed, TwinOptions, make_all, say_simulated
+from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
@@ -73,13 +73,7 @@ def evaluate(
     stated: Annotated[
         Path | None, typer.Option(help="Folder for the stated covariances of each method, as files for gpvo score.")
     ] = None,
-    twins: Annotated[
-        bool,
-        typer.Option(
-            "--twins",
-            help="Simulate each run again from its own tracks: truth for a run that has none, else a row 'twin'.",
-        ),
-    ] = False,
+    twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
     json_: Json = False,

@@ -11,7 +11,7 @@ import typer
 
 from gpvo.cli.common import is_given
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
-from gpvo.cli.twin import TwinOptions, in_place_of_runs_without_truth
+from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import outweighed_by_truth
 from gpvo.errors import GpvoError
 from gpvo.files import read_json
@@ -58,12 +58,7 @@ def train(
         Path | None,
         typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
     ] = None,
-    twins: Annotated[
-        bool,
-        typer.Option(
-            "--twins", help="For runs without ground truth, learn from their twins (needs gpvo run --keep-tracks)."
-        ),
-    ] = False,
+    twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     statements: Annotated[
         Path | None,
