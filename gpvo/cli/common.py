@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
@@ -287,3 +287,12 @@ def is_given(ctx: typer.Context, option: str) -> bool:
     """Whether the user gave an option, rather than leaving its default."""
     source = ctx.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
+
+
+def refuse_twice(paths: Iterable[Path]) -> None:
+    """Raise GpvoError for one that is given twice: it would narrow every interval, and be judged on itself in training."""
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise GpvoError("is given twice", where=path, cure="give each once: intervals count on separate ones")
+        seen.add(path.resolve())

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
 from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
@@ -157,6 +158,7 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
 
 
 def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:
+    refuse_twice(runs)
     model = judge.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     loaded = [read_run(path) for path in runs]

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, one_of, print_json, say
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
 
@@ -45,6 +46,7 @@ def fuse(
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
+    refuse_twice(runs)
     judging = twin_options.asked(ctx, twins, seed, "seed")
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))
