@@ -290,7 +290,7 @@ def is_given(ctx: typer.Context, option: str) -> bool:
 
 
 def refuse_twice(paths: Iterable[Path]) -> None:
-    """Raise GpvoError for one that is given twice: it would narrow every interval, and be judged on itself in training."""
+    """Raise GpvoError for one that is given twice: it would narrow every interval, and judge training on itself."""
     seen: set[Path] = set()
     for path in paths:
         if path.resolve() in seen:
