@@ -44,6 +44,10 @@ class SourceError(GpvoError):
     """A sequence, log or trajectory cannot be read as what it claims to be."""
 
 
+class OutputError(SourceError):
+    """A file or folder cannot be written: no right, no space, or another process is writing it."""
+
+
 class CalibrationError(GpvoError):
     """A camera or rig calibration is missing, malformed or impossible."""
 

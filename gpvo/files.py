@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import GpvoError, OutputError, SourceError
 
 try:
     import fcntl
@@ -49,7 +49,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; at the end of the block it takes its place.
 
     If the block fails, what was written is removed, and ``path`` is as it was. No two writers share a name. Raises
-    SourceError, naming ``path``, where the block or the replacement raises OSError: no folder, no right, no space.
+    OutputError, naming ``path``, where the block or the replacement raises OSError: no folder, no right, no space.
     """
     temporary: Path | None = None
     try:
@@ -64,7 +64,7 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
             reason = error.strerror or (str(error).splitlines() or ["the disk refuses"])[-1]
-            raise SourceError(f"cannot be written: {reason}", where=path) from None
+            raise OutputError(f"cannot be written: {reason}", where=path) from None
         raise
 
 
@@ -74,10 +74,19 @@ def _umask() -> int:
     return mask
 
 
+def make_folder(path: Path) -> Path:
+    """The folder, made with those above it where it is missing. Raises OutputError where it cannot be made."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", where=path) from None
+    return path
+
+
 def is_writable(path: Path) -> bool:
     """Whether a file can be made under this name, whose folder is made."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(OutputError):
+        make_folder(path.parent)
     return path.parent.is_dir() and os.access(path.parent, os.W_OK)
 
 
@@ -89,7 +98,7 @@ def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write named arrays as a packed ``.npz`` whole or not at all, in a folder made on the way."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with replacing(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
@@ -97,21 +106,24 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 class FolderLock:
     """Held from its making to :meth:`release`, or to the end of the process, however that comes.
 
-    ``path``: the folder, or with ``create`` a file that stands for ``where``. Raises SourceError where another process,
-    or another writer of this one, holds it.
+    ``path``: the folder, or with ``create`` a file that stands for ``where``. Raises OutputError where another process,
+    or another writer of this one, holds it, or it cannot be opened.
     """
 
     def __init__(self, path: Path, *, create: bool = False, where: Path | None = None) -> None:
         self._handle = -1
         if fcntl is None:
             return
-        self._handle = os.open(path, os.O_RDWR | os.O_CREAT if create else os.O_RDONLY)
+        try:
+            self._handle = os.open(path, os.O_RDWR | os.O_CREAT if create else os.O_RDONLY)
+        except OSError as error:
+            raise OutputError(f"cannot be written: {error.strerror}", where=where or path) from None
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self.release()
             cure = "wait for it, or choose another folder with -o"
-            raise SourceError("is being written by another process", where=where or path, cure=cure) from None
+            raise OutputError("is being written by another process", where=where or path, cure=cure) from None
 
     def release(self) -> None:
         """Let others write; a second time does nothing."""

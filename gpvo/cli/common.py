@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
@@ -139,8 +139,16 @@ Kind = Annotated[str | None, typer.Option("--source", help="Format of the sequen
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
 
 
-class _OfSource:
-    """Options that go to :func:`gpvo.io.open_source`."""
+@dataclass(frozen=True)
+class ViewOptions:
+    """How images are rectified: options that go to :func:`gpvo.io.open_source`."""
+
+    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")] = None
+    size: Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")] = None
+    mask_left: Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")] = (
+        None
+    )
+    mask_right: Annotated[Path | None, typer.Option(help="The same for the right lens.")] = None
 
     def given(self) -> dict[str, Any]:
         """Those that were given, parsed. Raises GpvoError if a size is not WIDTHxHEIGHT."""
@@ -153,8 +161,8 @@ class _OfSource:
 
 
 @dataclass(frozen=True)
-class PairOptions(_OfSource):
-    """What makes the stereo pairs of a sequence."""
+class SequenceOptions(ViewOptions):
+    """How a sequence is read."""
 
     calibration: Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")] = None
     tolerance_s: Annotated[
@@ -163,24 +171,6 @@ class PairOptions(_OfSource):
     ] = None
     left_topic: Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")] = None
     right_topic: Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")] = None
-
-
-@dataclass(frozen=True)
-class ViewOptions(_OfSource):
-    """How images are rectified."""
-
-    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")] = None
-    size: Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")] = None
-    mask_left: Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")] = (
-        None
-    )
-    mask_right: Annotated[Path | None, typer.Option(help="The same for the right lens.")] = None
-
-
-@dataclass(frozen=True)
-class SequenceOptions(ViewOptions, PairOptions):
-    """How a sequence is read."""
-
     bits: Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")] = None
     rate_hz: Annotated[
         float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")
@@ -297,3 +287,12 @@ def is_given(ctx: typer.Context, option: str) -> bool:
     """Whether the user gave an option, rather than leaving its default."""
     source = ctx.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
+
+
+def refuse_twice(paths: Iterable[Path]) -> None:
+    """Raise GpvoError for one that is given twice: it would narrow every interval, and judge training on itself."""
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise GpvoError("is given twice", where=path, cure="give each once: intervals count on separate ones")
+        seen.add(path.resolve())

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
-from gpvo.cli.twin import Seed, TwinOptions, make_all, say_simulated
+from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
@@ -73,13 +74,7 @@ def evaluate(
     stated: Annotated[
         Path | None, typer.Option(help="Folder for the stated covariances of each method, as files for gpvo score.")
     ] = None,
-    twins: Annotated[
-        bool,
-        typer.Option(
-            "--twins",
-            help="Simulate each run again from its own tracks: truth for a run that has none, else a row 'twin'.",
-        ),
-    ] = False,
+    twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
     json_: Json = False,
@@ -163,6 +158,7 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
 
 
 def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor | None]:
+    refuse_twice(runs)
     model = judge.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
     loaded = [read_run(path) for path in runs]

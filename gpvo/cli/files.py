@@ -136,14 +136,14 @@ def _frame(log: ForeignLog) -> str:
 def info(
     path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
     kind: options.Kind = None,
-    pairs: options.PairOptions = options.PairOptions(),
+    reading: options.SequenceOptions = options.SequenceOptions(),
     json_: Json = False,
 ) -> None:
     """Describe a file or folder.
 
     Example: gpvo info MH_01_easy/
     """
-    document = plain(describe(path, kind, pairs.given()))
+    document = plain(describe(path, kind, reading.given()))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:

@@ -10,8 +10,9 @@ from typing import Annotated
 
 import typer
 
+from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, one_of, print_json, say
-from gpvo.cli.twin import Seed, TwinOptions, in_place_of_runs_without_truth, say_simulated
+from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
 
 
 def fuse(
@@ -28,10 +29,7 @@ def fuse(
         str, typer.Option(help="What to do with a measurement beyond 3 sigma: discard or inflate.")
     ] = "discard",
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
-    twins: Annotated[
-        bool,
-        typer.Option("--twins", help="For runs without ground truth, use twins: simulated again from their tracks."),
-    ] = False,
+    twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
     plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
@@ -48,6 +46,7 @@ def fuse(
     from gpvo.filters.run import FuseOptions
     from gpvo.filters.study import table
 
+    refuse_twice(runs)
     judging = twin_options.asked(ctx, twins, seed, "seed")
     one_of("--init", init, ("truth", "static"))
     one_of("--gate", gate, ("discard", "inflate"))

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.common import is_given
+from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
-from gpvo.cli.twin import TwinOptions, in_place_of_runs_without_truth
+from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import outweighed_by_truth
 from gpvo.errors import GpvoError
 from gpvo.files import read_json
@@ -58,12 +58,7 @@ def train(
         Path | None,
         typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
     ] = None,
-    twins: Annotated[
-        bool,
-        typer.Option(
-            "--twins", help="For runs without ground truth, learn from their twins (needs gpvo run --keep-tracks)."
-        ),
-    ] = False,
+    twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     statements: Annotated[
         Path | None,
@@ -152,7 +147,7 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
-    _refuse_twice(paths)
+    refuse_twice(paths)
     if config.regressor != "auto" and config.target != "position":
         note("gpvo: --regressor applies only to --target position; the log-variance GP is always sparse")
     if update is not None and config.target == "position":
@@ -173,15 +168,6 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_
     from gpvo.learning.train import train as train_model
 
     return train_model(runs, config, on_fit=on_fit)
-
-
-def _refuse_twice(paths: list[Path]) -> None:
-    """A run that is left out must not be among those learned from."""
-    seen: set[Path] = set()
-    for path in paths:
-        if path.resolve() in seen:
-            raise GpvoError("is given twice, so it would be judged on itself", where=path, cure="give each run once")
-        seen.add(path.resolve())
 
 
 def _train_file(paths: list[Path], config: TrainConfig, update: Path | None, on_fit: OnFit) -> TrainedModel:

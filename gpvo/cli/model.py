@@ -12,7 +12,7 @@ import typer
 
 from gpvo.cli.output import Json, new_table, print_json, say, show
 from gpvo.errors import GpvoError
-from gpvo.files import replacing, write_csv
+from gpvo.files import make_folder, replacing, write_csv
 from gpvo.io.parquet import write_table
 from gpvo.io.run import read_run, write_predictions
 from gpvo.io.run_folder import FILES
@@ -52,7 +52,7 @@ def predict(
         target = out if len(runs) == 1 else out / f"{name}.parquet"
         if target.exists() and target.name in FILES and target.name != "predictions.parquet":
             raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         write_predictions(target, predictions)
         documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
     if json_:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
 from gpvo.cli.output import Json, cell, new_table, print_json, say, show
 from gpvo.errors import GpvoError
@@ -37,6 +38,7 @@ def score(
     from gpvo.evaluation.score import board, on_other_axes, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
 
+    refuse_twice(stated)
     truth = truth or []
     options = JudgeOptions(truth_sigma=truth_sigma).options()
     if len(stated) == 1 and stated[0].is_dir() and not truth:

@@ -63,6 +63,14 @@ class TwinOptions:
         return None
 
 
+Twins = Annotated[
+    bool,
+    typer.Option(
+        "--twins",
+        help="For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run"
+        " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
+    ),
+]
 Seed = Annotated[
     int,
     typer.Option(

@@ -15,7 +15,7 @@ from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 from gpvo.types import Array, VoLog, VoRecord
 
-_RATE = 0.2
+_RATE, _ROWS = 0.2, 8
 ENOUGH_INSIDE = 0.8
 """A model fits a run if at least this share of its frames lies in the training domain; in a vehicle's next flight of
 the same kind, a tenth may lie outside."""
@@ -45,6 +45,8 @@ def check(predictor: Predictor, run: Run) -> Check:
     if any(s.get("of") == twin.get("of") and s.get("seed") == twin.get("seed") for s in known if twin):
         problems.append(f"it learned from these very twins of {twin['of']}: judge it by others, with another --seed")
     records, X = observe(run.log, predictor.features, predictor.target)
+    if not twin and _learned_from(predictor, X):
+        problems.append("it learned from this very run, which says nothing about others: judge it by another")
     seen = VoLog(records)
     X = X[seen.usable]
     missing = [n for n, lacks in zip(predictor.features, _mean(~np.isfinite(X))) if lacks > 0.5]
@@ -57,6 +59,17 @@ def check(predictor: Predictor, run: Run) -> Check:
     if inside < ENOUGH_INSIDE:
         problems.append(f"only {100 * inside:.0f} % of the frames lie inside the training domain")
     return Check(len(run.log), len(X), inside, farthest, tuple(problems))
+
+
+def _learned_from(predictor: Predictor, X: Array) -> bool:
+    """Whether most rows that the model file keeps of one of its training sequences are among these features (N, d)."""
+    kept, sequence = predictor.arrays.get("sample.X"), predictor.arrays.get("sample.sequence")
+    if kept is None or sequence is None:  # an older file
+        return False
+    here, there = ({row.tobytes() for row in np.nan_to_num(rows).astype(np.float32)} for rows in (X, kept))
+    known = np.array([row.tobytes() in here for row in np.nan_to_num(kept)])
+    enough = len(here & there) >= _ROWS  # a vehicle at rest has the same few rows in every run
+    return enough and any(known[sequence == s].mean() > 0.5 for s in np.unique(sequence))
 
 
 def _mean(rows: NDArray[Any]) -> Array:

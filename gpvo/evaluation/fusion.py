@@ -15,7 +15,7 @@ from gpvo.dataset.check import check
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
 from gpvo.evaluation.flights import constants_in, constants_of, flight_of, start_sigmas
-from gpvo.files import write_text
+from gpvo.files import make_folder, write_text
 from gpvo.filters.measurement import chi2_quantile
 from gpvo.filters.metrics import Scores
 from gpvo.filters.policies import CONSTANT_BEST, CONSTANT_HINDSIGHT, LEARNED, POLICIES, STATED
@@ -204,10 +204,7 @@ def write_log(path: Path, fused: FusedRun) -> None:
             sigma = np.sqrt(np.diagonal(step.innovation.S[0]))
             values = [step.innovation.nis[0], *step.innovation.residual[0], *sigma]
         lines.append(",".join([str(step.t_ns), step.outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
+    make_folder(path.parent)
     write_text(path, "\n".join(lines) + "\n", "ascii")
 
 

@@ -116,14 +116,16 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     t0 = flight.records[k].t_ns
     if options.init == "static":
         if flight.imu is None:
-            raise GpvoError("a static start needs an IMU", where=flight.name, cure="use --init truth")
+            cure = "use --init truth" if flight.has_truth else "use --twins"
+            raise GpvoError("a static start needs an IMU", where=flight.name, cure=cure)
         rest = from_rest(flight.imu, t0, options.sigmas)
         if not flight.has_truth:
             return rest, None
         T, up = flight.T_world_imu[k], rest.nominal.R_world_imu[0, 2]
         return from_rest(flight.imu, t0, options.sigmas, yaw_rad=heading(T[:3, :3], up), position=T[:3, 3]), None
     if not flight.has_truth:
-        raise GpvoError("--init truth needs ground truth for the frames", where=flight.name, cure="use --init static")
+        cure = "use --twins" if flight.imu is None else "use --twins or --init static"
+        raise GpvoError("--init truth needs ground truth for the frames", where=flight.name, cure=cure)
     valid = np.flatnonzero(flight.known)
     if len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gpvo.errors import SourceError
-from gpvo.files import FolderLock, read_json
+from gpvo.errors import OutputError, SourceError
+from gpvo.files import FolderLock, make_folder, read_json
 from gpvo.io import run_table
 from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
 from gpvo.io.run_read import check_log
@@ -71,11 +71,7 @@ def claim(path: Path) -> FolderLock:
     """Make the folder, for one writer."""
     if path.exists() and not path.is_dir():
         raise SourceError("is a file, not a folder for a run", where=path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        return FolderLock(path)
-    except OSError as error:
-        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
+    return FolderLock(make_folder(path))
 
 
 def put_in_place(new: Path, target: Path) -> None:
@@ -86,14 +82,14 @@ def put_in_place(new: Path, target: Path) -> None:
         os.replace(target, old)
         os.replace(new, target)
     except OSError as error:
-        raise SourceError(f"cannot be replaced: {error.strerror}; run the command again", where=target) from None
+        raise OutputError(f"cannot be replaced: {error.strerror}; run the command again", where=target) from None
     shutil.rmtree(old, ignore_errors=True)
 
 
 def prepare(path: Path, *, keep_chunks: bool) -> None:
     """Make the folder; clear an older run of exactly the files that a run has."""
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        make_folder(path)
         unfinished = [p for p in path.iterdir() if p.name.startswith(".") and p.name.endswith(".part")]
         present = {p.name for p in path.iterdir()} - {p.name for p in unfinished}
         if present and "run.json" not in present:
@@ -103,7 +99,7 @@ def prepare(path: Path, *, keep_chunks: bool) -> None:
         for file in (*unfinished, *(path / name for name in _OWN)):
             file.unlink(missing_ok=True)
     except OSError as error:
-        raise SourceError(f"cannot be written: {error.strerror}", where=path) from None
+        raise OutputError(f"cannot be written: {error.strerror}", where=path) from None
 
 
 def write_truth(path: Path, truth: TruthLog) -> None:

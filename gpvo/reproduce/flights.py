@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpvo import __version__, runner
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, OutputError
 from gpvo.files import write_text
 from gpvo.io import open_source
 from gpvo.io.run import is_finished
@@ -92,7 +92,10 @@ class Flown:
 
 
 def fly(flight: Flight, store: Store) -> Flown:
-    """Simulate and run odometry, as far as that is not done yet. What goes wrong comes back as ``error``."""
+    """Simulate and run odometry, as far as not done yet; a path that no vehicle can fly comes back as ``error``.
+
+    Raises OutputError where a folder cannot be written: the disk is full, or workers of a killed reproduction live on.
+    """
     pairs = {preset: sigma_pairs(flight.set_name, preset) for preset in flight.presets}
     runs = {p: store.folder("runs") / f"{flight.name}-{p}-{digest_of(pairs[p])[:4]}" for p in flight.presets}
     missing = {preset: path for preset, path in runs.items() if not is_finished(path)}
@@ -100,11 +103,12 @@ def fly(flight: Flight, store: Store) -> Flown:
     try:
         if missing:
             simulate(flight.scenario, flight.seed, sequence, points=flight.mode == "points")
-        for preset, path in missing.items():
-            runner.run(open_source(sequence), path, make_config(preset, sigma_pairs_px=pairs[preset]))
+    except OutputError:
+        raise
     except GpvoError as error:
-        # One path that no vehicle can fly does not stop the others.
         return Flown(flight, {}, str(error))
+    for preset, path in missing.items():
+        runner.run(open_source(sequence), path, make_config(preset, sigma_pairs_px=pairs[preset]))
     if sequence.is_dir():
         shutil.rmtree(sequence, ignore_errors=True)
     sequence.unlink(missing_ok=True)

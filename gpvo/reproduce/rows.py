@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpvo import __version__, runner
 from gpvo.dataset.build import leave_one_out
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, OutputError
 from gpvo.io import open_source
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run import is_finished, write_run
@@ -27,6 +27,7 @@ from gpvo.reproduce.bounds import Bounds, BoundsJob, job_of, load_bounds, method
 from gpvo.reproduce.experiments import EXPERIMENTS, WAYS, Experiment, Mode, Plan, Way, printed
 from gpvo.reproduce.flights import Flights
 from gpvo.reproduce.stages import Store, Workers, digest_of, digest_of_file
+from gpvo.stats.series import bootstrap_over
 from gpvo.types import Array, TruthLog, VoLog
 from gpvo.vo.config import make_config
 
@@ -34,7 +35,6 @@ _PAIR_PX = (0.1, 0.5)
 RATIO = (0.7, 1.5)
 MAGNITUDE_BELOW, VECTOR_UP_TO = 0.7, 1.0
 _RESIDUAL_TABLES = ("4.3", "4.6")
-_DRAWS = 4000
 
 Interval = tuple[float, float]
 
@@ -114,6 +114,8 @@ def attempt(run: RealRun, store: Store) -> str:
     try:
         if not is_finished(path):
             run.make(path, store)
+    except OutputError:
+        raise
     except GpvoError as error:
         return str(error)
     return ""
@@ -244,10 +246,8 @@ def pooled(above: Array, below: Array) -> tuple[float, Interval | None]:
 
 def over_seeds(seeds: int, statistic: Callable[[NDArray[np.int64]], Array]) -> Interval | None:
     """95 % of a statistic (draws,) of drawn seeds (draws, seeds), by a bootstrap; None with fewer than three."""
-    if seeds < 3:
-        return None
-    low, high = np.quantile(statistic(np.random.default_rng(0).integers(0, seeds, (_DRAWS, seeds))), [0.025, 0.975])
-    return float(low), float(high)
+    found = bootstrap_over(seeds, statistic)
+    return (found.low, found.high) if seeds > 2 else None
 
 
 def scored(cells: Sequence[Cell], store: Store) -> list[dict[str, Any]]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from gpvo.errors import GpvoError, SourceError
-from gpvo.files import FolderLock, plain
+from gpvo.errors import GpvoError, OutputError
+from gpvo.files import FolderLock, make_folder, plain
 from gpvo.parallel import map_jobs
 
 Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
@@ -38,12 +38,7 @@ class Store:
 
     def folder(self, kind: str) -> Path:
         """The folder of one stage, made on first use."""
-        path = self.root / "stages" / kind
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise GpvoError(f"cannot be written: {error.strerror}", where=path) from None
-        return path
+        return make_folder(self.root / "stages" / kind)
 
 
 class Stage(Protocol):
@@ -95,7 +90,7 @@ def only_user(root: Path) -> Iterator[None]:
     folder = Store(root).folder(".")
     try:
         lock = FolderLock(folder)
-    except SourceError:
+    except OutputError:
         raise GpvoError("another reproduction is running here", where=root, cure="give another --out") from None
     try:
         yield

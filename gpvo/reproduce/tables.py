@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gpvo.evaluation.plots import save
-from gpvo.files import markdown_table
+from gpvo.files import make_folder, markdown_table
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
@@ -146,7 +146,7 @@ def draw(cells: Sequence[Cell], studied: Studies | None, store: Store, out: Path
 
     def keep(name: str, title: str, figure: Figure) -> None:
         path = out / "figures" / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         save(figure, path, dpi=100, metadata={"Software": None})
         drawn.append({"file": f"figures/{name}.png", "title": title})
 

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rig import StereoRig
-from gpvo.errors import GpvoError
-from gpvo.files import FolderLock, to_toml, write_json
+from gpvo.errors import GpvoError, OutputError
+from gpvo.files import FolderLock, make_folder, to_toml, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import path_length_m
 from gpvo.io.images import read_grey8
@@ -83,7 +83,7 @@ def simulate(
             os.replace(part, target)
         except OSError as error:
             cure = "free some space and run again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else None
-            raise GpvoError(f"cannot be written: {error.strerror}", where=target, cure=cure) from None
+            raise OutputError(f"cannot be written: {error.strerror}", where=target, cure=cure) from None
         finally:
             shutil.rmtree(part, ignore_errors=True)
     return Flight(seed, target, frames, distance)
@@ -106,11 +106,8 @@ def _digests(scenario: Scenario) -> dict[str, dict[str, str]]:
 def _only_writer(target: Path) -> Iterator[None]:
     """Hold a lock beside the folder, so that two processes never fill one; it falls when the process dies."""
     file = target.with_name(target.name + ".lock")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        lock = FolderLock(file, create=True, where=target)
-    except OSError as error:
-        raise GpvoError(f"cannot be written: {error.strerror}", where=target) from None
+    make_folder(target.parent)
+    lock = FolderLock(file, create=True, where=target)
     try:
         yield
     finally:

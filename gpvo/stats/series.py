@@ -14,6 +14,7 @@ from statistics import NormalDist
 from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpvo.stats import student_t
 from gpvo.types import Array
@@ -157,9 +158,14 @@ def sequence_bootstrap(values: Array, *, level: float = 0.95, draws: int = 10000
     For a paired comparison pass the differences. Fewer than three sequences show no spread: (-inf, inf).
     """
     values = np.asarray(values, dtype=np.float64)
-    n = len(values)
+    return bootstrap_over(len(values), lambda pick: values[pick].mean(axis=1), level=level, draws=draws, seed=seed)
+
+
+def bootstrap_over(
+    n: int, statistic: Callable[[NDArray[np.int64]], Array], *, level: float = 0.95, draws: int = 10000, seed: int = 0
+) -> Interval:
+    """The same for any ``statistic`` (draws,) of n sequences, given the indices (draws, n) of those that were drawn."""
+    value = float(statistic(np.arange(n)[None])[0]) if n else np.nan
     if n < 3:
-        return Interval(float(values.mean()) if n else np.nan, -np.inf, np.inf)
-    rng = np.random.default_rng(seed)
-    means = values[rng.integers(0, n, (draws, n))].mean(axis=1)
-    return _expanded(float(values.mean()), means, level, n)
+        return Interval(value, -np.inf, np.inf)
+    return _expanded(value, statistic(np.random.default_rng(seed).integers(0, n, (draws, n))), level, n)

@@ -344,6 +344,18 @@ def test_pair_tolerance(gpvo, tmp_path):
     assert (code, json.loads(out)["frames"]) == (0, 12)
 
 
+def test_numbered_images_as_their_refusal_advises(gpvo, tmp_path):
+    path = seq.write_folder(tmp_path / "s")
+    for k, file in enumerate(sorted((path / "left").iterdir())):
+        (path / "right" / file.name).rename(path / "right" / f"{k:04d}.png")
+        file.rename(path / "left" / f"{k:04d}.png")
+    code, _, err = gpvo("info", path)
+    assert code == 2
+    assert "or give --rate-hz" in err
+    code, out, _ = gpvo("info", path, "--rate-hz", 10, "--json")
+    assert (code, json.loads(out)["frames"], json.loads(out)["rate_hz"]) == (0, 12, pytest.approx(10.0))
+
+
 @pytest.mark.parametrize(("term", "told"), [(0, "0.00 px remain"), (10, "--calibration-state")])
 def test_what_a_corrected_calibration_leaves(gpvo, tmp_path, term, told):
     """A shift, and a bend of fourth order, which neither a rotation nor a focal length explains."""

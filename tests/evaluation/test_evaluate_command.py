@@ -196,6 +196,14 @@ def test_bad_flags_are_one_line(capsys, run_folder):
     _assert_refused(capsys, run_folder, "--align", "sideways", says="sideways")
 
 
+@pytest.mark.parametrize("command", ["evaluate", "report", "fuse", "score"])
+def test_one_run_given_twice_is_refused(capsys, run_folder, command):
+    """Three times the same run had a mean with an interval of no width."""
+    code, out, err = _main(capsys, command, run_folder, run_folder.parent / "." / run_folder.name)
+    assert (code, out) == (2, "")
+    assert "hall: is given twice" in err
+
+
 def test_a_run_without_truth_is_one_line(capsys, run_folder, tmp_path):
     write_run(tmp_path / "blind", read_run(run_folder).log)
     _assert_refused(capsys, tmp_path / "blind", says="blind: has no ground truth")

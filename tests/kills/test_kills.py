@@ -105,6 +105,25 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_sigterm_ends_the_workers_too(tmp_path: Path) -> None:
+    """As of a service manager or a batch system: nothing goes on to write after the command has ended."""
+    call = start(*GPVO, "simulate", "tunnel-clean", "--points", "--seeds", "0..9999", "--jobs", 2, "-o", tmp_path)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(call.pid, signal.SIGTERM)
+    _, err = call.communicate(timeout=60)
+    assert (call.returncode, err) == (128 + signal.SIGTERM, b"")
+    for _ in range(100):
+        try:
+            os.killpg(call.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    os.killpg(call.pid, signal.SIGKILL)
+    pytest.fail("a worker lives on")
+
+
 @pytest.mark.slow
 def test_runs(flights: Path, tmp_path: Path) -> None:
     """Each goes on from what the last one left, of which every whole chunk can be read."""

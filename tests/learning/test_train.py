@@ -578,6 +578,10 @@ def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> No
     (told,) = (problem for problem in check(predictor, runs[2]).problems if "settings" in problem)
     assert "keyframe_parallax_px is 0.0, not 1.0" in told
     assert "self_calibration is False, not True" in told
+    # Scores on what it learned from say nothing about others: a copy under another name is known by its rows.
+    (tmp_path / "a").rename(tmp_path / "copy")
+    assert any("learned from this very run" in p for p in check(predictor, read_run(tmp_path / "copy")).problems)
+    assert not any("this very run" in problem for problem in check(predictor, runs[2]).problems)
     # Kept with the rows for --update; of settings that differ among the runs, nothing is said.
     assert [s.odometry for s in read_sets(rows_path(path))] == [s.odometry for s in sets[:2]]
     mixed = train_sets(sets, QUICK, judge=False).predictor()

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 from gpvo.cli import app
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, OutputError
+from gpvo.files import FolderLock, make_folder
 from gpvo.reproduce import tables
 from gpvo.reproduce.experiments import Plan
 from gpvo.reproduce.flights import flights_of, fly
@@ -146,6 +147,18 @@ def test_wrong_wishes_are_one_line():
 def test_two_reproductions_do_not_share_a_folder(tmp_path):
     with only_user(tmp_path), pytest.raises(GpvoError, match="another reproduction"):
         reproduce(Plan(**SMALL), tmp_path)
+
+
+def test_a_run_that_cannot_be_written_is_no_flight_that_cannot_be_flown(tmp_path):
+    """Else the tables would be of fewer flights, as while a worker of a killed reproduction still writes its run."""
+    store = Store(tmp_path)
+    flight = flights_of(Plan(**SMALL), "tunnel-training", "points", store)[0]
+    (run,) = fly(flight, store).runs.values()
+    (run / "run.json").unlink()
+    lock = FolderLock(make_folder(run))
+    with pytest.raises(OutputError, match="being written by another process"):
+        fly(flight, store)
+    lock.release()
 
 
 def test_a_flight_that_cannot_be_flown_is_told_and_does_not_stop_the_others(tmp_path):

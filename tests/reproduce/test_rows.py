@@ -43,6 +43,16 @@ def test_two_seeds_say_nothing_of_an_interval():
     assert pooled(np.ones(3), np.ones(3))[1][0] == pytest.approx(1.0)
 
 
+def test_the_interval_over_five_seeds_knows_how_few_they_are():
+    """500 sets of right statements, whose true ratio is 1: a plain bootstrap holds it in 79 %, this one in 87 %."""
+    rng, inside = np.random.default_rng(1), 0
+    for _ in range(500):
+        variance = rng.lognormal(0.0, 0.3, 5)
+        low, high = pooled(3 * variance, variance * (rng.standard_normal((5, 3)) ** 2).sum(axis=1))[1]
+        inside += low <= 1.0 <= high
+    assert 0.83 <= inside / 500 <= 0.99
+
+
 def test_expected_length_against_draws():
     rng = np.random.default_rng(3)
     mean = np.array([[0.0, 0, 0], [1, 2, 3], [0, 0, 0], [4, 0, 0]])
