@@ -47,9 +47,9 @@ class Division(Stored):
     def split(self, variance: Array, twist: Array, geometry: Array | None, steps: Array) -> MotionError:
         """The errors of motions by their parts, without a mean, from variances (n, 6).
 
-        ``twist`` (n, 6): velocities. ``geometry`` (n, 6, 6): covariances, NaN where unknown. ``steps`` (n,): how long the
-        motions took, in usual durations. Pixel noise, which is jitter and white, is correlated as the geometry says;
-        the bias has its own pattern.
+        ``twist`` (n, 6): velocities. ``geometry`` (n, 6, 6): covariances, NaN where unknown. ``steps`` (n,): durations,
+        in usual ones. Pixel noise, which is jitter and white, is correlated as the geometry says; the bias has its own
+        pattern.
         """
         root, rest = np.zeros((len(variance), 6, 6)), variance
         if self._calibrated:
@@ -106,8 +106,9 @@ def of_calibration(variance: Array, patterns: Array, twist: Array) -> tuple[Arra
 
     A wrong baseline, focal length or rectification makes errors that are linear in the motion and reverse with it: a
     scale that is 1 % off adds on the way out what it takes back on the way home. Each of ``patterns`` (P, D, 6) is one
-    way to be wrong, by its usual amount: the error of a motion of the usual duration at unit velocities. ``twist`` (n, 6)
-    [m/s, rad/s]: velocities, times the duration over the usual one; unknown ones contribute nothing. However fast the motion, a millionth of the variance is left.
+    way to be wrong, by its usual amount: the error of a motion of the usual duration at unit velocities. ``twist``
+    (n, 6) [m/s, rad/s]: velocities, times the duration over the usual one; unknown ones contribute nothing. However
+    fast the motion, a millionth of the variance is left.
     """
     P, D, _ = patterns.shape
     known = np.where(np.isfinite(twist), twist, 0.0)
