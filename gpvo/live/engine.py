@@ -28,7 +28,7 @@ from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
-from gpvo.publish.odometry import Odometry, OdometryBuilder, lift
+from gpvo.publish.odometry import Odometry, OdometryBuilder, about_zero, lift
 from gpvo.types import VEHICLES, Array, Prediction, Status, Vehicle, VoRecord
 from gpvo.vo.quality import lost_covariance
 
@@ -235,7 +235,7 @@ class Engine:
     def _of_increment(self, message: Odometry, record: VoRecord, prediction: Prediction | None) -> Odometry:
         C = record.covariances.get(self.stage.method)
         if prediction is not None:
-            C = prediction.covariance + np.outer(prediction.mean, prediction.mean)
+            C = about_zero(prediction.covariance, prediction.mean)
         if C is None:
             return message
         A = se3.adjoint(self.stage.T_body_cam)
