@@ -226,6 +226,7 @@ class Engine:
         assert self._seen_ns is not None
         away_s = max((taken.received_ns - self._seen_ns) * 1e-9, 0.0)
         self.counts["restarts"] += 1
+        builder.place(self.stage.T_body_cam)
         builder.step(lost(taken.record, away_s, _unknown(away_s, self._velocity()), self.stage.method))
 
     def _velocity(self) -> Array:

@@ -97,11 +97,15 @@ class OdometryBuilder:
 
     def __post_init__(self) -> None:
         forward = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
-        self._T_body_cam = forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64)
-        self._Ad = se3.adjoint(self._T_body_cam)
+        self.place(forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64))
+        self._T_odom_cam = self.T_odom_body @ self._T_body_cam
         self._chain: dict[int, _Chain] = {}
         self._last: tuple[_Chain, Array] | None = None  # the last good frame and its noise
         self._speed = np.zeros(6)
+
+    def place(self, T_body_cam: Array) -> None:
+        """From here on, messages are of the body on which the camera sits at ``T_body_cam`` (4, 4)."""
+        self._T_body_cam, self._Ad = T_body_cam, se3.adjoint(T_body_cam)
 
     def step(self, record: VoRecord, prediction: Prediction | None = None) -> Odometry:
         """The message of one frame.
@@ -184,7 +188,7 @@ class OdometryBuilder:
         twist: Array | None,
         twist_covariance: Array | None,
     ) -> Odometry:
-        T = self.T_odom_body @ self._T_body_cam @ chain.T_first_cam @ se3.inverse(self._T_body_cam)
+        T = self._T_odom_cam @ chain.T_first_cam @ se3.inverse(self._T_body_cam)
         status = _status(record, prediction)
         # A mean is not taken off, as the pose must not jump; so it is part of the error, and adds up along the path.
         error = about_zero(chain.error.covariance, chain.error.mean)
