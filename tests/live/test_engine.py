@@ -221,10 +221,43 @@ def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
         engine(settings)
 
 
+def _gone(way_m: float, n: int = 300) -> list[Arrival]:
+    """Straight ahead at 20 messages per second."""
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, 0, 3] = np.linspace(0.0, way_m, n)
+    return flown(10**18 + np.arange(n) * 50_000_000, T)
+
+
+def test_a_state_taken_up_under_way_is_as_unsure_as_what_was_missed_is_long(tmp_path: Path) -> None:
+    arrivals, settings = _gone(150.0), EngineSettings(state=tmp_path / "state.json")
+    before, _, _ = engine(settings)
+    for arrival in arrivals[:100]:
+        before.take(arrival)
+    before.close()
+    after, kept, _ = engine(settings)
+    after.take(arrivals[200])  # 5 s and 50 m later
+    missed_m = 150.0 * 101 / 299
+    assert missed_m / 3 < np.sqrt(kept.frames[0].pose_covariance[0, 0]) < 3 * missed_m
+
+
+def test_a_silence_after_a_lost_frame_is_at_the_speed_of_before() -> None:
+    arrivals = _gone(150.0)
+    live, kept, _ = engine()
+    for arrival in [*arrivals[:100], arrivals[130]]:
+        live.take(arrival)
+    lost = kept.frames[-1]
+    assert lost.status is Status.LOST
+    live.stage.reset()
+    live.take(arrivals[240])
+    grown = kept.frames[-1].pose_covariance - lost.pose_covariance
+    assert np.sqrt(grown[0, 0]) > 0.9 * 150.0 * 110 / 299
+
+
 @pytest.mark.parametrize("changed", [
     {"T_odom_body": 2.0 * np.eye(4)}, {"T_odom_body": np.diag([1.0, 1.0, 1.0, np.nan])},
     {"pose_covariance": -np.eye(6)}, {"pose_covariance": np.eye(6) + 2.0 * np.eye(6)[::-1]},
     {"pose_covariance": np.full((6, 6), 1e300)}, {"scale": np.zeros(6)}, {"scale": "x"}, {"resets": "x"},
+    {"twist": [1.0, np.inf, 0.0, 0.0, 0.0, 0.0]}, {"t_ns": "x"},
 ], ids=str)  # fmt: skip
 def test_a_state_that_cannot_be_is_refused_in_one_line(changed: dict, tmp_path: Path) -> None:
     good = {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6), "scale": np.ones(6)}
