@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import shutil
 import struct
+import weakref
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.geometry.se3 import rotate_covariance
+from gpvo.io.bag_reader import open_bag, stamp_ns
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
 from gpvo.live import outputs
@@ -25,6 +29,7 @@ from gpvo.live.job import LiveSettings, run_live
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import PoseStage
 from gpvo.live.stereo_stage import StereoStage
+from gpvo.publish import ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder
 from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog, VoRecord
@@ -326,6 +331,44 @@ def test_a_flight_that_is_killed_remains_in_parts(tmp_path: Path, monkeypatch: p
         again.odometry(frame)
     again.close()
     assert sorted(p.name for p in tmp_path.rglob("*.bag")) == ["1.bag", "again.bag"]
+
+
+def test_a_bag_in_parts_holds_all_in_order_whatever_its_suffix_and_memory_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outputs, "PART_S", 0.0)
+    live, kept, _ = engine()
+    for arrival in flown(*flight(n=12)):
+        live.take(arrival)
+    write, fails = ros.write_bag, [True, False]
+
+    def write_bag(*args: Any, **options: Any) -> int:
+        if fails and fails.pop(0):
+            raise GpvoError("the disk is full")
+        return write(*args, **options)
+
+    monkeypatch.setattr(ros, "write_bag", write_bag)
+    output, stamps = outputs.FileOutput(tmp_path / "OUT.BAG"), [o.t_ns for o in kept.frames[1:]]
+    (tmp_path / "OUT.BAG.parts").mkdir()
+    (tmp_path / "OUT.BAG.parts" / f"{stamps[3]}.bag").touch()  # of a process that was killed, on a clock from zero
+    frames = [replace(o) for o in kept.frames]
+    for frame in frames[:2]:
+        output.odometry(frame)
+    output._writer.submit(lambda: None).result()  # it is done
+    with pytest.raises(GpvoError, match="disk is full"):
+        output.odometry(frames[2])
+    for frame in frames[3:]:
+        output.odometry(frame)
+    output._writer.shutdown()
+    held, frame = [weakref.ref(f) for f in frames], None
+    del frames
+    assert [ref() is None for ref in held] == [k != 1 for k in range(len(held))]  # but for what could not be written
+    output.close()
+    with open_bag((tmp_path / "OUT.BAG").rename(tmp_path / "out.bag")) as reader:
+        headers = [reader.deserialize(raw, c.msgtype).header for c, _, raw in reader.messages()]
+    assert [stamp_ns(SimpleNamespace(header=h)) for h in headers] == stamps
+    assert [h.seq for h in headers] == list(range(len(stamps)))
+    assert [p.name for p in (tmp_path / "OUT.BAG.parts").iterdir()] == [f"{stamps[3]}.bag"]
 
 
 def test_status_lost_is_not_sent_but_reported() -> None:
