@@ -98,7 +98,6 @@ class Timeline:
         self._doubt: Doubt[int] = Doubt()
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
-        self._usual_ns = 0
 
     # -- inputs -----------------------------------------------------------------------------------------------
 
@@ -111,9 +110,6 @@ class Timeline:
         if self._imu_t and t_ns <= self._imu_t[-1]:
             # The clock was set back, and no record can be put among what came before.
             del self._imu_t[:], self._imu[:]
-        if self._imu_t:
-            step = t_ns - self._imu_t[-1]
-            self._usual_ns = min(self._usual_ns or step, step)
         self._imu_t.append(int(t_ns))
         self._imu.append(sample)
 
@@ -255,12 +251,16 @@ class Timeline:
         """
         last_ns = self._imu_t[i - 1] if i > 0 else start_ns
         age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
-        shortest = max(_GAP_S, _GAP_FACTOR * (self._usual_ns * 1e-9))
+        if age[1] < _GAP_S:
+            return
+        nearby = slice(max(0, i - 100), i + 100)
+        steps = np.diff(self._imu_t[nearby])
+        shortest = max(_GAP_S, _GAP_FACTOR * 1e-9 * float(np.median(steps)) if len(steps) else 0.0)
         if age[1] < shortest:
             return
         begun = age[0] if age[0] >= shortest else 0.0
         counts["imu_gaps"] += 1
-        near = np.array(self._imu[max(0, i - 100) : i + 100])
+        near = np.array(self._imu[nearby])
         spread = np.maximum(near.std(axis=0), np.abs(near[-1] - near[0]))
         dt = age[1] - begun
         grown = age[1] ** 2 - begun**2

@@ -152,6 +152,17 @@ def test_a_gap_in_the_imu_widens_the_state(flight: Flight) -> None:
     assert np.trace(broken.covariance[55, 3:6, 3:6]) > 2 * np.trace(whole.covariance[55, 3:6, 3:6])
 
 
+def test_the_jitter_of_a_slow_imus_stamps_is_no_gap() -> None:
+    flight = synthetic_flight(4, duration_s=20, rate_hz=5, imu_hz=20)
+    assert flight.imu is not None
+    t_ns = flight.imu.t_ns.copy()
+    t_ns[1:-1:7] += 42_000_000
+    steps = np.diff(t_ns)
+    assert steps.min() == 8_000_000
+    run = fuse_flight(replace(flight, imu=replace(flight.imu, t_ns=t_ns)), LearnedPolicy())[0]
+    assert "imu_gaps" not in run.counts
+
+
 def test_darkness_frozen_frames_and_bursts_do_not_diverge() -> None:
     law = ErrorLaw(burst_factor=15.0)
     for seed in range(3):
