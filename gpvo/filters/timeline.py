@@ -15,7 +15,7 @@ import numpy as np
 
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate, Innovation, Wait
-from gpvo.filters.plausible import ImuGuard
+from gpvo.filters.plausible import LONGEST_GAP_S, ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import CORE, TH, Nominal, P, V
 from gpvo.online.observer import LONGEST_STEP_S, follows
@@ -24,7 +24,7 @@ from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.
 _GAP_FACTOR, _GAP_S = 5.0, 0.05
-_LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
+_LONGEST_STEP_NS, _LONGEST_GAP_NS = round(LONGEST_STEP_S * 1e9), round(LONGEST_GAP_S * 1e9)
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,7 @@ class Timeline:
         self._newest_ns: int | None = None
         self._guard = ImuGuard()
         self._doubt: Doubt[int] = Doubt()
+        self._is_set_back = False
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
 
@@ -109,9 +110,22 @@ class Timeline:
             return
         if self._imu_t and t_ns <= self._imu_t[-1]:
             # The clock was set back, and no record can be put among what came before.
+            if self._imu_t[-1] - t_ns > _LONGEST_GAP_NS:
+                self._go_on_from(int(t_ns))
             del self._imu_t[:], self._imu[:]
         self._imu_t.append(int(t_ns))
         self._imu.append(sample)
+
+    def _go_on_from(self, t_ns: int) -> None:
+        """What the filter is at the newest sample holds, by another clock, two samples before ``t_ns``: of these the
+        first was in doubt."""
+        self.filter = self.latest()
+        self.t_ns = self._bias_ns = t_ns - 2 * int(np.diff(self._imu_t[-2:]).sum())
+        self._reference_ns = self._newest_ns = None
+        self._wait = Wait.since(self.t_ns, self.filter.batch)
+        self._history.clear()
+        self._is_set_back = True
+        self.counts["clock_set_back"] += 1
 
     def reaches(self, t_ns: int) -> bool:
         """Whether an IMU sample at or past ``t_ns`` was taken: what comes before can be interpolated."""
@@ -119,6 +133,10 @@ class Timeline:
 
     def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
         """Take one VO record; returns the steps done, more than one where later records were used again."""
+        if self._is_set_back and record.t_ns - self._imu_t[-1] > _LONGEST_GAP_NS // 2:
+            self.counts["too_late"] += 1  # by the clock of before
+            return []
+        self._is_set_back = False
         if record.t_ns <= self.t_ns and self._already_seen(record.t_ns):
             self.counts["repeated"] += 1
             return []
