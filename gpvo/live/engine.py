@@ -6,6 +6,7 @@ What it keeps in a file lets a restart continue from it.
 from __future__ import annotations
 
 import os
+import re
 import struct
 import time
 from collections import Counter, deque
@@ -286,7 +287,7 @@ class Engine:
         return out + self.stage.problems()
 
     def _warn(self, text: str) -> None:
-        kind = text.split(":")[0][:40]
+        kind = re.sub(r"\d[\d.e+]*", "", text.split(":")[0])[:40]  # the same one holds while its numbers change
         if self._now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
             self._told_s[kind] = self._now_s
             self.tell(text)

@@ -284,6 +284,15 @@ def test_a_model_of_another_camera_is_called_out_at_once_and_every_ten_seconds()
     assert sum("baseline is 0.5" in text for text in told) == 3
 
 
+def test_a_warning_whose_numbers_change_is_repeated_every_ten_seconds_as_well() -> None:
+    live, _, told = engine()
+    shares = iter(range(100))
+    live.stage.problems = lambda: [f"only {next(shares) / 3:.3g} % of the images are of {next(shares)} lines"]
+    for second in range(26):
+        live.take(Arrival("/other", None, second * 10**9))
+    assert sum("% of the images" in text for text in told) == 3
+
+
 def test_an_odometry_at_another_rate_or_outside_the_domain_is_called_out() -> None:
     stamps, T = flight(n=60)
     live, kept, told = engine()
