@@ -116,7 +116,7 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     Where truth's z is not up, gravity is measured in truth's world.
     """
     sigmas, valid = options.sigmas, np.flatnonzero(flight.known)
-    t_ns = np.array([flight.records[i].t_ns for i in valid], dtype=np.int64)
+    t_ns = np.array([flight.records[i].t_ns for i in valid.tolist()], dtype=np.int64)
     if options.init == "static":
         if flight.imu is None:
             raise GpvoError("a static start needs an IMU", where=flight.name, cure="use --init truth")
