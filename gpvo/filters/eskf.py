@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 from gpvo.accumulation import first_jitter, from_end, independent_part, persistence
 from gpvo.filters import kernels
 from gpvo.filters import measurement as me
-from gpvo.filters.measurement import BIAS, CLONE, JITTER_CUR, JITTER_REF, JOINT, KEPT, CameraOnImu, Gate, Innovation
+from gpvo.filters.measurement import (
+    BIAS,
+    CLONE,
+    CLONE_P,
+    JITTER_CUR,
+    JITTER_REF,
+    JOINT,
+    KEPT,
+    CameraOnImu,
+    Gate,
+    Innovation,
+)
 from gpvo.filters.propagation import (
     BA,
     BG,
@@ -37,6 +48,7 @@ from gpvo.filters.propagation import (
     imu_step,
     process_noise,
 )
+from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 
@@ -176,7 +188,7 @@ class ErrorStateFilter:
             again = self.correct(H, r, alone, replace(gate, on_fail="inflate"), ~stuck, consider=BIAS)
             innovation = replace(innovation, residual=again.residual, S=again.S, used=innovation.used | stuck)
         if innovation.used.any():
-            self.inject()
+            self.inject(innovation.passed)
         return innovation
 
     def correct(
@@ -244,23 +256,38 @@ class ErrorStateFilter:
         new = AP + (K @ R - AP @ kernels.transpose(H)) @ kernels.transpose(K)
         self.P = 0.5 * (new + kernels.transpose(new))
 
-    def inject(self) -> None:
-        """Move the error's mean into the estimate and carry the covariance to the new attitudes."""
+    def inject(self, passed: NDArray[np.bool_] | None = None) -> None:
+        """Move the error's mean into the estimate and carry the covariance there.
+
+        It is carried as that of the right-invariant error, of which heading and place of the whole are the same states
+        for every estimate: no measurement tells them, and with the Jacobian of the attitude alone each update would
+        seem to, and the heading's variance stop growing. A. Barrau, S. Bonnabel, "The invariant extended Kalman filter
+        as a stable observer" (2017); J. Hesch et al., "Consistency analysis and improvement of vision-aided inertial
+        navigation" (2014). Not so members that have not ``passed`` (B,) their gate: a move that the covariance does
+        not explain would widen it without end.
+        """
         dx, x = self.dx, self.x
-        E, J = kernels.exp_and_right_jacobian(dx[:, TH])
-        E_clone, J_clone = kernels.exp_and_right_jacobian(dx[:, me.CLONE_TH])
+        (E, J), (E_clone, J_clone) = (kernels.exp_and_right_jacobian(dx[:, block]) for block in (TH, me.CLONE_TH))
+        sound = np.ones(self.batch, bool) if passed is None else passed
+        G = np.broadcast_to(np.eye(JOINT), self.P.shape).copy()
+        of_state, of_clone = (
+            (TH, x.R_world_imu, E, J, (P, V)),
+            (me.CLONE_TH, self.clone_R, E_clone, J_clone, (CLONE_P,)),
+        )
+        for turned, R, turn, jacobian, moved in (of_state, of_clone):
+            G[:, turned, turned] = np.where(sound[:, None, None], kernels.transpose(turn), jacobian)
+            for block in moved:
+                G[sound, block, turned] = -(se3.skew(dx[:, block]) @ R)[sound]
         x.position = x.position + dx[:, P]
         x.velocity = x.velocity + dx[:, V]
         x.R_world_imu = kernels.orthonormalise(x.R_world_imu @ E)
         x.acc_bias = x.acc_bias + dx[:, BA]
         x.gyro_bias = x.gyro_bias + dx[:, BG]
-        self.clone_p = self.clone_p + dx[:, me.CLONE_P]
+        self.clone_p = self.clone_p + dx[:, CLONE_P]
         self.clone_R = kernels.orthonormalise(self.clone_R @ E_clone)
         self.jitter_mean = self.jitter_mean + dx[:, JITTER_REF]
         self.jitter_cur_mean = dx[:, JITTER_CUR].copy()
-        for block, G in ((TH, J), (me.CLONE_TH, J_clone)):
-            self.P[:, block, :] = G @ self.P[:, block, :]
-            self.P[:, :, block] = self.P[:, :, block] @ kernels.transpose(G)
+        self.P = G @ self.P @ kernels.transpose(G)
         self.P = 0.5 * (self.P + kernels.transpose(self.P))
         dx[:] = 0.0
 

@@ -16,7 +16,7 @@ from gpvo.filters.measurement import Gate
 from gpvo.filters.plausible import usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_noise, each
-from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, heading, tilt_of, vertical_in_world
+from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, tilt_of, vertical_in_world
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
@@ -111,45 +111,47 @@ class FusedRun:
 
 
 def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
-    """The start that every policy shares, and the gravity vector where it is not the usual one."""
-    k = flight.first
-    t0 = flight.records[k].t_ns
+    """The start that every policy shares, and the gravity vector where it is not the usual one.
+
+    Where truth's z is not up, gravity is measured in truth's world.
+    """
+    sigmas, valid = options.sigmas, np.flatnonzero(flight.known)
+    t_ns = np.array([flight.records[i].t_ns for i in valid.tolist()], dtype=np.int64)
     if options.init == "static":
         if flight.imu is None:
             cure = "use --init truth" if flight.has_truth else "use --twins"
             raise GpvoError("a static start needs an IMU", where=flight.name, cure=cure)
-        rest = from_rest(flight.imu, t0, options.sigmas)
         if not flight.has_truth:
-            return rest, None
-        T, up = flight.T_world_imu[k], rest.nominal.R_world_imu[0, 2]
-        return from_rest(flight.imu, t0, options.sigmas, yaw_rad=heading(T[:3, :3], up), position=T[:3, 3]), None
-    if not flight.has_truth:
+            return from_rest(flight.imu, flight.records[flight.first].t_ns, sigmas), None
+    elif not flight.has_truth:
         cure = "use --twins" if flight.imu is None else "use --twins or --init static"
         raise GpvoError("--init truth needs ground truth for the frames", where=flight.name, cure=cure)
-    valid = np.flatnonzero(flight.known)
-    if len(valid) < 2:
+    elif len(valid) < 2:
         raise GpvoError("ground truth covers fewer than two frames", where=flight.name, cure="use --init static")
-    t = np.array([flight.records[i].t_ns for i in valid[:5]], dtype=np.int64)
-    start = from_truth(t, flight.T_world_imu[valid[:5]], options.sigmas, with_imu=flight.imu is not None)
-    return _aligned_with_gravity(flight, start, valid, options.sigmas)
+    T = flight.T_world_imu[valid]
+    up, tilt, note = None, np.zeros((3, 3)), ""
+    if flight.imu is not None and len(valid) > 1:
+        up, tilt, note = _vertical(flight.imu, t_ns, T, sigmas)
+    if options.init == "static":
+        assert flight.imu is not None
+        start = from_rest(flight.imu, int(t_ns[0]), sigmas, T_world_imu=T[0], up_world=up)
+    else:
+        start = from_truth(t_ns[:5], T[:5], sigmas, with_imu=flight.imu is not None)
+        start.covariance[TH, TH] += T[0, :3, :3].T @ tilt @ T[0, :3, :3]
+    gravity = None if up is None else -STANDARD_GRAVITY_MPS2 * up
+    return replace(start, note=start.note + note, world_tilt=tilt), gravity
 
 
-def _aligned_with_gravity(
-    flight: Flight, start: Start, valid: NDArray[np.int64], sigmas: StartSigmas
-) -> tuple[Start, Array | None]:
-    """Where truth's z is not up, measure gravity in truth's world and admit what that costs in tilt."""
-    if flight.imu is None:
-        return start, None
-    t_ns = np.array([flight.records[i].t_ns for i in valid])
-    up, tilt = vertical_in_world(flight.imu, t_ns, flight.T_world_imu[valid], sigmas.acc_bias_mps2)
+def _vertical(
+    imu: ImuLog, t_ns: NDArray[np.int64], T_world_imu: Array, sigmas: StartSigmas
+) -> tuple[Array | None, Array, str]:
+    """The vertical (3,) in truth's world where that is not z, what it costs in tilt (3, 3), and a line that says so."""
+    up, tilt = vertical_in_world(imu, t_ns, T_world_imu, sigmas.acc_bias_mps2)
     tilt = tilt + sigmas.tilt_rad**2 * (np.eye(3) - np.outer(up, up))
     off_rad, axis = tilt_of(up)
     if off_rad <= _LEVEL_SIGMAS * np.sqrt(axis @ tilt @ axis):
-        return start, None
-    R, C = start.nominal.R_world_imu[0], start.covariance.copy()
-    C[TH, TH] += R.T @ tilt @ R
-    note = f"{start.note}; truth's z axis is {np.rad2deg(off_rad):.1f} deg from up: gravity measured from the IMU"
-    return Start(start.nominal, C, note, tilt), -STANDARD_GRAVITY_MPS2 * up
+        return None, np.zeros((3, 3)), ""
+    return up, tilt, f"; truth's z axis is {np.rad2deg(off_rad):.1f} deg from up: gravity measured from the IMU"
 
 
 def make_filter(

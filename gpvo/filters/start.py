@@ -103,10 +103,16 @@ def _slope_weights(t_s: Array) -> Array:
 
 
 def from_rest(
-    imu: ImuLog, t_ns: int, sigmas: StartSigmas | None = None, *, yaw_rad: float = 0.0, position: Array | None = None
+    imu: ImuLog,
+    t_ns: int,
+    sigmas: StartSigmas | None = None,
+    *,
+    T_world_imu: Array | None = None,
+    up_world: Array | None = None,
 ) -> Start:
     """Start from a vehicle at rest at ``t_ns``: tilt from gravity, gyroscope bias from the mean rate.
 
+    ``T_world_imu`` (4, 4): gives position and heading, zero by default; ``up_world``: unit vector (3,), by default z.
     An accelerometer bias tilts the horizon by bias / g; the covariance carries that correlation. Raises
     ``GpvoError`` where the IMU says that the vehicle moves.
     """
@@ -121,7 +127,10 @@ def from_rest(
 
     f = acc.mean(axis=0)
     up = f / np.linalg.norm(f)
-    R = _leveled(up, yaw_rad)
+    T = np.eye(4) if T_world_imu is None else T_world_imu
+    R_level_imu, R_level_world = _leveled(up), np.eye(3) if up_world is None else _leveled(up_world)
+    yaw_rad = 0.0 if T_world_imu is None else se3.so3_log(R_level_world @ T[:3, :3] @ R_level_imu.T)[2]
+    R = R_level_world.T @ se3.so3_exp(np.array([0.0, 0.0, yaw_rad])) @ R_level_imu
     C = _diagonal(sigmas, with_imu=True)
     U = se3.skew(up) / STANDARD_GRAVITY_MPS2
     cov_acc = C[BA, BA] + np.diag(acc.var(axis=0) / len(acc))
@@ -132,10 +141,9 @@ def from_rest(
     C[BA, TH] = C[TH, BA].T
     C[BG, BG] = np.diag(gyro.var(axis=0) / len(gyro) + 1e-10)
     C[V, V] = np.eye(3) * 1e-4
-    origin = np.zeros(3) if position is None else position
     tilt_rad = np.sqrt(np.linalg.eigvalsh(U @ cov_acc @ U.T)[-1])
     note = f"static: {int(window.sum())} IMU samples at rest, tilt {np.degrees(tilt_rad):.2f} deg (1 sigma)"
-    return Start(_member(origin, np.zeros(3), R, np.zeros(3), gyro.mean(axis=0)), C, note)
+    return Start(_member(T[:3, 3], np.zeros(3), R, np.zeros(3), gyro.mean(axis=0)), C, note)
 
 
 def _require_rest(gyro: Array, acc: Array) -> None:
@@ -149,21 +157,15 @@ def _require_rest(gyro: Array, acc: Array) -> None:
         raise GpvoError(f"the vehicle is not at rest at the start: {reasons}", cure="use --init truth")
 
 
-def _leveled(up_imu: Array, yaw_rad: float) -> Array:
-    """``R_world_imu`` that turns the measured vertical to +z, with the IMU's heading axis at ``yaw_rad``.
+def _leveled(up: Array) -> Array:
+    """(3, 3) that turns the vertical (3,) of some axes to +z, and the heading axis into the plane of x and z.
 
-    The heading axis is the IMU's x axis, or its z axis where x is nearly vertical (a camera-like mounting).
+    The heading axis is x, or z where x is nearly vertical (a camera-like mounting).
     """
-    axis = np.array([1.0, 0, 0]) if abs(up_imu[0]) < 0.8 else np.array([0.0, 0, 1.0])
-    level = axis - up_imu * (axis @ up_imu)
+    axis = np.array([1.0, 0, 0]) if abs(up[0]) < 0.8 else np.array([0.0, 0, 1.0])
+    level = axis - up * (axis @ up)
     x = level / np.linalg.norm(level)
-    R_level_imu = np.stack([x, np.cross(up_imu, x), up_imu])
-    return se3.so3_exp(np.array([0.0, 0.0, yaw_rad])) @ R_level_imu
-
-
-def heading(R_world_imu: Array, up_imu: Array) -> float:
-    """The yaw [rad] that :func:`from_rest` needs to agree with a known attitude."""
-    return float(se3.so3_log(R_world_imu @ _leveled(up_imu, 0.0).T)[2])
+    return np.stack([x, np.cross(up, x), up])
 
 
 def vertical_in_world(

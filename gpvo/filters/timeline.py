@@ -15,7 +15,7 @@ import numpy as np
 
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate, Innovation, Wait
-from gpvo.filters.plausible import ImuGuard
+from gpvo.filters.plausible import LONGEST_GAP_S, ImuGuard
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import CORE, TH, Nominal, P, V
 from gpvo.online.observer import LONGEST_STEP_S, follows
@@ -24,7 +24,7 @@ from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.
 _GAP_FACTOR, _GAP_S = 5.0, 0.05
-_LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
+_LONGEST_STEP_NS, _LONGEST_GAP_NS = round(LONGEST_STEP_S * 1e9), round(LONGEST_GAP_S * 1e9)
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ class Timeline:
         self._newest_ns: int | None = None
         self._guard = ImuGuard()
         self._doubt: Doubt[int] = Doubt()
+        self._is_set_back = False
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
-        self._usual_ns = 0
 
     # -- inputs -----------------------------------------------------------------------------------------------
 
@@ -110,12 +110,22 @@ class Timeline:
             return
         if self._imu_t and t_ns <= self._imu_t[-1]:
             # The clock was set back, and no record can be put among what came before.
+            if self._imu_t[-1] - t_ns > _LONGEST_GAP_NS:
+                self._go_on_from(int(t_ns))
             del self._imu_t[:], self._imu[:]
-        if self._imu_t:
-            step = t_ns - self._imu_t[-1]
-            self._usual_ns = min(self._usual_ns or step, step)
         self._imu_t.append(int(t_ns))
         self._imu.append(sample)
+
+    def _go_on_from(self, t_ns: int) -> None:
+        """What the filter is at the newest sample holds, by another clock, two samples before ``t_ns``: of these the
+        first was in doubt."""
+        self.filter = self.latest()
+        self.t_ns = self._bias_ns = t_ns - 2 * int(np.diff(self._imu_t[-2:]).sum())
+        self._reference_ns = self._newest_ns = None
+        self._wait = Wait.since(self.t_ns, self.filter.batch)
+        self._history.clear()
+        self._is_set_back = True
+        self.counts["clock_set_back"] += 1
 
     def reaches(self, t_ns: int) -> bool:
         """Whether an IMU sample at or past ``t_ns`` was taken: what comes before can be interpolated."""
@@ -123,6 +133,10 @@ class Timeline:
 
     def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
         """Take one VO record; returns the steps done, more than one where later records were used again."""
+        if self._is_set_back and record.t_ns - self._imu_t[-1] > _LONGEST_GAP_NS // 2:
+            self.counts["too_late"] += 1  # by the clock of before
+            return []
+        self._is_set_back = False
         if record.t_ns <= self.t_ns and self._already_seen(record.t_ns):
             self.counts["repeated"] += 1
             return []
@@ -255,12 +269,16 @@ class Timeline:
         """
         last_ns = self._imu_t[i - 1] if i > 0 else start_ns
         age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
-        shortest = max(_GAP_S, _GAP_FACTOR * (self._usual_ns * 1e-9))
+        if age[1] < _GAP_S:
+            return
+        nearby = slice(max(0, i - 100), i + 100)
+        steps = np.diff(self._imu_t[nearby])
+        shortest = max(_GAP_S, _GAP_FACTOR * 1e-9 * float(np.median(steps)) if len(steps) else 0.0)
         if age[1] < shortest:
             return
         begun = age[0] if age[0] >= shortest else 0.0
         counts["imu_gaps"] += 1
-        near = np.array(self._imu[max(0, i - 100) : i + 100])
+        near = np.array(self._imu[nearby])
         spread = np.maximum(near.std(axis=0), np.abs(near[-1] - near[0]))
         dt = age[1] - begun
         grown = age[1] ** 2 - begun**2

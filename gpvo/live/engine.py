@@ -6,11 +6,12 @@ What it keeps in a file lets a restart continue from it.
 from __future__ import annotations
 
 import os
+import re
 import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,7 +29,7 @@ from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
-from gpvo.publish.odometry import Odometry, OdometryBuilder, lift
+from gpvo.publish.odometry import Odometry, OdometryBuilder, about_zero, lift
 from gpvo.types import VEHICLES, Array, Prediction, Status, Vehicle, VoRecord
 from gpvo.vo.quality import lost_covariance
 
@@ -104,6 +105,7 @@ class Engine:
         self.counts: Counter[str] = Counter()
         self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
         self.last: Odometry | None = None
+        self._twist = np.zeros(6)  # of the body, as last measured
         self.tell = tell
         self._truth, self._unheard = truth, list(topics)
         self._told_s: dict[str, float] = {}
@@ -183,7 +185,7 @@ class Engine:
         if builder is None:
             builder = self._builder = self._first_builder(taken)
         if taken.begins and self._seen_ns is not None:
-            self._bridge(builder, taken)
+            self._bridge(builder, taken, self._seen_ns)
         record = taken.record
         prediction = self.predictor.step(record)
         if self._truth is not None:
@@ -191,6 +193,7 @@ class Engine:
         message = builder.step(record, prediction)
         message = replace(message, frame_id=taken.frame_id, child_frame_id=taken.child_frame_id)
         self._seen_ns, self._used_s, self.last = taken.received_ns, taken.received_ns * 1e-9, message
+        self._twist = self._twist if message.twist_body is None else message.twist_body
         self.counts[f"frames_{message.status.value}"] += 1
         if record.dt_s > 0:
             self._motions.append(record)
@@ -217,25 +220,23 @@ class Engine:
         if resume is not None:
             A = se3.adjoint(se3.inverse(self.stage.T_body_cam))
             in_body = rotate_covariance(T_odom_body[:3, :3].T, resume.pose_covariance)
-            away = _unknown(1.0, np.zeros(6))
-            builder.step(lost(taken.record, 1.0, A @ in_body @ A.T + away, self.stage.method))
+            away_s = (taken.record.t_ns - resume.t_ns) * 1e-9
+            away_s = away_s if away_s > 0 else 1.0  # nobody knows: the source's clock is another one
+            away = _unknown(away_s, resume.twist)
+            builder.step(lost(taken.record, away_s, A @ in_body @ A.T + away, self.stage.method))
         return builder
 
-    def _bridge(self, builder: OdometryBuilder, taken: Taken) -> None:
-        """The motion that nobody saw between the last message of before and this one."""
-        assert self._seen_ns is not None
-        away_s = max((taken.received_ns - self._seen_ns) * 1e-9, 0.0)
+    def _bridge(self, builder: OdometryBuilder, taken: Taken, seen_ns: int) -> None:
+        """The motion that nobody saw between the last message of before, received at ``seen_ns``, and this one."""
+        away_s = max((taken.received_ns - seen_ns) * 1e-9, 0.0)
         self.counts["restarts"] += 1
-        builder.step(lost(taken.record, away_s, _unknown(away_s, self._velocity()), self.stage.method))
-
-    def _velocity(self) -> Array:
-        twist = None if self.last is None else self.last.twist_body
-        return np.zeros(6) if twist is None else twist
+        builder.place(self.stage.T_body_cam)
+        builder.step(lost(taken.record, away_s, _unknown(away_s, self._twist), self.stage.method))
 
     def _of_increment(self, message: Odometry, record: VoRecord, prediction: Prediction | None) -> Odometry:
         C = record.covariances.get(self.stage.method)
         if prediction is not None:
-            C = prediction.covariance + np.outer(prediction.mean, prediction.mean)
+            C = about_zero(prediction.covariance, prediction.mean)
         if C is None:
             return message
         A = se3.adjoint(self.stage.T_body_cam)
@@ -286,7 +287,7 @@ class Engine:
         return out + self.stage.problems()
 
     def _warn(self, text: str) -> None:
-        kind = text.split(":")[0][:40]
+        kind = re.sub(r"\d[\d.e+]*", "", text.split(":")[0])[:40]  # the same one holds while its numbers change
         if self._now_s - self._told_s.get(kind, -np.inf) >= REPEAT_S:
             self._told_s[kind] = self._now_s
             self.tell(text)
@@ -321,7 +322,8 @@ class Engine:
         path, last = self.settings.state, self.last
         if path is None or last is None:
             return
-        kept = KeptState(last.T_odom_body, last.pose_covariance, self._scale, self.predictor.digest, last.reset_counter)
+        T, C, resets = last.T_odom_body, last.pose_covariance, last.reset_counter
+        kept = KeptState(T, C, self._scale, self.predictor.digest, resets, last.t_ns, self._twist)
         try:
             write_json(path, {"schema": 1, **vars(kept)})  # whole or not at all
         except GpvoError as error:
@@ -337,13 +339,16 @@ def _unknown(away_s: float, twist: Array) -> Array:
 @dataclass(frozen=True)
 class KeptState:
     """Pose (4, 4) and its covariance (6, 6) in ``odom``; the scale (6,) of sigma that late truth taught a ``model``,
-    by its digest (empty: unknown); how often the pose was reset."""
+    by its digest (empty: unknown); how often the pose was reset; when, by the source's clock, and how fast (6,) the
+    body then moved."""
 
     T_odom_body: Array
     pose_covariance: Array
     scale: Array
     model: str = ""
     resets: int = 0
+    t_ns: int = 0
+    twist: Array = field(default_factory=lambda: np.zeros(6))
 
 
 def load_state(path: Path | None) -> KeptState | None:
@@ -359,13 +364,16 @@ def load_state(path: Path | None) -> KeptState | None:
         document = read_json(path)
         T, C = (np.array(document[k], dtype=np.float64) for k in ("T_odom_body", "pose_covariance"))
         scale = np.array(document.get("scale", np.ones(6)), dtype=np.float64)
-        model, resets = str(document.get("model", "")), int(document.get("resets", 0))
+        model, (resets, t_ns) = str(document.get("model", "")), (int(document.get(k, 0)) for k in ("resets", "t_ns"))
+        twist = np.array(document.get("twist", np.zeros(6)), dtype=np.float64)
         if T.shape != (4, 4) or not is_rigid(T, FARTHEST_M):
             raise ValueError("it holds no pose")
         if C.shape != (6, 6) or not are_positive_definite(C[None], semi=True).all():
             raise ValueError("its covariance is not positive semidefinite")
         if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
             raise ValueError("it holds an impossible scale")
+        if twist.shape != (6,) or not (np.abs(twist) < FARTHEST_M).all():
+            raise ValueError("it holds no twist")
     except (GpvoError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise GpvoError(f"is not a state file of gpvo live: {error}", where=path, cure="remove it") from None
-    return KeptState(T, symmetrise(C), scale, model, resets)
+    return KeptState(T, symmetrise(C), scale, model, resets, t_ns, twist)

@@ -124,49 +124,64 @@ class FileOutput(Output):
     """A ROS 1 bag (``.bag``), MCAP (``.mcap``) or ROS 2 bag folder of the odometry, written at the end.
 
     Until then, what came in each half minute is a bag of its own in the folder ``<name>.parts`` beside it, by its first
-    stamp: nothing else remains where the process is killed. Raises GpvoError at once where the bag exists, as it may be
-    the flight before a restart, and where nothing can be written or the suffix is of another kind of file.
+    stamp: nothing else remains where the process is killed, and memory holds no more than what is not yet written.
+    Raises GpvoError at once where the bag exists, as it may be the flight before a restart, and where nothing can be
+    written or the suffix is of another kind of file.
     """
 
     def __init__(self, path: Path, topic: str = ros.TOPIC) -> None:
         if path.exists():
             raise GpvoError("already exists", where=path, cure="give another name or remove it")
-        if path.suffix not in ("", ".bag", ".mcap"):
+        if path.suffix.lower() not in ("", ".bag", ".mcap"):
             cure = "end it in .bag or .mcap, or name a folder"
             raise GpvoError("its suffix does not tell what to write", where=path, cure=cure)
         if not is_writable(path):
             raise GpvoError("cannot be written", where=path, cure="name a file in a writable folder")
         self._path, self._topic, self._folder = path, topic, path.with_name(f"{path.name}.parts")
-        self._odometry: list[Odometry] = []
-        self._begun, self._begun_s = 0, time.monotonic()  # of the part that is yet to be written
+        self._part: list[Odometry] = []
+        self._begun_s, self._count = time.monotonic(), 0
         self._writer = ThreadPoolExecutor(1)  # frames must not wait for the disk
-        self._parts: dict[Path, Future[int]] = {}
+        self._parts: dict[Path, Callable[[], None]] = {}  # what writes each, if it is not written
+        self._last: Future[None] | None = None
 
     def odometry(self, odometry: Odometry) -> None:
         """Keep one frame. GpvoError where the part before could not be written."""
-        self._odometry.append(odometry)
-        if time.monotonic() - self._begun_s >= PART_S:
+        if odometry.twist_body is not None:
+            self._part.append(odometry)
+        if self._part and time.monotonic() - self._begun_s >= PART_S:
+            before, self._last = self._last, self._writer.submit(self._end_part())
             self._begun_s = time.monotonic()
-            self._write_part()
+            if before is not None and before.done():
+                before.result()
 
-    def _write_part(self) -> None:
-        part = self._odometry[self._begun :]
-        if all(o.twist_body is None for o in part):
-            return
-        before, place = list(self._parts.values()), self._folder / f"{part[0].t_ns}{self._path.suffix}"
-        self._parts[place] = self._writer.submit(ros.write_bag, place, part, self._topic)
-        self._begun = len(self._odometry)
-        if before and before[-1].done():
-            before[-1].result()
+    def _end_part(self) -> Callable[[], None]:
+        """What writes the frames of this part where nothing lies, and then lets go of them."""
+        part, self._part, seq = self._part, [], self._count
+        self._count += len(part)
+        stamp = part[0].t_ns
+        while (place := self._folder / f"{stamp}{self._path.suffix.lower()}").exists() or place in self._parts:
+            stamp += 1
+
+        def write() -> None:
+            if part:
+                ros.write_bag(place, part, self._topic, seq=seq)
+                part.clear()
+
+        self._parts[place] = write
+        return write
 
     def close(self) -> None:
         """Write the bag; only warn where there is nothing to write, as when the end comes before the first image."""
         self._writer.shutdown()
-        if all(o.twist_body is None for o in self._odometry):
+        if self._part:
+            self._end_part()
+        if not self._parts:
             warnings.warn(f"{self._path}: not written, because no frame had a motion", stacklevel=2)
-        else:
-            ros.write_bag(self._path, self._odometry, self._topic)
-            for place in self._parts:  # those of a process that was killed stay
-                shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
-            with suppress(OSError):
-                self._folder.rmdir()
+            return
+        for write in self._parts.values():
+            write()
+        ros.join_bags(self._path, self._parts, self._topic)
+        for place in self._parts:  # those of a process that was killed stay
+            shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+        with suppress(OSError):
+            self._folder.rmdir()

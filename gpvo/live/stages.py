@@ -96,8 +96,8 @@ class PoseStage:
 
     The same rules as in :mod:`gpvo.io.foreign`, message by message: the covariance of a motion is that of the twist
     where it is positive definite, else the growth of the pose's; of a robot in a plane, on the axes along which it has
-    moved. ``T_body_cam``: where the camera sits on the body that the poses describe; by default as the first message
-    names its frame, optical or not.
+    moved. ``T_body_cam``: where the camera sits on the body that the poses describe; by default as the messages name
+    their frame, optical or not.
     """
 
     method = IMPORTED
@@ -105,7 +105,7 @@ class PoseStage:
     odometry: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, topic: str, T_body_cam: Array | None = None) -> None:
-        self.topic, self._is_placed = topic, T_body_cam is not None
+        self.topic, self._is_fixed = topic, T_body_cam is not None
         self.counts: Counter[str] = Counter()
         self._place(T_FLU_OPTICAL if T_body_cam is None else T_body_cam)
         self.reset()
@@ -140,6 +140,8 @@ class PoseStage:
         else:
             self.counts["other_frames"] += 1
             return
+        if frames != self._frames and not self._is_fixed:
+            self._place(np.eye(4) if is_optical(moving_frame(message)) else T_FLU_OPTICAL)
         self._frames = frames
         t_ns = stamp_ns(message)
         seen = self._watch.see(t_ns)
@@ -148,9 +150,6 @@ class PoseStage:
             return
         if seen is Sequence.RESTART:
             self._last = None
-        if not self._is_placed:
-            self._place(np.eye(4) if is_optical(moving_frame(message)) else T_FLU_OPTICAL)
-            self._is_placed = True
         begins = self._last is None
         record = self._record(t_ns, T_parent_body @ self.T_body_cam, message, seen)
         yield Taken(record, begins, arrival.received_ns, T_parent_body, frames[0] or "odom", frames[1] or "base_link")
@@ -283,8 +282,9 @@ class FrameTree:
 class BaseFrameStage:
     """A stage whose odometry is that of the frame ``base``, which sits rigidly on the frame that the source names.
 
-    The place is read once, from the first transforms that join the two; messages of before are dropped and counted
-    (``unplaced``). If the transforms say something else later, that is a problem, and the first place stays.
+    The place is read once for each frame that the source names, from the first transforms that join the two; messages
+    of before are dropped and counted (``unplaced``). If the transforms say something else later, that is a problem, and
+    the first place stays.
     """
 
     def __init__(self, inner: Stage, base: str) -> None:
@@ -323,10 +323,16 @@ class BaseFrameStage:
             self.counts["tf_refused"] = self._tree.refused
             self._look_again()
             return
-        if arrival.topic == self.topic and not self._is_placed(arrival.message):
+        names_it = arrival.topic == self.topic
+        if names_it and self._T_base_source is None and not self._is_placed(arrival.message):
             self.counts["unplaced"] += 1
             return
-        yield from map(self._of_base, self.inner.take(arrival))
+        for taken in self.inner.take(arrival):
+            if names_it and taken.begins and not self._is_placed(arrival.message):
+                self.counts["unplaced"] += 1
+                self.inner.reset()
+                return
+            yield self._of_base(taken)
 
     def flush(self) -> Iterator[Taken]:
         """What waited in the stage within."""
@@ -347,14 +353,14 @@ class BaseFrameStage:
         return moved + self.inner.problems()
 
     def _is_placed(self, message: Any) -> bool:
-        if self._T_base_source is None:
-            # The header of an image names what is placed; that of a pose names the frame that it is stated in.
-            header_names_it = not isinstance(self.inner, PoseStage)
-            named = getattr(message, "child_frame_id", message.header.frame_id if header_names_it else None)
-            self._is_nameless = named is None
-            if named is None:
-                return False
-            self._source = _frame_name(named)
+        # The header of an image names what is placed; that of a pose names the frame that it is stated in.
+        header_names_it = not isinstance(self.inner, PoseStage)
+        named = getattr(message, "child_frame_id", message.header.frame_id if header_names_it else None)
+        self._is_nameless = named is None
+        if named is None:
+            return False
+        if self._T_base_source is None or _frame_name(named) != self._source:
+            self._source, self._has_moved = _frame_name(named), False
             self._T_base_source = self._tree.transform(self.base, self._source)
         return self._T_base_source is not None
 

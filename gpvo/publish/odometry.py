@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -59,6 +59,11 @@ def lift(covariance: Array, first: float, second: float) -> Array:
     return out + np.diag(missing)
 
 
+def about_zero(covariance: Array, mean: Array) -> Array:
+    """Mean square (6, 6) of an error of this covariance about its ``mean`` (6,), which is not taken off."""
+    return covariance + np.outer(mean, mean)
+
+
 @dataclass(frozen=True)
 class _Chain:
     """The pose at one frame and its error, in camera axes."""
@@ -92,11 +97,15 @@ class OdometryBuilder:
 
     def __post_init__(self) -> None:
         forward = se3.from_rt(R_FLU_OPTICAL, np.zeros(3))
-        self._T_body_cam = forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64)
-        self._Ad = se3.adjoint(self._T_body_cam)
+        self.place(forward if self.T_body_cam is None else np.asarray(self.T_body_cam, dtype=np.float64))
+        self._T_odom_cam = self.T_odom_body @ self._T_body_cam
         self._chain: dict[int, _Chain] = {}
-        self._last: tuple[int, Array, Array] | None = None  # stamp, T_first_cam, noise of the last good frame
+        self._last: tuple[_Chain, Array] | None = None  # the last good frame and its noise
         self._speed = np.zeros(6)
+
+    def place(self, T_body_cam: Array) -> None:
+        """From here on, messages are of the body on which the camera sits at ``T_body_cam`` (4, 4)."""
+        self._T_body_cam, self._Ad = T_body_cam, se3.adjoint(T_body_cam)
 
     def step(self, record: VoRecord, prediction: Prediction | None = None) -> Odometry:
         """The message of one frame.
@@ -115,7 +124,7 @@ class OdometryBuilder:
         chain = base.extended(record, error)
         twist, twist_covariance = self._twist(record, error, chain)
         self._remember(record, chain)
-        self._last = (record.t_ns, chain.T_first_cam, frame_jitter(error.jitter) + error.white)
+        self._last = (chain, frame_jitter(error.jitter) + error.white)
         return self._message(record, prediction, chain, twist, twist_covariance)
 
     def _error(self, record: VoRecord, prediction: Prediction | None) -> MotionError:
@@ -123,8 +132,7 @@ class OdometryBuilder:
         if prediction is not None:
             if not is_positive_definite(prediction.covariance):
                 raise GpvoError(f"the prediction at t_ns {record.t_ns} is not symmetric positive definite")
-            # A mean is not taken off, as the pose must not jump; so it is part of the error.
-            return replace(prediction, white=prediction.white + np.outer(prediction.mean, prediction.mean))
+            return prediction
         covariance = record.covariances.get(self.method or "")
         if covariance is None or not is_positive_definite(covariance):
             raise GpvoError(
@@ -139,17 +147,18 @@ class OdometryBuilder:
         Usually that frame is the reference. Where it is not (the vehicle stood still, or a keyframe is kept), the
         motion is the difference of two motions from one reference, whose noise cancels; both frames' noise remains.
         """
-        own = frame_jitter(error.jitter)
-        t_last, T_last, noise_last = self._last or (record.t_prev_ns, se3.inverse(record.T_prev_cur), own)
+        t_last = record.t_prev_ns if self._last is None else self._last[0].t_ns
         dt = (record.t_ns - t_last) * 1e-9
         if dt <= 0:
             raise GpvoError(f"the frame at t_ns {record.t_ns} does not follow the one at {t_last}")
-        if t_last == record.t_prev_ns:
-            xi, covariance = se3.log(record.T_prev_cur), error.covariance
+        if self._last is None or t_last == record.t_prev_ns:
+            xi, covariance = se3.log(record.T_prev_cur), about_zero(error.covariance, error.mean)
         else:
-            T_rel = se3.inverse(T_last) @ chain.T_first_cam
+            last, noise_last = self._last
+            T_rel = se3.inverse(last.T_first_cam) @ chain.T_first_cam
             A = se3.adjoint(se3.inverse(T_rel))
-            xi, covariance = se3.log(T_rel), error.covariance - own + A @ noise_last @ A.T
+            xi, covariance = se3.log(T_rel), error.covariance - frame_jitter(error.jitter) + A @ noise_last @ A.T
+            covariance = about_zero(covariance, chain.error.mean - A @ last.error.mean)
         self._speed = xi / dt
         twist = self._Ad @ xi / dt
         J = self._Ad @ se3.right_jacobian_inverse(xi)
@@ -179,9 +188,11 @@ class OdometryBuilder:
         twist: Array | None,
         twist_covariance: Array | None,
     ) -> Odometry:
-        T = self.T_odom_body @ self._T_body_cam @ chain.T_first_cam @ se3.inverse(self._T_body_cam)
+        T = self._T_odom_cam @ chain.T_first_cam @ se3.inverse(self._T_body_cam)
         status = _status(record, prediction)
-        in_odom = rotate_covariance(T[:3, :3], self._Ad @ chain.error.covariance @ self._Ad.T)
+        # A mean is not taken off, as the pose must not jump; so it is part of the error, and adds up along the path.
+        error = about_zero(chain.error.covariance, chain.error.mean)
+        in_odom = rotate_covariance(T[:3, :3], self._Ad @ error @ self._Ad.T)
         return Odometry(
             t_ns=record.t_ns,
             T_odom_body=T,

@@ -13,7 +13,7 @@ import shutil
 import sqlite3
 import tempfile
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -82,14 +82,29 @@ def check_topic(topic: str) -> str:
     return topic
 
 
-def write_bag(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, kind: str | None = None) -> int:
+def write_bag(
+    path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, kind: str | None = None, seq: int = 0
+) -> int:
     """Write every frame that has a motion, in place of a bag of ``topic`` alone; returns the number of messages.
 
     ``kind``: a file for ``ros1``, a ROS 2 bag folder for ``sqlite3`` and ``mcap``; by default as the suffix says.
-    Raises GpvoError where something else lies there, or nothing can be written.
+    ``seq``: of the first message, in ROS 1. Raises GpvoError where something else lies there, or nothing can be
+    written.
     """
-    path = Path(path)
-    kind = kind or {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "sqlite3")
+    kind = kind or _kind(path)
+    return _write(Path(path), _serialised(odometry, kind, seq), topic, kind)
+
+
+def join_bags(path: str | Path, parts: Iterable[Path], topic: str = TOPIC) -> int:
+    """The same of the messages of other bags that :func:`write_bag` wrote, of the kind that the suffix says."""
+    return _write(Path(path), _raw(parts), topic, _kind(path))
+
+
+def _kind(path: str | Path) -> str:
+    return {".bag": "ros1", ".mcap": "mcap"}.get(Path(path).suffix.lower(), "sqlite3")
+
+
+def _write(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: str) -> int:
     if kind != "ros1" and path.is_file():
         raise GpvoError("is a file, and a ROS 2 bag is a folder", where=path, cure="choose another -o")
     if path.exists() and not _holds_only(path, topic):
@@ -99,7 +114,7 @@ def write_bag(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC
         path.parent.mkdir(parents=True, exist_ok=True)
         holder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         # A bag's files carry its name inside, so the temporary one has the same name in a folder of its own.
-        count = _fill(holder / path.name, odometry, topic, kind)
+        count = _fill(holder / path.name, messages, topic, kind)
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(holder / path.name, path)
@@ -111,19 +126,33 @@ def write_bag(path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC
     return count
 
 
-def _fill(path: Path, odometry: Iterable[Odometry], topic: str, kind: str) -> int:
+def _fill(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: str) -> int:
     ros1, count = kind == "ros1", 0
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     opened: Any = Ros1Writer(path) if ros1 else Ros2Writer(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
     with opened as writer:
-        connection = writer.add_connection(topic, _TYPE, typestore=store)
-        for item in odometry:
-            if item.twist_body is not None:
-                message = odometry_message(item, store.types, seq=count if ros1 else None)
-                writer.write(connection, item.t_ns, serialize(message, _TYPE))
-                count += 1
+        connection = writer.add_connection(topic, _TYPE, typestore=_store(kind))
+        for t_ns, data in messages:
+            writer.write(connection, t_ns, data)
+            count += 1
     return count
+
+
+def _store(kind: str) -> Any:
+    return get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+
+
+def _serialised(odometry: Iterable[Odometry], kind: str, seq: int) -> Iterator[tuple[int, bytes]]:
+    store, ros1 = _store(kind), kind == "ros1"
+    serialise = store.serialize_ros1 if ros1 else store.serialize_cdr
+    for number, item in enumerate((o for o in odometry if o.twist_body is not None), seq):
+        yield item.t_ns, serialise(odometry_message(item, store.types, seq=number if ros1 else None), _TYPE)
+
+
+def _raw(bags: Iterable[Path]) -> Iterator[tuple[int, bytes]]:
+    for bag in bags:
+        with open_bag(bag) as reader:
+            for _, t_ns, data in reader.messages():
+                yield t_ns, data
 
 
 def _holds_only(bag: Path, topic: str) -> bool:

@@ -11,11 +11,11 @@ from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import start_sigmas
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.propagation import BA, TH
-from gpvo.filters.run import FuseOptions, begin, fuse_flight
-from gpvo.filters.start import StartSigmas, from_rest, from_truth, heading, vertical_in_world
+from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight
+from gpvo.filters.start import StartSigmas, from_rest, from_truth, vertical_in_world
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
-from gpvo.types import ImuLog, TruthLog, VoLog
+from gpvo.types import ImuLog, Status, TruthLog, VoLog, VoRecord
 from synthetic_flights import synthetic_flight
 
 
@@ -34,8 +34,7 @@ def test_static_start_knows_its_tilt_and_bias_together() -> None:
         R = se3.so3_exp(rng.standard_normal(3) * [0.5, 0.5, 1.5])
         bias = sigma * rng.standard_normal(3)
         imu = _rest(rng, R, bias)
-        up = imu.acc_mps2.mean(axis=0)
-        start = from_rest(imu, 0, yaw_rad=heading(R, up / np.linalg.norm(up)))
+        start = from_rest(imu, 0, T_world_imu=se3.from_rt(R, np.zeros(3)))
         error = np.concatenate([se3.so3_log(start.nominal.R_world_imu[0].T @ R), bias])
         rows = np.r_[TH, BA]
         C = start.covariance[np.ix_(rows, rows)]
@@ -44,6 +43,22 @@ def test_static_start_knows_its_tilt_and_bias_together() -> None:
         np.testing.assert_allclose(start.nominal.gyro_bias[0], [0.01, -0.02, 0.005], atol=1e-3)
         np.linalg.cholesky(start.covariance)
     assert 2.0 < np.mean(nees) < 6.5
+
+
+def test_a_static_start_in_a_world_whose_z_is_not_up() -> None:
+    rng, t_ns = np.random.default_rng(3), np.arange(40) * 50_000_000
+    for turn in ([np.radians(3.0), 0, 0], [np.pi / 2, 0, 0], [np.pi, 0.1, 0.2]):
+        R, R_world_level = (se3.so3_exp(np.array(v)) for v in ([0.2, -0.3, 2.5], turn))
+        T = np.tile(se3.from_rt(R_world_level @ R, np.array([1.0, 2, 3])), (len(t_ns), 1, 1))
+        records = [VoRecord(int(t), int(max(t - 50_000_000, 0)), Status.OK, np.eye(4)) for t in t_ns]
+        start, gravity = begin(
+            Flight("rest", records, _rest(rng, R, np.zeros(3), 400), None, T), FuseOptions(init="static")
+        )
+        assert gravity is not None
+        np.testing.assert_allclose(gravity, R_world_level @ [0, 0, -9.80665], atol=0.05)
+        np.testing.assert_allclose(start.nominal.position[0], [1, 2, 3])
+        assert np.linalg.norm(se3.so3_log(start.nominal.R_world_imu[0].T @ T[0, :3, :3])) < 5e-3
+        assert "gravity measured" in start.note
 
 
 def test_static_start_refuses_a_moving_vehicle() -> None:

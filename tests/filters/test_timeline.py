@@ -9,7 +9,7 @@ import pytest
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import BIAS, JOINT, THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
 from gpvo.filters.policies import LearnedPolicy
-from gpvo.filters.propagation import BA
+from gpvo.filters.propagation import BA, P
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight, make_filter
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
@@ -150,6 +150,43 @@ def test_a_gap_in_the_imu_widens_the_state(flight: Flight) -> None:
     assert broken.scores is not None
     assert not broken.scores.diverged
     assert np.trace(broken.covariance[55, 3:6, 3:6]) > 2 * np.trace(whole.covariance[55, 3:6, 3:6])
+
+
+@pytest.mark.parametrize("back_s", [1.2, 3.0, 3600.0])
+@pytest.mark.parametrize("late", [0, 2])
+def test_the_filter_goes_on_when_the_clock_is_set_back(flight: Flight, back_s: float, late: int) -> None:
+    """``late``: records that are on their way then."""
+    imu, begin_ns = flight.imu, flight.records[0].t_ns
+    assert imu is not None
+
+    def told(t_ns: int) -> int:
+        return int(t_ns) - (round(back_s * 1e9) if t_ns >= begin_ns + 2 * 10**9 else 0)
+
+    timeline = _timeline(flight)
+    for k in range(100 + late):
+        for i in range(max(0, 10 * k - 9), 10 * k + 1):
+            timeline.add_imu(told(imu.t_ns[i]), imu.gyro_radps[i], imu.acc_mps2[i])
+        if k >= late:
+            r = flight.records[k - late]
+            again = replace(r, t_ns=told(r.t_ns), t_prev_ns=told(r.t_prev_ns))
+            timeline.add_vo(again, flight.predictions.get(r.t_ns))
+    assert timeline.t_ns == told(flight.records[99].t_ns)
+    assert timeline.counts["clock_set_back"] == 1
+    assert timeline.counts["used"] >= 96 - late
+    error = timeline.filter.x.position[0] - flight.T_world_imu[99, :3, 3]
+    C = timeline.filter.covariance[0, P, P]
+    assert error @ np.linalg.solve(C, error) / 3 < 3.0
+
+
+def test_the_jitter_of_a_slow_imus_stamps_is_no_gap() -> None:
+    flight = synthetic_flight(4, duration_s=20, rate_hz=5, imu_hz=20)
+    assert flight.imu is not None
+    t_ns = flight.imu.t_ns.copy()
+    t_ns[1:-1:7] += 42_000_000
+    steps = np.diff(t_ns)
+    assert steps.min() == 8_000_000
+    run = fuse_flight(replace(flight, imu=replace(flight.imu, t_ns=t_ns)), LearnedPolicy())[0]
+    assert "imu_gaps" not in run.counts
 
 
 def test_darkness_frozen_frames_and_bursts_do_not_diverge() -> None:

@@ -94,6 +94,33 @@ def test_covariance_after_5000_steps() -> None:
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_no_measured_motion_tells_the_heading_or_the_place_of_the_whole(seed: int) -> None:
+    """The information on turning and moving state and clone together is the same before and after an update."""
+    rng = np.random.default_rng(seed)
+    filter = _filter(np.eye(CORE) * 1e-2)
+    for k in range(40):
+        filter.propagate_imu(0.05, *(rng.standard_normal((4, 1, 3)) * np.array([1, 10, 1, 10])[:, None, None]))
+        if k == 19:
+            filter.clone()
+
+    def information() -> np.ndarray:
+        x, z = filter.x, np.array([0.0, 0.0, 1.0])
+        turned = [np.cross(z, x.position[0]), np.cross(z, x.velocity[0]), x.R_world_imu[0].T @ z, np.zeros(6)]
+        turned += [np.cross(z, filter.clone_p[0]), filter.clone_R[0].T @ z]
+        moved = np.zeros((3, 21))
+        moved[:, :3] = moved[:, 15:18] = np.eye(3)
+        N = np.vstack([np.concatenate(turned), moved])
+        return N @ np.linalg.solve(filter.P[0, :21, :21], N.T)
+
+    before = information()
+    R, t = me.relative_motion(filter.clone_R, filter.clone_p, filter.x.R_world_imu, filter.x.position)
+    T = se3.inverse(FORWARD_CAMERA) @ se3.from_rt(R[0], t[0]) @ FORWARD_CAMERA @ se3.exp(0.1 * rng.standard_normal(6))
+    assert filter.update_motion(T, MotionError.independent(np.eye(6)[None] * 1e-4), ACCEPT).passed.all()
+    np.testing.assert_allclose(information(), before, rtol=1e-4, atol=1e-4 * np.abs(before).max())
+
+
 def _own_rule_flight(seed: int, n: int = 2000, every: int = 10, with_lost: bool = False) -> tuple[Flight, Nominal]:
     """Truth integrated from smooth samples by the filter's own rule; VO exact."""
     rng = np.random.default_rng(seed)

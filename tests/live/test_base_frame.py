@@ -100,6 +100,25 @@ def test_a_mounting_that_moves_is_told_and_the_first_place_stays() -> None:
     assert kept.reports[-1].level == 0
 
 
+def test_a_source_that_names_another_frame_is_placed_anew() -> None:
+    """One path, of the base frame, told of two frames on it one after the other."""
+    T_SOURCE_EYE = se3.exp(np.array([0.1, 0.2, 0.3, 0.4, -0.2, 0.1])) @ T_FLU_OPTICAL
+    stamps, T = flight(n=60)
+    before, after = flown(stamps[:30], T[:30]), flown(stamps[30:], T[30:] @ T_SOURCE_EYE, child="eye_optical")
+    live, kept, _ = based()
+    for arrival in [tf(*TRANSFORMS), *before, *after[:10]]:
+        live.take(arrival)
+    assert len(kept.frames) == 30  # nothing says yet where it is
+    for arrival in [tf(("base_link", "eye_optical", T_SOURCE_EYE)), *after[10:]]:
+        live.take(arrival)
+    np.testing.assert_allclose(live.stage.T_body_cam, T_CHASSIS_SOURCE @ T_SOURCE_EYE, atol=1e-9)
+    T_base = T @ se3.inverse(T_CHASSIS_SOURCE)
+    twists = {f.t_ns: f.twist_body for f in kept.frames if f.twist_body is not None}
+    for k in (20, 45, 59):
+        moved = se3.log(se3.inverse(T_base[k - 1]) @ T_base[k]) * 20.0
+        np.testing.assert_allclose(twists[int(stamps[k])], moved, atol=1e-6)
+
+
 def test_a_tree_joins_frames_over_their_common_ancestor_and_refuses_what_cannot_be() -> None:
     tree = FrameTree()
     assert tree.transform("a", "b") is None

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import shutil
 import struct
+import weakref
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.geometry.se3 import rotate_covariance
+from gpvo.io.bag_reader import open_bag, stamp_ns
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
 from gpvo.live import outputs
@@ -25,6 +29,7 @@ from gpvo.live.job import LiveSettings, run_live
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import PoseStage
 from gpvo.live.stereo_stage import StereoStage
+from gpvo.publish import ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder
 from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog, VoRecord
@@ -221,10 +226,43 @@ def test_a_state_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
         engine(settings)
 
 
+def _gone(way_m: float, n: int = 300) -> list[Arrival]:
+    """Straight ahead at 20 messages per second."""
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, 0, 3] = np.linspace(0.0, way_m, n)
+    return flown(10**18 + np.arange(n) * 50_000_000, T)
+
+
+def test_a_state_taken_up_under_way_is_as_unsure_as_what_was_missed_is_long(tmp_path: Path) -> None:
+    arrivals, settings = _gone(150.0), EngineSettings(state=tmp_path / "state.json")
+    before, _, _ = engine(settings)
+    for arrival in arrivals[:100]:
+        before.take(arrival)
+    before.close()
+    after, kept, _ = engine(settings)
+    after.take(arrivals[200])  # 5 s and 50 m later
+    missed_m = 150.0 * 101 / 299
+    assert missed_m / 3 < np.sqrt(kept.frames[0].pose_covariance[0, 0]) < 3 * missed_m
+
+
+def test_a_silence_after_a_lost_frame_is_at_the_speed_of_before() -> None:
+    arrivals = _gone(150.0)
+    live, kept, _ = engine()
+    for arrival in [*arrivals[:100], arrivals[130]]:
+        live.take(arrival)
+    lost = kept.frames[-1]
+    assert lost.status is Status.LOST
+    live.stage.reset()
+    live.take(arrivals[240])
+    grown = kept.frames[-1].pose_covariance - lost.pose_covariance
+    assert np.sqrt(grown[0, 0]) > 0.9 * 150.0 * 110 / 299
+
+
 @pytest.mark.parametrize("changed", [
     {"T_odom_body": 2.0 * np.eye(4)}, {"T_odom_body": np.diag([1.0, 1.0, 1.0, np.nan])},
     {"pose_covariance": -np.eye(6)}, {"pose_covariance": np.eye(6) + 2.0 * np.eye(6)[::-1]},
     {"pose_covariance": np.full((6, 6), 1e300)}, {"scale": np.zeros(6)}, {"scale": "x"}, {"resets": "x"},
+    {"twist": [1.0, np.inf, 0.0, 0.0, 0.0, 0.0]}, {"t_ns": "x"},
 ], ids=str)  # fmt: skip
 def test_a_state_that_cannot_be_is_refused_in_one_line(changed: dict, tmp_path: Path) -> None:
     good = {"schema": 1, "T_odom_body": np.eye(4), "pose_covariance": np.eye(6), "scale": np.ones(6)}
@@ -244,6 +282,15 @@ def test_a_model_of_another_camera_is_called_out_at_once_and_every_ten_seconds()
     for second in range(26):
         live.take(Arrival("/other", None, second * 10**9))
     assert sum("baseline is 0.5" in text for text in told) == 3
+
+
+def test_a_warning_whose_numbers_change_is_repeated_every_ten_seconds_as_well() -> None:
+    live, _, told = engine()
+    shares = iter(range(100))
+    live.stage.problems = lambda: [f"only {next(shares) / 3:.3g} % of the images are of {next(shares)} lines"]
+    for second in range(26):
+        live.take(Arrival("/other", None, second * 10**9))
+    assert sum("% of the images" in text for text in told) == 3
 
 
 def test_an_odometry_at_another_rate_or_outside_the_domain_is_called_out() -> None:
@@ -293,6 +340,44 @@ def test_a_flight_that_is_killed_remains_in_parts(tmp_path: Path, monkeypatch: p
         again.odometry(frame)
     again.close()
     assert sorted(p.name for p in tmp_path.rglob("*.bag")) == ["1.bag", "again.bag"]
+
+
+def test_a_bag_in_parts_holds_all_in_order_whatever_its_suffix_and_memory_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outputs, "PART_S", 0.0)
+    live, kept, _ = engine()
+    for arrival in flown(*flight(n=12)):
+        live.take(arrival)
+    write, fails = ros.write_bag, [True, False]
+
+    def write_bag(*args: Any, **options: Any) -> int:
+        if fails and fails.pop(0):
+            raise GpvoError("the disk is full")
+        return write(*args, **options)
+
+    monkeypatch.setattr(ros, "write_bag", write_bag)
+    output, stamps = outputs.FileOutput(tmp_path / "OUT.BAG"), [o.t_ns for o in kept.frames[1:]]
+    (tmp_path / "OUT.BAG.parts").mkdir()
+    (tmp_path / "OUT.BAG.parts" / f"{stamps[3]}.bag").touch()  # of a process that was killed, on a clock from zero
+    frames = [replace(o) for o in kept.frames]
+    for frame in frames[:2]:
+        output.odometry(frame)
+    output._writer.submit(lambda: None).result()  # it is done
+    with pytest.raises(GpvoError, match="disk is full"):
+        output.odometry(frames[2])
+    for frame in frames[3:]:
+        output.odometry(frame)
+    output._writer.shutdown()
+    held, frame = [weakref.ref(f) for f in frames], None
+    del frames
+    assert [ref() is None for ref in held] == [k != 1 for k in range(len(held))]  # but for what could not be written
+    output.close()
+    with open_bag((tmp_path / "OUT.BAG").rename(tmp_path / "out.bag")) as reader:
+        headers = [reader.deserialize(raw, c.msgtype).header for c, _, raw in reader.messages()]
+    assert [stamp_ns(SimpleNamespace(header=h)) for h in headers] == stamps
+    assert [h.seq for h in headers] == list(range(len(stamps)))
+    assert [p.name for p in (tmp_path / "OUT.BAG.parts").iterdir()] == [f"{stamps[3]}.bag"]
 
 
 def test_status_lost_is_not_sent_but_reported() -> None:

@@ -10,6 +10,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from gpvo.geometry import se3
+from gpvo.io.bag_reader import stamp_ns
+from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, Mailbox, Sequence, StampWatch
 from gpvo.live.stages import PoseStage
@@ -278,6 +280,28 @@ def test_two_publishers_on_one_topic_are_not_mixed_and_other_frames_for_good_are
     )
     assert {(o.frame_id, o.child_frame_id) for o in kept.frames[:50]} == {("odom", "base_link")}
     assert {(o.frame_id, o.child_frame_id) for o in kept.frames[50:]} == {("map", "imu")}
+
+
+def test_a_child_frame_that_becomes_an_optical_one_has_its_axes(recording: list[Arrival]) -> None:
+    """The same path, told of the body and later of the camera on it."""
+    live, kept, _ = engine()
+    for k, arrival in enumerate(recording):
+        of_camera = _in_frames(_placed(arrival, _pose(arrival) @ T_FLU_OPTICAL), "odom", "camera_optical")
+        live.take(arrival if k < 50 else of_camera)
+    body, camera = kept.frames[45], kept.frames[60]
+    assert (body.child_frame_id, camera.child_frame_id) == ("base_link", "camera_optical")
+    # A body goes along its x, a camera along its z; and it is where it was, but for what two dropped messages missed.
+    for k, ahead in ((45, 0), (60, 2)):
+        T_rel = se3.inverse(_pose(recording[k - 1])) @ _pose(recording[k])
+        T_rel = T_rel if ahead == 0 else se3.inverse(T_FLU_OPTICAL) @ T_rel @ T_FLU_OPTICAL
+        twist = next(f for f in kept.frames if f.t_ns == stamp_ns(recording[k].message)).twist_body
+        assert twist is not None
+        assert np.argmax(np.abs(twist[:3])) == ahead
+        np.testing.assert_allclose(twist, se3.log(T_rel) * RATE, atol=1e-6)
+    T_odom_camera = _pose(recording[57]) @ T_FLU_OPTICAL
+    off = se3.log(se3.inverse(T_odom_camera) @ kept.frames[55].T_odom_body)
+    assert np.abs(off[:3]).max() < 0.6
+    assert np.abs(off[3:]).max() < 0.3
 
 
 def test_a_full_mailbox_drops_the_oldest_and_counts_them() -> None:

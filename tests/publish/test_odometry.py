@@ -173,6 +173,32 @@ def test_a_mean_is_part_of_the_error_and_moves_nothing() -> None:
     assert added[0, 0] == pytest.approx((0.01 / 0.1) ** 2)
 
 
+def test_a_mean_adds_up_along_the_path() -> None:
+    """The error of the pose over that of one motion is the mean's number of motions, as the mean is the same in all."""
+    zero, step, mean = np.zeros((6, 6)), se3.exp(np.array([0, 0, 0.1, 0, 0.02, 0])), np.array([0, 0, 1e-3, 0, 2e-5, 0])
+    C, builder, estimate = 1e-12 * np.eye(6), OdometryBuilder(np.eye(4), floors=TINY), np.eye(4)
+    for k in range(1, 101):
+        estimate = estimate @ step @ se3.exp(mean)
+        stated = replace(_prediction(k * 10**8, zero, C, zero), mean=mean)
+        out = builder.step(VoRecord(k * 10**8, (k - 1) * 10**8, Status.OK, step), stated)
+    error = se3.log(se3.inverse(out.T_odom_body) @ estimate)
+    R = np.kron(np.eye(2), out.T_odom_body[:3, :3])
+    np.testing.assert_allclose(out.pose_covariance, np.outer(R @ error, R @ error), atol=2e-5)
+    assert np.abs(R @ error)[:3].max() > 0.05
+    np.testing.assert_allclose(np.diagonal(out.twist_covariance), (mean / 0.1) ** 2, atol=1e-6)
+
+
+def test_at_rest_against_one_reference_a_mean_cancels() -> None:
+    zero, C, mean = np.zeros((6, 6)), 1e-6 * np.eye(6), np.array([0.01, 0, 0, 0, 0, 0])
+    builder = OdometryBuilder(np.eye(4), floors=TINY)
+    builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
+    for k in range(1, 4):
+        stated = replace(_prediction(k * 10**8, zero, C, zero), mean=mean)
+        out = builder.step(VoRecord(k * 10**8, 0, Status.OK, np.eye(4), is_reference=False), stated)
+    assert out.twist_covariance is not None
+    np.testing.assert_allclose(np.diagonal(out.twist_covariance), 2e-6 / 0.01, rtol=1e-6)
+
+
 def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
     C = _spd(np.random.default_rng(1), 1e-6)
     out = lift(C, 1e-6, 1e-4)
