@@ -218,9 +218,9 @@ def _slips(s: TrainingSet, estimate: Prediction, learned: Learned, constant: Arr
     dt_s = learned.model.dt_s
     rate_var = variances(estimate.covariance).mean(axis=0) / dt_s**2
     velocities = learned.model.velocities
-    lost_var = [velocities.lost_variance(dt_s, dt_s, dt_s, np.zeros(6), rate_var, jump) for jump in s.lost_jump]
+    lost = [velocities.lost_covariance(dt_s, dt_s, dt_s, np.zeros(6), rate_var, jump) for jump in s.lost_jump]
     learned_all = np.concatenate(
-        [nees(s.Y - estimate.mean, estimate.covariance), (s.lost_xi**2 / np.reshape(lost_var, (-1, 6))).sum(1)]
+        [nees(s.Y - estimate.mean, estimate.covariance), nees(s.lost_xi, np.reshape(lost, (-1, 6, 6)))]
     )
     constant_all = nees(np.concatenate([s.Y, s.lost_xi]), constant)
     return {

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpvo.geometry import se3
 from gpvo.online.features import AXES
 from gpvo.online.stored import Stored
 from gpvo.types import Array
@@ -115,22 +116,25 @@ class Velocities(Stored):
         longer than both together, whatever is said of its variance."""
         return _block_sums((rate**2 + self.usual_rate_var) * duration_s[:, None] ** 2)
 
-    def lost_variance(
+    def lost_covariance(
         self, step_s: float, dt_s: float, age_s: float, rate: Array, rate_var: Array, jump: Array
     ) -> Array:
-        """(6,) variance of a lost motion of duration ``dt_s``, about which nothing was measured.
+        """(6, 6) mean square error of a lost motion of duration ``dt_s``, about which nothing was measured.
 
         The vehicle is assumed to keep the velocity ``rate`` (6,) [m/s, rad/s] of ``age_s`` ago, known to ``rate_var``
         (6,), give or take how much velocities changed in training over such a time, or more if it is faster than usual
         there; at most, and after longer times than in training, the error is as large as the velocity. ``jump`` (6,)
-        [m, rad]: by how much the motion given differs from that velocity's. ``step_s``: the usual duration.
+        [m, rad]: by how much the motion given differs from that velocity's; the error has its direction, and is at most
+        as long. ``step_s``: the usual duration.
         """
         lags = step_s * np.array(COASTED)
         change = np.array([np.interp(age_s, lags, of_axis, right=np.inf) for of_axis in self.rate_change_var.T])
         speed2 = _block_sums(rate**2)
         faster = np.maximum(speed2 / _block_sums(self.usual_rate_var), 1.0)
         changed = np.minimum(change * faster, np.maximum(self.usual_rate_var, speed2))
-        return np.asarray((changed + rate_var) * dt_s**2 + _block_sums(jump**2))
+        # What is wrong with the velocity acts at the end of the jump, of which a turn is a lever.
+        A = se3.right_jacobian_inverse(-jump)
+        return A * ((changed + rate_var) * dt_s**2) @ A.T + np.outer(jump, jump)
 
 
 def _block_sums(values: Array) -> Array:

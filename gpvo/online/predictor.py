@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import variances
 from gpvo.online import modelfile
 from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import ErrorModel
@@ -27,7 +28,7 @@ from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, 
 MODEL_SCHEMA = 1
 """Of the arrays and header keys described in :mod:`gpvo.online.modelfile`."""
 
-_NO_MOTION_VAR = 1e-12
+_NO_MOTION_VAR, _ROUNDING = 1e-12, 1e-9
 _REMEMBERED = 512
 
 
@@ -230,27 +231,29 @@ class Predictor:
 
     def _publish_lost(self, record: VoRecord, prediction: Prediction) -> Prediction:
         """What was learned from measured motions does not apply to one that was not measured."""
-        variance = self._lost_variance(record)
+        covariance = self._lost_covariance(record)
         # Its truth says nothing about the scale of measured motions.
         self._remember(record.t_ns, None)
-        p = self._unmeasured(record, np.diag(variance), 0.0, float(prediction.in_domain))
-        return replace(p, epistemic=np.minimum(prediction.epistemic * self._adaptive.scale**2, variance))
+        p = self._unmeasured(record, covariance, 0.0, float(prediction.in_domain))
+        epistemic = np.minimum(prediction.epistemic * self._adaptive.scale**2, variances(covariance))
+        return replace(p, epistemic=epistemic)
 
     def _remember(self, t_ns: int, stated: tuple[Array, Array] | None) -> None:
         self._stated[t_ns] = stated
         if len(self._stated) > _REMEMBERED:
             del self._stated[next(iter(self._stated))]
 
-    def _lost_variance(self, record: VoRecord) -> Array:
-        """(6,) variance of a lost motion: what VO gives is the motion expected of the vehicle, or a jump away from it,
-        which means that the vehicle has not kept its velocity."""
-        xi, slip = se3.log(record.T_prev_cur), self._observer.slip
+    def _lost_covariance(self, record: VoRecord) -> Array:
+        """(6, 6) of a lost motion: what VO gives is the motion expected of the vehicle, or a jump away from it."""
+        slip = self._observer.slip
         # A record that is lost because of its stamps has no usable duration.
         dt_s = record.dt_s if record.dt_s > 0 else self.model.dt_s
-        known = np.inf, xi / dt_s, np.zeros(6), np.zeros(6)
+        known = np.inf, se3.log(record.T_prev_cur) / dt_s, np.zeros(6)
         if slip.expected is not None:
-            known = slip.age_s, slip.expected, self._rate_var, xi - slip.expected * dt_s
-        return np.maximum(self.model.velocities.lost_variance(self.model.dt_s, dt_s, *known), _NO_MOTION_VAR)
+            known = slip.age_s, slip.expected, self._rate_var
+        C = self.model.velocities.lost_covariance(self.model.dt_s, dt_s, *known, slip.jump(record))
+        # After a jump of kilometres, rounding alone would make it indefinite.
+        return C + np.diag(_NO_MOTION_VAR + _ROUNDING * variances(C))
 
     def _unmeasured(self, record: VoRecord, white: Array, confidence: float, in_domain: float) -> Prediction:
         return Prediction(

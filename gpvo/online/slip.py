@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gpvo.geometry import se3
 from gpvo.online.lately import lengths, twist
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, Status, Vehicle, VoLog, VoRecord
 
@@ -101,6 +102,12 @@ class SlipDetector:
             self._gyro.append(disagreement)
         self._anchor = (middle_s, now)
         return record
+
+    def jump(self, record: VoRecord) -> Array:
+        """(6,) error of the motion [m, rad] if the vehicle has kept the velocity expected of it, after ``step``."""
+        if self.expected is None:
+            return np.zeros(6)
+        return se3.log(se3.inverse(se3.exp(self.expected * record.dt_s)) @ record.T_prev_cur)
 
     def _problem(self, record: VoRecord, change: tuple[float, float], disagreement: float | None) -> str:
         acc = record.imu_acc_mean_mps2

@@ -133,6 +133,10 @@ def test_a_slip_is_lost_and_its_covariance_covers_the_jump(predictor, flight):
     assert said[80].status is Status.LOST
     assert said[80].confidence == 0
     assert said[80].sigma[2] > 5.0
+    # The jump is along z alone: of the other axes no more is unknown than that the velocity may have changed.
+    assert said[80].sigma[:2].max() < 0.5
+    wrong = se3.log(se3.inverse(flight[0].records[80].T_prev_cur) @ records[80].T_prev_cur)
+    assert wrong @ np.linalg.solve(said[80].covariance, wrong) < 22.5  # chi-square of 6 at 99.9 %
     assert said[81].status is not Status.LOST
 
 
@@ -180,11 +184,11 @@ def test_a_lost_motion_is_as_wrong_as_velocities_change(predictor, gone):
 def test_a_lost_motion_is_at_most_as_wrong_as_the_vehicle_is_fast(predictor):
     """Longer ago than training shows, the last velocity says nothing but how fast the vehicle is."""
     rate, none = np.array([0.0, 0.0, 1.5, 0.0, 0.1, 0.0]), np.zeros(6)
-    variance = predictor.model.velocities.lost_variance(predictor.model.dt_s, 2.0, 1e3, rate, none, none)
+    variance = np.diag(predictor.model.velocities.lost_covariance(predictor.model.dt_s, 2.0, 1e3, rate, none, none))
     most = 4.0 * np.maximum(predictor.model.velocities.usual_rate_var, np.repeat([2.25, 0.01], 3))
     np.testing.assert_allclose(variance, most)
     ages = [
-        predictor.model.velocities.lost_variance(predictor.model.dt_s, 2.0, age, rate, none, none)
+        np.diag(predictor.model.velocities.lost_covariance(predictor.model.dt_s, 2.0, age, rate, none, none))
         for age in np.geomspace(0.01, 100.0, 40)
     ]
     assert (np.diff(ages, axis=0) >= 0).all()
