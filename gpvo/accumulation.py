@@ -182,10 +182,14 @@ def along(T_prev_cur: Array, errors: Sequence[MotionError], parent: Iterable[int
     origin, which is known.
     """
     states: dict[int, PoseError] = {}
+    parent = list(parent)
+    starts = set(parent)  # while a vehicle stands, hours of motions start from one pose, and none from their ends
     mean, covariance = np.zeros((len(errors), 6)), np.zeros((len(errors), 6, 6))
     for k, (T, error, p) in enumerate(zip(T_prev_cur, errors, parent, strict=True)):
-        states[k] = PoseError() if p < 0 else states[p].after(T, error)
-        mean[k], covariance[k] = states[k].mean, states[k].covariance
+        state = PoseError() if p < 0 else states[p].after(T, error)
+        mean[k], covariance[k] = state.mean, state.covariance
+        if k in starts:
+            states[k] = state
         # No motion starts before the reference of this one.
         for old in [j for j in states if j < p]:
             del states[old]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -98,6 +99,17 @@ def test_a_frame_that_is_skipped_leaves_no_trace(parts):
     _, branched = along(PATH[:8], errors, parent)
     _, straight = along(PATH[kept], [errors[k] for k in kept], np.arange(7) - 1)
     np.testing.assert_allclose(branched[kept], straight, atol=1e-18)
+
+
+def test_hours_at_rest_keep_one_state():
+    """While a vehicle stands, all motions start from one frame: their ends are not kept, and not searched each time."""
+    n, error = 2000, motion_error(0.5 * C, 0.5 * C, 0 * C)
+    tracemalloc.start()
+    _, P = along(np.tile(np.eye(4), (n, 1, 1)), [error] * n, [-1] + [0] * (n - 1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(P[1:], np.broadcast_to(P[1], (n - 1, 6, 6)))
+    assert peak < 2 * n * (6 + 36 + 16) * 8
 
 
 def test_an_error_without_persistent_part_lets_time_pass():

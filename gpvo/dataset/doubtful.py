@@ -65,10 +65,11 @@ def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
 
 def in_waits(records: Sequence[VoRecord], waits: ArrayLike) -> NDArray[np.bool_]:
     """(N,) which motions, or windows of motions, share time with one of the waits, or odd stretches, (W, 2) [ns]."""
-    first, last = np.asarray(waits, dtype=np.int64).reshape(-1, 2).T
-    start = np.array([r.t_prev_ns for r in records], dtype=np.int64)[:, None]
-    end = np.array([r.t_ns for r in records], dtype=np.int64)[:, None]
-    return np.asarray(((start < last) & (end > first)).any(axis=1), dtype=np.bool_)
+    first, last = np.sort(np.asarray(waits, dtype=np.int64).reshape(-1, 2), axis=0).T
+    start = np.array([r.t_prev_ns for r in records], dtype=np.int64)
+    end = np.array([r.t_ns for r in records], dtype=np.int64)
+    # More have begun by its end than were over by its start: compared in pairs, a day of stops would fill the memory.
+    return np.asarray(np.searchsorted(first, end) > np.searchsorted(last, start, side="right"), dtype=np.bool_)
 
 
 def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:

@@ -199,12 +199,22 @@ def inputs(e: Evaluation) -> list[Panel]:
 
 
 def _shades(e: Evaluation) -> list[dict[str, Any]]:
-    """Stretches of time that were degraded or lost; each frame reaches back to the one before."""
+    """Stretches of time that were degraded or lost; each frame reaches back to the one before.
+
+    Those that no screen shows apart are one: each panel of a long run would hold thousands.
+    """
     t_s, out = [round(float(t), 3) for t in e.t_s], []
+    last: dict[str, dict[str, Any]] = {}
     for tint, group in groupby(range(1, len(t_s)), lambda k: _SHADES.get(e.run.log.records[k].status)):
         frames = list(group)
-        if tint is not None:
-            out.append({"from": t_s[frames[0] - 1], "to": t_s[frames[-1]], "colour": tint})
+        if tint is None:
+            continue
+        begin, end = t_s[frames[0] - 1], t_s[frames[-1]]
+        if tint in last and begin - last[tint]["to"] < (t_s[-1] - t_s[0]) / MAX_POINTS:
+            last[tint]["to"] = end
+        else:
+            last[tint] = {"from": begin, "to": end, "colour": tint}
+            out.append(last[tint])
     return out
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, tilt_o
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
 from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
+
+T = TypeVar("T")
 
 # Truth whose vertical is measured further than this from +z, in sigmas, is in another frame: gravity is as measured.
 _LEVEL_SIGMAS = 3.0
@@ -173,7 +175,33 @@ def fuse_flight(
     flight: Flight, policy: Policy, options: FuseOptions | None = None, *, batch: int = 1
 ) -> list[FusedRun]:
     """Filter one run under one policy; one result per member (a policy may set several noises side by side)."""
-    options = options or FuseOptions()
+    timeline, start, steps = _fly(flight, policy, options or FuseOptions(), batch, lambda step: step)
+    return [_member(flight, policy.name, b, steps, timeline, start) for b in range(batch)]
+
+
+def ate_of_members(flight: Flight, policy: Policy, options: FuseOptions, *, batch: int) -> Array:
+    """(batch,) ATE [m] of the members of one filter, by the flight's truth.
+
+    Their positions are all that is kept: with its covariances, a member takes 5 kB a frame, 64 of them 30 GB an hour.
+    """
+    mount = np.eye(4) if flight.T_imu_cam is None else flight.T_imu_cam
+
+    def position(step: Step) -> Array:
+        return np.array((se3.from_rt(step.nominal.R_world_imu, step.nominal.position) @ mount)[:, :3, 3])
+
+    steps = _fly(flight, policy, options, batch, position)[2]
+    t_ns = sorted(steps)
+    rows, valid = _rows_with_truth(flight, t_ns)
+    estimate = np.array([steps[t] for t in t_ns])[valid]
+    assert flight.T_world_cam is not None
+    truth = flight.T_world_cam[rows][valid][:, :3, 3]
+    return np.array([metrics.ate_rmse(np.ascontiguousarray(estimate[:, b]), truth) for b in range(batch)])
+
+
+def _fly(
+    flight: Flight, policy: Policy, options: FuseOptions, batch: int, kept: Callable[[Step], T]
+) -> tuple[Timeline, Start, dict[int, T]]:
+    """The filter at the end, its start, and what is kept of the step of each record, by stamp."""
     start, gravity = begin(flight, options)
     first = flight.first
     records = [flight.records[int(i)] for i in np.flatnonzero(flight.covered) if i >= first]
@@ -186,15 +214,15 @@ def fuse_flight(
         with_imu=flight.imu is not None,
         history_s=options.history_s,
     )
-    steps: dict[int, Step] = {}
+    steps: dict[int, T] = {}
     imu = flight.imu
     samples = iter(()) if imu is None else zip(imu.t_ns.tolist(), imu.gyro_radps, imu.acc_mps2)
     for record in records:
         while not timeline.reaches(record.t_ns) and (sample := next(samples, None)):
             timeline.add_imu(*sample)
         for step in timeline.add_vo(record, flight.predictions.get(record.t_ns)):
-            steps[step.t_ns] = step
-    return [_member(flight, policy.name, b, steps, timeline, start) for b in range(batch)]
+            steps[step.t_ns] = kept(step)
+    return timeline, start, steps
 
 
 def _member(
@@ -222,9 +250,7 @@ def _member(
 def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
     """The run's, and what the truth tells; ``world_tilt`` (3, 3), of the filter's vertical, turns all attitudes alike,
     and positions about the start."""
-    index = {r.t_ns: i for i, r in enumerate(flight.records)}
-    rows = np.array([index[t] for t in run.t_ns.tolist()])
-    valid = np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]
+    rows, valid = _rows_with_truth(flight, run.t_ns.tolist())
     assert flight.T_world_cam is not None
     truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
     est, imu, C = run.T_world_cam[valid], run.T_world_imu[valid], run.covariance[valid]
@@ -248,3 +274,10 @@ def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
         diverged=metrics.diverged(error, path),
         frames=int(valid.sum()),
     )
+
+
+def _rows_with_truth(flight: Flight, t_ns: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The flight's records of these stamps (n,), and which of them have truth (n,)."""
+    index = {r.t_ns: i for i, r in enumerate(flight.records)}
+    rows = np.array([index[t] for t in t_ns])
+    return rows, np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]

@@ -25,7 +25,7 @@ from gpvo.filters.policies import (
     LearnedPolicy,
     Policy,
 )
-from gpvo.filters.run import Flight, FusedRun, FuseOptions, fuse_flight
+from gpvo.filters.run import Flight, FusedRun, FuseOptions, ate_of_members, fuse_flight
 from gpvo.stats.series import Interval, sequence_bootstrap
 from gpvo.types import Array, MotionError, Prediction, VoRecord
 
@@ -59,8 +59,7 @@ def grid_scores(
     for flight in flights:
         if progress:
             progress(flight.name)
-        fused = fuse_flight(flight, policy, replace(options, history_s=0.0), batch=len(grid))
-        total += [run.scores.ate_rmse_m for run in fused]
+        total += ate_of_members(flight, policy, replace(options, history_s=0.0), batch=len(grid))
     return np.where(np.isfinite(total), total / max(len(flights), 1), np.inf)
 
 

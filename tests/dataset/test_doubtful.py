@@ -4,6 +4,7 @@ stands, and one that differs from odometry far more than elsewhere.
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
@@ -64,6 +65,21 @@ def test_a_truth_that_wanders_at_rest_is_found(flight):
     hit, s = in_waits(log.records, waits), seconds(log)
     assert hit[(s > 0.3) & (s < AT_REST_S)].all()
     assert not hit[s > AT_REST_S + 1.0].any()
+
+
+def test_many_waits_are_those_of_each_pair_and_fill_no_memory():
+    """Waits of one run lie apart, its odd stretches may overlap; one that a motion only touches is none of its."""
+    t, rng = np.arange(0, 60_000, 3), np.random.default_rng(3)
+    records = [VoRecord(int(b), int(a), Status.OK, np.eye(4)) for a, b in zip([0, *t[:-1]], t)]
+    first = 3 * rng.integers(0, 20_000, 1000)
+    waits = np.column_stack([first, first + rng.integers(1, 9, 1000)])
+    tracemalloc.start()
+    hit = in_waits(records, waits)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert hit.tolist() == [bool(((r.t_prev_ns < waits[:, 1]) & (r.t_ns > waits[:, 0])).any()) for r in records]
+    assert 0.05 < hit.mean() < 0.5
+    assert peak < len(records) * 200 < len(records) * len(waits)
 
 
 def test_an_exact_truth_is_believed(tmp_path):

@@ -14,10 +14,10 @@ from evaluation_runs import make_run
 from gpvo.errors import SourceError
 from gpvo.evaluation import panels, plots
 from gpvo.evaluation.document import document
-from gpvo.evaluation.evaluate import Evaluation, evaluate_run
+from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.report import render, scene, write_report
 from gpvo.io.run import Run, read_run, write_run
-from gpvo.types import Mounting, VoLog
+from gpvo.types import Mounting, Status, VoLog, VoRecord
 from matplotlib.figure import Figure
 
 AXES = {
@@ -206,6 +206,17 @@ def test_thinning_loses_no_peak():
     assert (np.diff(x) > 0).all()
     assert np.nanmax(thin) == 5.0
     assert np.nanmin(thin) == -3.0
+
+
+def test_shades_of_a_long_run_are_no_more_than_a_screen_shows():
+    n, bad = 20_000, {Status.LOST: range(7, 19_000, 10), Status.DEGRADED: [19_500]}
+    status = {k: s for s, frames in bad.items() for k in frames}
+    records = [VoRecord(k * 10**8, max(k - 1, 0) * 10**8, status.get(k, Status.OK), np.eye(4)) for k in range(n)]
+    run = Run(Path("long"), "long", VoLog(records), None, None, Mounting(), [])
+    shades = panels._shades(unjudged_run(run))
+    assert [s["colour"] for s in shades] == ["#d62728", "#ffbf00"]
+    assert (shades[0]["from"], shades[0]["to"]) == (0.6, 1899.7)
+    assert (shades[1]["from"], shades[1]["to"]) == (1949.9, 1950.0)
 
 
 def test_views_are_no_mirror_images(evaluation):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from gpvo.filters.policies import ConstantPolicy
 from gpvo.filters.propagation import BA, BG, CORE, TH, Nominal, P, V, imu_step
 from gpvo.filters.run import Flight, FuseOptions, fuse_flight
 from gpvo.filters.start import StartSigmas
+from gpvo.filters.study import Constants, grid_scores
 from gpvo.filters.timeline import Timeline
 from gpvo.geometry import se3
 from gpvo.types import ImuLog, MotionError, Status, VoRecord
@@ -295,3 +297,17 @@ def test_members_of_a_batch_are_independent_filters() -> None:
         alone = fuse_flight(flight, ConstantPolicy(np.full(6, 1e-6), 0.05, scalars[None]), options)[0]
         np.testing.assert_allclose(member.T_world_imu, alone.T_world_imu, atol=1e-9)
         np.testing.assert_allclose(member.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_tuning_a_constant_keeps_no_covariances() -> None:
+    """The grid has 64 members: with all their states, an hour of a run would fill any memory."""
+    flight, _ = _own_rule_flight(7, n=1500)
+    flight = replace(flight, truth_valid=np.arange(len(flight.records)) % 7 != 3)
+    grid, options = np.geomspace(0.1, 10.0, 64)[:, None] * [1.0, 2.0], FuseOptions(history_s=0.0)
+    policy = ConstantPolicy(np.full(6, 1e-6), 0.05, grid)
+    tracemalloc.start()
+    found = grid_scores([flight], Constants(policy.mean_squares, 0.05), grid, options)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.5 * len(flight.records) * len(grid) * 8 * CORE**2
+    np.testing.assert_array_equal(found, [r.scores.ate_rmse_m for r in fuse_flight(flight, policy, options, batch=64)])

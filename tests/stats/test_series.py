@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gpvo.stats import student_t
+from gpvo.stats import series, student_t
 from gpvo.stats.series import Interval, allan_deviation, autocorrelation, block_bootstrap, sequence_bootstrap
 
 N = 40_000
@@ -117,3 +117,27 @@ def test_a_constant_has_no_width_and_the_seed_decides():
     assert block_bootstrap(x, seed=3) == block_bootstrap(x, seed=3)
     assert block_bootstrap(x, seed=3) != block_bootstrap(x, seed=4)
     assert str(Interval(1.0, 0.5, 1.5)) == "1 [0.5, 1.5]"
+
+
+@pytest.mark.parametrize("n", [300, 3000, 3001])
+def test_memory_of_a_series_is_that_of_its_lags_one_by_one(n):
+    """Also where it changes its level, and remembers itself over thousands of rows: found without all pairs of rows."""
+    x = np.random.default_rng(4).chisquare(6, n) * np.where(np.arange(n) < n // 2, 1.0, 8.0)
+    rho, memory = autocorrelation(x, n // 2 - 1), 1.0
+    for lag in range(1, n // 2):
+        memory += 2.0 * rho[lag]
+        if lag >= 5.0 * memory:
+            break
+    np.testing.assert_allclose(series._memory(x), memory, rtol=1e-12)
+
+
+def test_interval_of_a_long_series_that_changes_its_level_costs_few_products():
+    class Counted(np.ndarray):
+        products = 0
+
+        def __matmul__(self, other):
+            Counted.products += 1
+            return np.asarray(self) @ np.asarray(other)
+
+    series._memory(np.repeat([1.0, 8.0], 10_000).view(Counted))
+    assert 0 < Counted.products < 2000
