@@ -115,8 +115,9 @@ def _checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
 def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
     """Where errors of an axis are zero throughout, as of a robot in a plane, noise of ``_UNSEEN`` stands for what the
     truth cannot show; seeded, so that the same rows give the same bytes."""
-    rms, rng = np.sqrt((np.concatenate([s.Y for s in sets]) ** 2).mean(axis=0)), np.random.default_rng(0)
-    quiet = rms < 0.1 * _UNSEEN
+    Y, rng = np.concatenate([s.Y for s in sets]), np.random.default_rng(0)
+    quiet = np.sqrt((Y**2).mean(axis=0)) < 0.1 * _UNSEEN
+    quiet[seen_axes(Y)] = False  # of a tiny rig
     return [replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s for s in sets]
 
 

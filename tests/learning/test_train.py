@@ -28,7 +28,7 @@ from gpvo.learning.methods import METHODS, best_scale, score
 from gpvo.learning.parts import fit_parts
 from gpvo.learning.rows import Rows
 from gpvo.learning.store import card_path, config_of, folds_path, picture_path, rows_path, save_model, update
-from gpvo.learning.train import TrainedModel, _slips, train_sets, unseen_axes
+from gpvo.learning.train import TrainedModel, _checked, _slips, train_sets, unseen_axes
 from gpvo.online.base import COASTED, TWIST_COLUMNS
 from gpvo.online.division import divide
 from gpvo.online.features import AXES
@@ -604,6 +604,15 @@ def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int])
     C = training.estimate_set(trained.predictor().model, sets[0]).covariance
     assert (np.diagonal(C, axis1=1, axis2=2)[:, axes] < 1e-10).all()
     assert train_sets(sets, QUICK, judge=False).arrays["share"].tobytes() == trained.arrays["share"].tobytes()
+
+
+def test_errors_of_a_tiny_rig_are_not_taken_for_an_axis_without_any() -> None:
+    """A baseline of a millimetre errs by 50 nm in a motion: noise of a micrometre would outweigh it."""
+    tiny = np.array([5e-8 / np.sqrt((training_sets([0], n=120)[0].Y[:, :3] ** 2).mean())] * 3 + [1.0] * 3)
+    sets = [replace(s, Y=s.Y * tiny) for s in training_sets(range(3), n=120)]
+    for before, after in zip(sets, _checked(sets, "frame"), strict=True):
+        np.testing.assert_array_equal(after.Y, before.Y)
+    assert unseen_axes(sets) == []
 
 
 def test_a_flight_that_begins_at_rest_is_learned_from() -> None:
