@@ -45,7 +45,8 @@ class RunSummary:
     def __str__(self) -> str:
         named = ((s.value, self.status.get(s.value, 0)) for s in Status if s is not Status.START)
         parts = ", ".join(f"{n} {name}" for name, n in named if n)
-        return f"{self.frames} frames ({parts}), {self.path_length_m:.1f} m, {self.frames_per_s:.0f} frames/s"
+        length = f"{self.path_length_m:{'.1f' if self.path_length_m >= 1 else '.3g'}} m"  # an endoscope's: centimetres
+        return f"{self.frames} frames ({parts}), {length}, {self.frames_per_s:.0f} frames/s"
 
 
 def run(

@@ -220,8 +220,9 @@ def _with_twins(
 def _print(d: dict[str, Any]) -> None:
     if about := d.get("simulated_truth"):
         say_simulated(about)
+    length = d["path_length_m"]
     say(
-        f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {d['path_length_m']:.1f} m;"
+        f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {length:{'.1f' if length >= 1 else '.3g'}} m;"
         f" ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )

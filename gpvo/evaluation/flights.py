@@ -23,6 +23,8 @@ from gpvo.online.predictor import Predictor
 from gpvo.twin.gap import restated
 from gpvo.types import TruthLog
 
+_POSITION_BASELINES = 2e-3  # how exact a start is at most, beside the baseline
+
 
 def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = True) -> Flight:
     """A run as the filters take it, with the model's predictions, else those stored in the run; a twin on a
@@ -59,8 +61,11 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
 
 
 def start_sigmas(runs: Sequence[Run]) -> StartSigmas:
-    """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope."""
+    """Initial covariance that is no smaller than the noise of the truth it starts from, as poses or as their slope; of
+    a tiny rig the position is as exact as beside any baseline."""
+    baseline_m = min((r.log.camera.baseline_m for r in runs if r.log.camera), default=np.inf)
     base = StartSigmas()
+    base = replace(base, position_m=min(base.position_m, _POSITION_BASELINES * baseline_m))
     known = [(r.truth, float(np.median(np.diff(r.log.t_ns))) * 1e-9) for r in runs if r.truth and len(r.log) > 1]
     position = max((truth.sigma_translation_m for truth, _ in known), default=0.0)
     velocity = max((slope_sigma(truth.sigma_translation_m, dt_s) for truth, dt_s in known), default=0.0)

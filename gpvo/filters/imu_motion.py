@@ -17,6 +17,7 @@ from gpvo.types import Array, ImuLog, VoRecord
 MIN_ROTATIONS = 10
 MIN_ROTATION_RAD = 0.02
 """Rms rotation of all motions together below which rotation says nothing."""
+_LONGEST_S = 1.0  # of a motion, unless frames are slower
 _MIN_POINTS = 5  # of a cubic
 _LATEST_S, _STEP_S = 0.2, 0.005  # shifts of the clock that are tried
 _SHIFT_S = 0.02  # below, a filter hardly notices
@@ -43,8 +44,9 @@ class Rotations:
     def __init__(self, flight: Flight, imu: ImuLog, margin_s: float = 0.0) -> None:
         R_imu_cam = np.eye(3) if flight.T_imu_cam is None else flight.T_imu_cam[:3, :3]
         first, last = imu.t_ns[0] + round(margin_s * 1e9), imu.t_ns[-1] - round(margin_s * 1e9)
-        used = [r for r in flight.records if r.usable and np.isfinite(r.T_prev_cur).all() and 0 < r.dt_s < 1.0]
-        used = [r for r in used if first <= r.t_prev_ns and r.t_ns <= last]
+        used = [r for r in flight.records if r.usable and np.isfinite(r.T_prev_cur).all() and r.dt_s > 0]
+        longest_s = max(_LONGEST_S, 1.5 * float(np.median([r.dt_s for r in used]))) if used else 0.0
+        used = [r for r in used if r.dt_s < longest_s and first <= r.t_prev_ns and r.t_ns <= last]
         T = np.array([r.T_prev_cur[:3, :3] for r in used]).reshape(-1, 3, 3)
         self.vo: Array = se3.so3_log(T) @ R_imu_cam.T
         self._ends = [np.array([(getattr(r, n) - imu.t_ns[0]) * 1e-9 for r in used]) for n in ("t_ns", "t_prev_ns")]

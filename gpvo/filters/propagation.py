@@ -185,5 +185,6 @@ def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNois
     change = np.abs(np.diff(twist, axis=0)) / np.sqrt(dt[1:, None])
     # 1.4826 times the median absolute value is the standard deviation of a Gaussian; the mean of heavy tails.
     linear, angular = change[:, :3].max(axis=1), change[:, 3:].max(axis=1)
-    sigma = [max(1.4826 * float(np.median(c)), float(np.quantile(c, 0.9)) / 2, 1e-3) for c in (linear, angular)]
-    return ConstantVelocityNoise(acceleration=sigma[0], angular_acceleration=sigma[1])
+    sigma = [max(1.4826 * float(np.median(c)), float(np.quantile(c, 0.9)) / 2) for c in (linear, angular)]
+    # The least is for logs without any change: an endoscope's velocity walks by less than a millimetre per second.
+    return ConstantVelocityNoise(acceleration=max(sigma[0], 1e-6), angular_acceleration=max(sigma[1], 1e-3))

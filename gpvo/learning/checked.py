@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import GpvoError
 from gpvo.geometry.covariance import where_stated
 from gpvo.online.features import AXES
-from gpvo.stats.consistency import SEEN
-from gpvo.types import Array
+from gpvo.stats.consistency import SEEN, least_seen, rms
 
-_UNSEEN, _STRETCH, _CLEARLY = 0.5 * SEEN, 10, 100.0
+_STRETCH, _CLEARLY = 10, 100.0
 
 
 def checked(sets: Sequence[TrainingSet], target: str) -> list[TrainingSet]:
@@ -54,11 +52,12 @@ def _where_stated(s: TrainingSet) -> TrainingSet:
 
 def _refuse_planar_among_others(sets: Sequence[TrainingSet]) -> None:
     """No feature tells a robot in a plane from one that is not. One that never moved is no matter."""
-    rms = np.array([np.sqrt((s.Y**2).mean(axis=0)) for s in sets])
-    flat = (rms < SEEN) & (rms >= SEEN).any(axis=1, keepdims=True) & (rms.max(axis=0) > _CLEARLY * SEEN)
+    size = np.array([rms(s.Y) for s in sets])
+    least = np.array([least_seen(of) for of in size])
+    flat = (size < least) & (size >= SEEN).any(axis=1, keepdims=True) & (size.max(axis=0) > _CLEARLY * least)
     for s, axes in zip(sets, flat, strict=True):
         if axes.any():
-            names, other = [AXES[k] for k in np.flatnonzero(axes)], sets[int(rms[:, axes].max(axis=1).argmax())].name
+            names, other = [AXES[k] for k in np.flatnonzero(axes)], sets[int(size[:, axes].max(axis=1).argmax())].name
             raise GpvoError(
                 f"log and truth never differ in {', '.join(names)} (planar?), but those of '{other}' do",
                 where=s.name,
@@ -67,16 +66,12 @@ def _refuse_planar_among_others(sets: Sequence[TrainingSet]) -> None:
 
 
 def _with_all_axes(sets: Sequence[TrainingSet]) -> list[TrainingSet]:
-    """Where errors of an axis are zero for ``_STRETCH`` motions, as at rest or of a robot in a plane, noise of
-    ``_UNSEEN`` stands for what the truth cannot show; seeded, so that the same rows give the same bytes."""
+    """Where errors of an axis are zero but for rounding for ``_STRETCH`` motions, as at rest or of a robot in a plane,
+    noise too small to be seen stands for what the truth cannot show; seeded: the same rows give the same bytes."""
+    unseen = 0.5 * least_seen(rms(np.concatenate([s.Y for s in sets])))
     rng, out = np.random.default_rng(0), []
     for s in sets:
         blocks = np.array_split(s.Y, max(len(s) // _STRETCH, 1))
-        quiet = np.repeat([_quiet(b) for b in blocks], [len(b) for b in blocks], axis=0)
-        out.append(replace(s, Y=s.Y + quiet * rng.normal(0.0, _UNSEEN, s.Y.shape)) if quiet.any() else s)
+        quiet = np.repeat([rms(b) < 0.1 * unseen for b in blocks], [len(b) for b in blocks], axis=0)
+        out.append(replace(s, Y=s.Y + quiet * rng.normal(0.0, unseen, s.Y.shape)) if quiet.any() else s)
     return out
-
-
-def _quiet(Y: Array) -> NDArray[np.bool_]:
-    """(6,) on which axes errors (n, 6) are zero but for rounding."""
-    return np.asarray(np.sqrt((Y**2).mean(axis=0)) < 0.1 * _UNSEEN)

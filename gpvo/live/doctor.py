@@ -30,7 +30,7 @@ from gpvo.types import Array
 
 _LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds up over as many frames as it lasts
 _SWAPPED = "every consumer reads metres where there are radians, and vice versa"
-_HUGE, _TINY = 1e3, 1e-8
+_HUGE, _TINY = 1e3, 0.999e-9  # 1e-9 in single precision is good
 _ZERO_FALLBACK = "FusionCore uses 0.1 m and 0.02 rad instead"
 _RL_FLOOR = "robot_localization uses 1e-9, a sigma of 0.03 mm, and ignores everything else"
 _PX4_FLOOR = "PX4 uses EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) instead"
@@ -114,7 +114,7 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
     checks: list[tuple[str, str, Any, str]] = [
         ("negative", "variances of the {} are negative", (D < 0).any(axis=1),
          "robot_localization takes the absolute value; PX4 and ArduPilot take their floors; Cholesky fails elsewhere"),
-        ("tiny", "variances of the {} are below 1e-8: a placeholder, not a measurement",
+        ("tiny", "variances of the {} are below 1e-9: a placeholder, not a measurement",
          ((D > 0) & (D < _TINY)).any(axis=1), f"{_RL_FLOOR}; {_PX4_FLOOR}; FusionCore's gate rejects good data"),
         ("huge", "variances of the {} are above 1e3 (9999, 1e6: 'unknown' or 'lost')", (D > _HUGE).any(axis=1),
          "no filter knows the flag: robot_localization fuses it with almost no weight and its correlations blow up; "

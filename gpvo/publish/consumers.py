@@ -164,7 +164,8 @@ def _verdict(
     """``typical``: the quantile of the predicted sigma that the parameter should not exceed. A velocity's sigma has a
     usual level and its low end matters; a pose's grows from nothing, so its middle does."""
     predicted = _percentiles(sigma)
-    hidden = 100.0 * float((sigma < (value if floor is None else floor)).mean())
+    # Variances were lifted to the one floor, up to rounding.
+    hidden = 100.0 * float((sigma < (value if floor is None else floor * (1 + 1e-6))).mean())
     advice, wanted = "", float(np.quantile(sigma, typical))
     if hidden > 1.0 and floor is None and wanted < value:
         advice = f"Set {name} to {max(wanted, minimum):.2g}"

@@ -45,12 +45,30 @@ BLOCKS = {"translation": (0, 1, 2), "rotation": (3, 4, 5), "joint": (0, 1, 2, 3,
 SEEN = 2e-6
 """m, rad: an axis whose errors are smaller throughout, as height, roll and pitch of a robot in a plane, tells nothing
 of a covariance: neither odometry nor truth speaks of it."""
+_SMALL_BESIDE, _LEAST_SEEN_M = 0.03, 1e-8
 
 
 def seen_axes(error: Array) -> NDArray[np.intp]:
-    """The axes (k,) of errors, or of motions, (n, d) that reach :data:`SEEN` in the root mean square."""
+    """The axes (k,) of errors, or of motions, (n, d) that reach :func:`least_seen` in the root mean square; none where
+    no axis reaches :data:`SEEN`."""
+    if not len(error):
+        return np.arange(0)
+    size = rms(error)
+    return np.flatnonzero((size >= least_seen(size)) & (size >= SEEN).any())
+
+
+def least_seen(size: Array) -> Array:
+    """(d,) what the root mean square errors ``size`` (d,) must reach: :data:`SEEN`; for a translation less, where even
+    the largest is tiny, as of an endoscope with a baseline of millimetres."""
+    least = np.full(len(size), SEEN)
+    least[:3] = np.clip(_SMALL_BESIDE * size[:3].max(), _LEAST_SEEN_M, SEEN)
+    return least
+
+
+def rms(error: Array) -> Array:
+    """(d,) root mean squares of errors (n, d)."""
     with np.errstate(over="ignore"):  # of a log that is absurd otherwise, too
-        return np.flatnonzero(np.sqrt((error**2).mean(axis=0)) >= SEEN) if len(error) else np.arange(0)
+        return np.asarray(np.sqrt((error**2).mean(axis=0)))
 
 
 def counted_axes(axes: ArrayLike | None, d: int) -> NDArray[np.intp]:

@@ -58,6 +58,13 @@ def test_a_wrong_imu_is_named(flight: Flight, change: Callable[[ImuLog], ImuLog]
     assert "\n" not in str(error.value)
 
 
+def test_a_wrong_gyroscope_is_named_beside_slow_frames() -> None:
+    slow = synthetic_flight(4, duration_s=60, rate_hz=1.0)
+    assert [f for f in check_flight(slow) if f.fatal] == []
+    wrong = _with_imu(slow, lambda i: replace(i, gyro_radps=i.gyro_radps[:, [1, 0, 2]]))
+    assert [f.kind for f in check_flight(wrong) if f.fatal] == ["gyro_axes"]
+
+
 @pytest.mark.parametrize("late_ms", [-120, -40, 60])
 def test_another_clock_is_measured(flight: Flight, late_ms: int) -> None:
     wrong = _with_imu(flight, lambda i: replace(i, t_ns=i.t_ns + late_ms * 10**6))

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError
 from gpvo.evaluation.flights import start_sigmas
-from gpvo.filters.policies import LearnedPolicy
+from gpvo.filters.policies import GeometricPolicy, LearnedPolicy
 from gpvo.filters.propagation import BA, TH
 from gpvo.filters.run import Flight, FuseOptions, begin, fuse_flight
 from gpvo.filters.start import StartSigmas, from_rest, from_truth, vertical_in_world
 from gpvo.geometry import se3
 from gpvo.io.run import read_run, write_run
-from gpvo.types import ImuLog, Status, TruthLog, VoLog, VoRecord
-from synthetic_flights import synthetic_flight
+from gpvo.types import ImuLog, Status, StereoCamera, TruthLog, VoLog, VoRecord
+from synthetic_flights import synthetic_flight, with_geometric
 
 
 def _rest(rng: np.random.Generator, R: np.ndarray, bias: np.ndarray, n: int = 100) -> ImuLog:
@@ -170,3 +170,28 @@ def test_missing_inputs_are_one_line() -> None:
     for init in ("truth", "static"):
         with pytest.raises(GpvoError, match=r"\(use --twins\)"):
             begin(replace(blind, imu=None), FuseOptions(init=init))
+
+
+def test_a_tiny_rig_is_filtered_as_any_other(tmp_path: Path) -> None:
+    """All lengths a thousandth, as of an endoscope: a start, or a walk of the velocity, of fixed size drowned its
+    errors."""
+    camera, C = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.25, 640, 480), np.diag([1e-6] * 3 + [1e-8] * 3)
+    flight, scores = replace(synthetic_flight(3, duration_s=10), imu=None, T_imu_cam=None), []
+    assert flight.T_world_cam is not None
+    for scale in (1.0, 1e-3):
+        S = np.diag([scale] * 3 + [1.0] * 3)
+        records, T = with_geometric(flight, S @ C @ S).records, flight.T_world_cam.copy()
+        records = [replace(r, T_prev_cur=_scaled(r.T_prev_cur, scale)) for r in records]
+        truth = TruthLog(np.array([r.t_ns for r in records]), _scaled(T, scale))
+        log = VoLog(records, replace(camera, baseline_m=scale * camera.baseline_m))
+        write_run(tmp_path / f"{scale:g}", log, truth=truth)
+        options = FuseOptions(sigmas=start_sigmas([read_run(tmp_path / f"{scale:g}")]))
+        tiny = replace(flight, records=records, T_world_cam=truth.T_world_cam, predictions={})
+        scores.append(fuse_flight(tiny, GeometricPolicy("triangulation"), options)[0].scores)
+    assert scores[1].ate_rmse_m == pytest.approx(1e-3 * scores[0].ate_rmse_m, rel=0.01)
+    for block, nees in scores[0].nees_dof.items():
+        assert scores[1].nees_dof[block] == pytest.approx(nees, rel=0.02)
+
+
+def _scaled(T: np.ndarray, scale: float) -> np.ndarray:
+    return se3.from_rt(T[..., :3, :3], scale * T[..., :3, 3])

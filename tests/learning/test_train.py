@@ -23,6 +23,7 @@ from gpvo.io.run import read_run, write_run
 from gpvo.learning import train as training
 from gpvo.learning.basefit import rate_changes
 from gpvo.learning.card import model_card
+from gpvo.learning.checked import checked
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import Learned, fit_model
 from gpvo.learning.methods import METHODS, best_scale, score
@@ -619,6 +620,15 @@ def test_axes_on_which_log_and_truth_never_differ_are_filled_in(axes: list[int])
     C = training.estimate_set(trained.predictor().model, sets[0]).covariance
     assert (np.diagonal(C, axis1=1, axis2=2)[:, axes] < 1e-10).all()
     assert train_sets(sets, QUICK, judge=False).arrays["share"].tobytes() == trained.arrays["share"].tobytes()
+
+
+def test_errors_of_a_tiny_rig_are_not_taken_for_an_axis_without_any() -> None:
+    """A baseline of a millimetre errs by 50 nm in a motion: noise of a micrometre would outweigh it."""
+    tiny = np.array([5e-8 / np.sqrt((training_sets([0], n=120)[0].Y[:, :3] ** 2).mean())] * 3 + [1.0] * 3)
+    sets = [replace(s, Y=s.Y * tiny) for s in training_sets(range(3), n=120)]
+    for before, after in zip(sets, checked(sets, "frame"), strict=True):
+        np.testing.assert_array_equal(after.Y, before.Y)
+    assert unseen_axes(sets) == []
 
 
 def test_a_flight_that_begins_at_rest_is_learned_from() -> None:

@@ -15,7 +15,7 @@ import pytest
 from gpvo.errors import GpvoError
 from gpvo.publish import consumers
 from gpvo.publish.mavlink import upper_triangle
-from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
+from gpvo.publish.odometry import Odometry, OdometryBuilder, lift, messages
 from receivers import ardupilot_errors, px4_sigmas, robot_localization_covariance
 from synthetic_flights import ErrorLaw, synthetic_flight
 
@@ -95,6 +95,8 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     assert any("VISO_POS_M_NSE" in line for line in ardupilot)
     assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
+    lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9, 1e-9)) for o in odometry]
+    assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
     with pytest.raises(GpvoError, match="unknown consumer"):
         consumers.check(odometry, "betaflight")
 

@@ -207,6 +207,16 @@ def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
     np.testing.assert_allclose(lift(np.eye(6), 1e-6, 1e-6), np.eye(6))
 
 
+def test_floors_hide_no_prediction_of_a_slow_or_tiny_rig() -> None:
+    """A frame a second turns by 6e-5 rad/s of error, a baseline of a millimetre errs by micrometres."""
+    C, record = np.diag([6e-5**2] * 6), VoRecord(10**9, 0, Status.OK, np.eye(4))
+    plain, floored = (
+        OdometryBuilder(floors=f).step(record, _prediction(10**9, 0 * C, C, 0 * C)) for f in (TINY, Floors())
+    )
+    np.testing.assert_allclose(floored.twist_covariance, plain.twist_covariance)
+    np.testing.assert_allclose(floored.pose_covariance, plain.pose_covariance)
+
+
 def test_no_covariance_is_one_clear_line() -> None:
     with pytest.raises(GpvoError, match="neither a prediction nor a 'triangulation'"):
         OdometryBuilder(method="triangulation").step(VoRecord(10**8, 0, Status.OK, np.eye(4)))

@@ -14,6 +14,7 @@ from gpvo.stats.consistency import (
     energy_score,
     nees,
     nll_per_dim,
+    seen_axes,
     whiten,
 )
 from scipy import stats
@@ -131,3 +132,20 @@ def test_a_constant_in_changing_conditions_fails_by_difficulty():
     blunted = (sigma**1.0)[:, None, None] * np.eye(2)  # half of what is to be known of each motion's difficulty
     nees_dof, _ = by_difficulty(e, blunted)
     assert nees_dof[0] < 0.7 < 1.6 < nees_dof[3]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 80.0])
+def test_the_axes_that_count_do_not_depend_on_the_size_of_the_rig(scale):
+    """An endoscope errs by less than a micrometre in a motion; height, roll and pitch in a plane are rounding."""
+    e = 4e-4 * scale * np.random.default_rng(0).standard_normal((500, 6)) * [1.0, 0.2, 2.0, 0.3, 1.0, 0.2]
+    e[:, 3:] /= scale
+    assert seen_axes(e).tolist() == [0, 1, 2, 3, 4, 5]
+    plane = [1, 3, 5]
+    e[:, plane] = 4e-7 * min(scale, 1.0) * np.random.default_rng(1).standard_normal((500, 3))
+    assert seen_axes(e).tolist() == [0, 2, 4]
+
+
+def test_an_odometry_that_is_its_own_truth_shows_no_axis():
+    rounding = 4e-7 * np.random.default_rng(0).standard_normal((500, 6))
+    for e in (rounding, 0.0 * rounding, rounding[:0]):
+        assert len(seen_axes(e)) == 0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
+from gpvo.runner import RunSummary
 from gpvo.sim.points import simulate_points
 from gpvo.types import ImuLog, Status, StereoFrame, TrackFrame, VoLog, VoRecord
 from gpvo.vo.config import make_config, read_settings
@@ -206,6 +207,8 @@ def test_settings_are_read_from_text() -> None:
         "methods": ("spherical", "triangulation"),
     }
     assert make_config(**read).klt_window_px == 21
+    slow = make_config(max_acceleration_mps2=0.01, max_turn_radps2=0.02).vehicle
+    assert (slow.max_acceleration_mps2, slow.max_turn_radps2) == (0.01, 0.02)
 
 
 @pytest.mark.parametrize(
@@ -244,3 +247,8 @@ def test_sigmas_follow_the_residuals(clip: Clip) -> None:
         records = [odometry.step(f) for f in source.frames]
         sizes.append(np.trace(records[-1].covariances["pointing_matching"]))
     assert sizes[1] > 2 * sizes[0]
+
+
+@pytest.mark.parametrize("length_m, told", [(0.0196, "0.0196 m"), (31.04, "31.0 m")])
+def test_a_short_path_is_not_called_none(length_m: float, told: str) -> None:
+    assert told in str(RunSummary(61, {}, length_m, 12.0, ""))
