@@ -1,4 +1,4 @@
-"""Does the model know this place? The training domain, and what to believe outside it."""
+"""Does the model know this place? The training domain, what to believe outside it, and what late truth teaches."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.online.stored import Stored
+from gpvo.stats import student_t
 from gpvo.types import Array, StereoCamera
 
 _CAMERA = 0.25
+_LEVEL, _STEP = 0.9, 0.05
 _MISSING = 2.0  # Standard deviations outside, where training never missed the value.
 DEGRADED_BELOW = 0.5
 """``in_domain`` below which a prediction is called ``degraded``."""
@@ -98,3 +100,30 @@ def camera_problems(trained: StereoCamera | None, here: StereoCamera | None) -> 
     )
     far = [pair for pair in pairs if abs(pair[2] / pair[1] - 1.0) > _CAMERA]
     return [f"{name} is {b:.4g}, the model was trained with {a:.4g}" for name, a, b in far]
+
+
+class AdaptiveScale:
+    """A factor on each axis' standard deviation that brings the long-run coverage of the 90 % interval to 90 %.
+
+    Steps are in the log of the scale, so the factor stays positive; it is kept within [1/100, 100]. I. Gibbs, E.
+    Candes, "Adaptive Conformal Inference Under Distribution Shift" (2021), equation 2, in the form that moves the
+    interval itself: A. Angelopoulos, E. Candes, R. Tibshirani, "Conformal PID Control" (2023), equation 4.
+    """
+
+    def __init__(self, scale: Array | None = None) -> None:
+        self._log_scale = np.zeros(6) if scale is None else np.log(scale)
+
+    @property
+    def scale(self) -> Array:
+        """(6,) factor on each standard deviation; ones before any truth."""
+        return np.exp(self._log_scale)
+
+    def observe(self, error: Array, sigma: Array, nu: float = np.inf) -> None:
+        """``error`` (6,) about the mean, and the ``sigma`` (6,) stated for it, including the factor at that time.
+
+        The interval is that of a t with ``nu`` degrees of freedom: by a Gaussian's, the standard deviations of heavy
+        tails would shrink. Axes whose error is NaN are left unchanged.
+        """
+        missed = np.abs(error) > student_t.half_width(_LEVEL, nu) * sigma
+        move = np.where(np.isfinite(error), _STEP * (missed - (1.0 - _LEVEL)), 0.0)
+        self._log_scale = np.clip(self._log_scale + move, -np.log(100.0), np.log(100.0))

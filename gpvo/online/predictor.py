@@ -18,9 +18,8 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
 from gpvo.online import modelfile
-from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.guard import DEGRADED_BELOW, camera_problems
+from gpvo.online.guard import DEGRADED_BELOW, AdaptiveScale, camera_problems
 from gpvo.online.observer import Observer
 from gpvo.online.stored import arrays_of_base
 from gpvo.types import Array, Prediction, Status, StereoCamera, Vehicle, VoLog, VoRecord

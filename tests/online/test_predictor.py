@@ -13,8 +13,8 @@ from gpvo.dataset.build import build
 from gpvo.errors import ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
-from gpvo.online.adapt import AdaptiveScale
 from gpvo.online.division import divide, ln_faster
+from gpvo.online.guard import AdaptiveScale
 from gpvo.online.observer import joined
 from gpvo.online.predictor import Predictor
 from gpvo.types import Status, VoLog
