@@ -30,7 +30,7 @@ from gpvo.sim.points import simulate_points
 from matplotlib.axes import Axes
 
 TRAINING = (0, 1, 2, 3)
-SHOWN = 43  # of the flights 40 to 48 the one whose filter gains as much as the median one
+SHOWN = 44  # of the flights 40 to 48 the one whose filter gains as much as the median one
 OUT = Path(__file__).parent / "images" / "overview.png"
 
 
@@ -83,7 +83,8 @@ def draw_path(ax: Axes, shown: Run, evaluation: Evaluation, fused: FusedRun) -> 
     ax.set(xlabel="x [m]", ylabel="y [m]")
     ax.margins(y=0.15)
     ax.set_aspect("equal", adjustable="datalim")
-    ax.legend(ncols=1, frameon=False, loc="center left", title="path from above,\n3 sigma drawn 10 times as large")
+    ax.set_title("path from above, 3 sigma drawn 10 times as large", loc="left", fontsize="medium")
+    ax.legend(ncols=1, frameon=False, loc="center left")
 
 
 def main() -> None:
