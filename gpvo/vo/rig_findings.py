@@ -112,14 +112,15 @@ def read_state(path: Path, camera: StereoCamera) -> RigState:
     state = RigState.prior(camera)
     mean, covariance = state.mean.copy(), state.covariance.copy()
     covariance[place], covariance[:, place] = 0.0, 0.0
-    mean[place], covariance[np.ix_(place, place)] = read_mean, 0.5 * (read_covariance + read_covariance.T)
-    uncertain = bool(covariance.any())  # else the calibration is right beyond doubt
-    covariance += 1e-14 * uncertain * np.eye(len(mean))
     # At half the width of the image all terms displace alike, however narrow the view.
     reach = np.tile((0.5 * camera.width / camera.fx_px) ** ORDER, 2)
-    at_border = covariance * np.outer(reach, reach)
-    # Comparisons with NaN are false.
-    if not (np.abs(mean * reach).max() <= 0.2 and np.abs(at_border).max() <= 1e3 and 0 <= probability <= 1):
+    with np.errstate(over="ignore", invalid="ignore"):  # Comparisons with NaN are false.
+        mean[place], covariance[np.ix_(place, place)] = read_mean, 0.5 * (read_covariance + read_covariance.T)
+        uncertain = bool(covariance.any())  # else the calibration is right beyond doubt
+        covariance += 1e-14 * uncertain * np.eye(len(mean))
+        at_border = covariance * np.outer(reach, reach)
+        is_usual = np.abs(mean * reach).max() <= 0.2 and np.abs(at_border).max() <= 1e3
+    if not (is_usual and 0 <= probability <= 1):
         raise SourceError("holds impossible numbers", where=path, cure=f"give the {STATE_FILE} of a run")
     if uncertain and np.linalg.eigvalsh(at_border)[0] <= 0:
         raise SourceError("its covariance is not positive definite", where=path)

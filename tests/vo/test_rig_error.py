@@ -166,7 +166,8 @@ def test_state_file_round_trip_and_hostile_ones(tmp_path: Path) -> None:
     assert again.probability == pytest.approx(state.probability)
     with pytest.raises(GpvoError, match="another camera"):
         read_state(path, replace(CAMERA, width=320))
-    for change in ({"mean": [1e9] * 30}, {"covariance": [[0.0]]}, {"mean": "x"}, {"probability": None}):
+    huge = {"covariance": [[1.7e308] * (2 * N_TERMS)] * (2 * N_TERMS)}
+    for change in ({"mean": [1e9] * 30}, {"covariance": [[0.0]]}, huge, {"mean": "x"}, {"probability": None}):
         write_json(path, {**document(state, CAMERA), **change})
         with pytest.raises(GpvoError):
             read_state(path, CAMERA)
