@@ -38,4 +38,5 @@ def test_each_sequence_and_each_system_left_out(tmp_path: Path) -> None:
         joint = np.array([r["learned"]["nees_dof"]["joint"] for r in rows])
         assert ((joint > 0.3) & (joint < 3.0)).all()
         assert all(r["learned"]["nll_per_dim"] < r["constant"]["nll_per_dim"] + 0.3 for r in rows)
-    assert found["across"]["b"][0]["fits"] is True
+    # The other system's log is a copy: a model of the one has learned from the very run of the other.
+    assert "this very run" in " ".join(found["across"]["b"][0]["problems"])
