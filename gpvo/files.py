@@ -255,6 +255,11 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     write_text(path, stream.getvalue())
 
 
+def in_metres(length_m: float) -> str:
+    """A length for people: to a decimetre, of less than a metre, as of an endoscope's path, three digits."""
+    return f"{length_m:{'.1f' if length_m >= 1 else '.3g'}} m"
+
+
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """The lines of a table in Markdown."""
     cells = [head, ["---"] * len(head), *rows]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpvo.errors import GpvoError, SourceError
-from gpvo.files import plain, read_toml, write_json
+from gpvo.files import in_metres, plain, read_toml, write_json
 from gpvo.io.run import RunWriter, as_stored
 from gpvo.io.snapshot import digest_of
 from gpvo.types import ImuLog, Prediction, Status, StereoFrame, TrackFrame, VoRecord
@@ -45,8 +45,7 @@ class RunSummary:
     def __str__(self) -> str:
         named = ((s.value, self.status.get(s.value, 0)) for s in Status if s is not Status.START)
         parts = ", ".join(f"{n} {name}" for name, n in named if n)
-        length = f"{self.path_length_m:{'.1f' if self.path_length_m >= 1 else '.3g'}} m"  # an endoscope's: centimetres
-        return f"{self.frames} frames ({parts}), {length}, {self.frames_per_s:.0f} frames/s"
+        return f"{self.frames} frames ({parts}), {in_metres(self.path_length_m)}, {self.frames_per_s:.0f} frames/s"
 
 
 def run(

@@ -15,6 +15,7 @@ from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
 from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
+from gpvo.files import in_metres
 from gpvo.io.run import Run, read_run
 from gpvo.io.source import open_source
 from gpvo.io.trajectory import read_tum
@@ -220,9 +221,8 @@ def _with_twins(
 def _print(d: dict[str, Any]) -> None:
     if about := d.get("simulated_truth"):
         say_simulated(about)
-    length = d["path_length_m"]
     say(
-        f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {length:{'.1f' if length >= 1 else '.3g'}} m;"
+        f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {in_metres(d['path_length_m'])};"
         f" ATE {d['ate_rmse_m']:.3g} m,"
         f" final error {d['final_error_m']:.3g} m"
     )

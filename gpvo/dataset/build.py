@@ -189,7 +189,7 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
         n_lost += judged.status is Status.LOST
         if judged.status is Status.LOST and REASON in judged.reason and detector.expected is not None:
             slips.append(judged)
-            jumps.append(detector.jump(judged))
+            jumps.append(detector.jump(judged.T_prev_cur, judged.dt_s))
     return n_lost, slips, np.array(jumps).reshape(-1, 6)
 
 

@@ -66,9 +66,10 @@ def _learned_from(predictor: Predictor, X: Array) -> bool:
     kept, sequence = predictor.arrays.get("sample.X"), predictor.arrays.get("sample.sequence")
     if kept is None or sequence is None:  # an older file
         return False
-    here, there = ({row.tobytes() for row in np.nan_to_num(rows).astype(np.float32)} for rows in (X, kept))
-    known = np.array([row.tobytes() in here for row in np.nan_to_num(kept)])
-    enough = len(here & there) >= _ROWS  # a vehicle at rest has the same few rows in every run
+    here, there = ([row.tobytes() for row in np.nan_to_num(rows).astype(np.float32)] for rows in (X, kept))
+    both = set(here) & set(there)
+    known = np.array([row in both for row in there])
+    enough = len(both) >= _ROWS  # a vehicle at rest has the same few rows in every run
     return enough and any(known[sequence == s].mean() > 0.5 for s in np.unique(sequence))
 
 

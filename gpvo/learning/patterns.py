@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gpvo.learning.rows import Rows
 from gpvo.learning.spans import cut
 from gpvo.online.base import TWIST_COLUMNS
+from gpvo.stats.consistency import rms
 from gpvo.types import Array
 
 PERSISTENT_S = 3600.0
@@ -64,8 +65,8 @@ def learn_patterns(rows: Rows, error: Array, variance: Array, fold: NDArray[np.i
 
 @dataclass(frozen=True)
 class _Sums:
-    """Of the separate windows of a flight: sums (w, 6) of the errors and of the velocities, and the stated deviations
-    of the former, were motions independent."""
+    """Of the separate windows of a flight: sums (w, 6) of the errors and of the velocities, each times its duration in
+    usual ones, and the stated deviations of the former, were motions independent."""
 
     error: Array
     sigma: Array
@@ -81,12 +82,8 @@ def _sums(error: Sequence[Array], variance: Sequence[Array], twist: Sequence[Arr
 def _clear(flights: Sequence[_Sums], step_s: float) -> NDArray[np.bool_]:
     """(6,) which velocities add up to ten times as much as VO's own errors in them: an error that seems to follow any
     other velocity may merely follow VO's error in it."""
-    moved, wrong = (_rms(np.concatenate(x)) for x in ([f.twist for f in flights], [f.error for f in flights]))
+    moved, wrong = (rms(np.concatenate(x)) for x in ([f.twist for f in flights], [f.error for f in flights]))
     return np.asarray(moved * step_s > _CLEAR * wrong)
-
-
-def _rms(values: Array) -> Array:
-    return np.asarray(np.sqrt((values**2).mean(axis=0)))
 
 
 @dataclass(frozen=True)
@@ -129,7 +126,7 @@ class _Unit:
     @classmethod
     def of(cls, flights: Sequence[_Sums], clear: NDArray[np.bool_]) -> _Unit:
         """By all windows."""
-        error, twist = (_rms(np.concatenate(x)) for x in ([f.sigma for f in flights], [f.twist for f in flights]))
+        error, twist = (rms(np.concatenate(x)) for x in ([f.sigma for f in flights], [f.twist for f in flights]))
         return cls(error, twist[clear], clear)
 
     def evidence(self, f: _Sums) -> _Evidence:

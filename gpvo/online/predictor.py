@@ -250,7 +250,8 @@ class Predictor:
         known = np.inf, se3.log(record.T_prev_cur) / dt_s, np.zeros(6)
         if slip.expected is not None:
             known = slip.age_s, slip.expected, self._rate_var
-        C = self.model.velocities.lost_covariance(self.model.dt_s, dt_s, *known, slip.jump(record))
+        jump = slip.jump(record.T_prev_cur, dt_s)
+        C = self.model.velocities.lost_covariance(self.model.dt_s, dt_s, *known, jump)
         # After a jump of kilometres, rounding alone would make it indefinite.
         return C + np.diag(_NO_MOTION_VAR + _ROUNDING * variances(C))
 

@@ -103,11 +103,11 @@ class SlipDetector:
         self._anchor = (middle_s, now)
         return record
 
-    def jump(self, record: VoRecord) -> Array:
-        """(6,) error of the motion [m, rad] if the vehicle has kept the velocity expected of it, after ``step``."""
+    def jump(self, T_prev_cur: Array, dt_s: float) -> Array:
+        """(6,) error of the latest motion (4, 4) [m, rad] if the vehicle has kept the velocity expected of it."""
         if self.expected is None:
             return np.zeros(6)
-        return se3.log(se3.inverse(se3.exp(self.expected * record.dt_s)) @ record.T_prev_cur)
+        return se3.log(se3.inverse(se3.exp(self.expected * dt_s)) @ T_prev_cur)
 
     def _problem(self, record: VoRecord, change: tuple[float, float], disagreement: float | None) -> str:
         acc = record.imu_acc_mean_mps2

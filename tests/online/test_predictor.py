@@ -140,6 +140,15 @@ def test_a_slip_is_lost_and_its_covariance_covers_the_jump(predictor, flight):
     assert said[81].status is not Status.LOST
 
 
+def test_a_motion_that_ends_before_it_begins_is_no_jump(predictor, flight):
+    """It lasted as long as usual: its stamps alone are wrong."""
+    records = list(flight[0].records[:61])
+    records[60] = replace(records[60], t_prev_ns=records[60].t_ns + 50_000_000)
+    lost = [predictor.step(r) for r in records][-1]
+    assert lost.status is Status.LOST
+    assert lost.sigma[2] < 0.5 * np.linalg.norm(records[60].T_prev_cur[:3, 3])
+
+
 def _losing(log: VoLog, gone: int) -> tuple[VoLog, list[int]]:
     """The log with stretches of ``gone`` motions lost, in which VO gives its last velocity from the last good frame on,
     and the last frames of the stretches."""
