@@ -29,8 +29,8 @@ PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-c
 demo: .venv/demo-ready
 	$(BIN)/python examples/demo.py
 
-# Two workers share the machine: more threads would only wait for one another.
-tests check: export OMP_NUM_THREADS = 1
+# Matrices are small, and two processes share the machine: more threads would only wait for one another.
+demo tests check: export OMP_NUM_THREADS = 1
 
 # Types are checked beside the tests, which leave a processor idle now and then.
 test: .venv/test-ready
