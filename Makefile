@@ -45,8 +45,9 @@ lint: .venv/test-ready
 tests: .venv/test-ready
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
+# Only files with longer tests are loaded, by each of the workers.
 check: .venv/test-ready
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow $$(grep -rl --include='*.py' 'mark\.slow' tests | sort)
 
 bench: .venv/test-ready
 	$(BIN)/python -m bench
