@@ -6,7 +6,8 @@
 # make bench  speed and memory, as ratios within one run
 PYTHON ?= python3
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Bytecode is written when a module is first imported, as most modules of large packages never are.
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
 .PHONY: demo test lint tests check bench docs dist clean
 
@@ -28,8 +29,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 demo: .venv/demo-ready
 	$(BIN)/python examples/demo.py
 
-# Two workers share the machine: more threads would only wait for one another.
-tests check: export OMP_NUM_THREADS = 1
+# Matrices are small, and two processes share the machine: more threads would only wait for one another.
+demo tests check: export OMP_NUM_THREADS = 1
 
 # Types are checked beside the tests, which leave a processor idle now and then.
 test: .venv/test-ready
@@ -44,8 +45,9 @@ lint: .venv/test-ready
 tests: .venv/test-ready
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
+# Only files with longer tests are loaded, by each of the workers.
 check: .venv/test-ready
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow $$(grep -rl --include='*.py' 'mark\.slow' tests | sort)
 
 bench: .venv/test-ready
 	$(BIN)/python -m bench

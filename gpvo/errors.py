@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 _EXTRAS = {
     "vo": ("cv2", "yaml"),
-    "runs": ("pyarrow", "pandas", "scipy", "matplotlib", "jinja2", "joblib"),
+    "runs": ("pyarrow", "scipy", "matplotlib", "jinja2", "joblib"),
     "train": ("torch", "gpytorch", "sklearn", "linear_operator"),
     "sim": ("embreex", "mujoco", "numba", "pydantic"),
     "ros": ("rosbags", "zenoh", "cyclonedds"),

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
 from gpvo.errors import SourceError
 from gpvo.files import replacing
 from gpvo.geometry.covariance import from_upper, upper
+from gpvo.io.parquet import numbers_of
 from gpvo.types import Array, StereoCamera
 
 SCHEMA = 1
@@ -48,7 +50,7 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
         schema = pa.unify_schemas(schemas).with_metadata(metadata)
         with pq.ParquetWriter(whole, schema, compression="zstd") as writer:
             for i in range(len(about)):
-                table = pq.read_table(Path(folder) / str(i))
+                table = pq.ParquetFile(Path(folder) / str(i)).read()  # read_table would load pandas
                 n = table.num_rows
                 columns = [table[f.name] if f.name in table.column_names else pa.nulls(n, f.type) for f in schema]
                 writer.write_table(pa.Table.from_arrays(columns, schema=schema), row_group_size=max(n, 1))
@@ -67,7 +69,12 @@ def _table(i: int, s: TrainingSet) -> pa.Table:
     for kind, matrices in (("cov", s.covariances), ("vt", s.v_t)):
         for method, C in matrices.items():
             columns |= zip(_elements(kind, method, C.shape[-1]), upper(C).T, strict=True)
-    return pa.table({k: pa.array(v) for k, v in columns.items()})
+    return pa.table({k: _array(np.ascontiguousarray(v)) for k, v in columns.items()})
+
+
+def _array(values: NDArray[Any]) -> pa.Array:
+    """``pa.array(values)``, which would load pandas, for numbers."""
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
 
 
 def _elements(kind: str, method: str, d: int) -> list[str]:
@@ -79,7 +86,7 @@ def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
     """Rows of one sequence; ``entry``: what the file's metadata says of it."""
 
     def column(name: str) -> Any:
-        return table[name].to_numpy(zero_copy_only=False)
+        return numbers_of(table[name])
 
     def matrices(kind: str, d: int) -> dict[str, Array]:
         methods = dict.fromkeys(n.split(".")[1] for n in table.column_names if n.startswith(f"{kind}."))

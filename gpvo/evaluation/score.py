@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,12 +24,14 @@ from gpvo.io.foreign import read_foreign
 from gpvo.io.run_read import Run
 from gpvo.io.stated import read_stated, to_records, write_stated
 from gpvo.io.trajectory import read_tum, write_tum
-from gpvo.learning.config import TrainConfig
-from gpvo.learning.train import TrainedModel, fold_model
 from gpvo.online.features import AXES
 from gpvo.online.predictor import Predictor
 from gpvo.stats.series import sequence_bootstrap
 from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog, VoRecord
+
+if TYPE_CHECKING:
+    from gpvo.learning.config import TrainConfig
+    from gpvo.learning.train import TrainedModel
 
 POOLED = ("energy_translation_m", "energy_rotation_rad", "nll_per_dim", "nees_dof", "correlation_gain_nats")
 """Scores that are averaged over the sequences, with an interval by whole sequences."""
@@ -215,6 +217,8 @@ def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConf
 
     ``trained`` from the same ``runs``, in their order, with its folds kept in ``config.keep``.
     """
+    from gpvo.learning.train import fold_model  # loads torch, which judging does without
+
     assert config.keep is not None
     names, options = distinct([run.name for run in runs]), EvaluateOptions(align=config.align)
     folds = leave_one_out(trained.sets)

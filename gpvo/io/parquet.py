@@ -249,7 +249,26 @@ def _to_numpy(name: str, column: pa.ChunkedArray) -> NDArray[Any]:
         raise ValueError(f"the column '{name}' holds {column.type}, not {wanted}")
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type) or pa.types.is_dictionary(column.type):
         return np.array(column.to_pylist(), dtype=object)
-    values = np.asarray(column.to_numpy())
+    values = numbers_of(column)
     if values.dtype.kind == "f" and (np.isfinite(values) & (np.abs(values) > _LARGEST)).any():
         raise ValueError(f"the column '{name}' holds a number beyond {_LARGEST:g}")
     return values
+
+
+def numbers_of(column: pa.ChunkedArray) -> NDArray[Any]:
+    """A column of numbers or booleans as ``column.to_numpy()`` gives it, NaN for null, or None if they are not numbers;
+    but that loads pandas where it is installed, which takes half a second."""
+    array = column.combine_chunks()
+    kind, end = np.dtype(array.type.to_pandas_dtype()), array.offset + len(array)
+    if kind.hasobject or not end:
+        return np.array(array.to_pylist(), kind)
+
+    def bits(buffer: pa.Buffer) -> NDArray[np.bool_]:
+        return np.unpackbits(np.frombuffer(buffer, np.uint8), count=end, bitorder="little").view(bool)
+
+    is_bool, (known, data) = kind.kind == "b", array.buffers()
+    values: NDArray[Any] = bits(data) if is_bool else np.frombuffer(data, kind, end)
+    if array.null_count:
+        values = values.astype(kind if kind.kind == "f" else object if is_bool else np.float64)
+        values[~bits(known)] = None if is_bool else np.nan
+    return values[array.offset :]

@@ -83,7 +83,9 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
     _check_document(document, path)
     if _digest(arrays, document["header"]) != document["digest"]:
         raise ModelError("the content does not match its digest", where=path, cure="copy or train the model again")
-    return arrays, _printable(document["header"])
+    # Without escapes, all text of the header stands as it is in the text that it was read from.
+    plain_text = text.isprintable() and "\\" not in text
+    return arrays, document["header"] if plain_text else _printable(document["header"])
 
 
 def _check_document(document: Any, path: Path) -> None:

@@ -56,7 +56,10 @@ def _placed(T_prev_cur: Array, uvd_prev: Array, camera: StereoCamera) -> tuple[A
     m = R @ m_prev + (-R @ T_prev_cur[:3, 3])[:, None] * rho
     in_front = m[2] > 1e-6
     w = 1.0 / np.where(in_front, m[2], 1.0)
-    uvd = np.stack([fx * (m[0] * w) + camera.cx_px, fy * (m[1] * w) + camera.cy_px, fx * b * rho * w])
+    uvd = np.empty_like(m)
+    uvd[0] = fx * (m[0] * w) + camera.cx_px
+    uvd[1] = fy * (m[1] * w) + camera.cy_px
+    uvd[2] = fx * b * rho * w
     return m, w, uvd, in_front
 
 
@@ -128,7 +131,11 @@ def whitener(C: Array) -> Array:
 def apply_whitener(W: Array, M: Array) -> Array:
     """Lower-triangular (3, 3, N) times (3, k, N) or (3, N)."""
     w = W if M.ndim == 2 else W[:, :, None]
-    return np.stack([w[0, 0] * M[0], w[1, 0] * M[0] + w[1, 1] * M[1], w[2, 0] * M[0] + w[2, 1] * M[1] + w[2, 2] * M[2]])
+    out = np.empty(M.shape)
+    out[0] = w[0, 0] * M[0]
+    out[1] = w[1, 0] * M[0] + w[1, 1] * M[1]
+    out[2] = w[2, 0] * M[0] + w[2, 1] * M[1] + w[2, 2] * M[2]
+    return out
 
 
 @dataclass(frozen=True)
@@ -260,13 +267,10 @@ def _smoothing(S: Array, G: Array, W: Array, left: Array, persistent: float) -> 
 
     Less the expected noise of the reference given the residual: ``(S G^T - persistent e_d g^T) W^T z``.
     """
-    lifted = np.stack(
-        [
-            W[0, 0] * left[0] + W[1, 0] * left[1] + W[2, 0] * left[2],
-            W[1, 1] * left[1] + W[2, 1] * left[2],
-            W[2, 2] * left[2],
-        ]
-    )
+    lifted = np.empty(left.shape)
+    lifted[0] = W[0, 0] * left[0] + W[1, 0] * left[1] + W[2, 0] * left[2]
+    lifted[1] = W[1, 1] * left[1] + W[2, 1] * left[2]
+    lifted[2] = W[2, 2] * left[2]
     out = np.einsum("ikn,in->nk", G, lifted) @ S
     out[:, 2] -= persistent * (persistent_direction(G) * lifted).sum(0)
     return out

@@ -70,11 +70,15 @@ def test_what_flies_needs_numpy_and_safetensors_alone() -> None:
     assert done.stdout == "frame\n", done.stderr
 
 
-@pytest.mark.parametrize("command", ["evaluate", "fuse"])
-def test_a_model_is_judged_without_what_trains_it(command: str) -> None:
+@pytest.mark.parametrize(
+    "words", [("evaluate", "--stated", "said"), ("fuse", "--plot", "said.png")], ids=["evaluate", "fuse"]
+)
+def test_a_model_is_judged_without_what_trains_it(words: tuple[str, str, str], tmp_path: Path) -> None:
     absent = ("torch", "gpytorch", "sklearn", "numba", "mujoco", "embreex", "rosbags")
     model = str(ROOT / "models" / "tunnel.gpvo")
-    code, said = call(absent, command, str(ROOT / "data" / "unseen"), "--model", model, "--json")
+    command, option, name = words
+    files = ("--model", model, option, str(tmp_path / name))
+    code, said = call(absent, command, str(ROOT / "data" / "unseen"), "--json", *files)
     assert code == 0, said
 
 

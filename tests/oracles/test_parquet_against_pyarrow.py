@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from gpvo.io.parquet import join_tables, read_columns, write_table
+from gpvo.io.parquet import join_tables, numbers_of, read_columns, write_table
 from hypothesis import given, settings
 
+ROOT = Path(__file__).parents[2]
 ROWS = st.integers(0, 70)
 NUMBERS = {"t_ns": st.integers(-(2**63), 2**63 - 1), "track": st.integers(-(2**31), 2**31 - 1)}
 
@@ -74,3 +78,42 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path, at: float):
     path.write_bytes(bytes(data))
     with pytest.raises(Exception, match="damaged"):
         read_columns(path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_numbers_are_those_of_to_numpy(data):
+    kind, values = data.draw(
+        st.sampled_from(
+            [
+                (pa.null(), st.none()),
+                (pa.bool_(), st.booleans()),
+                (pa.int32(), st.integers(-(2**31), 2**31 - 1)),
+                (pa.uint8(), st.integers(0, 255)),
+                (pa.int64(), st.integers(-(2**63), 2**63 - 1)),
+                (pa.float32(), st.floats(width=32)),
+                (pa.float64(), st.floats()),
+            ]
+        )
+    )
+    some = values if data.draw(st.booleans()) else st.none() | values
+    parts = data.draw(st.lists(st.lists(some, max_size=20), max_size=3))
+    cuts = data.draw(st.lists(st.integers(0, 9), min_size=len(parts), max_size=len(parts)))
+    column = pa.chunked_array([pa.array(p, kind).slice(c) for p, c in zip(parts, cuts, strict=True)], kind)
+    found, expected = numbers_of(column), column.to_numpy()
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_no_table_loads_pandas(tmp_path):
+    code = f"""
+import sys
+from gpvo.dataset.build import build_run
+from gpvo.dataset.table import read_sets, write_sets
+from gpvo.io.run import read_run
+path = {str(tmp_path / "sets.parquet")!r}
+write_sets(path, [build_run(read_run({str(ROOT / "data" / "tunnel-1")!r}))])
+print(len(read_sets(path)), "pandas" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "1 False\n", done.stderr
