@@ -50,6 +50,14 @@ def _has_storage(path: Path) -> bool:
     return path.suffix.lower() in (".bag", ".db3", ".mcap")
 
 
+class _AnyCase(type(Path())):  # type: ignore[misc]
+    """A path by whose suffix rosbags tells the kind of a bag, also where it is in capitals."""
+
+    @property
+    def suffix(self) -> str:
+        return str(super().suffix).lower()
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
     """An open ``rosbags`` reader.
@@ -71,7 +79,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     try:
         require_tables(path)
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([_AnyCase(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
@@ -81,7 +89,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     # memory errors, the last for a length that is no length.
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
-        cure = "the recording was cut off: 'rosbag reindex' or 'ros2 bag reindex' may repair it"
+        cure = "if the recording was cut off, 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover' may repair it"
         raise SourceError(f"unreadable bag: {reason or type(error).__name__}", where=path, cure=cure) from None
 
 
@@ -279,12 +287,18 @@ def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], 
 
 def require_tables(path: Path) -> None:
     """Raise SourceError where a bag (a file or folder) has a database of more than tables and their indices: a view
-    may have no end. sqlite3.Error where one is damaged."""
+    may have no end; and one whose last messages are in a journal beside it, which rosbags does not read. sqlite3.Error
+    where one is damaged."""
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         if file.suffix.lower() != ".db3":
             continue
         if found := set(str(file)) & set("#%?"):  # rosbags opens databases by an address, in which these have a meaning
             raise SourceError(f"its path holds '{min(found)}'", where=file, cure="rename the file or folder")
+        journals = (file.with_name(f"{file.name}-{kind}") for kind in ("wal", "journal"))
+        if journal := next((p for p in journals if p.is_file() and p.stat().st_size), None):
+            text = f"is not whole without {journal.name}: it is still recorded, or the recorder was killed"
+            cure = f"end the recorder, then let SQLite join them: sqlite3 {file.name} 'SELECT count(*) FROM messages'"
+            raise SourceError(text, where=file, cure=cure)
         database = sqlite3.connect(f"{file.resolve().as_uri()}?immutable=1", uri=True)
         try:
             other = " AND ".join(["sql NOT LIKE ?"] * len(_ALLOWED))

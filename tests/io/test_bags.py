@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +49,13 @@ def test_single_storage_files(tmp_path):
     assert len(seq.frames_of(open_source(next(folder.glob("*.mcap"))))) == 12
     folder = _write(tmp_path / "b", "sqlite3")
     assert len(seq.frames_of(open_source(next(folder.glob("*.db3"))))) == 12
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_suffixes_in_capitals_are_suffixes(tmp_path, kind):
+    path = _write(tmp_path, kind)
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    assert len(seq.frames_of(open_source(file.rename(tmp_path / f"A{file.suffix.upper()}")))) == 12
 
 
 def test_missing_images_shift_nothing(tmp_path):
@@ -137,6 +147,29 @@ def test_a_database_that_rosbags_cannot_open_by_its_name(tmp_path, name):
     path = maker.write(tmp_path / "plain").rename(tmp_path / name)
     with pytest.raises(SourceError, match=r"its path holds '.'.*rename"):
         open_source(path)
+
+
+@pytest.mark.parametrize("mode", ["wal", "delete"])
+def test_a_database_whose_recorder_was_killed_is_read_whole_or_not_at_all(tmp_path, mode):
+    folder = _write(tmp_path, "sqlite3")
+    live = next(folder.glob("*.db3"))
+    with closing(sqlite3.connect(live, isolation_level=None)) as recorder:
+        for line in (f"PRAGMA journal_mode={mode}", "PRAGMA cache_size=1", "BEGIN", "CREATE TABLE other (data BLOB)"):
+            recorder.execute(line).fetchall()
+        recorder.execute("UPDATE messages SET data=data, topic_id=topic_id")  # stays in the journal
+        if mode == "wal":
+            recorder.execute("COMMIT")
+        killed = tmp_path / "killed"
+        killed.mkdir()
+        for file in folder.glob("*.db3*"):
+            shutil.copy(file, killed)
+    path = killed / live.name
+    assert sorted(p.suffix for p in killed.iterdir())[1].startswith(".db3-")
+    with pytest.raises(SourceError, match=f"{live.name}-{mode.replace('delete', 'journal')}.*SELECT count"):
+        open_source(path)
+    with closing(sqlite3.connect(path)) as cure:
+        cure.execute("SELECT count(*) FROM messages").fetchall()
+    assert len(seq.frames_of(open_source(path))) == 12
 
 
 def test_a_bag_of_colour_images(tmp_path):
