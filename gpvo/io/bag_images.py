@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.errors import printable
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.images import Image8, decode_stored, to_grey8
 from gpvo.io.source import Depth, SourceReport
@@ -53,6 +54,11 @@ def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
     if pattern is not None and pixels[0, 0].size == 1:
         pixels = np.asarray(cv2.cvtColor(pixels, pattern))
     return to_grey8(pixels, bgr=bgr, depth=depth)
+
+
+def encoding_of(message: Any) -> str:
+    """What an Image or CompressedImage says that its pixels are."""
+    return printable(getattr(message, "encoding", getattr(message, "format", "?")))
 
 
 def _raw_pixels(message: Any) -> tuple[NDArray[Any] | None, bool]:

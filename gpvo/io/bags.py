@@ -15,7 +15,7 @@ from gpvo.cameras.kalibr import camchain_topics
 from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.bag_images import decode_message, pair_streams
+from gpvo.io.bag_images import decode_message, encoding_of, pair_streams
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
@@ -224,9 +224,11 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
         for _, message in islice(messages(reader, [topic]), 20):  # one by one: each may be large
             stamps.append(stamp_ns(message))
             image = decode_message(message) if image is None else image
+        if not stamps:
+            cure = "'ros2 bag reindex' writes it anew"
+            raise SourceError(f"holds no message on '{topic}', against its index", where=path, cure=cure)
         if image is None:
-            encoding = getattr(message, "encoding", getattr(message, "format", "?"))
-            raise SourceError(f"no readable image on '{topic}' (encoding '{encoding}')", where=path)
+            raise SourceError(f"no readable image on '{topic}' (encoding '{encoding_of(message)}')", where=path)
         sizes.append((image.shape[1], image.shape[0]))
         if stamps[0] == 0:
             raise SourceError(f"images on '{topic}' carry no stamp", where=path, cure="the driver must set them")

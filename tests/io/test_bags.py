@@ -241,6 +241,15 @@ def test_unreadable_bags_in_one_line(tmp_path, kind, how):
     assert "unreadable bag" in text or "empty" in text
 
 
+def test_a_topic_that_is_empty_against_its_index_is_named(tmp_path):
+    path = _write(tmp_path, "sqlite3")
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
+        left = "SELECT id FROM topics WHERE name='/camera/left/image_raw'"
+        database.execute(f"DELETE FROM messages WHERE topic_id IN ({left})")
+    with pytest.raises(SourceError, match="no message on '/camera/left/image_raw'.*reindex"):
+        open_source(path)
+
+
 def test_bag_without_images(tmp_path):
     maker = BagMaker(ros1=True)
     maker.imu("/imu0", seq.START_NS)
