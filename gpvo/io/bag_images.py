@@ -121,14 +121,16 @@ class PairQueue:
 def pair_streams(
     stream: Iterable[tuple[str, Any]], left: str, tolerance_ns: int, report: SourceReport, where: object
 ) -> Iterator[tuple[int, Any, Any]]:
-    """(left stamp, left message, right message) of a whole recording: :class:`PairQueue`.
+    """(left stamp, left message, right message) of a whole recording: :class:`PairQueue`. Images without a stamp are
+    counted as missing.
 
     Raises SourceError at the end, where no message found a partner.
     """
     queue = PairQueue(left, tolerance_ns, report)
     for topic, message in stream:
-        pair = queue.push(topic, message)
-        if pair is not None:
+        if stamp_ns(message) == 0:
+            report.count("missing", f"an image on '{topic}' carries no stamp")
+        elif (pair := queue.push(topic, message)) is not None:
             yield pair
     queue.clear()
     if tolerance_ns < queue.nearest_ns < np.inf:

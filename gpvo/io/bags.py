@@ -204,7 +204,7 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
     sides = ((topic, topic.replace(one, other), k) for k, (one, other) in enumerate(_SIDES) for topic in images)
     # Raw before rectified before compressed.
     pairs = [
-        ("compressed" in topic, "rect" in topic, rank, topic, partner)
+        ("compressed" in topic, are_rectified(topic), rank, topic, partner)
         for topic, partner, rank in sides
         if partner != topic and partner in images and "depth" not in topic
     ]
@@ -230,7 +230,8 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
         if image is None:
             raise SourceError(f"no readable image on '{topic}' (encoding '{encoding_of(message)}')", where=path)
         sizes.append((image.shape[1], image.shape[0]))
-        if stamps[0] == 0:
+        stamps = [t for t in stamps if t]
+        if not stamps:
             raise SourceError(f"images on '{topic}' carry no stamp", where=path, cure="the driver must set them")
     return sizes, (min(stamps), min(stamps) + round((usual_interval(stamps) or 0.0) * (topics.count - 1)))
 
@@ -246,8 +247,13 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
             raise CalibrationError(text, where=path, cure=cure)
         _, message = next(messages(reader, [name]))
         infos.append(camera_info_of(message, path, name))
-    rectified = all("rect" in t for t in (topics.left, topics.right))
+    rectified = are_rectified(topics.left, topics.right)
     return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
+
+
+def are_rectified(*topics: str) -> bool:
+    """Whether the topics of images say so, by a word that begins with "rect": "direct" and "unrectified" do not."""
+    return all(re.search("(?<![a-z])rect", topic) for topic in topics)
 
 
 def info_topic(image_topic: str) -> str:

@@ -16,6 +16,7 @@ from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.bag_images import decode_message, pair_streams
 from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.bags import are_rectified
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport
 from gpvo.io.stated import to_records
@@ -248,6 +249,39 @@ def test_a_topic_that_is_empty_against_its_index_is_named(tmp_path):
         database.execute(f"DELETE FROM messages WHERE topic_id IN ({left})")
     with pytest.raises(SourceError, match="no message on '/camera/left/image_raw'.*reindex"):
         open_source(path)
+
+
+def test_images_without_a_stamp_are_left_out_and_only_all_of_them_refused(tmp_path):
+    maker = stereo_bag(True)
+    unset = maker.type("builtin_interfaces/msg/Time")(0, 0)
+    images = [m for m in sorted(maker.messages, key=lambda m: m[0]) if "image" in m[1]]
+    for _, _, message in images[:2]:
+        message.header.stamp = unset
+    source = open_source(maker.write(tmp_path / "a.bag"))
+    assert [k for _, k in seq.frames_of(source)] == list(range(1, 12))
+    assert source.report.missing == 2
+    for _, _, message in images:
+        message.header.stamp = unset
+    with pytest.raises(SourceError, match="carry no stamp"):
+        open_source(maker.write(tmp_path / "b.bag"))
+
+
+@pytest.mark.parametrize("where", [0, 3, 59])
+def test_one_imu_stamp_far_ahead_costs_one_sample(tmp_path, where):
+    maker = stereo_bag(True)
+    imu = [m for m in sorted(maker.messages, key=lambda m: m[0]) if m[1] == "/imu0"]
+    imu[where][2].header.stamp = maker.type("builtin_interfaces/msg/Time")(2_000_000_000, 0)
+    source = open_source(maker.write(tmp_path / "a.bag"))
+    assert len(source.imu.t_ns) >= 59
+    assert np.array_equal(source.imu.t_ns[:58], [stamp_ns(m[2]) for i, m in enumerate(imu) if i != where][:58])
+
+
+@pytest.mark.parametrize("name", ["direct/{}/image_raw", "correct_{}/image", "{}/image_unrectified"])
+def test_a_word_that_ends_in_rect_makes_no_image_rectified(name):
+    sides = [f"/{name.format(side)}" for side in ("left", "right")]
+    assert not are_rectified(*sides)
+    assert not are_rectified(sides[0], "/right/image_rect")
+    assert are_rectified("/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
 
 
 def test_bag_without_images(tmp_path):
