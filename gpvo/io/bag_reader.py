@@ -99,11 +99,19 @@ def topics_of(reader: Any, types: tuple[str, ...]) -> dict[str, str]:
     return {name: info.msgtype for name, info in topics if info.msgtype in types and info.msgcount}
 
 
-def messages(reader: Any, topics: list[str]) -> Iterator[tuple[str, Any]]:
-    """(topic, message) of the named topics, in the order of recording."""
+def messages(reader: Any, topics: list[str], torn: Callable[[str], None] | None = None) -> Iterator[tuple[str, Any]]:
+    """(topic, message) of the named topics, in the order of recording; ``torn`` is told the topic of each message that
+    cannot be decoded."""
     connections = [c for c in reader.connections if c.topic in topics]
     for connection, _, raw in reader.messages(connections=connections):
-        yield connection.topic, reader.deserialize(raw, connection.msgtype)
+        try:
+            message = reader.deserialize(raw, connection.msgtype)
+        except Exception:  # index, struct, unicode, assertion
+            if torn is None:
+                raise
+            torn(connection.topic)
+            continue
+        yield connection.topic, message
 
 
 def stamp_ns(message: Any) -> int:

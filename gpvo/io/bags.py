@@ -123,7 +123,11 @@ class BagSource(ImageSource):
         """Pairs in the order of recording, decoded."""
         topics = self._topics
         with open_bag(self.path) as reader:
-            stream = messages(reader, [topics.left, topics.right])
+            stream = messages(
+                reader,
+                [topics.left, topics.right],
+                lambda topic: report.count("unreadable", f"a message on '{topic}' is torn"),
+            )
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
@@ -221,12 +225,12 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
     sizes: list[tuple[int, int]] = []
     for topic in (topics.left, topics.right):
         stamps, image = [], None
-        for _, message in islice(messages(reader, [topic]), 20):  # one by one: each may be large
+        for _, message in islice(messages(reader, [topic], lambda _: None), 20):  # one by one: each may be large
             stamps.append(stamp_ns(message))
             image = decode_message(message) if image is None else image
         if not stamps:
             cure = "'ros2 bag reindex' writes it anew"
-            raise SourceError(f"holds no message on '{topic}', against its index", where=path, cure=cure)
+            raise SourceError(f"holds no whole message on '{topic}', against its index", where=path, cure=cure)
         if image is None:
             raise SourceError(f"no readable image on '{topic}' (encoding '{encoding_of(message)}')", where=path)
         sizes.append((image.shape[1], image.shape[0]))

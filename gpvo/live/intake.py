@@ -158,21 +158,28 @@ def arrivals(
             yield None
             continue
         received_ns, topic, data = raw
-        try:
-            message = decode(topic, data)
-        except Exception:  # whatever a decoder of bytes from the network raises: index, struct, unicode, assertion
-            counts["undecodable"] += 1
-            continue
-        yield Arrival(topic, message, received_ns)
+        if (message := _decoded(decode, topic, data, counts)) is not None:
+            yield Arrival(topic, message, received_ns)
 
 
-def replay(path: Path, topics: Iterable[str], stop: threading.Event, *, fast: bool = False) -> Iterator[Arrival]:
-    """Messages of the named topics until ``stop``; they arrive when they were recorded.
+def _decoded(decode: Callable[[str, bytes], Any], which: str, data: bytes, counts: Counter[str]) -> Any:
+    try:
+        return decode(which, data)
+    except Exception:  # whatever a decoder of foreign bytes raises: index, struct, unicode, assertion
+        counts["undecodable"] += 1
+        return None
+
+
+def replay(
+    path: Path, topics: Iterable[str], stop: threading.Event, counts: Counter[str] | None = None, *, fast: bool = False
+) -> Iterator[Arrival]:
+    """Messages of the named topics until ``stop``; they arrive when they were recorded. What cannot be decoded is
+    counted.
 
     Raises SourceError where the bag cannot be read or lacks a topic.
     """
     wanted = set(topics)
-    start, first = time.monotonic_ns(), None
+    start, first, counts = time.monotonic_ns(), None, Counter() if counts is None else counts
     with open_bag(path) as reader:
         absent = sorted(wanted - set(reader.topics))
         if absent:
@@ -186,7 +193,9 @@ def replay(path: Path, topics: Iterable[str], stop: threading.Event, *, fast: bo
                 time.sleep(min(ahead_s, _LONGEST_WAIT_S))
             if stop.is_set():
                 return
-            yield Arrival(connection.topic, reader.deserialize(raw, connection.msgtype), due_ns)
+            message = _decoded(lambda kind, data: reader.deserialize(data, kind), connection.msgtype, raw, counts)
+            if message is not None:
+                yield Arrival(connection.topic, message, due_ns)
 
 
 def odometry_topic(path: Path) -> str:

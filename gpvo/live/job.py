@@ -81,8 +81,11 @@ def run_live(settings: LiveSettings) -> dict[str, Any]:
     try:
         with ending_by_signal(stop):
             live = Live(settings, wire, _tell)
-            live.run(stop)
-            return {"counts": live.close()}
+            try:
+                live.run(stop)
+            finally:  # a recording that breaks off has given something
+                counts = live.close()
+            return {"counts": counts}
     finally:
         if wire is not None:
             wire.close()
@@ -167,7 +170,7 @@ class Live:
             with open_bag(path) as reader:
                 present = set(reader.topics)
             wanted = [t for t, kind in topics.items() if kind not in _LASTING or t in present]
-            return replay(path, wanted, stop, fast=self._settings.fast)
+            return replay(path, wanted, stop, self.engine.counts, fast=self._settings.fast)
         assert wire is not None
         self._mailbox.open([t for t, kind in topics.items() if kind in _LASTING])
         self._tell(f"listening to {', '.join(topics)}")

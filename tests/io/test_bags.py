@@ -66,6 +66,17 @@ def test_missing_images_shift_nothing(tmp_path):
     assert source.report.missing == 4
 
 
+def test_a_torn_image_costs_its_pair(tmp_path):
+    path = _write(tmp_path, "sqlite3")
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
+        left = "SELECT id FROM topics WHERE name='/camera/left/image_raw'"
+        images = database.execute(f"SELECT id FROM messages WHERE topic_id IN ({left}) ORDER BY timestamp").fetchall()
+        database.execute("UPDATE messages SET data=substr(data, 1, 30) WHERE id=?", images[5])
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
+    assert (source.report.unreadable, source.report.missing) == (1, 1)
+
+
 def test_lone_camera_does_not_pile_up(tmp_path):
     path = _write(tmp_path, "ros1", n=60, skip={(k, "right") for k in range(10, 50)})
     source = open_source(path)
@@ -247,7 +258,7 @@ def test_a_topic_that_is_empty_against_its_index_is_named(tmp_path):
     with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
         left = "SELECT id FROM topics WHERE name='/camera/left/image_raw'"
         database.execute(f"DELETE FROM messages WHERE topic_id IN ({left})")
-    with pytest.raises(SourceError, match="no message on '/camera/left/image_raw'.*reindex"):
+    with pytest.raises(SourceError, match="no whole message on '/camera/left/image_raw'.*reindex"):
         open_source(path)
 
 
