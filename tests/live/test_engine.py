@@ -22,6 +22,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.geometry.se3 import rotate_covariance
 from gpvo.io.bag_reader import ODOMETRY_TYPE, open_bag, stamp_ns
+from gpvo.io.bag_reader import messages as read
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
 from gpvo.live import job, outputs
@@ -408,6 +409,23 @@ def test_a_bag_in_parts_holds_all_in_order_whatever_its_suffix_and_memory_none(
     assert [stamp_ns(SimpleNamespace(header=h)) for h in headers] == stamps
     assert [h.seq for h in headers] == list(range(len(stamps)))
     assert [p.name for p in (tmp_path / "OUT.BAG.parts").iterdir()] == [f"{stamps[3]}.bag"]
+
+
+@pytest.mark.parametrize("part_s", [0.0, 1e9])
+def test_a_clock_that_is_set_back_does_not_mix_two_flights(
+    part_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outputs, "PART_S", part_s)
+    (stamps, T), kept = flight(n=60), Kept()
+    live = Engine(PoseStage(TOPIC), shim_predictor(), [outputs.FileOutput(tmp_path / "out.mcap"), kept])
+    for back_ns in (0, 2 * 10**9):
+        for arrival in flown(stamps - back_ns, T):
+            live.take(replace(arrival, received_ns=arrival.received_ns + 3 * back_ns))
+    live.close()
+    sent = [o.t_ns for o in kept.frames if o.twist_body is not None]
+    assert (np.diff(sent) < 0).sum() == 1
+    with open_bag(tmp_path / "out.mcap") as reader:
+        assert [stamp_ns(m) for _, m in read(reader, ["/gpvo/odometry"])] == sent
 
 
 def test_status_lost_is_not_sent_but_reported() -> None:
