@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import sqlite3
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -137,8 +138,9 @@ def read_poses(
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
     ``remark`` is told how many were dropped, or out of order. Messages that hold no pose, as some odometries send when
-    they are lost, are dropped, or refused where the poses must be ``complete``. Raises SourceError where the topic has
-    no poses, and where its clock goes back by more than a second or gives many messages one stamp.
+    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, and a few
+    between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes frames, and
+    where its clock goes back by more than a second or gives many messages one stamp.
     """
     with open_bag(path) as reader:
         available = topics_of(reader, POSE_TYPES)
@@ -148,6 +150,7 @@ def read_poses(
         kept = [message for _, message in messages(reader, [topic])]
     if not kept:
         raise SourceError(f"holds no message on '{topic}'", where=path)
+    kept = _of_one_odometry(kept, topic, path, remark)
     t, data = np.array([stamp_ns(m) for m in kept], dtype=np.int64), np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)
     good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
@@ -159,6 +162,24 @@ def read_poses(
     order = order[good]
     t, data = t[order], data[order]
     return t, se3.from_quaternion(data[:, :3], data[:, 3:]), [kept[i] for i in order]
+
+
+def _of_one_odometry(messages: list[Any], topic: str, path: Path, remark: Callable[[str], None] | None) -> list[Any]:
+    """Those with a stamp, if any has one, and of the frames that most are between."""
+    kept = [m for m in messages if stamp_ns(m)]
+    if not kept or min(map(stamp_ns, kept)) < _BACK_NS:  # on a clock that starts there, zero is a stamp
+        kept = messages
+    if remark is not None and (unset := len(messages) - len(kept)):
+        remark(f"{unset} of {len(messages)} messages on '{topic}' carry no stamp and were left out")
+    frames = [(str(m.header.frame_id), str(getattr(m, "child_frame_id", ""))) for m in kept]
+    (most, count), *others = Counter(frames).most_common()
+    if count < _LEAST_LEFT * len(kept):
+        a, b = (" to ".join(filter(None, pair)) for pair in (most, others[0][0]))
+        cure = "one topic must be one odometry's: record its publishers apart, or split the bag where the frames change"
+        raise SourceError(f"poses of different frames are mixed on '{topic}': {a}, and {b}", where=path, cure=cure)
+    if remark is not None and others:
+        remark(f"{len(kept) - count} of {len(kept)} messages on '{topic}' are of other frames and were left out")
+    return [m for m, pair in zip(kept, frames) if pair == most]
 
 
 def _in_time(

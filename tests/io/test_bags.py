@@ -418,6 +418,27 @@ def test_odometry_of_others(tmp_path, kind):
     assert not records[0].covariances
 
 
+def test_poses_of_other_frames_are_left_out_or_refused_and_so_are_those_without_a_stamp(tmp_path):
+    T, C = seq.true_poses(40), np.eye(6) * 1e-4
+
+    def bag(name, others):
+        maker = BagMaker(False)
+        for k, t in enumerate(seq.stamps(40)):
+            maker.odometry("/odom", t, T[k], C, C)
+            if k in others:
+                maker.odometry("/odom", t + 10**7, T[k] @ seq.true_poses(40)[9], C, C, "camera")
+        maker.messages[0][2].header.stamp.sec = maker.messages[0][2].header.stamp.nanosec = 0
+        return maker.write(tmp_path / name)
+
+    log = read_foreign(bag("few", {20, 30}))
+    np.testing.assert_array_equal(log.t_ns, seq.stamps(40)[1:])
+    np.testing.assert_allclose(log.trajectory.T_world_body, T[1:], atol=1e-9)
+    assert any("1 of 42 messages on '/odom' carry no stamp" in n for n in log.notes)
+    assert any("2 of 41 messages on '/odom' are of other frames" in n for n in log.notes)
+    with pytest.raises(SourceError, match="mixed on '/odom': odom to camera, and odom to base_link"):
+        read_foreign(bag("half", range(40)))
+
+
 def _matrix(message) -> np.ndarray:
     p = pose_of(message)
     return se3.from_quaternion(p[:3], p[3:])
