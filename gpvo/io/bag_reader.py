@@ -9,7 +9,7 @@ from __future__ import annotations
 import bz2
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -100,11 +100,28 @@ def topics_of(reader: Any, types: tuple[str, ...]) -> dict[str, str]:
     return {name: info.msgtype for name, info in topics if info.msgtype in types and info.msgcount}
 
 
-def messages(reader: Any, topics: list[str], torn: Callable[[str], None] | None = None) -> Iterator[tuple[str, Any]]:
-    """(topic, message) of the named topics, in the order of recording; ``torn`` is told the topic of each message that
-    cannot be decoded."""
+def raw_messages(reader: Any, topics: Container[str]) -> Iterator[tuple[Any, int, bytes]]:
+    """(connection, time of recording [ns], bytes) of the named topics, in the order of recording.
+
+    Raises SourceError at the end where a topic gave none of the messages that the bag counts: rosbags leaves out those
+    whose QoS in metadata.yaml, as people edit it, is not that of the file beside.
+    """
     connections = [c for c in reader.connections if c.topic in topics]
-    for connection, _, raw in reader.messages(connections=connections):
+    silent = {c.topic for c in connections if c.msgcount}
+    for connection, recorded_ns, raw in reader.messages(connections=connections):
+        silent.discard(connection.topic)
+        yield connection, recorded_ns, raw
+    if silent:
+        text = f"its index does not fit the messages on '{min(silent)}': none of those it counts is found"
+        cure = "if metadata.yaml was edited, name the .mcap or .db3 file inside; else 'ros2 bag reindex'"
+        raise SourceError(text, where=reader.paths[0], cure=cure)
+
+
+def messages(
+    reader: Any, topics: Container[str], torn: Callable[[str], None] | None = None
+) -> Iterator[tuple[str, Any]]:
+    """(topic, message) of :func:`raw_messages`; ``torn`` is told the topic of each that cannot be decoded."""
+    for connection, _, raw in raw_messages(reader, topics):
         try:
             message = reader.deserialize(raw, connection.msgtype)
         except Exception:  # index, struct, unicode, assertion
@@ -148,8 +165,6 @@ def read_poses(
             found = ", ".join(available) or "none"
             raise SourceError(f"has no poses on '{topic}' (topics with poses: {found})", where=path)
         kept = [message for _, message in messages(reader, [topic])]
-    if not kept:
-        raise SourceError(f"holds no message on '{topic}'", where=path)
     kept = _of_one_odometry(kept, topic, path, remark)
     t, data = np.array([stamp_ns(m) for m in kept], dtype=np.int64), np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)

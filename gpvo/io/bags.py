@@ -228,11 +228,9 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
         for _, message in islice(messages(reader, [topic], lambda _: None), 20):  # one by one: each may be large
             stamps.append(stamp_ns(message))
             image = decode_message(message) if image is None else image
-        if not stamps:
-            cure = "'ros2 bag reindex' writes it anew"
-            raise SourceError(f"holds no whole message on '{topic}', against its index", where=path, cure=cure)
         if image is None:
-            raise SourceError(f"no readable image on '{topic}' (encoding '{encoding_of(message)}')", where=path)
+            encoding = encoding_of(message) if stamps else "?"
+            raise SourceError(f"no readable image on '{topic}' (encoding '{encoding}')", where=path)
         sizes.append((image.shape[1], image.shape[0]))
         stamps = [t for t in stamps if t]
         if not stamps:

@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 from gpvo.errors import SourceError
-from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, topics_of
+from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, raw_messages, topics_of
 from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.io.stated import GAP_STEPS
 from gpvo.stats.series import Doubt
@@ -185,8 +185,7 @@ def replay(
         if absent:
             found = ", ".join(sorted(reader.topics))
             raise SourceError(f"has no topic {', '.join(absent)} (there are: {found})", where=path)
-        connections = [c for c in reader.connections if c.topic in wanted]
-        for connection, recorded_ns, raw in reader.messages(connections=connections):
+        for connection, recorded_ns, raw in raw_messages(reader, wanted):
             first = recorded_ns if first is None else first
             due_ns = recorded_ns if fast else start + recorded_ns - first
             while not fast and not stop.is_set() and (ahead_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:

@@ -253,13 +253,18 @@ def test_unreadable_bags_in_one_line(tmp_path, kind, how):
     assert "unreadable bag" in text or "empty" in text
 
 
-def test_a_topic_that_is_empty_against_its_index_is_named(tmp_path):
-    path = _write(tmp_path, "sqlite3")
-    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
-        left = "SELECT id FROM topics WHERE name='/camera/left/image_raw'"
-        database.execute(f"DELETE FROM messages WHERE topic_id IN ({left})")
-    with pytest.raises(SourceError, match="no whole message on '/camera/left/image_raw'.*reindex"):
-        open_source(path)
+@pytest.mark.parametrize("topic", ["/camera/left/image_raw", "/imu0", "/vicon/head/head"])
+def test_a_topic_that_metadata_describes_otherwise_than_the_file_is_named(tmp_path, topic):
+    path = _write(tmp_path, "mcap")
+    before, name, after = (path / "metadata.yaml").read_text().partition(f"name: {topic}\n")
+    zero = "{sec: 0, nsec: 0}"
+    qos = f"history: 3, depth: 0, reliability: 2, durability: 2, liveliness: 1, deadline: {zero}, lifespan: {zero}"
+    qos = f"[{{{qos}, liveliness_lease_duration: {zero}, avoid_ros_namespace_conventions: false}}]"
+    after = after.replace("offered_qos_profiles: ''", f"offered_qos_profiles: {qos}", 1)
+    (path / "metadata.yaml").write_text(before + name + after)
+    with pytest.raises(SourceError, match=f"index does not fit the messages on '{topic}'.*inside"):
+        open_source(path, truth_frame="cam")
+    assert open_source(next(path.glob("*.mcap")), truth_frame="cam").truth is not None
 
 
 def test_images_without_a_stamp_are_left_out_and_only_all_of_them_refused(tmp_path):
