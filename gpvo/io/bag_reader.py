@@ -36,6 +36,7 @@ _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
 MAX_CHUNK_BYTES = 1 << 28
 """No recorder makes chunks of more than a few megabytes, or of one message where that is larger."""
 _STEP_BYTES = 1 << 22
+_ZSTD = b"\x28\xb5\x2f\xfd"
 # What SQLite itself writes of a table or an index; views, triggers and virtual tables run code of the file's.
 _ALLOWED = ("CREATE TABLE %", "CREATE INDEX %", "CREATE UNIQUE INDEX %")
 
@@ -110,6 +111,9 @@ def raw_messages(reader: Any, topics: Container[str]) -> Iterator[tuple[Any, int
     silent = {c.topic for c in connections if c.msgcount}
     for connection, recorded_ns, raw in reader.messages(connections=connections):
         silent.discard(connection.topic)
+        if reader.is2 and raw[:4] == _ZSTD:
+            text, cure = "its messages are compressed one by one, as metadata.yaml tells", "name the bag's folder"
+            raise SourceError(text, where=reader.paths[0], cure=cure)
         yield connection, recorded_ns, raw
     if silent:
         text = f"its index does not fit the messages on '{min(silent)}': none of those it counts is found"

@@ -20,6 +20,7 @@ from gpvo.io.bags import are_rectified
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport
 from gpvo.io.stated import to_records
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
 
@@ -50,6 +51,21 @@ def test_single_storage_files(tmp_path):
     assert len(seq.frames_of(open_source(next(folder.glob("*.mcap"))))) == 12
     folder = _write(tmp_path / "b", "sqlite3")
     assert len(seq.frames_of(open_source(next(folder.glob("*.db3"))))) == 12
+
+
+def test_a_file_of_messages_that_are_compressed_one_by_one_needs_its_folder(tmp_path):
+    maker, connections = stereo_bag(False), {}
+    writer = Writer(tmp_path / "a", version=8)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        for t, topic, message in sorted(maker.messages, key=lambda m: m[0]):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=maker.store)
+            writer.write(connections[topic], t, maker.store.serialize_cdr(message, kind))
+    assert len(seq.frames_of(open_source(tmp_path / "a"))) == 12
+    with pytest.raises(SourceError, match="compressed one by one.*folder"):
+        open_source(next((tmp_path / "a").glob("*.db3")))
 
 
 @pytest.mark.parametrize("kind", KINDS)
