@@ -33,7 +33,7 @@ from gpvo.io.bag_reader import (
 )
 from gpvo.io.images import Image8, ImageSource, check_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
+from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, tolerance_ns, usual_interval
 from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
 from gpvo.types import TruthLog
 
@@ -102,6 +102,8 @@ class BagSource(ImageSource):
         self.span_ns = span
         self._tolerance_ns = tolerance_ns(tolerance_s)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
+        if self.imu is not None and not _overlap(self.imu.t_ns, span):
+            self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
         if self._topics.truth is not None:
             self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
         if self._topics.doubtful is not None:
@@ -147,6 +149,10 @@ class BagSource(ImageSource):
         truth = carry(Trajectory(t, T), place, noise or usual)
         check_overlap(truth, self.span_ns, self.path)
         return truth
+
+
+def _overlap(t_ns: Stamps, span_ns: tuple[int, int]) -> bool:
+    return bool(t_ns[0] <= span_ns[1] and t_ns[-1] >= span_ns[0])
 
 
 def _calibration_beside(path: Path) -> Path | None:

@@ -30,6 +30,7 @@ from gpvo.vo.rig_findings import read_state
 
 _IMU_KEPT = 4000
 _PAIRS_KEPT = 10  # while no CameraInfo has come
+_UNUSED = 20  # motions on end without a sample, after which the IMU is called out
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,7 @@ class StereoStage:
         self._report, self._order, self._unfit = SourceReport(), OrderCheck(), ""
         self._pairs = PairQueue(self.left, self._tolerance_ns, self._report)
         self._watch, self._imu_watch = StampWatch(), StampWatch()
+        self._without_imu = 0  # motions on end
         self._measures = np.zeros(2, dtype=bool)  # rates, accelerations
         self._samples: deque[tuple[int, Array]] = deque(maxlen=_IMU_KEPT)
         self._waiting: deque[tuple[int, Any, Any, int]] = deque(maxlen=_PAIRS_KEPT)  # with time of arrival
@@ -134,13 +136,15 @@ class StereoStage:
 
     def problems(self) -> list[str]:
         """Images that nobody says the calibration of, that it is not for, that make no pair, cannot be read, or are
-        swapped."""
+        swapped; and an IMU that says nothing of them."""
         if self.camera is None and self.counts["uncalibrated"]:
             return ["images arrive, but no calibration: no CameraInfo comes with them"]
         nearest_ns, apart = self._pairs.nearest_ns, ""
         if self._tolerance_ns < nearest_ns < np.inf:
             apart = str(no_pair(self._tolerance_ns, int(nearest_ns), None))
-        return [text for text in (apart, self._unfit, self._depth.doubt()) if text]
+        unused = self.imu is not None and self._without_imu >= _UNUSED
+        idle = f"no sample of the IMU on '{self.imu}' falls between the pairs: does it run, on the cameras' clock?"
+        return [text for text in (apart, self._unfit, self._depth.doubt(), idle * unused) if text]
 
     def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:
         if self._rectifier is None or self.camera is None:
@@ -232,6 +236,7 @@ class StereoStage:
         chosen = [s for s in self._samples if self._t_last_ns < s[0] <= t_ns]
         while self._samples and self._samples[0][0] <= t_ns:
             self._samples.popleft()
+        self._without_imu = 0 if chosen else self._without_imu + 1
         if not chosen:
             return None
         data = np.array([row for _, row in chosen])

@@ -105,6 +105,18 @@ def test_an_imu_whose_clock_is_set_back_leaves_no_samples_of_before() -> None:
     np.testing.assert_allclose(means, np.tile([0.1, 0.2, 0.3], (len(means), 1)), atol=1e-12)
 
 
+def test_an_imu_on_another_clock_is_called_out(tmp_path: Path) -> None:
+    maker = stereo_bag(ros1=True, n=30)
+    for _, topic, message in maker.messages:
+        message.header.stamp.sec -= 1000 * (topic == "/imu0")
+    bag = maker.write(tmp_path / "a.bag")
+    assert any("IMU does not overlap the images in time" in note for note in open_source(bag).report.notes)
+    stage = StereoStage(LEFT, RIGHT, "/imu0")
+    for t, topic, message in sorted(maker.messages, key=lambda m: m[0]):
+        list(stage.take(Arrival(topic, message, t)))
+    assert "no sample of the IMU on '/imu0'" in stage.problems()[0]
+
+
 def test_images_that_make_no_pair_or_cannot_be_read_are_called_out() -> None:
     lens = PinholeRadtan(60.0, 60.0, 31.5, 23.5, 64, 48)
     apart = StereoStage("/l", "/r")
