@@ -211,7 +211,13 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
         a, b = camchain_topics(chain)
         if a is not None and b is not None and {a, b} <= set(images):
             return a, b
-    sides = ((topic, topic.replace(one, other), k) for k, (one, other) in enumerate(_SIDES) for topic in images)
+    # The last word that names a side is the camera's; "/left_head/left" may be one of two heads.
+    sides = (
+        (topic, partner, (k, i))
+        for k, (one, other) in enumerate(_SIDES)
+        for topic in images
+        for i, partner in enumerate((other.join(topic.rsplit(one, 1)), topic.replace(one, other)))
+    )
     # Raw before rectified before compressed.
     pairs = [
         ("compressed" in topic, are_rectified(topic), rank, topic, partner)

@@ -223,6 +223,17 @@ def test_compressed_images_with_camchain_beside(tmp_path):
     assert [k for _, k in seq.frames_of(open_source(path))] == [0, 1, 2]
 
 
+def test_of_two_heads_one_is_taken_and_not_a_camera_of_each(tmp_path):
+    maker = BagMaker(True)
+    for head in ("left", "right"):
+        for side, tx in (("left", 0.0), ("right", -6.0)):
+            for k, t in enumerate(seq.stamps(3)):
+                maker.image(f"/{head}_head/{side}/image_raw", t, seq.grey(k))
+                maker.camera_info(f"/{head}_head/{side}/camera_info", t, tx)
+    topics = open_source(maker.write(tmp_path / "a.bag"))._topics
+    assert (topics.left, topics.right) == ("/left_head/left/image_raw", "/left_head/right/image_raw")
+
+
 def test_topics_by_name_and_by_choice(tmp_path):
     maker = BagMaker(ros1=True)
     for k, t in enumerate(seq.stamps(3)):
