@@ -220,7 +220,7 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
     )
     # Raw before rectified before compressed.
     pairs = [
-        ("compressed" in topic, are_rectified(topic), rank, topic, partner)
+        (say("compressed", topic), say("rect", topic), rank, topic, partner)
         for topic, partner, rank in sides
         if partner != topic and partner in images and "depth" not in topic
     ]
@@ -261,13 +261,13 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
             raise CalibrationError(text, where=path, cure=cure)
         _, message = next(messages(reader, [name]))
         infos.append(camera_info_of(message, path, name))
-    rectified = are_rectified(topics.left, topics.right)
+    rectified = say("rect", topics.left, topics.right)
     return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
 
 
-def are_rectified(*topics: str) -> bool:
-    """Whether the topics of images say so, by a word that begins with "rect": "direct" and "unrectified" do not."""
-    return all(re.search("(?<![a-z])rect", topic) for topic in topics)
+def say(word: str, *topics: str) -> bool:
+    """Whether all topics hold a word that begins so: of "rect", neither "direct" nor "unrectified" does."""
+    return all(re.search(f"(?<![a-z]){word}", topic) for topic in topics)
 
 
 def info_topic(image_topic: str) -> str:

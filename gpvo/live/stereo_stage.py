@@ -15,7 +15,7 @@ from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.io.bag_images import PairQueue, decode_message, encoding_of
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.bags import are_rectified, camera_info_of, info_topic
+from gpvo.io.bags import camera_info_of, info_topic, say
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import Depth, SourceReport
@@ -189,7 +189,7 @@ class StereoStage:
         self._infos[topic] = camera_info_of(message, topic, topic)
         names = [info_topic(t) for t in (self.left, self.right)]
         if all(n in self._infos for n in names):
-            rectified = are_rectified(self.left, self.right)
+            rectified = say("rect", self.left, self.right)
             self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
 
     @property

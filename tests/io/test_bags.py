@@ -16,7 +16,7 @@ from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.bag_images import decode_message, pair_streams
 from gpvo.io.bag_reader import pose_of, stamp_ns
-from gpvo.io.bags import are_rectified
+from gpvo.io.bags import say
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport
 from gpvo.io.stated import to_records
@@ -322,9 +322,9 @@ def test_one_imu_stamp_far_ahead_costs_one_sample(tmp_path, where):
 @pytest.mark.parametrize("name", ["direct/{}/image_raw", "correct_{}/image", "{}/image_unrectified"])
 def test_a_word_that_ends_in_rect_makes_no_image_rectified(name):
     sides = [f"/{name.format(side)}" for side in ("left", "right")]
-    assert not are_rectified(*sides)
-    assert not are_rectified(sides[0], "/right/image_rect")
-    assert are_rectified("/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
+    assert not say("rect", *sides)
+    assert not say("rect", sides[0], "/right/image_rect")
+    assert say("rect", "/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
 
 
 def test_bag_without_images(tmp_path):

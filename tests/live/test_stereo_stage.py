@@ -117,6 +117,13 @@ def test_an_imu_on_another_clock_is_called_out(tmp_path: Path) -> None:
     assert "no sample of the IMU on '/imu0'" in stage.problems()[0]
 
 
+def test_images_that_were_decompressed_are_not_compressed(tmp_path: Path) -> None:
+    sides = ("/l/image_uncompressed", "/r/image_raw/compressed")
+    settings = LiveSettings(tmp_path / "m.gpvo", stereo=sides)
+    kinds = topics_in(make_stage(settings), settings)
+    assert [kinds[t] for t in sides] == ["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"]
+
+
 def test_images_that_make_no_pair_or_cannot_be_read_are_called_out() -> None:
     lens = PinholeRadtan(60.0, 60.0, 31.5, 23.5, 64, 48)
     apart = StereoStage("/l", "/r")
