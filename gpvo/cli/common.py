@@ -141,7 +141,7 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How images are rectified: options that go to :func:`gpvo.io.open_source`."""
+    """How images are paired, read and rectified: options that go to :func:`gpvo.io.open_source`."""
 
     hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")] = None
     size: Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")] = None
@@ -149,6 +149,11 @@ class ViewOptions:
         None
     )
     mask_right: Annotated[Path | None, typer.Option(help="The same for the right lens.")] = None
+    tolerance_s: Annotated[
+        float | None,
+        typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
+    ] = None
+    bits: Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")] = None
 
     def given(self) -> dict[str, Any]:
         """Those that were given, parsed. Raises GpvoError if a size is not WIDTHxHEIGHT."""
@@ -165,13 +170,8 @@ class SequenceOptions(ViewOptions):
     """How a sequence is read."""
 
     calibration: Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")] = None
-    tolerance_s: Annotated[
-        float | None,
-        typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
-    ] = None
     left_topic: Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")] = None
     right_topic: Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")] = None
-    bits: Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")] = None
     rate_hz: Annotated[
         float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")
     ] = None

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.errors import printable
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.images import Image8, decode_stored, to_grey8
 from gpvo.io.source import Depth, SourceReport
@@ -53,6 +54,11 @@ def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
     if pattern is not None and pixels[0, 0].size == 1:
         pixels = np.asarray(cv2.cvtColor(pixels, pattern))
     return to_grey8(pixels, bgr=bgr, depth=depth)
+
+
+def encoding_of(message: Any) -> str:
+    """What an Image or CompressedImage says that its pixels are."""
+    return printable(getattr(message, "encoding", getattr(message, "format", "?")))
 
 
 def _raw_pixels(message: Any) -> tuple[NDArray[Any] | None, bool]:
@@ -115,14 +121,16 @@ class PairQueue:
 def pair_streams(
     stream: Iterable[tuple[str, Any]], left: str, tolerance_ns: int, report: SourceReport, where: object
 ) -> Iterator[tuple[int, Any, Any]]:
-    """(left stamp, left message, right message) of a whole recording: :class:`PairQueue`.
+    """(left stamp, left message, right message) of a whole recording: :class:`PairQueue`. Images without a stamp are
+    counted as missing.
 
     Raises SourceError at the end, where no message found a partner.
     """
     queue = PairQueue(left, tolerance_ns, report)
     for topic, message in stream:
-        pair = queue.push(topic, message)
-        if pair is not None:
+        if stamp_ns(message) == 0:
+            report.count("missing", f"an image on '{topic}' carries no stamp")
+        elif (pair := queue.push(topic, message)) is not None:
             yield pair
     queue.clear()
     if tolerance_ns < queue.nearest_ns < np.inf:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import bz2
 import sqlite3
-from collections.abc import Callable, Iterator
+from array import array
+from collections import Counter
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -35,6 +37,7 @@ _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
 MAX_CHUNK_BYTES = 1 << 28
 """No recorder makes chunks of more than a few megabytes, or of one message where that is larger."""
 _STEP_BYTES = 1 << 22
+_ZSTD = b"\x28\xb5\x2f\xfd"
 # What SQLite itself writes of a table or an index; views, triggers and virtual tables run code of the file's.
 _ALLOWED = ("CREATE TABLE %", "CREATE INDEX %", "CREATE UNIQUE INDEX %")
 
@@ -48,6 +51,14 @@ def _has_storage(path: Path) -> bool:
     if path.is_dir():
         return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
     return path.suffix.lower() in (".bag", ".db3", ".mcap")
+
+
+class _AnyCase(type(Path())):  # type: ignore[misc]
+    """A path by whose suffix rosbags tells the kind of a bag, also where it is in capitals."""
+
+    @property
+    def suffix(self) -> str:
+        return str(super().suffix).lower()
 
 
 @contextmanager
@@ -71,7 +82,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     try:
         require_tables(path)
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([_AnyCase(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
@@ -81,7 +92,7 @@ def open_bag(path: Path) -> Iterator[Any]:
     # memory errors, the last for a length that is no length.
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
-        cure = "the recording was cut off: 'rosbag reindex' or 'ros2 bag reindex' may repair it"
+        cure = "if the recording was cut off, 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover' may repair it"
         raise SourceError(f"unreadable bag: {reason or type(error).__name__}", where=path, cure=cure) from None
 
 
@@ -91,11 +102,39 @@ def topics_of(reader: Any, types: tuple[str, ...]) -> dict[str, str]:
     return {name: info.msgtype for name, info in topics if info.msgtype in types and info.msgcount}
 
 
-def messages(reader: Any, topics: list[str]) -> Iterator[tuple[str, Any]]:
-    """(topic, message) of the named topics, in the order of recording."""
+def raw_messages(reader: Any, topics: Container[str]) -> Iterator[tuple[Any, int, bytes]]:
+    """(connection, time of recording [ns], bytes) of the named topics, in the order of recording.
+
+    Raises SourceError at the end where a topic gave none of the messages that the bag counts: rosbags leaves out those
+    whose QoS in metadata.yaml, as people edit it, is not that of the file beside.
+    """
     connections = [c for c in reader.connections if c.topic in topics]
-    for connection, _, raw in reader.messages(connections=connections):
-        yield connection.topic, reader.deserialize(raw, connection.msgtype)
+    silent = {c.topic for c in connections if c.msgcount}
+    for connection, recorded_ns, raw in reader.messages(connections=connections):
+        silent.discard(connection.topic)
+        if reader.is2 and raw[:4] == _ZSTD:
+            text, cure = "its messages are compressed one by one, as metadata.yaml tells", "name the bag's folder"
+            raise SourceError(text, where=reader.paths[0], cure=cure)
+        yield connection, recorded_ns, raw
+    if silent:
+        text = f"its index does not fit the messages on '{min(silent)}': none of those it counts is found"
+        cure = "if metadata.yaml was edited, name the .mcap or .db3 file inside; else 'ros2 bag reindex'"
+        raise SourceError(text, where=reader.paths[0], cure=cure)
+
+
+def messages(
+    reader: Any, topics: Container[str], torn: Callable[[str], None] | None = None
+) -> Iterator[tuple[str, Any]]:
+    """(topic, message) of :func:`raw_messages`; ``torn`` is told the topic of each that cannot be decoded."""
+    for connection, _, raw in raw_messages(reader, topics):
+        try:
+            message = reader.deserialize(raw, connection.msgtype)
+        except Exception:  # index, struct, unicode, assertion
+            if torn is None:
+                raise
+            torn(connection.topic)
+            continue
+        yield connection.topic, message
 
 
 def stamp_ns(message: Any) -> int:
@@ -121,8 +160,9 @@ def read_poses(
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
     ``remark`` is told how many were dropped, or out of order. Messages that hold no pose, as some odometries send when
-    they are lost, are dropped, or refused where the poses must be ``complete``. Raises SourceError where the topic has
-    no poses, and where its clock goes back by more than a second or gives many messages one stamp.
+    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, and a few
+    between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes frames, and
+    where its clock goes back by more than a second or gives many messages one stamp.
     """
     with open_bag(path) as reader:
         available = topics_of(reader, POSE_TYPES)
@@ -130,8 +170,7 @@ def read_poses(
             found = ", ".join(available) or "none"
             raise SourceError(f"has no poses on '{topic}' (topics with poses: {found})", where=path)
         kept = [message for _, message in messages(reader, [topic])]
-    if not kept:
-        raise SourceError(f"holds no message on '{topic}'", where=path)
+    kept = _of_one_odometry(kept, topic, path, remark)
     t, data = np.array([stamp_ns(m) for m in kept], dtype=np.int64), np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)
     good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
@@ -143,6 +182,24 @@ def read_poses(
     order = order[good]
     t, data = t[order], data[order]
     return t, se3.from_quaternion(data[:, :3], data[:, 3:]), [kept[i] for i in order]
+
+
+def _of_one_odometry(messages: list[Any], topic: str, path: Path, remark: Callable[[str], None] | None) -> list[Any]:
+    """Those with a stamp, if any has one, and of the frames that most are between."""
+    kept = [m for m in messages if stamp_ns(m)]
+    if not kept or min(map(stamp_ns, kept)) < _BACK_NS:  # on a clock that starts there, zero is a stamp
+        kept = messages
+    if remark is not None and (unset := len(messages) - len(kept)):
+        remark(f"{unset} of {len(messages)} messages on '{topic}' carry no stamp and were left out")
+    frames = [(str(m.header.frame_id), str(getattr(m, "child_frame_id", ""))) for m in kept]
+    (most, count), *others = Counter(frames).most_common()
+    if count < _LEAST_LEFT * len(kept):
+        a, b = (" to ".join(filter(None, pair)) for pair in (most, others[0][0]))
+        cure = "one topic must be one odometry's: record its publishers apart, or split the bag where the frames change"
+        raise SourceError(f"poses of different frames are mixed on '{topic}': {a}, and {b}", where=path, cure=cure)
+    if remark is not None and others:
+        remark(f"{len(kept) - count} of {len(kept)} messages on '{topic}' are of other frames and were left out")
+    return [m for m, pair in zip(kept, frames) if pair == most]
 
 
 def _in_time(
@@ -212,13 +269,14 @@ def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
 
     That is where a covariance begins with -1, as ROS has it, or nothing but exact zeros came.
     """
-    stamps, rows = [], []
+    stamps, rows = array("q"), array("d")  # of hours: lists of numbers take several times as much
     with open_bag(path) as reader:
         for _, m in messages(reader, [topic]):
             stamps.append(stamp_ns(m))
             measured = (m.angular_velocity, m.linear_acceleration)
             covariances = (m.angular_velocity_covariance, m.linear_acceleration_covariance)
-            rows.append([(v.x, v.y, v.z, C[0]) for v, C in zip(measured, covariances)])
+            for v, C in zip(measured, covariances):
+                rows.extend((v.x, v.y, v.z, C[0]))
     data = np.array(rows, dtype=np.float64).reshape(-1, 2, 4)
     for values in (data[:, 0], data[:, 1]):
         if (values[:, 3] == -1).all() or not values[:, :3].any():
@@ -279,12 +337,18 @@ def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], 
 
 def require_tables(path: Path) -> None:
     """Raise SourceError where a bag (a file or folder) has a database of more than tables and their indices: a view
-    may have no end. sqlite3.Error where one is damaged."""
+    may have no end; and one whose last messages are in a journal beside it, which rosbags does not read. sqlite3.Error
+    where one is damaged."""
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         if file.suffix.lower() != ".db3":
             continue
         if found := set(str(file)) & set("#%?"):  # rosbags opens databases by an address, in which these have a meaning
             raise SourceError(f"its path holds '{min(found)}'", where=file, cure="rename the file or folder")
+        journals = (file.with_name(f"{file.name}-{kind}") for kind in ("wal", "journal"))
+        if journal := next((p for p in journals if p.is_file() and p.stat().st_size), None):
+            text = f"is not whole without {journal.name}: it is still recorded, or the recorder was killed"
+            cure = f"end the recorder, then let SQLite join them: sqlite3 {file.name} 'SELECT count(*) FROM messages'"
+            raise SourceError(text, where=file, cure=cure)
         database = sqlite3.connect(f"{file.resolve().as_uri()}?immutable=1", uri=True)
         try:
             other = " AND ".join(["sql NOT LIKE ?"] * len(_ALLOWED))

@@ -15,7 +15,7 @@ from gpvo.cameras.kalibr import camchain_topics
 from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.bag_images import decode_message, pair_streams
+from gpvo.io.bag_images import decode_message, encoding_of, pair_streams
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
@@ -33,7 +33,7 @@ from gpvo.io.bag_reader import (
 )
 from gpvo.io.images import Image8, ImageSource, check_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
+from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, tolerance_ns, usual_interval
 from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
 from gpvo.types import TruthLog
 
@@ -102,6 +102,8 @@ class BagSource(ImageSource):
         self.span_ns = span
         self._tolerance_ns = tolerance_ns(tolerance_s)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
+        if self.imu is not None and not _overlap(self.imu.t_ns, span):
+            self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
         if self._topics.truth is not None:
             self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
         if self._topics.doubtful is not None:
@@ -123,7 +125,11 @@ class BagSource(ImageSource):
         """Pairs in the order of recording, decoded."""
         topics = self._topics
         with open_bag(self.path) as reader:
-            stream = messages(reader, [topics.left, topics.right])
+            stream = messages(
+                reader,
+                [topics.left, topics.right],
+                lambda topic: report.count("unreadable", f"a message on '{topic}' is torn"),
+            )
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
@@ -143,6 +149,10 @@ class BagSource(ImageSource):
         truth = carry(Trajectory(t, T), place, noise or usual)
         check_overlap(truth, self.span_ns, self.path)
         return truth
+
+
+def _overlap(t_ns: Stamps, span_ns: tuple[int, int]) -> bool:
+    return bool(t_ns[0] <= span_ns[1] and t_ns[-1] >= span_ns[0])
 
 
 def _calibration_beside(path: Path) -> Path | None:
@@ -201,10 +211,16 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
         a, b = camchain_topics(chain)
         if a is not None and b is not None and {a, b} <= set(images):
             return a, b
-    sides = ((topic, topic.replace(one, other), k) for k, (one, other) in enumerate(_SIDES) for topic in images)
+    # The last word that names a side is the camera's; "/left_head/left" may be one of two heads.
+    sides = (
+        (topic, partner, (k, i))
+        for k, (one, other) in enumerate(_SIDES)
+        for topic in images
+        for i, partner in enumerate((other.join(topic.rsplit(one, 1)), topic.replace(one, other)))
+    )
     # Raw before rectified before compressed.
     pairs = [
-        ("compressed" in topic, "rect" in topic, rank, topic, partner)
+        (say("compressed", topic), say("rect", topic), rank, topic, partner)
         for topic, partner, rank in sides
         if partner != topic and partner in images and "depth" not in topic
     ]
@@ -221,14 +237,15 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
     sizes: list[tuple[int, int]] = []
     for topic in (topics.left, topics.right):
         stamps, image = [], None
-        for _, message in islice(messages(reader, [topic]), 20):  # one by one: each may be large
+        for _, message in islice(messages(reader, [topic], lambda _: None), 20):  # one by one: each may be large
             stamps.append(stamp_ns(message))
             image = decode_message(message) if image is None else image
         if image is None:
-            encoding = getattr(message, "encoding", getattr(message, "format", "?"))
+            encoding = encoding_of(message) if stamps else "?"
             raise SourceError(f"no readable image on '{topic}' (encoding '{encoding}')", where=path)
         sizes.append((image.shape[1], image.shape[0]))
-        if stamps[0] == 0:
+        stamps = [t for t in stamps if t]
+        if not stamps:
             raise SourceError(f"images on '{topic}' carry no stamp", where=path, cure="the driver must set them")
     return sizes, (min(stamps), min(stamps) + round((usual_interval(stamps) or 0.0) * (topics.count - 1)))
 
@@ -244,8 +261,13 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
             raise CalibrationError(text, where=path, cure=cure)
         _, message = next(messages(reader, [name]))
         infos.append(camera_info_of(message, path, name))
-    rectified = all("rect" in t for t in (topics.left, topics.right))
+    rectified = say("rect", topics.left, topics.right)
     return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
+
+
+def say(word: str, *topics: str) -> bool:
+    """Whether all topics hold a word that begins so: of "rect", neither "direct" nor "unrectified" does."""
+    return all(re.search(f"(?<![a-z]){word}", topic) for topic in topics)
 
 
 def info_topic(image_topic: str) -> str:

@@ -163,8 +163,9 @@ def guess(path: str | Path) -> str:
     raise SourceError(
         "not recognised as a stereo sequence",
         where=p,
-        cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap), image"
-        " pairs with a camchain.yaml, and tracks (.npz); name one with --source",
+        cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap, or a"
+        " folder of these with metadata.yaml), image pairs with a camchain.yaml, and tracks (.npz); name one with"
+        " --source",
     )
 
 

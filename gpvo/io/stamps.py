@@ -168,8 +168,16 @@ def _growing_frames(frames: Iterable[F], report: SourceReport) -> Iterator[F]:
 
 
 def growing(t_ns: Stamps) -> NDArray[np.bool_]:
-    """(N,) whether each stamp is later than all before it."""
-    return np.concatenate([[True], t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]])
+    """(N,) whether each stamp is later than all before it.
+
+    A single one that is ahead of the next, which continues those before, is itself the wrong one: as in `in_order`.
+    """
+    goes_on = np.concatenate([[True], t_ns[2:] > np.maximum.accumulate(t_ns)[:-2]])  # the next, without this one
+    keep = np.ones(len(t_ns), dtype=bool)
+    keep[:-1] = (t_ns[1:] >= t_ns[:-1]) | ~goes_on
+    rest = t_ns[keep]
+    keep[np.flatnonzero(keep)[1:]] = rest[1:] > np.maximum.accumulate(rest)[:-1]
+    return keep
 
 
 def usual_interval(t_ns: Iterable[int]) -> float | None:

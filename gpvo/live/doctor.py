@@ -148,7 +148,7 @@ def _stamps(s: Stated) -> Iterator[Finding]:
     steps = np.diff(s.t_ns)
     if (s.t_ns == 0).any():
         text = "every consumer dates the measurement to the epoch and drops it"
-        yield Finding("stamp-zero", "stamps are zero", text)
+        yield Finding("stamp-zero", "stamps are zero", text, float((s.t_ns == 0).mean()))
     elif (steps < 0).any():
         text = "robot_localization drops or replays them; PX4 and ArduPilot use them as they are"
         yield Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean()))

@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 from gpvo.errors import SourceError
-from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, topics_of
+from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE, POSE_TYPES, open_bag, raw_messages, topics_of
 from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.io.stated import GAP_STEPS
 from gpvo.stats.series import Doubt
@@ -158,35 +158,43 @@ def arrivals(
             yield None
             continue
         received_ns, topic, data = raw
-        try:
-            message = decode(topic, data)
-        except Exception:  # whatever a decoder of bytes from the network raises: index, struct, unicode, assertion
-            counts["undecodable"] += 1
-            continue
-        yield Arrival(topic, message, received_ns)
+        if (message := _decoded(decode, topic, data, counts)) is not None:
+            yield Arrival(topic, message, received_ns)
 
 
-def replay(path: Path, topics: Iterable[str], stop: threading.Event, *, fast: bool = False) -> Iterator[Arrival]:
-    """Messages of the named topics until ``stop``; they arrive when they were recorded.
+def _decoded(decode: Callable[[str, bytes], Any], which: str, data: bytes, counts: Counter[str]) -> Any:
+    try:
+        return decode(which, data)
+    except Exception:  # whatever a decoder of foreign bytes raises: index, struct, unicode, assertion
+        counts["undecodable"] += 1
+        return None
+
+
+def replay(
+    path: Path, topics: Iterable[str], stop: threading.Event, counts: Counter[str] | None = None, *, fast: bool = False
+) -> Iterator[Arrival]:
+    """Messages of the named topics until ``stop``; they arrive when they were recorded. What cannot be decoded is
+    counted.
 
     Raises SourceError where the bag cannot be read or lacks a topic.
     """
     wanted = set(topics)
-    start, first = time.monotonic_ns(), None
+    start, first, counts = time.monotonic_ns(), None, Counter() if counts is None else counts
     with open_bag(path) as reader:
         absent = sorted(wanted - set(reader.topics))
         if absent:
             found = ", ".join(sorted(reader.topics))
             raise SourceError(f"has no topic {', '.join(absent)} (there are: {found})", where=path)
-        connections = [c for c in reader.connections if c.topic in wanted]
-        for connection, recorded_ns, raw in reader.messages(connections=connections):
+        for connection, recorded_ns, raw in raw_messages(reader, wanted):
             first = recorded_ns if first is None else first
             due_ns = recorded_ns if fast else start + recorded_ns - first
             while not fast and not stop.is_set() and (ahead_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
                 time.sleep(min(ahead_s, _LONGEST_WAIT_S))
             if stop.is_set():
                 return
-            yield Arrival(connection.topic, reader.deserialize(raw, connection.msgtype), due_ns)
+            message = _decoded(lambda kind, data: reader.deserialize(data, kind), connection.msgtype, raw, counts)
+            if message is not None:
+                yield Arrival(connection.topic, message, due_ns)
 
 
 def odometry_topic(path: Path) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import GpvoError
 from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, ODOMETRY_TYPE, POSE_TYPE, open_bag
-from gpvo.io.bags import info_topic
+from gpvo.io.bags import info_topic, say
 from gpvo.live.engine import Engine, EngineSettings, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
@@ -81,8 +81,11 @@ def run_live(settings: LiveSettings) -> dict[str, Any]:
     try:
         with ending_by_signal(stop):
             live = Live(settings, wire, _tell)
-            live.run(stop)
-            return {"counts": live.close()}
+            try:
+                live.run(stop)
+            finally:  # a recording that breaks off has given something
+                counts = live.close()
+            return {"counts": counts}
     finally:
         if wire is not None:
             wire.close()
@@ -167,7 +170,7 @@ class Live:
             with open_bag(path) as reader:
                 present = set(reader.topics)
             wanted = [t for t, kind in topics.items() if kind not in _LASTING or t in present]
-            return replay(path, wanted, stop, fast=self._settings.fast)
+            return replay(path, wanted, stop, self.engine.counts, fast=self._settings.fast)
         assert wire is not None
         self._mailbox.open([t for t, kind in topics.items() if kind in _LASTING])
         self._tell(f"listening to {', '.join(topics)}")
@@ -228,7 +231,7 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     if isinstance(stage, PoseStage):
         return {stage.topic: settings.pose_type, **truth}
     assert isinstance(stage, StereoStage)
-    images = {t: IMAGE_TYPES["compressed" in t] for t in (stage.left, stage.right)}
+    images = {t: IMAGE_TYPES[say("compressed", t)] for t in (stage.left, stage.right)}
     infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
     return {**images, **infos, **({stage.imu: IMU_TYPE} if stage.imu else {}), **truth}
 

@@ -13,13 +13,13 @@ import numpy as np
 from gpvo.cameras.readers import CameraInfo, read_projections, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
-from gpvo.io.bag_images import PairQueue, decode_message
+from gpvo.io.bag_images import PairQueue, decode_message, encoding_of
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.bags import camera_info_of, info_topic
+from gpvo.io.bags import camera_info_of, info_topic, say
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.images import SWAPPED, Image8, OrderCheck
-from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S
+from gpvo.io.source import Depth, SourceReport
+from gpvo.io.stamps import PAIR_TOLERANCE_S, no_pair, tolerance_ns
 from gpvo.live.intake import Arrival, Sequence, StampWatch
 from gpvo.live.stages import Taken
 from gpvo.types import Array, ImuLog, StereoCamera, StereoFrame
@@ -30,6 +30,7 @@ from gpvo.vo.rig_findings import read_state
 
 _IMU_KEPT = 4000
 _PAIRS_KEPT = 10  # while no CameraInfo has come
+_UNUSED = 20  # motions on end without a sample, after which the IMU is called out
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class StereoSettings:
     """How ``gpvo run`` would go about it: the model knows only the odometry that it was trained on.
 
     ``calibration_state``: what an earlier run found out. ``hfov_deg``, ``size``: of the rectified images.
-    ``mask_left``, ``mask_right``: images of the usable pixels.
+    ``mask_left``, ``mask_right``: images of the usable pixels. ``tolerance_s``: between the stamps of a pair.
+    ``bits``: depth of the samples in 16-bit images.
     """
 
     config: VoConfig = field(default_factory=VoConfig)
@@ -46,6 +48,8 @@ class StereoSettings:
     size: tuple[int, int] | None = None
     mask_left: Path | None = None
     mask_right: Path | None = None
+    tolerance_s: float = PAIR_TOLERANCE_S
+    bits: int = 16
 
 
 class StereoStage:
@@ -69,6 +73,7 @@ class StereoStage:
         self.settings = settings or StereoSettings()
         masks = (self.settings.mask_left, self.settings.mask_right)
         self._masks = None if masks == (None, None) else [None if m is None else read_mask(m) for m in masks]
+        self._depth, self._tolerance_ns = Depth(self.settings.bits), tolerance_ns(self.settings.tolerance_s)
         self._state: RigState | None = None
         self.odometry = asdict(self.settings.config)
         stated = self.settings.config.stated
@@ -93,8 +98,10 @@ class StereoStage:
     def reset(self) -> None:
         """Begin anew with the next pair."""
         self._report, self._order, self._unfit = SourceReport(), OrderCheck(), ""
-        self._pairs = PairQueue(self.left, round(PAIR_TOLERANCE_S * 1e9), self._report)
-        self._watch = StampWatch()
+        self._pairs = PairQueue(self.left, self._tolerance_ns, self._report)
+        self._watch, self._imu_watch = StampWatch(), StampWatch()
+        self._without_imu = 0  # motions on end
+        self._measures = np.zeros(2, dtype=bool)  # rates, accelerations
         self._samples: deque[tuple[int, Array]] = deque(maxlen=_IMU_KEPT)
         self._waiting: deque[tuple[int, Any, Any, int]] = deque(maxlen=_PAIRS_KEPT)  # with time of arrival
         self._restart()
@@ -128,10 +135,16 @@ class StereoStage:
             yield from self._step(*self._waiting.popleft())
 
     def problems(self) -> list[str]:
-        """Images that nobody says the calibration of, that it is not for, or that are swapped."""
+        """Images that nobody says the calibration of, that it is not for, that make no pair, cannot be read, or are
+        swapped; and an IMU that says nothing of them."""
         if self.camera is None and self.counts["uncalibrated"]:
             return ["images arrive, but no calibration: no CameraInfo comes with them"]
-        return [self._unfit] if self._unfit else []
+        nearest_ns, apart = self._pairs.nearest_ns, ""
+        if self._tolerance_ns < nearest_ns < np.inf:
+            apart = str(no_pair(self._tolerance_ns, int(nearest_ns), None))
+        unused = self.imu is not None and self._without_imu >= _UNUSED
+        idle = f"no sample of the IMU on '{self.imu}' falls between the pairs: does it run, on the cameras' clock?"
+        return [text for text in (apart, self._unfit, self._depth.doubt(), idle * unused) if text]
 
     def _step(self, t_ns: int, left: Any, right: Any, received_ns: int) -> Iterator[Taken]:
         if self._rectifier is None or self.camera is None:
@@ -139,9 +152,10 @@ class StereoStage:
             return
         images: list[Image8] = []
         for message, lens in ((left, self._rectifier.rig.left), (right, self._rectifier.rig.right)):
-            image = decode_message(message)
+            image = decode_message(message, self._depth)
             if image is None or image.shape != (lens.height, lens.width):
                 self.counts["unreadable"] += 1
+                self._unfit = f"images of encoding '{encoding_of(message)}' cannot be read"
                 if image is not None:
                     size = f"{image.shape[1]}x{image.shape[0]}"
                     self._unfit = f"images are {size}, the calibration is for {lens.width}x{lens.height}"
@@ -175,7 +189,7 @@ class StereoStage:
         self._infos[topic] = camera_info_of(message, topic, topic)
         names = [info_topic(t) for t in (self.left, self.right)]
         if all(n in self._infos for n in names):
-            rectified = all("rect" in t for t in (self.left, self.right))
+            rectified = say("rect", self.left, self.right)
             self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
 
     @property
@@ -202,18 +216,27 @@ class StereoStage:
         self.T_body_cam = T_FLU_OPTICAL if place is None else place
 
     def _take_imu(self, message: Any) -> None:
-        w, a = message.angular_velocity, message.linear_acceleration
-        row = np.array([w.x, w.y, w.z, a.x, a.y, a.z])
-        t_ns = stamp_ns(message) - self._shift_ns
-        if not np.isfinite(row).all() or (self._samples and 0 <= self._samples[-1][0] - t_ns < 10**9):
+        rates = (message.angular_velocity, message.angular_velocity_covariance)
+        forces = (message.linear_acceleration, message.linear_acceleration_covariance)
+        row = np.array([[np.nan] * 3 if C[0] == -1 else [v.x, v.y, v.z] for v, C in (rates, forces)])
+        # As bags are read: what has been nothing but zeros so far is not measured.
+        self._measures |= np.isfinite(row).all(axis=1) & row.any(axis=1)
+        row[~self._measures] = np.nan
+        known = np.isfinite(row).all(axis=1)
+        t_ns = stamp_ns(message)
+        seen = self._imu_watch.see(t_ns)
+        if seen.dropped or not known[0] or known[1] != self._measures[1]:
             self.counts["imu_dropped"] += 1
             return
-        self._samples.append((t_ns, row))
+        if seen is Sequence.RESTART:
+            self._samples.clear()
+        self._samples.append((t_ns - self._shift_ns, row.ravel()))
 
     def _imu_since(self, t_ns: int) -> ImuLog | None:
         chosen = [s for s in self._samples if self._t_last_ns < s[0] <= t_ns]
         while self._samples and self._samples[0][0] <= t_ns:
             self._samples.popleft()
+        self._without_imu = 0 if chosen else self._without_imu + 1
         if not chosen:
             return None
         data = np.array([row for _, row in chosen])

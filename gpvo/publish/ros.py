@@ -127,12 +127,15 @@ def _write(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: 
 
 
 def _fill(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: str) -> int:
-    ros1, count = kind == "ros1", 0
+    ros1, count, shift_ns, last_ns = kind == "ros1", 0, 0, -1
     opened: Any = Ros1Writer(path) if ros1 else Ros2Writer(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
     with opened as writer:
         connection = writer.add_connection(topic, _TYPE, typestore=_store(kind))
         for t_ns, data in messages:
-            writer.write(connection, t_ns, data)
+            # Readers sort by the time of recording: where the stamps are set back, that goes on.
+            shift_ns = max(shift_ns, last_ns + 1 - t_ns)
+            last_ns = t_ns + shift_ns
+            writer.write(connection, last_ns, data)
             count += 1
     return count
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +16,11 @@ from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.bag_images import decode_message, pair_streams
 from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.bags import say
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport
 from gpvo.io.stated import to_records
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
 
@@ -48,11 +53,44 @@ def test_single_storage_files(tmp_path):
     assert len(seq.frames_of(open_source(next(folder.glob("*.db3"))))) == 12
 
 
+def test_a_file_of_messages_that_are_compressed_one_by_one_needs_its_folder(tmp_path):
+    maker, connections = stereo_bag(False), {}
+    writer = Writer(tmp_path / "a", version=8)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        for t, topic, message in sorted(maker.messages, key=lambda m: m[0]):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=maker.store)
+            writer.write(connections[topic], t, maker.store.serialize_cdr(message, kind))
+    assert len(seq.frames_of(open_source(tmp_path / "a"))) == 12
+    with pytest.raises(SourceError, match="compressed one by one.*folder"):
+        open_source(next((tmp_path / "a").glob("*.db3")))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_suffixes_in_capitals_are_suffixes(tmp_path, kind):
+    path = _write(tmp_path, kind)
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    assert len(seq.frames_of(open_source(file.rename(tmp_path / f"A{file.suffix.upper()}")))) == 12
+
+
 def test_missing_images_shift_nothing(tmp_path):
     path = _write(tmp_path, "ros1", skip={(2, "left"), (5, "right"), (6, "right"), (9, "left")})
     source = open_source(path)
     assert [k for _, k in seq.frames_of(source)] == [0, 1, 3, 4, 7, 8, 10, 11]
     assert source.report.missing == 4
+
+
+def test_a_torn_image_costs_its_pair(tmp_path):
+    path = _write(tmp_path, "sqlite3")
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
+        left = "SELECT id FROM topics WHERE name='/camera/left/image_raw'"
+        images = database.execute(f"SELECT id FROM messages WHERE topic_id IN ({left}) ORDER BY timestamp").fetchall()
+        database.execute("UPDATE messages SET data=substr(data, 1, 30) WHERE id=?", images[5])
+    source = open_source(path)
+    assert [k for _, k in seq.frames_of(source)] == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
+    assert (source.report.unreadable, source.report.missing) == (1, 1)
 
 
 def test_lone_camera_does_not_pile_up(tmp_path):
@@ -139,6 +177,29 @@ def test_a_database_that_rosbags_cannot_open_by_its_name(tmp_path, name):
         open_source(path)
 
 
+@pytest.mark.parametrize("mode", ["wal", "delete"])
+def test_a_database_whose_recorder_was_killed_is_read_whole_or_not_at_all(tmp_path, mode):
+    folder = _write(tmp_path, "sqlite3")
+    live = next(folder.glob("*.db3"))
+    with closing(sqlite3.connect(live, isolation_level=None)) as recorder:
+        for line in (f"PRAGMA journal_mode={mode}", "PRAGMA cache_size=1", "BEGIN", "CREATE TABLE other (data BLOB)"):
+            recorder.execute(line).fetchall()
+        recorder.execute("UPDATE messages SET data=data, topic_id=topic_id")  # stays in the journal
+        if mode == "wal":
+            recorder.execute("COMMIT")
+        killed = tmp_path / "killed"
+        killed.mkdir()
+        for file in folder.glob("*.db3*"):
+            shutil.copy(file, killed)
+    path = killed / live.name
+    assert sorted(p.suffix for p in killed.iterdir())[1].startswith(".db3-")
+    with pytest.raises(SourceError, match=f"{live.name}-{mode.replace('delete', 'journal')}.*SELECT count"):
+        open_source(path)
+    with closing(sqlite3.connect(path)) as cure:
+        cure.execute("SELECT count(*) FROM messages").fetchall()
+    assert len(seq.frames_of(open_source(path))) == 12
+
+
 def test_a_bag_of_colour_images(tmp_path):
     maker = BagMaker(ros1=True)
     for k, t in enumerate(seq.stamps(3)):
@@ -160,6 +221,17 @@ def test_compressed_images_with_camchain_beside(tmp_path):
     assert "camchain.yaml" in str(caught.value)
     (tmp_path / "camchain.yaml").write_text(seq.camchain_yaml())
     assert [k for _, k in seq.frames_of(open_source(path))] == [0, 1, 2]
+
+
+def test_of_two_heads_one_is_taken_and_not_a_camera_of_each(tmp_path):
+    maker = BagMaker(True)
+    for head in ("left", "right"):
+        for side, tx in (("left", 0.0), ("right", -6.0)):
+            for k, t in enumerate(seq.stamps(3)):
+                maker.image(f"/{head}_head/{side}/image_raw", t, seq.grey(k))
+                maker.camera_info(f"/{head}_head/{side}/camera_info", t, tx)
+    topics = open_source(maker.write(tmp_path / "a.bag"))._topics
+    assert (topics.left, topics.right) == ("/left_head/left/image_raw", "/left_head/right/image_raw")
 
 
 def test_topics_by_name_and_by_choice(tmp_path):
@@ -206,6 +278,53 @@ def test_unreadable_bags_in_one_line(tmp_path, kind, how):
     assert "\n" not in text
     assert str(path) in text
     assert "unreadable bag" in text or "empty" in text
+
+
+@pytest.mark.parametrize("topic", ["/camera/left/image_raw", "/imu0", "/vicon/head/head"])
+def test_a_topic_that_metadata_describes_otherwise_than_the_file_is_named(tmp_path, topic):
+    path = _write(tmp_path, "mcap")
+    before, name, after = (path / "metadata.yaml").read_text().partition(f"name: {topic}\n")
+    zero = "{sec: 0, nsec: 0}"
+    qos = f"history: 3, depth: 0, reliability: 2, durability: 2, liveliness: 1, deadline: {zero}, lifespan: {zero}"
+    qos = f"[{{{qos}, liveliness_lease_duration: {zero}, avoid_ros_namespace_conventions: false}}]"
+    after = after.replace("offered_qos_profiles: ''", f"offered_qos_profiles: {qos}", 1)
+    (path / "metadata.yaml").write_text(before + name + after)
+    with pytest.raises(SourceError, match=f"index does not fit the messages on '{topic}'.*inside"):
+        open_source(path, truth_frame="cam")
+    assert open_source(next(path.glob("*.mcap")), truth_frame="cam").truth is not None
+
+
+def test_images_without_a_stamp_are_left_out_and_only_all_of_them_refused(tmp_path):
+    maker = stereo_bag(True)
+    unset = maker.type("builtin_interfaces/msg/Time")(0, 0)
+    images = [m for m in sorted(maker.messages, key=lambda m: m[0]) if "image" in m[1]]
+    for _, _, message in images[:2]:
+        message.header.stamp = unset
+    source = open_source(maker.write(tmp_path / "a.bag"))
+    assert [k for _, k in seq.frames_of(source)] == list(range(1, 12))
+    assert source.report.missing == 2
+    for _, _, message in images:
+        message.header.stamp = unset
+    with pytest.raises(SourceError, match="carry no stamp"):
+        open_source(maker.write(tmp_path / "b.bag"))
+
+
+@pytest.mark.parametrize("where", [0, 3, 59])
+def test_one_imu_stamp_far_ahead_costs_one_sample(tmp_path, where):
+    maker = stereo_bag(True)
+    imu = [m for m in sorted(maker.messages, key=lambda m: m[0]) if m[1] == "/imu0"]
+    imu[where][2].header.stamp = maker.type("builtin_interfaces/msg/Time")(2_000_000_000, 0)
+    source = open_source(maker.write(tmp_path / "a.bag"))
+    assert len(source.imu.t_ns) >= 59
+    assert np.array_equal(source.imu.t_ns[:58], [stamp_ns(m[2]) for i, m in enumerate(imu) if i != where][:58])
+
+
+@pytest.mark.parametrize("name", ["direct/{}/image_raw", "correct_{}/image", "{}/image_unrectified"])
+def test_a_word_that_ends_in_rect_makes_no_image_rectified(name):
+    sides = [f"/{name.format(side)}" for side in ("left", "right")]
+    assert not say("rect", *sides)
+    assert not say("rect", sides[0], "/right/image_rect")
+    assert say("rect", "/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
 
 
 def test_bag_without_images(tmp_path):
@@ -329,6 +448,27 @@ def test_odometry_of_others(tmp_path, kind):
     expected = np.array([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6]) * 0.05**2
     np.testing.assert_allclose(np.diag(records[3].covariances["imported"]), expected, rtol=1e-9)
     assert not records[0].covariances
+
+
+def test_poses_of_other_frames_are_left_out_or_refused_and_so_are_those_without_a_stamp(tmp_path):
+    T, C = seq.true_poses(40), np.eye(6) * 1e-4
+
+    def bag(name, others):
+        maker = BagMaker(False)
+        for k, t in enumerate(seq.stamps(40)):
+            maker.odometry("/odom", t, T[k], C, C)
+            if k in others:
+                maker.odometry("/odom", t + 10**7, T[k] @ seq.true_poses(40)[9], C, C, "camera")
+        maker.messages[0][2].header.stamp.sec = maker.messages[0][2].header.stamp.nanosec = 0
+        return maker.write(tmp_path / name)
+
+    log = read_foreign(bag("few", {20, 30}))
+    np.testing.assert_array_equal(log.t_ns, seq.stamps(40)[1:])
+    np.testing.assert_allclose(log.trajectory.T_world_body, T[1:], atol=1e-9)
+    assert any("1 of 42 messages on '/odom' carry no stamp" in n for n in log.notes)
+    assert any("2 of 41 messages on '/odom' are of other frames" in n for n in log.notes)
+    with pytest.raises(SourceError, match="mixed on '/odom': odom to camera, and odom to base_link"):
+        read_foreign(bag("half", range(40)))
 
 
 def _matrix(message) -> np.ndarray:

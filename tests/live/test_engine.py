@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 import struct
 import weakref
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,17 +16,18 @@ import numpy as np
 import pytest
 from bag_maker import BagMaker
 from gpvo.dataset.check import rate_problems
-from gpvo.errors import GpvoError
+from gpvo.errors import GpvoError, SourceError
 from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.geometry.se3 import rotate_covariance
-from gpvo.io.bag_reader import open_bag, stamp_ns
+from gpvo.io.bag_reader import ODOMETRY_TYPE, open_bag, stamp_ns
+from gpvo.io.bag_reader import messages as read
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
-from gpvo.live import outputs
+from gpvo.live import job, outputs
 from gpvo.live.engine import Engine, EngineSettings
-from gpvo.live.intake import Arrival
+from gpvo.live.intake import Arrival, replay
 from gpvo.live.job import LiveSettings, run_live
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import PoseStage
@@ -33,6 +36,7 @@ from gpvo.publish import ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder
 from gpvo.publish.odometry import messages as offline
 from gpvo.types import Status, StereoCamera, VoLog, VoRecord
+from rosbags.rosbag2 import Writer
 from shim_bags import STATED, TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
 from synthetic_runs import make_run
 
@@ -320,6 +324,33 @@ def test_a_bag_replayed_by_the_command_is_the_same_in_a_bag(tmp_path: Path) -> N
     assert all(is_positive_definite(C) for C in written.covariance[1:])
 
 
+def test_a_torn_message_of_a_recording_costs_no_other(tmp_path: Path) -> None:
+    maker, model = messages(*flight(n=60)), save_model(tmp_path / "vio.gpvo")
+    with Writer(tmp_path / "vio", version=8) as writer:
+        connection = writer.add_connection(TOPIC, ODOMETRY_TYPE, typestore=maker.store)
+        for k, (t, _, message) in enumerate(maker.messages):
+            data = maker.store.serialize_cdr(message, ODOMETRY_TYPE)
+            writer.write(connection, t, data[:20] if k == 30 else data)
+    result = run_live(LiveSettings(model, replay=tmp_path / "vio", fast=True, out=tmp_path / "out.mcap"))
+    assert (result["counts"]["undecodable"], result["counts"]["frames_ok"]) == (1, 59)
+    assert len(read_foreign(tmp_path / "out.mcap").trajectory.t_ns) == 59
+
+
+def test_of_a_recording_that_breaks_off_what_was_before_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut(*args: Any, **options: Any) -> Iterator[Arrival]:
+        yield from islice(replay(*args, **options), 30)
+        raise SourceError("a chunk is cut off")
+
+    monkeypatch.setattr(job, "replay", cut)
+    bag = messages(*flight(n=60)).write(tmp_path / "vio")
+    settings = LiveSettings(save_model(tmp_path / "vio.gpvo"), replay=bag, fast=True, out=tmp_path / "out.bag")
+    with pytest.raises(SourceError, match="cut off"):
+        run_live(settings)
+    assert len(read_foreign(tmp_path / "out.bag").trajectory.t_ns) == 29
+
+
 def test_a_flight_that_is_killed_remains_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outputs, "PART_S", 0.0)
     arrivals, kept = flown(*flight(n=12)), Kept()
@@ -378,6 +409,23 @@ def test_a_bag_in_parts_holds_all_in_order_whatever_its_suffix_and_memory_none(
     assert [stamp_ns(SimpleNamespace(header=h)) for h in headers] == stamps
     assert [h.seq for h in headers] == list(range(len(stamps)))
     assert [p.name for p in (tmp_path / "OUT.BAG.parts").iterdir()] == [f"{stamps[3]}.bag"]
+
+
+@pytest.mark.parametrize("part_s", [0.0, 1e9])
+def test_a_clock_that_is_set_back_does_not_mix_two_flights(
+    part_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outputs, "PART_S", part_s)
+    (stamps, T), kept = flight(n=60), Kept()
+    live = Engine(PoseStage(TOPIC), shim_predictor(), [outputs.FileOutput(tmp_path / "out.mcap"), kept])
+    for back_ns in (0, 2 * 10**9):
+        for arrival in flown(stamps - back_ns, T):
+            live.take(replace(arrival, received_ns=arrival.received_ns + 3 * back_ns))
+    live.close()
+    sent = [o.t_ns for o in kept.frames if o.twist_body is not None]
+    assert (np.diff(sent) < 0).sum() == 1
+    with open_bag(tmp_path / "out.mcap") as reader:
+        assert [stamp_ns(m) for _, m in read(reader, ["/gpvo/odometry"])] == sent
 
 
 def test_status_lost_is_not_sent_but_reported() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import sequences as seq
 from bag_maker import BagMaker, stereo_bag
 from gpvo import runner
 from gpvo.cameras.models import PinholeRadtan
@@ -72,6 +73,70 @@ def test_a_bag_with_imu_and_camera_info(settings: str, tmp_path: Path) -> None:
     assert taken[0].begins
     assert not any(t.begins for t in taken[1:])
     _equal([t.record for t in taken], theirs)
+
+
+@pytest.mark.parametrize("which", ["12 bits", "5 ms apart", "zeros", "-1", "nan"])
+def test_what_a_run_reads_is_read_live(which: str, tmp_path: Path) -> None:
+    maker, seen = BagMaker(ros1=True), {"12 bits": {"bits": 12}, "5 ms apart": {"tolerance_s": 0.006}}.get(which, {})
+    acc = {"-1": (1.0, 0.0, 0.0), "nan": (np.nan,) * 3}.get(which, (0.0, 0.0, 0.0))
+    for k, t in enumerate(seq.stamps(8)):
+        for side, late_ns, tx in (("left", 0, 0.0), ("right", 5_000_000 * (which == "5 ms apart"), -6.0)):
+            image = seq.grey(k).astype(np.uint16) << 4 if which == "12 bits" else seq.grey(k)
+            maker.image(f"/camera/{side}/image_raw", t + late_ns, image, "mono16" if which == "12 bits" else "mono8")
+            maker.camera_info(f"/camera/{side}/camera_info", t, tx)
+        maker.imu("/imu0", t, (0.1 * k, 0.2, 0.3), acc, known=(0.0, -1.0 if which == "-1" else 0.0))
+    bag = maker.write(tmp_path / "stereo.bag")
+    theirs = [s.record for s in runner.steps(open_source(bag, prefetch=False, **seen), make_config())]
+    stage = StereoStage(LEFT, RIGHT, "/imu0", settings=StereoSettings(**seen))
+    topics = ["/imu0", *(f"/camera/{s}/{t}" for s in ("left", "right") for t in ("image_raw", "camera_info"))]
+    taken = [t for a in replay(bag, topics, threading.Event(), fast=True) for t in stage.take(a)]
+    _equal([t.record for t in [*taken, *stage.flush()]], theirs)
+    assert not stage.problems()
+
+
+def test_an_imu_whose_clock_is_set_back_leaves_no_samples_of_before() -> None:
+    early, late, stage, records = BagMaker(False), stereo_bag(False, n=50), StereoStage(LEFT, RIGHT, "/imu0"), []
+    for k in range(40):  # before the cameras run, on a clock that is 1.5 s ahead
+        early.imu("/imu0", seq.START_NS + 15 * 10**8 + k * 10**7, (9.0, 9.0, 9.0))
+    for t, topic, message in [*early.messages, *sorted(late.messages, key=lambda m: m[0])]:
+        records += [r.record for r in stage.take(Arrival(topic, message, t))]
+    means = [r.imu_gyro_mean_radps for r in records if r.imu_gyro_mean_radps is not None]
+    assert len(means) > 40
+    np.testing.assert_allclose(means, np.tile([0.1, 0.2, 0.3], (len(means), 1)), atol=1e-12)
+
+
+def test_an_imu_on_another_clock_is_called_out(tmp_path: Path) -> None:
+    maker = stereo_bag(ros1=True, n=30)
+    for _, topic, message in maker.messages:
+        message.header.stamp.sec -= 1000 * (topic == "/imu0")
+    bag = maker.write(tmp_path / "a.bag")
+    assert any("IMU does not overlap the images in time" in note for note in open_source(bag).report.notes)
+    stage = StereoStage(LEFT, RIGHT, "/imu0")
+    for t, topic, message in sorted(maker.messages, key=lambda m: m[0]):
+        list(stage.take(Arrival(topic, message, t)))
+    assert "no sample of the IMU on '/imu0'" in stage.problems()[0]
+
+
+def test_images_that_were_decompressed_are_not_compressed(tmp_path: Path) -> None:
+    sides = ("/l/image_uncompressed", "/r/image_raw/compressed")
+    settings = LiveSettings(tmp_path / "m.gpvo", stereo=sides)
+    kinds = topics_in(make_stage(settings), settings)
+    assert [kinds[t] for t in sides] == ["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"]
+
+
+def test_images_that_make_no_pair_or_cannot_be_read_are_called_out() -> None:
+    lens = PinholeRadtan(60.0, 60.0, 31.5, 23.5, 64, 48)
+    apart = StereoStage("/l", "/r")
+    unread = StereoStage("/l", "/r", rig=StereoRig(lens, lens, se3.exp(np.array([-0.1, 0, 0, 0, 0, 0]))))
+    maker = BagMaker(ros1=False)
+    for topic, late_ns in (("/l", 0), ("/r", 4_000_000)):
+        maker.image(topic, 10**18 + late_ns, np.zeros((48, 64), np.uint8), "h264")
+    for t, topic, message in maker.messages:
+        assert not list(apart.take(Arrival(topic, message, t)))
+        message.header.stamp.nanosec = 0
+        assert not list(unread.take(Arrival(topic, message, t)))
+    assert "no pair within 2 ms; the nearest are 4 ms apart" in apart.problems()[0]
+    assert unread.problems() == ["images of encoding 'h264' cannot be read"]
 
 
 def test_real_pictures_and_a_source_that_starts_again(real_data: Path) -> None:

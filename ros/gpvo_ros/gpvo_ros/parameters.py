@@ -42,6 +42,8 @@ PARAMETERS = {
     "size": Parameter("", "Size of the rectified images, WIDTHxHEIGHT; default: that of the raw ones."),
     "mask_left": Parameter("", "Mask image for the left lens: which pixels may be used."),
     "mask_right": Parameter("", "The same for the right lens."),
+    "pair_tolerance": Parameter(0.002, "Largest difference between the stamps of a stereo pair [s].", (0.0, 10.0)),
+    "bits": Parameter(16, "Bits in use per sample of 16-bit images, e.g. 12.", (8, 16)),
     "base_frame": Parameter(
         "", "Publish the odometry of this frame, located through /tf_static and /tf; default: the source's own."
     ),
@@ -112,7 +114,8 @@ def _stereo_settings(p: Mapping[str, Any], vehicle: Vehicle) -> StereoSettings:
     bounds = {"max_acceleration_mps2": vehicle.max_acceleration_mps2, "max_turn_radps2": vehicle.max_turn_radps2}
     config = make_config(p["preset"], **{**bounds, **read_settings((p["settings"] or "").split())})
     state, left, right = (p[name] and Path(p[name]) for name in ("calibration_state", "mask_left", "mask_right"))
-    return StereoSettings(config, state, p["hfov_deg"] or None, p["size"] and read_size(p["size"]), left, right)
+    view = (p["hfov_deg"] or None, p["size"] and read_size(p["size"]))
+    return StereoSettings(config, state, *view, left, right, p["pair_tolerance"], p["bits"])
 
 
 def typed(name: str, text: str) -> str | int | float | bool:
