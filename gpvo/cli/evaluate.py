@@ -110,7 +110,9 @@ def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path 
     if stated is not None:
         from gpvo.evaluation.score import write_statements
 
-        write_statements(e, stated, name)
+        if len(write_statements(e, stated, name)) == 1:  # the truth
+            text = f"{name} states no covariance of single motions: {stated} holds its truth alone, nothing to score"
+            warnings.warn(text, stacklevel=2)
     if tables is not None:
         from gpvo.evaluation.document import write_tables
 

@@ -198,12 +198,11 @@ def write_log(path: Path, fused: FusedRun) -> None:
     """A line per record: what was done with it, NIS, innovation and its standard deviation per axis (camera frame)."""
     header = ["t_ns", "outcome", "nis", *(f"innovation_{a}" for a in _AXES), *(f"sigma_{a}" for a in _AXES)]
     lines = [",".join(header)]
-    for step in fused.steps:
+    for t_ns, outcome, innovation in zip(fused.t_ns.tolist(), fused.outcomes, fused.innovations, strict=True):
         values = [np.nan] * 13
-        if step.innovation is not None:
-            sigma = np.sqrt(np.diagonal(step.innovation.S[0]))
-            values = [step.innovation.nis[0], *step.innovation.residual[0], *sigma]
-        lines.append(",".join([str(step.t_ns), step.outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
+        if innovation is not None:
+            values = [innovation.nis[0], *innovation.residual[0], *np.sqrt(np.diagonal(innovation.S[0]))]
+        lines.append(",".join([str(t_ns), outcome, *(f"{v:.9g}" if np.isfinite(v) else "" for v in values)]))
     make_folder(path.parent)
     write_text(path, "\n".join(lines) + "\n", "ascii")
 

@@ -145,9 +145,11 @@ class ErrorStateFilter:
         self.P[:, :CORE, CORE:KEPT] = rest
         self.P[:, CORE:KEPT, :CORE] = kernels.transpose(rest)
 
-    def add_uncertainty(self, variances: Array) -> None:
-        """Widen the core by variances (15,), as over a gap in the IMU."""
-        self.P[:, range(CORE), range(CORE)] += variances
+    def doubt_readings(self, sigma: Array) -> None:
+        """Widen by constant errors of the readings, gyroscope first, of standard deviations ``sigma`` (6,) [rad/s,
+        m/s^2] over the interval just passed, as where its samples are missing: they act as biases do."""
+        G = self._F[:, : BA.start, BA.start :] * np.roll(sigma, 3)
+        self.P[:, : BA.start, : BA.start] += G @ kernels.transpose(G)
 
     def decay_bias(self, dt: float, tau_s: Array) -> None:
         """Let the normalised VO bias forget over ``dt`` by its time constants (P,), variance kept at one."""

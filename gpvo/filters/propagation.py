@@ -27,6 +27,7 @@ from gpvo.types import Array, ImuNoise, VoRecord, field_names
 
 P, V, TH, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 CORE = 15
+_SHARE_OF_FASTEST = 0.1  # of a vehicle's speed, below which it counts as resting
 
 # A consumer-grade MEMS IMU, for logs that do not say what theirs is.
 DEFAULT_IMU_NOISE = ImuNoise(
@@ -173,18 +174,37 @@ def process_noise(densities: Densities, dt: float) -> Array:
 
 
 def constant_velocity_noise(records: Sequence[VoRecord]) -> ConstantVelocityNoise:
-    """How much the vehicle's velocity and turn rate walk, from the log itself: robust spread of their changes.
+    """How much the vehicle's velocity and turn rate walk while it moves, from the log itself: robust spread of their
+    changes. Rest does not count: a filter that takes the vehicle to stay at rest rejects the motions of its start.
 
     VO's own noise is in these changes too, which errs on the wide side.
     """
-    usable = [r for r in records if r.usable and r.dt_s > 0]
+    usable = [r for r in records if r.usable and r.dt_s > 0 and np.isfinite(r.T_prev_cur).all()]
     if len(usable) < 3:
         return ConstantVelocityNoise()
     dt = np.array([r.dt_s for r in usable])
+    end = np.array([(r.t_ns - usable[0].t_ns) * 1e-9 for r in usable])
     twist = se3.log(np.array([r.T_prev_cur for r in usable])) / dt[:, None]
-    change = np.abs(np.diff(twist, axis=0)) / np.sqrt(dt[1:, None])
-    # 1.4826 times the median absolute value is the standard deviation of a Gaussian; the mean of heavy tails.
-    linear, angular = change[:, :3].max(axis=1), change[:, 3:].max(axis=1)
-    sigma = [max(1.4826 * float(np.median(c)), float(np.quantile(c, 0.9)) / 2) for c in (linear, angular)]
+    # The means of a walk over two stretches, one after the other, differ by the variance of this much time.
+    walked = np.diff(end - 0.5 * dt) - (dt[1:] + dt[:-1]) / 6.0
+    apart = end[1:] - dt[1:] > end[:-1] - 1e-6
+    if not apart.any():
+        return ConstantVelocityNoise()
+    change = np.abs(np.diff(twist, axis=0))[apart] / np.sqrt(walked[apart, None])
+    second = max(5, round(1.0 / float(np.median(dt))))
+    sigma = [
+        _walk(change[:, block].max(axis=1), np.linalg.norm(twist[1:, block], axis=1)[apart], second)
+        for block in (slice(0, 3), slice(3, 6))
+    ]
     # The least is for logs without any change: an endoscope's velocity walks by less than a millimetre per second.
     return ConstantVelocityNoise(acceleration=max(sigma[0], 1e-6), angular_acceleration=max(sigma[1], 1e-3))
+
+
+def _walk(change: Array, speed: Array, second: int) -> float:
+    """Robust standard deviation of ``change`` (n,) where ``speed`` (n,) is more than a tenth of that in the fastest
+    second, of so many frames: what is faster for a few frames is a failure of VO."""
+    blocks = speed[: len(speed) // second * second].reshape(-1, second)
+    fastest = np.median(blocks, axis=1).max() if len(blocks) else np.median(speed)
+    moving = change[speed >= _SHARE_OF_FASTEST * fastest]
+    # 1.4826 times the median absolute value is the standard deviation of a Gaussian; the mean of heavy tails.
+    return max(1.4826 * float(np.median(moving)), float(np.quantile(moving, 0.9)) / 2)

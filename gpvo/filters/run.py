@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gpvo.errors import GpvoError
 from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
-from gpvo.filters.measurement import Gate
+from gpvo.filters.measurement import Gate, Innovation
 from gpvo.filters.plausible import usable
 from gpvo.filters.policies import Policy
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_noise, each
@@ -97,7 +97,8 @@ class FuseOptions:
 
 @dataclass(frozen=True)
 class FusedRun:
-    """The filtered run of one policy at its n records: poses, core covariances, innovations, counts and scores."""
+    """The filtered run of one policy at its n records: poses, core covariances, what became of each record with its
+    innovation (None where nothing was measured), counts and scores."""
 
     name: str
     policy: str
@@ -105,7 +106,8 @@ class FusedRun:
     T_world_imu: Array
     T_world_cam: Array
     covariance: Array
-    steps: Sequence[Step]
+    outcomes: Sequence[str]
+    innovations: Sequence[Innovation | None]
     nis: Array
     counts: Mapping[str, int]
     scores: metrics.Scores
@@ -239,11 +241,12 @@ def _member(
     T_imu = se3.from_rt(np.array([x.R_world_imu[0] for x in nominal]), np.array([x.position[0] for x in nominal]))
     T_cam = T_imu if flight.T_imu_cam is None else T_imu @ flight.T_imu_cam
     covariance = np.array([s.covariance[0] for s in ordered])
-    nis = np.array([np.nan if s.innovation is None else s.innovation.nis[0] for s in ordered])
-    failed = sum(1 for s in ordered if s.innovation is not None and not s.innovation.passed[0])
+    outcomes, innovations = [s.outcome for s in ordered], [s.innovation for s in ordered]
+    nis = np.array([np.nan if i is None else i.nis[0] for i in innovations])
+    failed = sum(1 for i in innovations if i is not None and not i.passed[0])
     counts = {**timeline.counts, "rejected": failed}
-    scores = metrics.without_truth(nis, failed)
-    run = FusedRun(flight.name, policy, t_ns, T_imu, T_cam, covariance, ordered, nis, counts, scores, start.note)
+    found = (covariance, outcomes, innovations, nis, counts, metrics.without_truth(nis, failed), start.note)
+    run = FusedRun(flight.name, policy, t_ns, T_imu, T_cam, *found)
     return replace(run, scores=_score(flight, run, start.world_tilt)) if flight.has_truth else run
 
 

@@ -8,6 +8,7 @@ the records that follow it, and applies them again.
 from __future__ import annotations
 
 import bisect
+import math
 from collections import Counter, deque
 from dataclasses import dataclass
 
@@ -17,13 +18,15 @@ from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import Gate, Innovation, Wait
 from gpvo.filters.plausible import LONGEST_GAP_S, ImuGuard
 from gpvo.filters.policies import Policy
-from gpvo.filters.propagation import CORE, TH, Nominal, P, V
+from gpvo.filters.propagation import Nominal
 from gpvo.online.observer import LONGEST_STEP_S, follows
-from gpvo.stats.series import Doubt
+from gpvo.stats.series import Doubt, integral, interpolated
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
 # An interval this many times the usual one, and at least this long, is a gap.
 _GAP_FACTOR, _GAP_S = 5.0, 0.05
+_NEARBY = 1000  # samples that tell how far a guess over a gap may be off
+_GUESS_NS = 250_000_000  # longest step of a guess
 _LONGEST_STEP_NS, _LONGEST_GAP_NS = round(LONGEST_STEP_S * 1e9), round(LONGEST_GAP_S * 1e9)
 
 
@@ -241,13 +244,17 @@ class Timeline:
         i = bisect.bisect_right(self._imu_t, start_ns)
         t, sample = start_ns, self._at(start_ns, i)
         while t < end_ns:
-            inside = i < len(self._imu_t) and self._imu_t[i] <= end_ns
-            t1 = self._imu_t[i] if inside else end_ns
-            after = self._imu[i] if inside else self._at(end_ns, i)
-            dt = (t1 - t) * 1e-9
-            filter.propagate_imu(dt, sample[None, :3], sample[None, 3:], after[None, :3], after[None, 3:])
-            self._widen_over_gap(filter, i, t, t1, counts)
-            t, sample, i = t1, after, i + 1
+            t1 = min(end_ns, t + _GUESS_NS, *self._imu_t[i : i + 1])
+            arrived = self._imu_t[i : i + 1] == [t1]
+            after = self._imu[i] if arrived else self._at(t1, i)
+            dt, ends = (t1 - t) * 1e-9, np.array([sample, after])
+            over = self._over_gap(i, t, t1, ends)
+            ends = ends if over is None else over[0]
+            filter.propagate_imu(dt, ends[:1, :3], ends[:1, 3:], ends[1:, :3], ends[1:, 3:])
+            if over is not None:
+                filter.doubt_readings(over[1])
+                counts["imu_gaps"] += 1
+            t, sample, i = t1, after, i + arrived
 
     def _at(self, t_ns: int, i: int) -> Array:
         """Sample at ``t_ns``, between samples i-1 and i; held beyond the ends."""
@@ -259,34 +266,49 @@ class Timeline:
         share = (t_ns - t0) / (t1 - t0)
         return (1.0 - share) * self._imu[i - 1] + share * self._imu[i]
 
-    def _widen_over_gap(
-        self, filter: ErrorStateFilter, i: int, start_ns: int, end_ns: int, counts: Counter[str]
-    ) -> None:
-        """Across missing samples the motion is a guess: as uncertain as the samples nearby vary.
+    def _over_gap(self, i: int, start_ns: int, end_ns: int, ends: Array) -> tuple[Array, Array] | None:
+        """What to take for the readings ``ends`` (2, 6) across missing samples, and by how much (6,) they may be off;
+        None where none are missing.
 
-        A gap may be crossed in several steps, a record at the end of each, and the guess is wrong the same way in all:
-        what its error grew to by the end of this step, less what it was at its start.
+        A gap may be crossed in several steps, a record at the end of each. Where the sample after it has not come, the
+        guess is wrong the same way in all: what its error grew to by the end of this step, less what it was at its
+        start. Else each step has its share of the variance, as nobody knows where the readings went between.
         """
         last_ns = self._imu_t[i - 1] if i > 0 else start_ns
         age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
         if age[1] < _GAP_S:
-            return
-        nearby = slice(max(0, i - 100), i + 100)
-        steps = np.diff(self._imu_t[nearby])
+            return None
+        steps = np.diff(self._imu_t[max(0, i - 100) : i + 100])
         shortest = max(_GAP_S, _GAP_FACTOR * 1e-9 * float(np.median(steps)) if len(steps) else 0.0)
         if age[1] < shortest:
-            return
+            return None
         begun = age[0] if age[0] >= shortest else 0.0
-        counts["imu_gaps"] += 1
-        near = np.array(self._imu[nearby])
-        spread = np.maximum(near.std(axis=0), np.abs(near[-1] - near[0]))
-        dt = age[1] - begun
-        grown = age[1] ** 2 - begun**2
-        variances = np.zeros(CORE)
-        variances[TH] = spread[:3].max() ** 2 * grown
-        variances[V] = spread[3:].max() ** 2 * grown
-        variances[P] = (0.5 * spread[3:].max() * dt * dt) ** 2
-        filter.add_uncertainty(variances)
+        is_held = i == 0 or i >= len(self._imu_t)
+        length_s = age[1] if is_held else (self._imu_t[i] - last_ns) * 1e-9
+        guess, missed = self._guess(i, length_s, ends, is_held)
+        grown = age[1] ** 2 - begun**2 if is_held else length_s * (age[1] - begun)
+        return guess, missed * math.sqrt(grown) / (age[1] - age[0])
+
+    def _guess(self, i: int, length_s: float, ends: Array, is_held: bool) -> tuple[Array, Array]:
+        """Readings (2, 6) over a gap of ``length_s`` before sample i, and the rms (6,) by which such a guess misses the
+        mean reading over stretches as long of the samples nearby: the line between the samples at its ends, the last
+        one held where no other came, or, where that is better, the mean of those nearby."""
+        near = slice(i, i + _NEARBY) if 2 * i < len(self._imu_t) else slice(max(0, i - _NEARBY), i)
+        t_s, values = (np.array(self._imu_t[near]) - self._imu_t[near.start]) * 1e-9, np.array(self._imu[near])
+        length_s = min(length_s, 0.5 * float(t_s[-1]))
+        if length_s <= 0:
+            return ends, np.abs(values).max(axis=0)
+        usual, total = values.mean(axis=0), integral(values, t_s)
+        later = t_s[t_s + length_s <= t_s[-1]] + length_s
+        begin, end = values[: len(later)], interpolated(later, t_s, values)
+        mean = (interpolated(later, t_s, total) - total[: len(later)]) / length_s
+        guesses = (begin if is_held else 0.5 * (begin + end), usual)
+        of_line, of_mean = (np.sqrt(np.square(mean - guess).mean(axis=0)) for guess in guesses)
+        # Readings at its ends that are unlike those nearby may have changed anywhere between.
+        known = ends if is_held else np.array(self._imu[i - 1 : i + 1])
+        of_line = np.maximum(of_line, np.abs(known[1] - known[0]) / math.sqrt(12.0))
+        of_mean = np.maximum(of_mean, 0.5 * np.abs(known - usual).max(axis=0))
+        return np.where(of_mean < of_line, usual, ends), np.minimum(of_mean, of_line)
 
     def _drop_imu_before(self, t_ns: int) -> None:
         keep = bisect.bisect_right(self._imu_t, t_ns) - 1

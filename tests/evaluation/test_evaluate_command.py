@@ -23,7 +23,7 @@ from gpvo.learning.store import save_model
 from gpvo.learning.thesis import fit_thesis
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
-from gpvo.types import Mounting, Prediction, Status, TruthLog, VoLog
+from gpvo.types import IMPORTED_POSE, Mounting, Prediction, Status, TruthLog, VoLog
 from small_model import small_model
 from synthetic_runs import make_run as synthetic_run
 
@@ -302,3 +302,14 @@ def test_constant_is_said_of_one_frame():
     one = constant.covariance[5]
     np.testing.assert_allclose(constant.covariance[22], 3 * one)
     np.testing.assert_allclose(constant.covariance[23], one)
+
+
+def test_a_run_that_states_nothing_of_motions_is_told_with_the_files_for_score(capsys, tmp_path: Path) -> None:
+    """Its covariances are of poses, as a filter's with a map; the folder would be refused by ``gpvo score``."""
+    log, truth = make_run(60, v_t=False)
+    log = VoLog([replace(r, covariances={IMPORTED_POSE: stated_covariance()}) for r in log])
+    write_run(tmp_path / "slam", log, truth=truth, meta={"source": "made"})
+    code, _, err = _main(capsys, "evaluate", tmp_path / "slam", "--stated", tmp_path / "stated")
+    assert code == 0
+    assert "slam states no covariance of single motions" in err
+    assert [p.name for p in (tmp_path / "stated").iterdir()] == ["truth"]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gpvo.filters import metrics
 from gpvo.filters.eskf import ErrorStateFilter
 from gpvo.filters.measurement import BIAS, JOINT, THREE_SIGMA, Gate, chi2_cdf, chi2_quantile
 from gpvo.filters.policies import LearnedPolicy
@@ -150,6 +151,38 @@ def test_a_gap_in_the_imu_widens_the_state(flight: Flight) -> None:
     assert broken.scores is not None
     assert not broken.scores.diverged
     assert np.trace(broken.covariance[55, 3:6, 3:6]) > 2 * np.trace(whole.covariance[55, 3:6, 3:6])
+
+
+@pytest.mark.parametrize(("silence_s", "least", "most"), [(1.0, 0.2, 2.0), (3.0, 0.3, 4.0)])
+def test_a_silence_of_camera_and_imu_is_as_uncertain_as_it_is(silence_s: float, least: float, most: float) -> None:
+    """NEES of eight flights at the first frame after it, and six seconds later."""
+    after, later = [], []
+    for seed in range(8):
+        flight = synthetic_flight(seed, duration_s=6 + silence_s + 6, imu_hz=100)
+        imu, t_ns = flight.imu, np.array([r.t_ns for r in flight.records])
+        assert imu is not None
+        assert flight.T_world_cam is not None
+        first, last = (t_ns[0] + round(s * 1e9) for s in (6.0, 6.0 + silence_s))
+        heard, seen = ((t <= first) | (t >= last) for t in (imu.t_ns, t_ns))
+        reference = int(t_ns[t_ns <= first][-1])
+        gap = VoRecord(int(last), reference, Status.LOST, np.eye(4), reason="gap")
+        flight = replace(
+            flight,
+            records=[gap if r.t_ns == last else r for r, s in zip(flight.records, seen, strict=True) if s],
+            imu=ImuLog(imu.t_ns[heard], imu.gyro_radps[heard], imu.acc_mps2[heard], imu.noise),
+            T_world_cam=flight.T_world_cam[seen],
+            truth_valid=np.ones(seen.sum(), bool),
+        )
+        run = fuse_flight(flight, LearnedPolicy())[0]
+        k = int(np.searchsorted(run.t_ns, last))
+        truth, C = flight.T_world_imu, run.covariance
+        p = metrics.position_nees(run.T_world_imu[:, :3, 3], truth[:, :3, 3], C[:, :3, :3])
+        a = metrics.attitude_nees(run.T_world_imu[:, :3, :3], truth[:, :3, :3], C[:, 6:9, 6:9])
+        after.append((p[k], a[k]))
+        later.append((p[-1], a[-1]))
+    assert least < np.mean(after, axis=0).min()
+    assert np.mean(after, axis=0).max() < most
+    assert np.median(later, axis=0).max() < 3 * most
 
 
 @pytest.mark.parametrize("back_s", [1.2, 3.0, 3600.0])

@@ -1,0 +1,70 @@
+"""Without an IMU: how much the vehicle's velocity walks, from the log itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gpvo.filters.policies import GeometricPolicy
+from gpvo.filters.propagation import constant_velocity_noise
+from gpvo.filters.run import Flight, fuse_flight
+from gpvo.geometry import se3
+from gpvo.types import Status, VoRecord
+
+RATE_HZ = 20.0
+SIGMA = np.repeat([2e-4, 1e-4], 3)
+
+
+def _records(T_world_cam: np.ndarray, rng: np.random.Generator) -> list[VoRecord]:
+    t_ns = np.round(np.arange(len(T_world_cam)) / RATE_HZ * 1e9).astype(np.int64)
+    T = se3.inverse(T_world_cam[:-1]) @ T_world_cam[1:] @ se3.exp(SIGMA * rng.standard_normal((len(t_ns) - 1, 6)))
+    stated = {"triangulation": np.diag(SIGMA**2)}
+    start = VoRecord(int(t_ns[0]), int(t_ns[0]), Status.START, np.eye(4))
+    moved = (VoRecord(int(t_ns[k + 1]), int(t_ns[k]), Status.OK, T[k], covariances=stated) for k in range(len(T)))
+    return [start, *moved]
+
+
+def _from_rest(rest_s: float, move_s: float) -> Flight:
+    """A vehicle that rests, and then sets off within two seconds, to 2 m/s and swings of half a radian."""
+    t = np.arange(round((rest_s + move_s) * RATE_HZ) + 1) / RATE_HZ
+    u = np.maximum(t - rest_s, 0.0)
+    w = np.minimum(u / 2.0, 1.0)
+    rise = w**3 * (10 - 15 * w + 6 * w * w)
+    forward, zero = 2.0 * np.cumsum(rise) / RATE_HZ, np.zeros_like(t)
+    position = np.stack([0.3 * np.sin(1.1 * u) * rise, 0.1 * np.sin(2 * u) * rise, forward], axis=1)
+    T = se3.from_rt(se3.so3_exp(np.stack([zero, 0.5 * np.sin(0.8 * u) * rise, zero], axis=1)), position)
+    return Flight("rest", _records(T, np.random.default_rng(0)), T_world_cam=T, truth_valid=np.ones(len(t), bool))
+
+
+def test_a_vehicle_that_rested_long_is_followed_when_it_sets_off() -> None:
+    run = fuse_flight(_from_rest(50.0, 10.0), GeometricPolicy("triangulation"))[0]
+    assert run.scores.rejected == 0
+    assert run.scores.final_error_m < 0.1
+    assert run.scores.nees_position < 3.0
+
+
+@pytest.mark.parametrize("axes", [1, 3])
+def test_the_walk_of_a_known_acceleration_is_found(axes: int) -> None:
+    """White acceleration of known density in steps of a hundredth of a frame, so that motions hold its integrals."""
+    rng, fine, n, density, dt = np.random.default_rng(1), 100, 4000, 0.3, 1.0 / RATE_HZ
+    a = np.zeros((n * fine, 3))
+    a[:, :axes] = density / np.sqrt(dt / fine) * rng.standard_normal((n * fine, axes))
+    position = np.cumsum(5.0 + np.cumsum(a, axis=0) * dt / fine, axis=0)[fine - 1 :: fine] * dt / fine
+    T = se3.from_rt(np.broadcast_to(np.eye(3), (n, 3, 3)), position)
+    found = constant_velocity_noise(_records(T, rng)).acceleration
+    assert 0.97 * density < found < 2.0 * density
+
+
+def test_failures_of_vo_are_not_taken_for_motion() -> None:
+    """Slips of half a metre, one by one, and a motion that is no number."""
+    flight = _from_rest(10.0, 10.0)
+    known = constant_velocity_noise(flight.records)
+    rng, records = np.random.default_rng(2), list(flight.records)
+    for i in (*rng.choice(np.arange(220, 395, 5), 6, replace=False), 300):
+        T = records[i].T_prev_cur.copy()
+        T[:3, 3] += 0.5 * rng.standard_normal(3) if i != 300 else np.nan
+        records[i] = replace(records[i], T_prev_cur=T)
+    found = constant_velocity_noise(records)
+    assert found.acceleration == pytest.approx(known.acceleration, rel=0.3)
+    assert found.angular_acceleration == pytest.approx(known.angular_acceleration, rel=0.3)
