@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gpvo.dataset.check import ENOUGH_INSIDE
-from gpvo.dataset.errors import MAX_GAP_S, interpolated_between, steps_of_slow_truth, turn_without_truth_deg
+from gpvo.dataset.errors import (
+    MAX_GAP_S,
+    interpolated_between,
+    steps_of_slow_truth,
+    turn_without_truth_deg,
+    without_held,
+)
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
@@ -245,9 +251,15 @@ def _conditions(e: Evaluation) -> Iterator[str]:
 
 
 def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
-    """A truth slower than the frames, and a path of another size."""
+    """A truth that stalls or is slower than the frames, and a path of another size."""
     if e.run.truth is None or not e.covered.any():
         return
+    given = len(e.run.truth.t_ns)
+    if held := given - len(without_held(e.run.truth).t_ns):
+        yield (
+            f"{held} of {given} poses of the ground truth only repeat the one before while it moves, as a source does"
+            " that stalls or is slower: they do not count."
+        )
     if steps_s := steps_of_slow_truth(e.run.truth, e.run.log.t_ns):
         between = (
             "between its poses it is interpolated, and what that misses is only estimated"
@@ -258,7 +270,7 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     if every := interpolated_between(e.run.truth):
         yield (
             f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks more exact than"
-            " it is. Give the poses as they were measured."
+            " it is. Give the poses as they were without_held."
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
