@@ -42,7 +42,7 @@ def without_held(truth: TruthLog) -> TruthLog:
 
     Such a pose ends by a leap: at more than ``_LEAPS`` times the pace around it, but over the whole time that it was
     held, at no less than ``_MOVING`` of the usual one. From true rest a vehicle starts slowly. A pose held to the end
-    counts likewise if the vehicle got there at such a pace; and where most are held, all are.
+    counts likewise if the vehicle got there at such a pace. Where most poses are held, all that repeat are.
     """
     T, t_s = truth.T_world_cam, (truth.t_ns - truth.t_ns[:1]) * 1e-9
     repeats = np.append(np.zeros(len(T[:1]), bool), (T[1:] == T[:-1]).all(axis=(1, 2)))
@@ -50,14 +50,15 @@ def without_held(truth: TruthLog) -> TruthLog:
     if len(new) == len(T) or len(new) < 3:
         return truth
     moved = se3.inverse(T[new[:-1]]) @ T[new[1:]]
-    held = np.zeros(len(new), dtype=bool)
+    held, judged = np.zeros((2, len(new)), dtype=bool)
     for step in (moved[:, :3, 3], se3.so3_log(moved[:, :3, :3])):
         size = np.linalg.norm(step, axis=1)
         pace, leap = size / np.diff(t_s[new]), size / (t_s[new[1:]] - t_s[new[1:] - 1])
         around = np.maximum(np.append(0.0, pace[:-1]), np.append(pace[1:], 0.0))
         moving = pace > _MOVING * np.quantile(pace, 0.75)
+        judged |= np.append(moving, moving[-1])
         held |= np.append(moving & (leap > _LEAPS * around), moving[-1])
-    held |= held.mean() > 0.5
+    held |= held.sum() > 0.5 * judged.sum()
     keep = ~(repeats & held[np.cumsum(~repeats) - 1])
     v = truth.v_world_mps
     return replace(truth, t_ns=truth.t_ns[keep], T_world_cam=T[keep], v_world_mps=None if v is None else v[keep])
