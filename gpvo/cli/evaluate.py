@@ -230,7 +230,7 @@ def _print(d: dict[str, Any]) -> None:
         for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):
             say(line)
     if d["truth_moves_at_rest"]:
-        say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands still while its truth moves")
+        say(f"  {d['truth_moves_at_rest']} motions are not scored: the truth moves while the vehicle rests, or jumps")
     for text in d["odd_stretches"]:
         say(f"  {text}: odometry or truth is wrong there")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.doubtful import in_waits, odd_stretches, wandering_waits
+from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
 from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
 from gpvo.errors import GpvoError
@@ -38,9 +38,9 @@ class TrainingSet:
 
     ``X`` (n, d) features ``columns``, NaN where unknown. ``Y`` (n, 6) errors [m, rad], or (n, 3) residuals of a
     position. ``covariances`` (n, 6, 6) and ``v_t`` (n, 3, 3) by method. ``counts``: frames, lost, slips (lost by
-    plausibility alone, also in ``lost``), frames without truth, those at rest whose truth moves, and those in odd
-    stretches. ``lost_xi``
-    (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from the motion expected.
+    plausibility alone, also in ``lost``), frames without truth, those whose truth moves at rest or jumps, and those in
+    odd stretches. ``lost_xi`` (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from
+    the motion expected.
     ``odometry``: settings of gpvo's own odometry, empty if another one made the log.
     """
 
@@ -112,8 +112,8 @@ def build(
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
     ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
-    waits in which the truth moves (:func:`gpvo.dataset.doubtful.wandering_waits`); "keep" learns from them. ``odd``:
-    the same of stretches in which odometry and truth differ far more than elsewhere
+    waits in which the truth moves, or its jumps (:func:`gpvo.dataset.doubtful.false_motions`); "keep" learns from
+    them. ``odd``: the same of stretches in which odometry and truth differ far more than elsewhere
     (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
     ``where``, by default ``name``.
     """
@@ -141,7 +141,7 @@ def build(
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())
     if waits == "drop":
-        known &= ~in_waits(records, wandering_waits(log, truth))
+        known &= ~in_waits(records, false_motions(log, truth))
     moves_at_rest = with_truth - int(known.sum())
     is_odd = known & in_waits(records, [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":

@@ -30,9 +30,10 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     over the runs. For each run, besides its name, counts, path length, ATE and segments:
 
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
-    * ``truth_moves_at_rest``: motions that are not scored, because the vehicle stands still while the truth moves; they
-      count only in ATE, final error and RPE.
-    * ``odd_stretches``: motions, in words, in which odometry and truth differ far more than elsewhere; they are scored.
+    * ``truth_moves_at_rest``: motions that are not scored, because the vehicle stands still while the truth moves, or
+      the truth jumps; they count only in ATE, final error and RPE.
+    * ``odd_stretches``: motions, in words, in which odometry and truth differ far more than elsewhere; scored,
+      unless they are jumps of the truth.
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.

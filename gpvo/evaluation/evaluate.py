@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gpvo.accumulation import along
 from gpvo.dataset.build import aligned_truth, predictions_of
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
-from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
+from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
     MAX_GAP_S,
     MotionErrors,
@@ -56,12 +56,12 @@ class EvaluateOptions:
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands. ``odd``: stretches in which odometry and truth differ far more than elsewhere. ``truth_sigma`` (6,): noise
-    of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source states. ``tells_from_m``:
-    length of path from which odometry's errors outweigh it. ``late_s``: offset between the clocks, where it matters and
-    none was given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``: poses of one of the
-    two seem to be inverse. ``in_domain``: share of the predicted frames that lie in the model's training domain, None
-    without a model. ``poses``: scores of the covariances of poses that a log states.
+    stands, or jumps. ``odd``: these jumps, and stretches in which odometry and truth differ far more than elsewhere.
+    ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source
+    states. ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the
+    clocks, where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise;
+    ``inverse``: poses of one of the two seem to be inverse. ``in_domain``: share of the predicted frames that lie in
+    the model's training domain, None without a model. ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run
@@ -171,7 +171,7 @@ def evaluate_run(
         time_offset_s=offset_s,
         late_s=late_s,
         unscored=int(log.usable.sum() - scored.usable.sum()),
-        odd=odd_stretches(scored, truth),
+        odd=[*jumps(log, truth), *odd_stretches(scored, truth)],
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=_in_domain(predictions),
     )

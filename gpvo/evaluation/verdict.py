@@ -30,6 +30,7 @@ HONEST = (0.5, 2.0)
 _FEW_WINDOWS = 5
 _FEW_BARE = 0.01  # of the frames, without truth: its ends
 _LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
+_FAR, _FEW_FAR, _OUTWEIGH = 20.0, 0.05, 0.9  # medians; share of the motions; of the sum of all squared errors
 
 Colour = Literal["green", "amber", "red"]
 
@@ -222,6 +223,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
         yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
+    yield from _of_few_motions(e)
     unseen = [a for k, a in enumerate(AXES) if len(e.errors.xi) and k not in seen_axes(e.errors.xi)]
     if 0 < len(unseen) < len(AXES):
         yield (
@@ -247,6 +249,19 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg"
             f" (mounting, calibration, or a steady bias of the odometry{asked})."
             f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
+        )
+
+
+def _of_few_motions(e: Evaluation) -> Iterator[str]:
+    """Motions so few and so wrong that every mean is theirs."""
+    size = np.linalg.norm(e.errors.xi.reshape(-1, 2, 3), axis=2)
+    far = (size > _FAR * np.median(size, axis=0)).any(axis=1) if len(size) else np.zeros(0, dtype=bool)
+    if 0 < far.sum() <= _FEW_FAR * len(far) and ((size[far] ** 2).sum(0) > _OUTWEIGH * (size**2).sum(0)).any():
+        at = e.errors.index[np.flatnonzero(far)[0]]
+        yield (
+            f"In {far.sum()} of {len(far)} motions, first at frame {at} ({e.t_s[at]:.2f} s), odometry and truth differ"
+            f" by more than {_FAR:g} times the median (slips, or jumps of the truth): they outweigh all others in every"
+            " mean."
         )
 
 

@@ -293,3 +293,32 @@ def test_a_truth_without_attitude_is_named() -> None:
     with pytest.raises(GpvoError, match=r"never turns, but odometry does, by up to [0-9]+ deg"):
         build(log, without(truth), name="hall")
     assert len(build(log, without(truth), name="hall", target="position")) == 200
+
+
+def test_few_motions_that_make_up_every_mean_are_named() -> None:
+    def moved(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        here = T[100].copy()  # from where it goes on turned, as some vehicle might turn
+        T[100:] = here @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.4, 0.0])) @ se3.inverse(here) @ T[100:]
+        return replace(truth, T_world_cam=T)
+
+    lines = verdict(of_truth(moved)).lines
+    assert any("In 1 of 600 motions, first at frame 100 (5.00 s)" in line for line in lines), lines
+    assert not any("outweigh all others" in line for line in verdict(of_truth(lambda truth: truth)).lines)
+
+
+def test_a_jump_that_no_vehicle_makes_is_not_scored_and_a_stalled_truth_is_named() -> None:
+    def faulty(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        T[100:] = se3.exp(np.array([3.0, 2.0, 0.0, 0.0, 0.0, 0.5])) @ T[100:]
+        T[400:420] = T[400]
+        return replace(truth, T_world_cam=T)
+
+    found, right = of_truth(faulty), of_truth(lambda truth: truth)
+    assert found.unscored == 1
+    assert any("motions 100 to 100: truth jumps" in str(s) for s in found.odd)
+    nees = [e.consistency["triangulation"].nees_dof["joint"].mean for e in (found, right)]
+    assert nees[0] == pytest.approx(nees[1], rel=0.02)
+    assert any(
+        "19 of 601 poses of the ground truth only repeat the one before" in line for line in verdict(found).lines
+    )
