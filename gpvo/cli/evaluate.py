@@ -45,7 +45,9 @@ class JudgeOptions:
         str | None,
         typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),
     ] = None
-    align: Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth: rotation or none.")] = "none"
+    align: Annotated[
+        str, typer.Option(help="Fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
+    ] = "none"
     time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")] = "0"
 
     def options(self) -> EvaluateOptions:

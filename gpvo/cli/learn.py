@@ -35,9 +35,9 @@ class TrainOptions:
     regressor: Annotated[
         str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
     ] = "auto"
-    align: Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth first: rotation or none.")] = (
-        "none"
-    )
+    align: Annotated[
+        str, typer.Option(help="First fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
+    ] = "none"
     waits: Annotated[
         str,
         typer.Option("--stationary", "--waits", help="Motions where truth wanders at rest, or jumps: drop or keep."),

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
-from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
+from gpvo.dataset.hand_eye import align_frames
 from gpvo.errors import GpvoError
-from gpvo.geometry import se3
 from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
@@ -202,7 +201,7 @@ def build_run(
     waits: str = "drop",
     odd: str = "keep",
 ) -> TrainingSet:
-    """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
+    """The training set of a run folder. ``align``: see :func:`aligned_truth`."""
     truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
     rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
     return replace(rows, odometry=that_matter(run.settings))
@@ -222,16 +221,12 @@ def that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
-    """The truth as it is, with ``align`` "none"; with "rotation" turned by the fixed rotation between its camera and
-    the log's, so that motions of a second agree best. Raises GpvoError for another word, or where nothing tells it.
+    """The truth as it is, with ``align`` "none"; else in the frame of the log, as motions of a second agree best
+    (:func:`gpvo.dataset.hand_eye.align_frames`). Raises GpvoError for another word, or where nothing tells it.
     """
     if align == "none":
         return truth
-    if align != "rotation":
-        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
-    A, B, _ = windowed_motions(flag_slips(log), truth)
-    fixed = fit_fixed_transform(A, B, lever_arm=False)
-    return replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))
+    return replace(truth, T_world_cam=align_frames(flag_slips(log), truth, align).in_log_frame(truth.T_world_cam))
 
 
 def _v_t(records: Sequence[VoRecord]) -> dict[str, Array]:

@@ -245,10 +245,12 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if e.turned is not None and len(unseen) < len(AXES):
         # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
         asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
+        apart = f" and a lever arm of {e.turned.lever_m:.3g} m" if e.turned.lever_m else ""
         yield (
-            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg"
+            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg{apart}"
             f" (mounting, calibration, or a steady bias of the odometry{asked})."
-            f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
+            f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller"
+            f" (--align {'transform' if apart else 'rotation'})."
         )
 
 

@@ -15,7 +15,7 @@ from gpvo.dataset.errors import interpolate_truth, turn_without_truth_deg
 from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
-from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
+from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run, unjudged_run
 from gpvo.evaluation.panels import _LEVELS, reliability
 from gpvo.evaluation.report import render
 from gpvo.evaluation.verdict import verdict
@@ -126,9 +126,10 @@ def test_nothing_stated_is_said() -> None:
     assert "nothing can be judged" in verdict(evaluated({})).headline
 
 
-def of_truth(change: Callable[[TruthLog], TruthLog]) -> Evaluation:
+def of_truth(change: Callable[[TruthLog], TruthLog], align: str = "none") -> Evaluation:
     log, truth = make_run(600, v_t=False)
-    return evaluate_run(Run(Path("hall"), "hall", log, change(truth), None, Mounting(), []))
+    run = Run(Path("hall"), "hall", log, change(truth), None, Mounting(), [])
+    return evaluate_run(run, options=EvaluateOptions(align=align))
 
 
 def scaled(truth: TruthLog, factor: float) -> TruthLog:
@@ -322,3 +323,20 @@ def test_a_jump_that_no_vehicle_makes_is_not_scored_and_a_stalled_truth_is_named
     assert any(
         "19 of 601 poses of the ground truth only repeat the one before" in line for line in verdict(found).lines
     )
+
+
+def test_a_lever_arm_of_the_truth_is_named_and_taken_off() -> None:
+    """Markers elsewhere on the vehicle, turned relative to the camera."""
+
+    def of_markers(truth: TruthLog) -> TruthLog:
+        X = se3.exp(np.array([0.3, -0.1, 0.2, 0.4, -0.2, 0.1]))
+        return replace(truth, T_world_cam=truth.T_world_cam @ X)
+
+    told = [line for line in verdict(of_truth(of_markers)).lines if "fixed rotation" in line]
+    assert len(told) == 1
+    assert "lever arm of 0.3" in told[0]
+    assert told[0].endswith("(--align transform).")
+    found, right = of_truth(of_markers, align="transform"), of_truth(lambda truth: truth)
+    assert found.turned is right.turned is None
+    nees = [e.consistency["triangulation"].nees_dof["joint"].mean for e in (found, right)]
+    assert nees[0] == pytest.approx(nees[1], rel=0.02)
