@@ -226,7 +226,7 @@ def _print(d: dict[str, Any]) -> None:
     say(
         f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {in_metres(d['path_length_m'])};"
         f" ATE {d['ate_rmse_m']:.3g} m,"
-        f" final error {d['final_error_m']:.3g} m"
+        f" final error {cell(d['final_error_m'])} m"
     )
     if found := d.get("verdict"):
         for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):

@@ -96,7 +96,7 @@ def import_log(
         notes.append(f"poses on {unread} are not used: --topic takes them as the odometry, --truth-topic as truth")
     fixed: FixedTransform | None = None
     if given is not None and truth is not None:
-        check_overlap(given, log.t_ns, truth.path)
+        check_overlap(given, log.t_ns, truth.path, " --time-offset auto finds what lies between two clocks")
         if align != "none":
             fixed = align_frames(VoLog(records), given, align)
             given = replace(given, T_world_cam=fixed.in_log_frame(given.T_world_cam))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
-from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
+from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
 from gpvo.dataset.hand_eye import align_frames
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
@@ -127,12 +127,8 @@ def build(
             where=where or name,
             cure="run a sequence that has it, or gpvo import --truth",
         )
-    if target != "position" and (turn_deg := turn_without_truth_deg(log, truth)):
-        raise GpvoError(
-            f"the ground truth holds no attitude: it never turns, but odometry does, by up to {turn_deg:.0f} deg",
-            where=where or name,
-            cure="give one with orientations, or learn from twins",
-        )
+    if target != "position":
+        require_attitude(log, truth, where or name)
     records, X = observe(log, names, target)
     if target == "position":
         Y, known = position_targets(log, VoLog(records).usable, truth)

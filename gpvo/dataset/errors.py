@@ -175,6 +175,16 @@ def turn_without_truth_deg(log: VoLog, truth: TruthLog) -> float:
     return turned if turned > _TURN_DEG else 0.0
 
 
+def require_attitude(log: VoLog, truth: TruthLog, where: object) -> None:
+    """Refuse a truth of positions alone, by which no motion can be judged. Raises GpvoError, naming ``where``."""
+    if turn_deg := turn_without_truth_deg(log, truth):
+        raise GpvoError(
+            f"the ground truth holds no attitude: it never turns, but odometry does, by up to {turn_deg:.0f} deg",
+            where=where,
+            cure="give one with orientations, or use twins",
+        )
+
+
 def _turn_deg(T: Array) -> float:
     """Largest rotation between the first of poses (N, 4, 4) and another."""
     R = np.swapaxes(T[:1, :3, :3], 1, 2) @ T[:, :3, :3]

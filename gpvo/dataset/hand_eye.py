@@ -169,6 +169,8 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
     or matters."""
     A, B, _ = windowed_motions(log, truth)
     half, found = len(A) // 2, None
+    if half < _MIN_MOTIONS:
+        return None
     parts = slice(None, half), slice(half, None)
     try:
         plain = least = np.array([np.median(_errors(A[p], B[p], np.eye(4))[0]) for p in parts])
@@ -180,7 +182,7 @@ def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
                 rotvec = tuple(se3.so3_log(fixed.T_log_truth[:3, :3]).tolist())
                 change = float(_change(left, plain, B).mean())
                 found, least = FixedRotation(fixed.angle_deg, rotvec, change, fixed.lever_m), left
-    except GpvoError:  # too few motions, or a path too straight to tell
+    except GpvoError:  # a path too straight to tell
         pass
     return found
 

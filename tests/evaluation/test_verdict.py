@@ -16,6 +16,7 @@ from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run, unjudged_run
+from gpvo.evaluation.flights import constants_of, flight_of
 from gpvo.evaluation.panels import _LEVELS, reliability
 from gpvo.evaluation.report import render
 from gpvo.evaluation.verdict import verdict
@@ -288,12 +289,29 @@ def test_a_truth_without_attitude_is_named() -> None:
         T[:, :3, :3] = np.eye(3)
         return replace(truth, T_world_cam=T)
 
-    assert "holds no attitude" in verdict(of_truth(without)).headline
+    found, right = of_truth(without), of_truth(lambda truth: truth)
+    assert "holds no attitude" in verdict(found).headline
+    assert not verdict(found).lines
+    assert found.trajectory.ate_rmse_m == right.trajectory.ate_rmse_m
+    assert not found.consistency  # neither is anything else that it cannot tell
+    assert np.isnan(found.trajectory.final_error_m)
+    assert not found.odd
+    assert render([found])
     assert "honest" in verdict(of_truth(lambda truth: truth)).headline
     log, truth = make_run(200)
     with pytest.raises(GpvoError, match=r"never turns, but odometry does, by up to [0-9]+ deg"):
         build(log, without(truth), name="hall")
     assert len(build(log, without(truth), name="hall", target="position")) == 200
+
+
+def test_no_filter_starts_from_a_truth_without_attitude_nor_takes_a_constant_from_it() -> None:
+    log, truth = make_run(600, v_t=False)
+    T = truth.T_world_cam.copy()
+    T[:, :3, :3] = np.eye(3)
+    run = Run(Path("hall"), "hall", log, replace(truth, T_world_cam=T), None, Mounting(), [])
+    for use in (flight_of, lambda run: constants_of([run])):
+        with pytest.raises(GpvoError, match="hall: the ground truth holds no attitude"):
+            use(run)
 
 
 def test_few_motions_that_make_up_every_mean_are_named() -> None:
