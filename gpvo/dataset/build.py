@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
-from gpvo.dataset.hand_eye import align_frames
+from gpvo.dataset.hand_eye import align_frames, windowed_motions
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
@@ -129,6 +129,7 @@ def build(
         )
     if target != "position":
         require_attitude(log, truth, where or name)
+        _require_one_unit(log, truth, where or name)
     records, X = observe(log, names, target)
     if target == "position":
         Y, known = position_targets(log, VoLog(records).usable, truth)
@@ -173,6 +174,25 @@ def build(
         lost_xi=as_if[has],
         lost_jump=jumps[has],
     )
+
+
+_MOST_SCALE = 3.0  # less than a metre has feet
+
+
+def _require_one_unit(log: VoLog, truth: TruthLog, where: object) -> None:
+    """Refuse motions of a second that are another size by odometry than by truth.
+
+    Of two that are noisy, the sum of products over that of squares underrates the scale by the noise of either: it lies
+    between the two. Raises GpvoError, naming ``where``.
+    """
+    a, b = (T[:, :3, 3] for T in windowed_motions(log, truth)[:2])
+    own, true, both = float((a**2).sum()), float((b**2).sum()), float((a * b).sum())
+    if _MOST_SCALE * min(own, true) < both:
+        raise GpvoError(
+            f"the odometry's motions are {np.sqrt(own / true):.2g} times as large as the truth's",
+            where=where,
+            cure="give both in metres",
+        )
 
 
 def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -302,6 +303,19 @@ def test_a_truth_without_attitude_is_named() -> None:
     with pytest.raises(GpvoError, match=r"never turns, but odometry does, by up to [0-9]+ deg"):
         build(log, without(truth), name="hall")
     assert len(build(log, without(truth), name="hall", target="position")) == 200
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1e3, "0.001"), (3.28, "0.31"), (1e-3, "1e+03"), (2.0, ""), (0.5, "")])
+def test_nothing_is_learned_from_a_truth_in_another_unit(factor: float, told: str) -> None:
+    log, truth = make_run(200)
+    if told:
+        with pytest.raises(GpvoError, match=f"are {re.escape(told)} times as large as the truth's"):
+            build(log, scaled(truth, factor), name="hall")
+        return
+    assert len(build(log, scaled(truth, factor), name="hall")) == 200
+    noise = np.random.default_rng(0).standard_normal((len(truth.t_ns), 6)) * [0.5, 0.5, 0.5, 0, 0, 0]
+    noisy = replace(truth, T_world_cam=truth.T_world_cam @ se3.exp(noise))  # far larger than the motions themselves
+    assert len(build(log, noisy, name="hall")) == 200
 
 
 def test_no_filter_starts_from_a_truth_without_attitude_nor_takes_a_constant_from_it() -> None:
