@@ -17,6 +17,7 @@ from gpvo.dataset.errors import (
     turn_without_truth_deg,
     without_held,
 )
+from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
@@ -243,15 +244,19 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         )
     yield from _of_truth_and_path(e)
     if e.turned is not None and len(unseen) < len(AXES):
-        # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
-        asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
-        apart = f" and a lever arm of {e.turned.lever_m:.3g} m" if e.turned.lever_m else ""
-        yield (
-            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg{apart}"
-            f" (mounting, calibration, or a steady bias of the odometry{asked})."
-            f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller"
-            f" (--align {'transform' if apart else 'rotation'})."
-        )
+        yield _of_frames(e.turned)
+
+
+def _of_frames(turned: FixedRotation) -> str:
+    # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
+    asked = "; are the quaternion's order and --frame right?" if turned.angle_deg > 90 else ""
+    apart = f" and a lever arm of {turned.lever_m:.3g} m" if turned.lever_m else ""
+    return (
+        f"Truth and odometry differ by a fixed rotation of {turned.angle_deg:.2f} deg{apart}"
+        f" (mounting, calibration, or a steady bias of the odometry{asked})."
+        f" Without it, errors over a second are {-100 * turned.error_change:.0f} % smaller"
+        f" (--align {'transform' if apart else 'rotation'})."
+    )
 
 
 def _of_few_motions(e: Evaluation) -> Iterator[str]:
