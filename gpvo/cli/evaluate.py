@@ -45,7 +45,9 @@ class JudgeOptions:
         str | None,
         typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),
     ] = None
-    align: Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth: rotation or none.")] = "none"
+    align: Annotated[
+        str, typer.Option(help="Fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
+    ] = "none"
     time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")] = "0"
 
     def options(self) -> EvaluateOptions:
@@ -226,13 +228,13 @@ def _print(d: dict[str, Any]) -> None:
     say(
         f"{d['run']}: {d['frames']} frames, {d['lost']:.3g} lost, {in_metres(d['path_length_m'])};"
         f" ATE {d['ate_rmse_m']:.3g} m,"
-        f" final error {d['final_error_m']:.3g} m"
+        f" final error {cell(d['final_error_m'])} m"
     )
     if found := d.get("verdict"):
         for line in (f"  {found['headline']}", *(f"    {text}" for text in found["lines"])):
             say(line)
     if d["truth_moves_at_rest"]:
-        say(f"  {d['truth_moves_at_rest']} motions are not scored: the vehicle stands still while its truth moves")
+        say(f"  {d['truth_moves_at_rest']} motions are not scored: the truth moves while the vehicle rests, or jumps")
     for text in d["odd_stretches"]:
         say(f"  {text}: odometry or truth is wrong there")
     errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]

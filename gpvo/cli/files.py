@@ -15,7 +15,7 @@ from gpvo.cli.describe import as_lines, describe
 from gpvo.cli.output import Json, note, numbers, one_of, print_json
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
-from gpvo.dataset.hand_eye import FixedTransform, fit_fixed_transform, windowed_motions
+from gpvo.dataset.hand_eye import FixedTransform, align_frames
 from gpvo.errors import GpvoError, SourceError
 from gpvo.files import plain
 from gpvo.io.foreign import T_FLU_OPTICAL, ForeignLog, check_same_rows, read_foreign
@@ -96,11 +96,9 @@ def import_log(
         notes.append(f"poses on {unread} are not used: --topic takes them as the odometry, --truth-topic as truth")
     fixed: FixedTransform | None = None
     if given is not None and truth is not None:
-        check_overlap(given, log.t_ns, truth.path)
+        check_overlap(given, log.t_ns, truth.path, " --time-offset auto finds what lies between two clocks")
         if align != "none":
-            A, B, attitudes = windowed_motions(VoLog(records), given)
-            whole = align == "transform"
-            fixed = fit_fixed_transform(A, B, attitudes if whole else None, lever_arm=whole)
+            fixed = align_frames(VoLog(records), given, align)
             given = replace(given, T_world_cam=fixed.in_log_frame(given.T_world_cam))
     meta: dict[str, Any] = {"source": log.path.name, "format": "import", "kind": "import"}
     write_run(

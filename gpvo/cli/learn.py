@@ -35,12 +35,12 @@ class TrainOptions:
     regressor: Annotated[
         str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
     ] = "auto"
-    align: Annotated[str, typer.Option(help="Fit a fixed rotation between log and truth first: rotation or none.")] = (
-        "none"
-    )
+    align: Annotated[
+        str, typer.Option(help="First fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
+    ] = "none"
     waits: Annotated[
         str,
-        typer.Option("--stationary", "--waits", help="Motions at rest during which the truth wanders: drop or keep."),
+        typer.Option("--stationary", "--waits", help="Motions where truth wanders at rest, or jumps: drop or keep."),
     ] = "drop"
     odd: Annotated[
         str, typer.Option(help="Stretches where odometry and truth differ far more than elsewhere: keep or drop.")
@@ -222,7 +222,7 @@ def _print_table(document: dict[str, Any]) -> None:
         for count in ("truth_moves_at_rest", "odd")
     )
     if at_rest:
-        why = "because the truth moves while the vehicle stands still"
+        why = "because the truth moves while the vehicle stands still, or jumps"
         say(f"left out, {why}: {at_rest} (--stationary keep keeps them)")
     if odd:
         say(f"motions in which odometry and truth differ far more than elsewhere: {odd}")

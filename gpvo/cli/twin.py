@@ -14,6 +14,7 @@ import typer
 
 from gpvo.cli.common import is_given
 from gpvo.cli.output import Json, new_table, note, print_json, progress, say, show
+from gpvo.dataset.errors import require_attitude
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
 from gpvo.online.features import AXES
@@ -103,6 +104,9 @@ def twin(
     real = [read_run(path) for path in runs] if against else []  # before the work, not after it
     if without := [run.path for run in real if run.truth is None]:
         raise GpvoError("has no ground truth to compare twins with", where=without[0], cure="leave out --against")
+    for run in real:
+        assert run.truth is not None
+        require_attitude(run.log, run.truth, run.path)
     with nullcontext(out) if out is not None else TemporaryDirectory(prefix="gpvo-twins-") as folder:
         made = make_all(runs, Path(folder), settings, jobs)
         if against:

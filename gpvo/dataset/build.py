@@ -11,11 +11,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.doubtful import in_waits, odd_stretches, wandering_waits
-from gpvo.dataset.errors import motion_targets, position_targets, turn_without_truth_deg
-from gpvo.dataset.hand_eye import fit_fixed_transform, windowed_motions
+from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
+from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
+from gpvo.dataset.hand_eye import align_frames, windowed_motions
 from gpvo.errors import GpvoError
-from gpvo.geometry import se3
 from gpvo.io.run_read import Run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
@@ -38,9 +37,9 @@ class TrainingSet:
 
     ``X`` (n, d) features ``columns``, NaN where unknown. ``Y`` (n, 6) errors [m, rad], or (n, 3) residuals of a
     position. ``covariances`` (n, 6, 6) and ``v_t`` (n, 3, 3) by method. ``counts``: frames, lost, slips (lost by
-    plausibility alone, also in ``lost``), frames without truth, those at rest whose truth moves, and those in odd
-    stretches. ``lost_xi``
-    (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from the motion expected.
+    plausibility alone, also in ``lost``), frames without truth, those whose truth moves at rest or jumps, and those in
+    odd stretches. ``lost_xi`` (m, 6): errors of the slips that have truth; ``lost_jump`` (m, 6): their distance from
+    the motion expected.
     ``odometry``: settings of gpvo's own odometry, empty if another one made the log.
     """
 
@@ -112,8 +111,8 @@ def build(
     """The training set of one run. Frames that are lost or lack truth are left out and counted.
 
     ``columns``: by default all of ``full`` and the residual. ``waits``: "drop" leaves out, and counts, what falls into
-    waits in which the truth moves (:func:`gpvo.dataset.doubtful.wandering_waits`); "keep" learns from them. ``odd``:
-    the same of stretches in which odometry and truth differ far more than elsewhere
+    waits in which the truth moves, or its jumps (:func:`gpvo.dataset.doubtful.false_motions`); "keep" learns from
+    them. ``odd``: the same of stretches in which odometry and truth differ far more than elsewhere
     (:func:`gpvo.dataset.doubtful.odd_stretches`). Raises GpvoError where nothing is left to learn from, which names
     ``where``, by default ``name``.
     """
@@ -128,12 +127,9 @@ def build(
             where=where or name,
             cure="run a sequence that has it, or gpvo import --truth",
         )
-    if target != "position" and (turn_deg := turn_without_truth_deg(log, truth)):
-        raise GpvoError(
-            f"the ground truth holds no attitude: it never turns, but odometry does, by up to {turn_deg:.0f} deg",
-            where=where or name,
-            cure="give one with orientations, or learn from twins",
-        )
+    if target != "position":
+        require_attitude(log, truth, where or name)
+        _require_one_unit(log, truth, where or name)
     records, X = observe(log, names, target)
     if target == "position":
         Y, known = position_targets(log, VoLog(records).usable, truth)
@@ -141,7 +137,7 @@ def build(
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())
     if waits == "drop":
-        known &= ~in_waits(records, wandering_waits(log, truth))
+        known &= ~in_waits(records, false_motions(log, truth))
     moves_at_rest = with_truth - int(known.sum())
     is_odd = known & in_waits(records, [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":
@@ -180,6 +176,25 @@ def build(
     )
 
 
+_MOST_SCALE = 3.0  # less than a metre has feet
+
+
+def _require_one_unit(log: VoLog, truth: TruthLog, where: object) -> None:
+    """Refuse motions of a second that are another size by odometry than by truth.
+
+    Of two that are noisy, the sum of products over that of squares underrates the scale by the noise of either: it lies
+    between the two. Raises GpvoError, naming ``where``.
+    """
+    a, b = (T[:, :3, 3] for T in windowed_motions(log, truth)[:2])
+    own, true, both = float((a**2).sum()), float((b**2).sum()), float((a * b).sum())
+    if _MOST_SCALE * min(own, true) < both:
+        raise GpvoError(
+            f"the odometry's motions are {np.sqrt(own / true):.2g} times as large as the truth's",
+            where=where,
+            cure="give both in metres",
+        )
+
+
 def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
     """How many records are lost, those that are so for their motion alone, and the distance (m, 6) of each such motion
     from the expected one. From the log itself: windows leave lost frames out before they become records."""
@@ -202,7 +217,7 @@ def build_run(
     waits: str = "drop",
     odd: str = "keep",
 ) -> TrainingSet:
-    """The training set of a run folder. ``align`` "rotation" first fits the fixed rotation between log and truth."""
+    """The training set of a run folder. ``align``: see :func:`aligned_truth`."""
     truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
     rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
     return replace(rows, odometry=that_matter(run.settings))
@@ -222,16 +237,12 @@ def that_matter(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
-    """The truth as it is, with ``align`` "none"; with "rotation" turned by the fixed rotation between its camera and
-    the log's, so that motions of a second agree best. Raises GpvoError for another word, or where nothing tells it.
+    """The truth as it is, with ``align`` "none"; else in the frame of the log, as motions of a second agree best
+    (:func:`gpvo.dataset.hand_eye.align_frames`). Raises GpvoError for another word, or where nothing tells it.
     """
     if align == "none":
         return truth
-    if align != "rotation":
-        raise GpvoError(f"unknown alignment '{align}'", cure="none or rotation")
-    A, B, _ = windowed_motions(flag_slips(log), truth)
-    fixed = fit_fixed_transform(A, B, lever_arm=False)
-    return replace(truth, T_world_cam=truth.T_world_cam @ se3.inverse(fixed.T_log_truth))
+    return replace(truth, T_world_cam=align_frames(flag_slips(log), truth, align).in_log_frame(truth.T_world_cam))
 
 
 def _v_t(records: Sequence[VoRecord]) -> dict[str, Array]:

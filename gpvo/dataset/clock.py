@@ -20,10 +20,11 @@ from gpvo.types import Array, TruthLog, VoLog
 # With clocks that overlap, offsets beyond this are mistakes of the search, not of the clocks: unless they leave of both
 # turns and distances less than this share unexplained of what smaller ones do.
 _MAX_OFFSET_S, _LESS_UNEXPLAINED = 5.0, 0.25
-_WINDOW_S = 0.25
+_WINDOW_S, _APART_S = 0.25, 0.025
 _MIN_OVERLAP_S = 3.0
 _MIN_CORRELATION = 0.3
 _MAX_SAMPLES = 200_000
+_ROUNDS, _ORDINARY = 8, 3.0  # the latter: median misfits, beyond which a sample counts less
 
 
 def estimate_time_offset(log: VoLog, truth: TruthLog) -> float:
@@ -47,7 +48,7 @@ def estimate_time_offset(log: VoLog, truth: TruthLog) -> float:
     step_s = float(np.median(np.diff(moving.t_ns))) * 1e-9
     window = max(1, round(_WINDOW_S / step_s))
     coarse = _coarse(moving, truth, min(step_s, _WINDOW_S), window * step_s)
-    return _refine(moving, truth, coarse, window, 1.5 * step_s)
+    return _refine(moving, truth, coarse, window)
 
 
 def on_clock_of_log(truth: TruthLog, offset_s: float) -> TruthLog:
@@ -127,36 +128,26 @@ def _correlation(x: Array, y: Array, min_overlap: int) -> Array:
     return np.where(enough, covariance / np.where(enough, power, 1.0), -1.0)
 
 
-def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius_s: float) -> float:
-    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: three nested grids and a parabola."""
+def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int) -> float:
+    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: of the parabola through three offsets.
+
+    These are whole steps of the truth apart. Interpolation averages the noise of two poses, most of all midway between
+    them: of offsets between which its fractions differ, noise alone would choose one.
+    """
     T = log.T_world_cam
     mine, gap_s = _amounts(T, np.ones(len(T), dtype=bool), window), _gap_s(truth)
-
-    def misfits(offsets: Array) -> Array:
-        differences = []
-        for offset in offsets:
-            moved = replace(log, t_ns=log.t_ns + round(float(offset) * 1e9))
-            differences.append(mine - _amounts(*interpolate_truth(truth, moved.t_ns, gap_s), window))
-        d = np.stack(differences)
-        known = np.isfinite(d).all(axis=(0, 1))
-        if known.sum() < 10:
-            return np.zeros(len(offsets))
-        d = d[:, :, known]
-        spread = np.maximum(np.median(np.abs(d), axis=(0, 2)), 1e-9)[None, :, None]
-        misfit: Array = np.log1p((d / spread) ** 2).mean(axis=(1, 2))
-        return misfit
-
-    for _ in range(3):
-        offsets = np.linspace(offset_s - radius_s, offset_s + radius_s, 13)
-        cost = misfits(offsets)
-        if not cost.any():
-            break  # too few samples to judge by: the coarse offset stands
-        best = int(np.argmin(cost))
-        offset_s = float(offsets[best])
-        if 0 < best < 12:
-            left, middle, right = cost[best - 1 : best + 2]
-            bend = left - 2 * middle + right
-            if bend > 0:
-                offset_s += 0.5 * (left - right) / bend * (offsets[1] - offsets[0])
-        radius_s /= 4.0
+    own_s = 1e-9 * float(np.median(np.diff(truth.t_ns)))
+    apart_s = own_s * max(1, round(_APART_S / own_s))
+    for _ in range(_ROUNDS):
+        asked = (log.t_ns + round((offset_s + k * apart_s) * 1e9) for k in (-1, 0, 1))
+        d = np.stack([mine - _amounts(*interpolate_truth(truth, t_ns, gap_s), window) for t_ns in asked])
+        d = d[:, :, np.isfinite(d).all(axis=(0, 1))]
+        if d.shape[2] < 10:
+            break  # too few samples to judge by: the offset stands
+        spread2 = np.maximum(np.median(np.abs(d[1]), axis=1, keepdims=True), 1e-9) ** 2
+        left, middle, right = (d**2 / (_ORDINARY**2 * spread2 + d[1] ** 2)).sum(axis=(1, 2))
+        bend = left - 2 * middle + right
+        if bend <= 0:
+            break
+        offset_s += apart_s * float(np.clip(0.5 * (left - right) / bend, -1, 1))
     return offset_s

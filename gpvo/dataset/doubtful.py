@@ -5,6 +5,9 @@ positions wander by decimetres while a car waits at a light, and odometry, which
 blamed for it. Image and IMU together decide whether the vehicle stands still: a motion to which odometry is blind does
 not escape a gyroscope.
 
+Jumps: motion capture confuses its markers, and pieces of a truth have different origins. Where the truth moves as the
+vehicle cannot, and odometry does not, the error is the truth's; and so it is between jumps there and back.
+
 Odd stretches: where odometry and truth differ far more than elsewhere in the sequence, one of the two is wrong, and a
 model that learned from them would be too cautious everywhere. Two differences are looked for: the share of the true
 motion that odometry shows; and the direction of travel, as when the truth climbs while the vehicle does not. Each must
@@ -22,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
+from gpvo.online.slip import flag_slips
 from gpvo.stats.series import moving_sums
 from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
 from gpvo.vo.imu_moments import ImuMoments
@@ -63,6 +67,39 @@ def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
+_JUMP_MEDIANS, _BACK_S = 10.0, 1.0
+
+
+def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
+    """Motions in which the truth moves as the vehicle cannot, though odometry does not, and far more of an error than
+    usual; those less than a second apart as one, with what lies between."""
+    errors = motion_errors(log, truth)
+    true = [
+        VoRecord(log.records[k].t_ns, log.records[k].t_prev_ns, Status.OK, T)
+        for k, T in zip(errors.index, errors.T_true, strict=True)
+    ]
+    size = np.linalg.norm(errors.xi.reshape(-1, 2, 3), axis=2)
+    large = (size > _JUMP_MEDIANS * np.median(size, axis=0)).any(axis=1) if len(size) else np.zeros(0, dtype=bool)
+    if not large.any():
+        return []
+    far = large & ~flag_slips(replace(log, records=true)).usable & flag_slips(log).usable[errors.index]
+    found: list[Stretch] = []
+    for k, xi in zip(errors.index[far].tolist(), errors.xi[far], strict=True):
+        first, t_ns = k, (log.records[k].t_prev_ns, log.records[k].t_ns)
+        if found and t_ns[0] - found[-1].t_ns[1] < _BACK_S * 1e9:
+            first, t_ns = found[-1].first, (found[-1].t_ns[0], t_ns[1])
+            found.pop()
+        metres, degrees = np.linalg.norm(xi[:3]), np.rad2deg(np.linalg.norm(xi[3:]))
+        found.append(Stretch(first, k, t_ns, f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored"))
+    return found
+
+
+def false_motions(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
+    """(W, 2) times [ns] of waits during which the truth moves, and of its jumps."""
+    waits, leaps = wandering_waits(log, truth), [s.t_ns for s in jumps(log, truth)]
+    return np.concatenate([waits, np.array(leaps, dtype=np.int64).reshape(-1, 2)])
+
+
 def in_waits(records: Sequence[VoRecord], waits: ArrayLike) -> NDArray[np.bool_]:
     """(N,) which motions, or windows of motions, share time with one of the waits, or odd stretches, (W, 2) [ns]."""
     first, last = np.sort(np.asarray(waits, dtype=np.int64).reshape(-1, 2), axis=0).T
@@ -73,13 +110,13 @@ def in_waits(records: Sequence[VoRecord], waits: ArrayLike) -> NDArray[np.bool_]
 
 
 def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
-    """The log with what falls into such waits called lost, so that neither an error nor a sum of errors reaches over
-    it; for statistics alone."""
-    waits = wandering_waits(log, truth)
+    """The log with what falls into such waits, or jumps of the truth, called lost, so that neither an error nor a sum
+    of errors reaches over it; for statistics alone."""
+    waits = false_motions(log, truth)
     if not len(waits):
         return log
     inside = in_waits(log.records, waits)
-    marked = [r.with_status(Status.LOST, "truth moves at rest") if i else r for r, i in zip(log.records, inside)]
+    marked = [r.with_status(Status.LOST, "truth moves otherwise") if i else r for r, i in zip(log.records, inside)]
     return replace(log, records=marked)
 
 

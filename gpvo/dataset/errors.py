@@ -5,7 +5,7 @@ the residual of a position; and the noise of the truth itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -33,6 +33,37 @@ _MIN_WINDOWS = 10
 _NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's extent, what it has across
 
 
+_LEAPS, _MOVING = 1.5, 0.25
+
+
+def without_held(truth: TruthLog) -> TruthLog:
+    """The truth without poses that repeat the one before, to the last digit, while the vehicle moves: motion capture
+    that stalls, and slow poses logged at a higher rate, hold the last one.
+
+    Such a pose ends by a leap: at more than ``_LEAPS`` times the pace around it, but over the whole time that it was
+    held, at no less than ``_MOVING`` of the usual one. From true rest a vehicle starts slowly. A pose held to the end
+    counts likewise if the vehicle got there at such a pace. Where most poses are held, all that repeat are.
+    """
+    T, t_s = truth.T_world_cam, (truth.t_ns - truth.t_ns[:1]) * 1e-9
+    repeats = np.append(np.zeros(len(T[:1]), bool), (T[1:] == T[:-1]).all(axis=(1, 2)))
+    new = np.flatnonzero(~repeats)
+    if len(new) == len(T) or len(new) < 3:
+        return truth
+    moved = se3.inverse(T[new[:-1]]) @ T[new[1:]]
+    held, judged = np.zeros((2, len(new)), dtype=bool)
+    for step in (moved[:, :3, 3], se3.so3_log(moved[:, :3, :3])):
+        size = np.linalg.norm(step, axis=1)
+        pace, leap = size / np.diff(t_s[new]), size / (t_s[new[1:]] - t_s[new[1:] - 1])
+        around = np.maximum(np.append(0.0, pace[:-1]), np.append(pace[1:], 0.0))
+        moving = pace > _MOVING * np.quantile(pace, 0.75)
+        judged |= np.append(moving, moving[-1])
+        held |= np.append(moving & (leap > _LEAPS * around), moving[-1])
+    held |= held.sum() > 0.5 * judged.sum()
+    keep = ~(repeats & held[np.cumsum(~repeats) - 1])
+    v = truth.v_world_mps
+    return replace(truth, t_ns=truth.t_ns[keep], T_world_cam=T[keep], v_world_mps=None if v is None else v[keep])
+
+
 def interpolate_truth(
     truth: TruthLog, t_ns: NDArray[np.int64], max_gap_s: float | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -40,9 +71,10 @@ def interpolate_truth(
 
     A stamp is known where it lies within the truth and the truth's neighbours are no further apart than ``max_gap_s``
     (or one of them is the stamp itself). By default that is three times the usual step of the truth, or of the stamps
-    where theirs is longer, and at most ``MAX_GAP_S``: over a longer drop-out, a straight line is no truth.
+    where theirs is longer, and at most ``MAX_GAP_S``: over a longer drop-out, a straight line is no truth. Poses that
+    were not measured (:func:`without_held`) are none.
     """
-    t = np.asarray(t_ns, dtype=np.int64)
+    t, truth = np.asarray(t_ns, dtype=np.int64), without_held(truth)
     if len(truth.t_ns) == 0:
         return np.broadcast_to(np.eye(4), (len(t), 4, 4)).copy(), np.zeros(len(t), dtype=bool)
     max_gap_ns = _usual_gap_ns(truth.t_ns, t) if max_gap_s is None else max_gap_s * 1e9
@@ -65,7 +97,7 @@ def _usual_gap_ns(*stamps: NDArray[np.int64]) -> float:
 
 def steps_of_slow_truth(truth: TruthLog, t_ns: NDArray[np.int64]) -> tuple[float, float] | None:
     """Usual steps [s] of a truth that comes more slowly than the frames at ``t_ns``, and of these; else None."""
-    step_s, frame_s = (1e-9 * float(np.median(np.diff(t))) for t in (truth.t_ns, t_ns))
+    step_s, frame_s = (1e-9 * float(np.median(np.diff(t))) for t in (without_held(truth).t_ns, t_ns))
     return (step_s, frame_s) if step_s > 1.2 * frame_s else None
 
 
@@ -92,6 +124,7 @@ def interpolation_sigma(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array:
     Half of the truth's own poses tell what interpolation misses at twice the step; as for any path smooth at that
     scale, it misses a quarter of it at the step itself.
     """
+    truth = without_held(truth)
     if len(truth.t_ns) < 9 or steps_of_slow_truth(truth, t_ns) is None:
         return np.zeros(6)
     half = TruthLog(truth.t_ns[::2], truth.T_world_cam[::2])
@@ -140,6 +173,16 @@ def turn_without_truth_deg(log: VoLog, truth: TruthLog) -> float:
         return 0.0
     turned = _turn_deg(log.trajectory())
     return turned if turned > _TURN_DEG else 0.0
+
+
+def require_attitude(log: VoLog, truth: TruthLog, where: object) -> None:
+    """Refuse a truth of positions alone, by which no motion can be judged. Raises GpvoError, naming ``where``."""
+    if turn_deg := turn_without_truth_deg(log, truth):
+        raise GpvoError(
+            f"the ground truth holds no attitude: it never turns, but odometry does, by up to {turn_deg:.0f} deg",
+            where=where,
+            cure="give one with orientations, or use twins",
+        )
 
 
 def _turn_deg(T: Array) -> float:

@@ -135,37 +135,56 @@ def fit_fixed_transform(
     return FixedTransform(se3.orthonormalise(X), float(scale[0]), R)
 
 
+def align_frames(log: VoLog, truth: TruthLog, align: str) -> FixedTransform:
+    """The fixed rotation between the frames of a log and its truth, or with ``align`` "transform" also their lever arm
+    and the rotation between the worlds of the truth's attitudes and positions.
+
+    Raises GpvoError for another word, or where the motions do not tell it.
+    """
+    if align not in ("rotation", "transform"):
+        raise GpvoError(f"unknown alignment '{align}'", cure="none, rotation or transform")
+    A, B, attitudes = windowed_motions(log, truth)
+    whole = align == "transform"
+    return fit_fixed_transform(A, B, attitudes if whole else None, lever_arm=whole)
+
+
 @dataclass(frozen=True)
 class FixedRotation:
-    """``rotvec_rad`` (3,) from the truth's camera to the log's; ``error_change``: relative change without it of the
-    median error over a second, on the halves of the run that it was not fitted to."""
+    """``rotvec_rad`` (3,) from the truth's camera to the log's, and ``lever_m`` between their origins, 0 where a lever
+    arm does not matter; ``error_change``: relative change without them of the median error over a second, on the halves
+    of the run that they were not fitted to."""
 
     angle_deg: float
     rotvec_rad: tuple[float, ...]
     error_change: float
+    lever_m: float = 0.0
 
 
 MATTERS = -0.1
-"""Change of the error from which a fixed rotation is reported."""
+"""Change of the error from which a fixed rotation, or a lever arm, is reported."""
 
 
 def fixed_rotation(log: VoLog, truth: TruthLog) -> FixedRotation | None:
-    """A fixed rotation between truth and odometry; None where none shows or it does not matter."""
+    """A fixed rotation between truth and odometry, and a lever arm if it matters beside that; None where neither shows
+    or matters."""
     A, B, _ = windowed_motions(log, truth)
-    half = len(A) // 2
+    half, found = len(A) // 2, None
+    if half < _MIN_MOTIONS:
+        return None
     parts = slice(None, half), slice(half, None)
     try:
-        X = [fit_fixed_transform(A[p], B[p], lever_arm=False).T_log_truth for p in parts]
-        fixed = fit_fixed_transform(A, B, lever_arm=False)
-    except GpvoError:  # too few motions, or a path too straight to tell
-        return None
-    turned = [np.median(_errors(A[p], B[p], x)[0]) for p, x in zip(parts, X[::-1])]
-    plain = [np.median(_errors(A[p], B[p], np.eye(4))[0]) for p in parts]
-    changes = _change(np.array(turned), np.array(plain), B)
-    if changes.max() > MATTERS:
-        return None
-    rotvec = se3.so3_log(fixed.T_log_truth[:3, :3])
-    return FixedRotation(fixed.angle_deg, tuple(rotvec.tolist()), float(changes.mean()))
+        plain = least = np.array([np.median(_errors(A[p], B[p], np.eye(4))[0]) for p in parts])
+        for lever_arm in (False, True):
+            X = [fit_fixed_transform(A[p], B[p], lever_arm=lever_arm).T_log_truth for p in parts]
+            fixed = fit_fixed_transform(A, B, lever_arm=lever_arm)
+            left = np.array([np.median(_errors(A[p], B[p], x)[0]) for p, x in zip(parts, X[::-1])])
+            if _change(left, least, B).max() <= MATTERS:
+                rotvec = tuple(se3.so3_log(fixed.T_log_truth[:3, :3]).tolist())
+                change = float(_change(left, plain, B).mean())
+                found, least = FixedRotation(fixed.angle_deg, rotvec, change, fixed.lever_m), left
+    except GpvoError:  # a path too straight to tell
+        pass
+    return found
 
 
 @dataclass(frozen=True)

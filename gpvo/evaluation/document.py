@@ -30,9 +30,10 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     over the runs. For each run, besides its name, counts, path length, ATE and segments:
 
     * ``degraded``: frames of that status, by the odometry or a model. ``lost`` are counted apart.
-    * ``truth_moves_at_rest``: motions that are not scored, because the vehicle stands still while the truth moves; they
-      count only in ATE, final error and RPE.
-    * ``odd_stretches``: motions, in words, in which odometry and truth differ far more than elsewhere; they are scored.
+    * ``truth_moves_at_rest``: motions that are not scored, because the vehicle stands still while the truth moves, or
+      the truth jumps; they count only in ATE, final error and RPE.
+    * ``odd_stretches``: motions, in words, in which odometry and truth differ far more than elsewhere; scored,
+      unless they are jumps of the truth.
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
@@ -44,8 +45,9 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       (:func:`gpvo.dataset.errors.estimate_truth_noise`), whichever is larger. ``truth_sigma_axes``: by axis, x y z [m],
       then [rad]. ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion;
       None: nowhere.
-    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None if it
-      does not matter; ``error_change``: relative change of the errors over a second without it.
+    * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``}: between truth and odometry,
+      None if it does not matter; ``lever_m`` between their origins, 0 if that does not; ``error_change``: relative
+      change of the errors over a second without them.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
       {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
       frame or a second do not reach across a gap in the truth.

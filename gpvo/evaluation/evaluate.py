@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gpvo.accumulation import along
 from gpvo.dataset.build import aligned_truth, predictions_of
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
-from gpvo.dataset.doubtful import Stretch, odd_stretches, without_wandering_truth
+from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
     MAX_GAP_S,
     MotionErrors,
@@ -21,6 +21,7 @@ from gpvo.dataset.errors import (
     interpolation_sigma,
     motion_errors,
     telling_distance_m,
+    turn_without_truth_deg,
     velocity_path,
 )
 from gpvo.dataset.hand_eye import FixedRotation, InversePoses, fixed_rotation, inverse_poses, late_by
@@ -29,8 +30,6 @@ from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
 from gpvo.evaluation.trajectory import (
     PoseConsistency,
-    RelativeError,
-    Statistics,
     TrajectoryErrors,
     pose_consistency,
     trajectory_errors,
@@ -56,12 +55,12 @@ class EvaluateOptions:
 class Evaluation:
     """Everything said of one run. ``covered``: frames with truth; ``T_est`` and ``T_true`` (N, 4, 4) with the first
     poses made equal. ``unscored``: motions left out of errors and consistency, as the truth moves while the vehicle
-    stands. ``odd``: stretches in which odometry and truth differ far more than elsewhere. ``truth_sigma`` (6,): noise
-    of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source states. ``tells_from_m``:
-    length of path from which odometry's errors outweigh it. ``late_s``: offset between the clocks, where it matters and
-    none was given; ``turned``: a fixed rotation between truth and odometry, likewise; ``inverse``: poses of one of the
-    two seem to be inverse. ``in_domain``: share of the predicted frames that lie in the model's training domain, None
-    without a model. ``poses``: scores of the covariances of poses that a log states.
+    stands, or jumps. ``odd``: these jumps, and stretches in which odometry and truth differ far more than elsewhere.
+    ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source
+    states. ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the
+    clocks, where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise;
+    ``inverse``: poses of one of the two seem to be inverse. ``in_domain``: share of the predicted frames that lie in
+    the model's training domain, None without a model. ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run
@@ -136,7 +135,8 @@ def evaluate_run(
     log = run.log
     T_true, known = interpolate_truth(truth, log.t_ns)
     _refuse_too_little(run, truth, int(known.sum()))
-    scored = without_wandering_truth(log, truth)
+    blind = turn_without_truth_deg(log, truth) > 0.0
+    scored = _unscored(log) if blind else without_wandering_truth(log, truth)
     errors = motion_errors(scored, truth)
     stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
     sigma = stated
@@ -151,13 +151,16 @@ def evaluate_run(
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
     found = {s.method: consistency(s, errors, scored, T_true, known, sigma, by_velocity) for s in made}
     first = int(np.flatnonzero(known)[0])
+    trajectory = trajectory_errors(
+        log.t_ns[known], T_est[known], T_true[known], options.segments_m, np.flatnonzero(known)
+    )
+    if blind:
+        trajectory = TrajectoryErrors.of_positions(trajectory.path_length_m, trajectory.ate_rmse_m)
     lift = T_true[first] @ np.linalg.inv(T_est[first])
     return Evaluation(
         run=run,
         errors=errors,
-        trajectory=trajectory_errors(
-            log.t_ns[known], T_est[known], T_true[known], options.segments_m, np.flatnonzero(known)
-        ),
+        trajectory=trajectory,
         statements=tuple(made),
         consistency={m: c for m, c in found.items() if c is not None},
         covered=known,
@@ -170,11 +173,16 @@ def evaluate_run(
         inverse=inverse,
         time_offset_s=offset_s,
         late_s=late_s,
-        unscored=int(log.usable.sum() - scored.usable.sum()),
-        odd=odd_stretches(scored, truth),
+        unscored=0 if blind else int(log.usable.sum() - scored.usable.sum()),
+        odd=[] if blind else [*jumps(log, truth), *odd_stretches(scored, truth)],
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=_in_domain(predictions),
     )
+
+
+def _unscored(log: VoLog) -> VoLog:
+    """The log with every motion called lost: a truth of positions alone judges none."""
+    return replace(log, records=[r.with_status(Status.LOST, "truth has no attitude") for r in log])
 
 
 def _misread(log: VoLog, truth: TruthLog) -> tuple[FixedRotation | None, InversePoses | None]:
@@ -210,12 +218,11 @@ def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
     run = replace(run, log=judged(run.log, predictions))
     T_est, noiseless = run.log.trajectory(), np.zeros(6)
     none = np.zeros((0, 4, 4))
-    of_none = RelativeError(Statistics.of(np.zeros(0)), Statistics.of(np.zeros(0)))
     length = float(se3.path_length_m(T_est[:, :3, 3])[-1])
     return Evaluation(
         run=run,
         errors=MotionErrors(np.zeros(0, np.int64), np.zeros((0, 6)), none, none, np.zeros(0)),
-        trajectory=TrajectoryErrors(length, np.nan, np.nan, np.nan, of_none, of_none, of_none, ()),
+        trajectory=TrajectoryErrors.of_positions(length),
         statements=tuple(statements(run.log, predictions, predictor)),
         consistency={},
         covered=np.zeros(len(run.log), bool),

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpvo.dataset.build import predictions_of
 from gpvo.dataset.doubtful import without_wandering_truth
-from gpvo.dataset.errors import interpolate_truth, motion_errors
+from gpvo.dataset.errors import interpolate_truth, motion_errors, require_attitude
 from gpvo.errors import GpvoError
 from gpvo.filters.propagation import DEFAULT_IMU_NOISE
 from gpvo.filters.run import Flight
@@ -30,7 +30,8 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
     """A run as the filters take it, with the model's predictions, else those stored in the run; a twin on a
     path that a vehicle can fly, with an IMU of this path.
 
-    Raises GpvoError where there is an IMU but nobody says how it sits to the camera, or the run is empty.
+    Raises GpvoError where there is an IMU but nobody says how it sits to the camera, the truth has no attitude, or the
+    run is empty.
     """
     if len(run.log) < 2:
         raise GpvoError(f"holds {len(run.log)} records: nothing to fuse", where=run.path)
@@ -40,6 +41,7 @@ def flight_of(run: Run, predictor: Predictor | None = None, *, use_imu: bool = T
     poses = valid = None
     truth_sigma = (0.0, 0.0)
     if run.truth is not None:
+        require_attitude(run.log, run.truth, run.path)
         truth_sigma = (run.truth.sigma_translation_m, run.truth.sigma_rotation_rad)
         poses, valid = interpolate_truth(run.truth, run.log.t_ns)
         if not valid.any():
@@ -85,6 +87,7 @@ def constants_of(runs: Sequence[Run]) -> Constants:
     for run in runs:
         if run.truth is None:
             raise GpvoError("has no ground truth to train a constant on", where=run.path)
+        require_attitude(run.log, run.truth, run.path)
         errors = motion_errors(without_wandering_truth(run.log, run.truth), run.truth)
         if not len(errors.index):
             raise GpvoError("has no motion with ground truth at both ends", where=run.path)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpvo.dataset.build import leave_one_out
-from gpvo.dataset.doubtful import in_waits, wandering_waits
+from gpvo.dataset.doubtful import false_motions, in_waits
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
 from gpvo.evaluation.statements import corrected
@@ -230,12 +230,12 @@ def write_left_out(trained: TrainedModel, runs: Sequence[Run], config: TrainConf
 def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str = "drop") -> list[Path]:
     """What each method states of a run's motions, a file per method ``METHOD/RUN.txt``, and the ``truth/RUN.txt``.
 
-    Truth that wanders while the vehicle stands is left out of its file, except with ``waits`` "keep".
+    Truth that wanders while the vehicle stands, or jumps, is left out of its file, except with ``waits`` "keep".
     """
     log, name = evaluation.run.log, f"{name}.txt"
     truth, known = folder / "truth" / name, evaluation.covered
     if waits == "drop" and evaluation.unscored and evaluation.run.truth is not None:
-        waiting = wandering_waits(log, evaluation.run.truth)
+        waiting = false_motions(log, evaluation.run.truth)
         for first, last in waiting:
             known = known & ~((log.t_ns > first) & (log.t_ns < last))
         # A motion over the whole wait still has truth at both ends.

@@ -87,6 +87,12 @@ class TrajectoryErrors:
     rpe_10m: RelativeError
     segments: tuple[Segment, ...]
 
+    @classmethod
+    def of_positions(cls, path_length_m: float, ate_rmse_m: float = float("nan")) -> TrajectoryErrors:
+        """What a truth without attitudes tells, or without an ATE none at all; the rest is NaN."""
+        nan, none = float("nan"), RelativeError(Statistics.of(np.zeros(0)), Statistics.of(np.zeros(0)))
+        return cls(path_length_m, ate_rmse_m, nan, nan, none, none, none, ())
+
 
 def rpe(T_est: Array, T_true: Array, start: NDArray[np.int64], end: NDArray[np.int64]) -> RelativeError:
     """Of ``(dT_true)^-1 dT_est`` between the poses ``start`` and ``end`` (M,)."""

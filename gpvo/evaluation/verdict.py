@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gpvo.dataset.check import ENOUGH_INSIDE
-from gpvo.dataset.errors import MAX_GAP_S, interpolated_between, steps_of_slow_truth, turn_without_truth_deg
+from gpvo.dataset.errors import (
+    MAX_GAP_S,
+    interpolated_between,
+    steps_of_slow_truth,
+    turn_without_truth_deg,
+    without_held,
+)
+from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
@@ -24,6 +31,7 @@ HONEST = (0.5, 2.0)
 _FEW_WINDOWS = 5
 _FEW_BARE = 0.01  # of the frames, without truth: its ends
 _LEAST_PATH_M, _MOST_SCALE = 0.5, 1.5
+_FAR, _FEW_FAR, _OUTWEIGH = 20.0, 0.05, 0.9  # medians; share of the motions; of the sum of all squared errors
 
 Colour = Literal["green", "amber", "red"]
 
@@ -216,6 +224,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     if e.tells_from_m > 0:
         where = "on this run" if math.isinf(e.tells_from_m) else f"below {e.tells_from_m:.2g} m of path"
         yield f"The truth's noise outweighs the odometry's errors {where}, so it cannot judge them there."
+    yield from _of_few_motions(e)
     unseen = [a for k, a in enumerate(AXES) if len(e.errors.xi) and k not in seen_axes(e.errors.xi)]
     if 0 < len(unseen) < len(AXES):
         yield (
@@ -235,19 +244,44 @@ def _conditions(e: Evaluation) -> Iterator[str]:
         )
     yield from _of_truth_and_path(e)
     if e.turned is not None and len(unseen) < len(AXES):
-        # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
-        asked = "; are the quaternion's order and --frame right?" if e.turned.angle_deg > 90 else ""
+        yield _of_frames(e.turned)
+
+
+def _of_frames(turned: FixedRotation) -> str:
+    # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
+    asked = "; are the quaternion's order and --frame right?" if turned.angle_deg > 90 else ""
+    apart = f" and a lever arm of {turned.lever_m:.3g} m" if turned.lever_m else ""
+    return (
+        f"Truth and odometry differ by a fixed rotation of {turned.angle_deg:.2f} deg{apart}"
+        f" (mounting, calibration, or a steady bias of the odometry{asked})."
+        f" Without it, errors over a second are {-100 * turned.error_change:.0f} % smaller"
+        f" (--align {'transform' if apart else 'rotation'})."
+    )
+
+
+def _of_few_motions(e: Evaluation) -> Iterator[str]:
+    """Motions so few and so wrong that every mean is theirs."""
+    size = np.linalg.norm(e.errors.xi.reshape(-1, 2, 3), axis=2)
+    far = (size > _FAR * np.median(size, axis=0)).any(axis=1) if len(size) else np.zeros(0, dtype=bool)
+    if 0 < far.sum() <= _FEW_FAR * len(far) and ((size[far] ** 2).sum(0) > _OUTWEIGH * (size**2).sum(0)).any():
+        at = e.errors.index[np.flatnonzero(far)[0]]
         yield (
-            f"Truth and odometry differ by a fixed rotation of {e.turned.angle_deg:.2f} deg"
-            f" (mounting, calibration, or a steady bias of the odometry{asked})."
-            f" Without it, errors over a second are {-100 * e.turned.error_change:.0f} % smaller (--align rotation)."
+            f"In {far.sum()} of {len(far)} motions, first at frame {at} ({e.t_s[at]:.2f} s), odometry and truth differ"
+            f" by more than {_FAR:g} times the median (slips, or jumps of the truth): they outweigh all others in every"
+            " mean."
         )
 
 
 def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
-    """A truth slower than the frames, and a path of another size."""
+    """A truth that stalls or is slower than the frames, and a path of another size."""
     if e.run.truth is None or not e.covered.any():
         return
+    given = len(e.run.truth.t_ns)
+    if held := given - len(without_held(e.run.truth).t_ns):
+        yield (
+            f"{held} of {given} poses of the ground truth only repeat the one before while it moves, as a source does"
+            " that stalls or is slower: they do not count."
+        )
     if steps_s := steps_of_slow_truth(e.run.truth, e.run.log.t_ns):
         between = (
             "between its poses it is interpolated, and what that misses is only estimated"
@@ -258,7 +292,7 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     if every := interpolated_between(e.run.truth):
         yield (
             f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks more exact than"
-            " it is. Give the poses as they were measured."
+            " it is. Give the poses as they were without_held."
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))

@@ -17,7 +17,7 @@ from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
 from gpvo.geometry.se3 import R_FLU_OPTICAL
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, read_poses, topics_of
-from gpvo.io.foreign_csv import Table, is_number, names_other_columns, read_table
+from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, is_number, names_other_columns, read_table
 from gpvo.io.stamps import check_interval, text_lines
 from gpvo.io.trajectory import REMOVE, Trajectory, check_growing, check_unit, read_kitti_poses, read_times, read_tum
 from gpvo.stats.consistency import SEEN, seen_axes
@@ -115,6 +115,8 @@ def guess_format(path: Path) -> str:
     if len(words) in (8, 12):
         return "tum" if len(words) == 8 else "kitti"
     cure = "TUM has 8 numbers a line, KITTI 12, CSV a header; see --format"
+    if len(words) == 4:
+        cure += f"; {POSITIONS_ALONE}"
     raise SourceError("does not look like a trajectory file", where=path, cure=cure)
 
 

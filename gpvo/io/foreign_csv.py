@@ -35,6 +35,9 @@ NO_HEADER = (
     "it has no header line: read as VINS-Fusion writes it, nanoseconds, position, quaternion with w first; a line of"
     " column names on top says otherwise"
 )
+POSITIONS_ALONE = (
+    "positions alone, of a laser tracker or satellites, still give the ATE: write 0, 0, 0, 1 as q_x, q_y, q_z, q_w"
+)
 _MAX_ROWS = 20_000_000
 _AXES = {
     name: i % 6
@@ -198,6 +201,8 @@ def _targets(path: Path, header: list[str], mapping: Mapping[str, str]) -> dict[
     if absent:
         text = f"no column for {', '.join(absent)} (there are: {', '.join(header)})"
         cure = f"name it with --map COLUMN={absent[0]}, for ground truth with --truth-map"
+        if absent == list(_POSE[3:]):
+            cure += f"; {POSITIONS_ALONE}"
         raise SourceError(text, where=path, cure=cure)
     return found
 

@@ -233,8 +233,9 @@ def carry(trajectory: Trajectory, T_body_cam: Array, noise: TruthNoise) -> Truth
     )
 
 
-def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path) -> None:
-    """Raise SourceError for a truth that does not overlap frames in time, the first and the last of ``t_ns``."""
+def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path, more: str = "") -> None:
+    """Raise SourceError for a truth that does not overlap frames in time, the first and the last of ``t_ns``; ``more``:
+    a further cure."""
     (first, last), (begin, end) = ((int(t[0]), int(t[-1])) for t in (t_ns, truth.t_ns))
     if end < first or begin > last:
         apart_s = max(first - end, begin - last) * 1e-9
@@ -242,7 +243,7 @@ def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path) -> 
             f"the ground truth ({begin * 1e-9:.3f} to {end * 1e-9:.3f} s) does not overlap the frames"
             f" ({first * 1e-9:.3f} to {last * 1e-9:.3f} s): they are {apart_s:.3f} s apart",
             where=path,
-            cure="is it the truth of this sequence, and of the same clock?",
+            cure="is it the truth of this sequence, and of the same clock?" + more,
         )
 
 

@@ -204,20 +204,25 @@ def test_import_finds_rotation_and_time_offset(gpvo, tmp_path):
         (["{log}", "-o", "{out}", "--truth-sigma", "1"], "--truth-sigma is '1'"),
         (["{log}", "-o", "{out}", "--vehicle", "boat"], "--vehicle is 'boat'"),
         (["{log}", "-o", "{out}", "--max-turn", "0"], "--max-turn is 0"),
+        (["{log}", "-o", "{out}", "--truth", "{late}"], "--time-offset auto"),
         (["{log}", "-o", "{out}", "--truth", "{late}"], "does not overlap"),
+        (["{log}", "-o", "{out}", "--truth", "{positions}"], "write 0, 0, 0, 1 as q_x, q_y, q_z, q_w"),
+        (["{log}", "-o", "{out}", "--truth", "{laser}"], "write 0, 0, 0, 1 as q_x, q_y, q_z, q_w"),
         (["{log}", "-o", "{out}", "--truth", "{nan}"], "line 5 holds NaN"),
         (["{missing}", "-o", "{out}"], "no such file"),
         (["{log}", "-o", "{taken}"], "not a run"),
     ],
 )
 def test_import_refuses_in_one_line(gpvo, tmp_path, words, reason):
-    files = {k: tmp_path / k for k in ("log", "out", "late", "nan", "missing", "taken")}
+    files = {k: tmp_path / k for k in ("log", "out", "late", "nan", "missing", "taken", "positions", "laser")}
     write_tum(files["log"], T_NS, _poses())
     write_tum(files["late"], T_NS + 10**12, _poses())
     write_tum(files["nan"], T_NS, _poses())
     lines = files["nan"].read_text().splitlines()
     lines[4] = lines[4].split(" ")[0] + " nan" * 7
     files["nan"].write_text("\n".join(lines))
+    files["positions"].write_text("1.5 0 0 0\n1.6 0 0 1\n")
+    files["laser"].write_text("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]\n1500000000,0,0,0\n")
     files["taken"].mkdir()
     (files["taken"] / "mine.txt").write_text("mine")
     code, out, err = gpvo("import", *(w.format(**files) for w in words))

@@ -99,3 +99,14 @@ def test_motions_of_something_else():
         estimate_time_offset(log_of(s, other), truth_of(np.arange(0, 40, 0.01)))
     with pytest.raises(GpvoError, match="too few"):
         estimate_time_offset(log_of(s[:5], path(s[:5])), truth_of(s))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.0125, -0.025, 3.2])
+@pytest.mark.parametrize("rate", [20.0, 100.0])
+def test_noise_of_the_truth_draws_the_offset_to_no_place_between_its_poses(offset, rate):
+    """Midway between two noisy poses, their mean has half the noise: no reason to set the clock there."""
+    s = np.arange(0, 60, 0.05)
+    exact = truth_of(np.arange(-5, 70, 1 / rate))
+    noise = np.random.default_rng(3).normal(size=(len(exact.t_ns), 6)) * ([0.01] * 3 + [5e-4] * 3)
+    truth = TruthLog(exact.t_ns, exact.T_world_cam @ se3.exp(noise))
+    assert estimate_time_offset(log_of(s - offset, path(s), noise=2e-4), truth) == pytest.approx(offset, abs=3e-3)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.dataset.build import build
-from gpvo.dataset.doubtful import in_waits, odd_stretches, wandering_waits
+from gpvo.dataset.doubtful import in_waits, jumps, odd_stretches, wandering_waits
 from gpvo.errors import GpvoError
 from gpvo.evaluation.document import document
 from gpvo.evaluation.evaluate import EvaluateOptions, evaluate_run
@@ -301,3 +301,42 @@ def test_a_log_at_rest_has_none_and_no_warnings(rate_hz):
     resting = [replace(r, T_prev_cur=np.eye(4)) for r in log.records]
     for records in (white_noise_run(0, rate_hz, False, speed_mps=0.0)[0].records, resting):
         assert odd_stretches(VoLog(records, None), still) == []
+
+
+ELSEWHERE = se3.exp(np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.5]))
+
+
+@pytest.mark.parametrize("rate_hz", [10, 50])
+@pytest.mark.parametrize("lasts", [3, None])
+def test_a_jump_of_the_truth_is_its_own_and_not_learned_from(rate_hz, lasts):
+    """Two pieces with different origins; and markers that are confused for a moment, with what lies between."""
+    log, truth = white_noise_run(1, rate_hz, stepped=False)
+    assert jumps(log, truth) == []
+    k, T = 12 * rate_hz, truth.T_world_cam.copy()
+    end = len(T) if lasts is None else k + lasts
+    T[k:end] = ELSEWHERE @ T[k:end]
+    moved = replace(truth, T_world_cam=T)
+    (found,) = jumps(log, moved)
+    assert (found.first, found.last) == (k, k if lasts is None else end)
+    assert "truth jumps" in found.what
+    kept, dropped = (build(log, moved, name="a", waits=way) for way in ("keep", "drop"))
+    assert len(kept) - len(dropped) == dropped.counts["truth_moves_at_rest"] == found.last - found.first + 1
+    assert np.abs(kept.Y[:, :3]).max() > 1.0
+    assert np.abs(dropped.Y[:, :3]).max() < 0.1
+
+
+def test_a_jump_of_the_odometry_or_of_both_is_none_of_the_truth():
+    log, truth = white_noise_run(1, 20, stepped=False)
+    k, T = 240, truth.T_world_cam.copy()
+    T[k:] = ELSEWHERE @ T[k:]
+    far = se3.inverse(T[k - 1]) @ T[k]
+    slipped = replace(log, records=[replace(r, T_prev_cur=far) if i == k else r for i, r in enumerate(log.records)])
+    assert jumps(slipped, truth) == []
+    assert jumps(slipped, replace(truth, T_world_cam=T)) == []
+
+
+def test_no_noise_of_the_truth_looks_like_a_jump():
+    log, truth = white_noise_run(1, 50, stepped=False)
+    for sigma_m in (0.001, 0.01, 0.1):
+        noise = np.random.default_rng(0).standard_normal((len(truth.t_ns), 6)) * ([sigma_m] * 3 + [0.1 * sigma_m] * 3)
+        assert jumps(log, replace(truth, T_world_cam=truth.T_world_cam @ se3.exp(noise))) == []

@@ -13,9 +13,12 @@ from gpvo.dataset.errors import (
     estimate_truth_noise,
     interpolate_truth,
     interpolated_between,
+    interpolation_sigma,
     motion_errors,
     outweighed_by_truth,
+    steps_of_slow_truth,
     telling_distance_m,
+    without_held,
 )
 from gpvo.dataset.hand_eye import fixed_rotation
 from gpvo.evaluation.evaluate import evaluate_run
@@ -285,3 +288,41 @@ def test_positions_that_drift_are_told_by_the_velocities_beside_them(flights, tm
     assert np.count_nonzero(innocent) <= len(innocent) / 15
     write_run(tmp_path / "run", run.log, truth=drifting.truth)
     np.testing.assert_array_equal(read_run(tmp_path / "run").truth.v_world_mps, drifting.truth.v_world_mps)
+
+
+def _wound(times_s: np.ndarray, least: float = 0.0) -> TruthLog:
+    """From rest, with long stops, at a pace that changes; by ``least`` m/s faster, without any."""
+    s = np.cumsum(np.clip(np.sin(0.5 * times_s), 0, None) ** 2 + least) * 0.05
+    return TruthLog(START_NS + np.round(times_s * 1e9).astype(np.int64), se3.exp(s[:, None] * TWIST))
+
+
+def test_a_pose_at_true_rest_counts_and_one_that_is_held_while_the_vehicle_moves_does_not():
+    times = np.arange(0, 30, 0.05)
+    truth = _wound(times)
+    assert (np.diff(truth.T_world_cam[:, 0, 3]) == 0).sum() > 100
+    assert len(without_held(truth).t_ns) == len(times)
+    stalled = truth.T_world_cam.copy()
+    stalled[50:70], stalled[300:301] = stalled[50], stalled[299]
+    stalled = TruthLog(truth.t_ns, stalled)
+    np.testing.assert_array_equal(
+        np.flatnonzero(~np.isin(truth.t_ns, without_held(stalled).t_ns)), [*range(51, 70), 300]
+    )
+    known = interpolate_truth(stalled, truth.t_ns)[1]
+    np.testing.assert_array_equal(np.flatnonzero(~known), range(51, 70))  # a single pose is interpolated
+
+
+@pytest.mark.parametrize("times", [2, 4, 10])
+def test_slow_poses_logged_at_a_higher_rate_are_the_slow_truth_that_they_are(times):
+    fast = _wound(np.arange(0, 30, 0.05), least=0.01)
+    slow = TruthLog(fast.t_ns[::times], fast.T_world_cam[::times])
+    held = TruthLog(fast.t_ns, np.repeat(slow.T_world_cam, times, axis=0))
+    np.testing.assert_array_equal(without_held(held).t_ns, slow.t_ns)
+    assert steps_of_slow_truth(held, fast.t_ns) == pytest.approx((0.05 * times, 0.05))
+    np.testing.assert_array_equal(interpolation_sigma(held, fast.t_ns), interpolation_sigma(slow, fast.t_ns))
+
+
+def test_a_source_that_dies_holds_its_last_pose_to_the_end():
+    truth = _wound(np.arange(0, 30, 0.05))
+    dead = truth.T_world_cam.copy()
+    dead[320:] = dead[320]
+    np.testing.assert_array_equal(without_held(TruthLog(truth.t_ns, dead)).t_ns, truth.t_ns[:321])

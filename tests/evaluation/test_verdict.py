@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -15,7 +16,8 @@ from gpvo.dataset.errors import interpolate_truth, turn_without_truth_deg
 from gpvo.dataset.hand_eye import FixedRotation
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
-from gpvo.evaluation.evaluate import Evaluation, evaluate_run, unjudged_run
+from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run, unjudged_run
+from gpvo.evaluation.flights import constants_of, flight_of
 from gpvo.evaluation.panels import _LEVELS, reliability
 from gpvo.evaluation.report import render
 from gpvo.evaluation.verdict import verdict
@@ -126,9 +128,10 @@ def test_nothing_stated_is_said() -> None:
     assert "nothing can be judged" in verdict(evaluated({})).headline
 
 
-def of_truth(change: Callable[[TruthLog], TruthLog]) -> Evaluation:
+def of_truth(change: Callable[[TruthLog], TruthLog], align: str = "none") -> Evaluation:
     log, truth = make_run(600, v_t=False)
-    return evaluate_run(Run(Path("hall"), "hall", log, change(truth), None, Mounting(), []))
+    run = Run(Path("hall"), "hall", log, change(truth), None, Mounting(), [])
+    return evaluate_run(run, options=EvaluateOptions(align=align))
 
 
 def scaled(truth: TruthLog, factor: float) -> TruthLog:
@@ -287,9 +290,85 @@ def test_a_truth_without_attitude_is_named() -> None:
         T[:, :3, :3] = np.eye(3)
         return replace(truth, T_world_cam=T)
 
-    assert "holds no attitude" in verdict(of_truth(without)).headline
+    found, right = of_truth(without), of_truth(lambda truth: truth)
+    assert "holds no attitude" in verdict(found).headline
+    assert not verdict(found).lines
+    assert found.trajectory.ate_rmse_m == right.trajectory.ate_rmse_m
+    assert not found.consistency  # neither is anything else that it cannot tell
+    assert np.isnan(found.trajectory.final_error_m)
+    assert not found.odd
+    assert render([found])
     assert "honest" in verdict(of_truth(lambda truth: truth)).headline
     log, truth = make_run(200)
     with pytest.raises(GpvoError, match=r"never turns, but odometry does, by up to [0-9]+ deg"):
         build(log, without(truth), name="hall")
     assert len(build(log, without(truth), name="hall", target="position")) == 200
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1e3, "0.001"), (3.28, "0.31"), (1e-3, "1e+03"), (2.0, ""), (0.5, "")])
+def test_nothing_is_learned_from_a_truth_in_another_unit(factor: float, told: str) -> None:
+    log, truth = make_run(200)
+    if told:
+        with pytest.raises(GpvoError, match=f"are {re.escape(told)} times as large as the truth's"):
+            build(log, scaled(truth, factor), name="hall")
+        return
+    assert len(build(log, scaled(truth, factor), name="hall")) == 200
+    noise = np.random.default_rng(0).standard_normal((len(truth.t_ns), 6)) * [0.5, 0.5, 0.5, 0, 0, 0]
+    noisy = replace(truth, T_world_cam=truth.T_world_cam @ se3.exp(noise))  # far larger than the motions themselves
+    assert len(build(log, noisy, name="hall")) == 200
+
+
+def test_no_filter_starts_from_a_truth_without_attitude_nor_takes_a_constant_from_it() -> None:
+    log, truth = make_run(600, v_t=False)
+    T = truth.T_world_cam.copy()
+    T[:, :3, :3] = np.eye(3)
+    run = Run(Path("hall"), "hall", log, replace(truth, T_world_cam=T), None, Mounting(), [])
+    for use in (flight_of, lambda run: constants_of([run])):
+        with pytest.raises(GpvoError, match="hall: the ground truth holds no attitude"):
+            use(run)
+
+
+def test_few_motions_that_make_up_every_mean_are_named() -> None:
+    def moved(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        here = T[100].copy()  # from where it goes on turned, as some vehicle might turn
+        T[100:] = here @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.4, 0.0])) @ se3.inverse(here) @ T[100:]
+        return replace(truth, T_world_cam=T)
+
+    lines = verdict(of_truth(moved)).lines
+    assert any("In 1 of 600 motions, first at frame 100 (5.00 s)" in line for line in lines), lines
+    assert not any("outweigh all others" in line for line in verdict(of_truth(lambda truth: truth)).lines)
+
+
+def test_a_jump_that_no_vehicle_makes_is_not_scored_and_a_stalled_truth_is_named() -> None:
+    def faulty(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        T[100:] = se3.exp(np.array([3.0, 2.0, 0.0, 0.0, 0.0, 0.5])) @ T[100:]
+        T[400:420] = T[400]
+        return replace(truth, T_world_cam=T)
+
+    found, right = of_truth(faulty), of_truth(lambda truth: truth)
+    assert found.unscored == 1
+    assert any("motions 100 to 100: truth jumps" in str(s) for s in found.odd)
+    nees = [e.consistency["triangulation"].nees_dof["joint"].mean for e in (found, right)]
+    assert nees[0] == pytest.approx(nees[1], rel=0.02)
+    assert any(
+        "19 of 601 poses of the ground truth only repeat the one before" in line for line in verdict(found).lines
+    )
+
+
+def test_a_lever_arm_of_the_truth_is_named_and_taken_off() -> None:
+    """Markers elsewhere on the vehicle, turned relative to the camera."""
+
+    def of_markers(truth: TruthLog) -> TruthLog:
+        X = se3.exp(np.array([0.3, -0.1, 0.2, 0.4, -0.2, 0.1]))
+        return replace(truth, T_world_cam=truth.T_world_cam @ X)
+
+    told = [line for line in verdict(of_truth(of_markers)).lines if "fixed rotation" in line]
+    assert len(told) == 1
+    assert "lever arm of 0.3" in told[0]
+    assert told[0].endswith("(--align transform).")
+    found, right = of_truth(of_markers, align="transform"), of_truth(lambda truth: truth)
+    assert found.turned is right.turned is None
+    nees = [e.consistency["triangulation"].nees_dof["joint"].mean for e in (found, right)]
+    assert nees[0] == pytest.approx(nees[1], rel=0.02)
