@@ -288,7 +288,9 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
     is_one_path = e.inverse is None and not _are_strangers(e)
     if is_one_path and true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
-        yield f"The odometry's path is {size / true_size:.2g} times as large as the truth's: are both in metres?"
+        own_scale = " Are the baseline and the focal length right?" if e.run.log.camera is not None else ""
+        told = f"The odometry's path is {size / true_size:.2g} times as large as the truth's: are both in metres?"
+        yield told + own_scale
 
 
 def _up_to(sigma: Array) -> str:

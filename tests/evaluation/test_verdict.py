@@ -150,6 +150,7 @@ def test_clocks_that_differ_are_named_and_not_taken_for_a_rotation() -> None:
 def test_another_unit_is_named(factor: float, told: bool) -> None:
     lines = verdict(of_truth(lambda truth: scaled(truth, factor))).lines
     assert any("times as large as the truth's: are both in metres?" in line for line in lines) == told
+    assert any("Are the baseline and the focal length right?" in line for line in lines) == told
 
 
 def _other_flight(truth: TruthLog) -> TruthLog:
