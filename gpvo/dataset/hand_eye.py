@@ -258,7 +258,7 @@ def resemblance(log: VoLog, truth: TruthLog) -> Resemblance | None:
     except GpvoError:  # a path too straight to tell
         X = np.eye(4)
     steps, true_steps = (P[end, :3, 3] - P[start, :3, 3] for P in (T, T_world))
-    motion, turn, path = [], [], []
+    motion, turn, path = list[float](), list[float](), list[float]()
     for h in np.array_split(np.arange(len(A)), 2):
         U, _, Vt = np.linalg.svd(steps[h].T @ true_steps[h])  # a mirrored path is the same one
         left = np.linalg.norm(steps[h] / max(scale, 1e-12) - true_steps[h] @ (U @ Vt).T, axis=1)

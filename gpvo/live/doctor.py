@@ -214,8 +214,8 @@ def _pose_against_twist(s: Stated, end: NDArray[np.intp], steps: Array, dt: Arra
     """What shows only when one part of the message is compared with another."""
     if s.v is not None and np.isfinite(s.v).all():
         moved = steps / dt[:, None]
-        found = list(_twist_against_motion(s.v[end], s.T[end, :3, :3], moved))
-        yield from found or _unlike(s.v[end], moved, dt)
+        of_twist = list(_twist_against_motion(s.v[end], s.T[end, :3, :3], moved))
+        yield from of_twist or _unlike(s.v[end], moved, dt)
     found: list[Finding] = []
     for name, C in (("pose", s.pose), ("twist", s.twist)):
         if C is not None and np.isfinite(C).all():
