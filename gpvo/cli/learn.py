@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +13,9 @@ import typer
 from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
+from gpvo.dataset.build import aligned_truth
 from gpvo.dataset.errors import outweighed_by_truth
+from gpvo.dataset.hand_eye import Misread, late_by
 from gpvo.errors import GpvoError
 from gpvo.files import read_json
 from gpvo.io.run import read_run
@@ -87,6 +90,11 @@ def train(
     if statements is not None:
         _check_statements(runs, settings, update)
     drawn = twin_options.asked(ctx, twins, options.seed)
+    for path in _contradictory(runs, settings["align"]):
+        note(
+            f"gpvo: odometry and truth of {path} contradict each other, and a model learns that as the odometry's"
+            f" error; 'gpvo evaluate {path}' says in what"
+        )
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
             trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
@@ -109,6 +117,15 @@ def train(
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", sampled from {given}" if given > kept else ""
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
+
+
+def _contradictory(paths: list[Path], align: str) -> Iterator[Path]:
+    """The runs whose poses or stamps, or those of whose truth, seem not to be what they are taken for."""
+    for run in (read_run(p) for p in paths if p.is_dir()):
+        if run.truth is not None and len(run.truth.t_ns) > 1:
+            truth = aligned_truth(run.log, run.truth, align)
+            if late_by(run.log, truth) or Misread.of(run.log, truth).grossly:
+                yield run.path
 
 
 def _noisy_truths(paths: list[Path]) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
-from gpvo.dataset.errors import interpolate_truth
+from gpvo.dataset.errors import interpolate_truth, turn_without_truth_deg
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog
@@ -227,6 +227,78 @@ def inverse_poses(log: VoLog, truth: TruthLog) -> InversePoses | None:
     return InversePoses(best, float(change.mean()), bool(after > (1 + _EXPLAINS) * before))
 
 
+_UNLIKE, _MISMATCH, _SAME_PATH = 0.5, 0.1, 0.3  # on correct data, errors are a tenth of the motion at most
+_MOVES, _LEAST_MOVES = 1.6, np.array([1e-3, 1e-2])  # noise grows over twice the time by 1.4 at most; [m], [rad]
+_TIMES_REST = 10.0
+
+
+@dataclass(frozen=True)
+class Resemblance:
+    """How alike odometry and truth move over a second. ``scale``: size of the odometry's motions relative to the
+    truth's. ``motion``, ``turn``: median error relative to the motion, or the turn, that remains with this scale and
+    the best fixed transform between their frames taken off, in the better half of the run; ``turn`` is 0 where one of
+    both does not turn, ``motion`` 1 where one does not travel. ``path``: the same of the steps of the position alone,
+    in the worse half.
+    """
+
+    scale: float
+    motion: float
+    turn: float
+    path: float
+
+    @property
+    def alike(self) -> bool:
+        """Whether one fixed transform, and a scale, explain the difference between the two."""
+        return max(self.motion, self.turn) < _UNLIKE and not self.in_path_alone
+
+    @property
+    def in_path_alone(self) -> bool:
+        """Whether their positions agree, so that the attitudes of one, or its axes, must be others."""
+        return self.motion > _MISMATCH and self.path < _SAME_PATH * min(self.motion, 1.0)
+
+
+def resemblance(log: VoLog, truth: TruthLog) -> Resemblance | None:
+    """None where there is too little to compare, or both are at rest."""
+    start, end, T, T_world = _windows(log, truth)
+    if len(start) < _MIN_MOTIONS:
+        return None
+    A, B = _between(T, start, end), _between(T_world, start, end)
+    moves, true_moves = _moves(T, start, end), _moves(T_world, start, end)
+    size = _sizes(B)
+    if not (moves[0] and true_moves[0]):
+        ratio = float(np.sqrt((_sizes(A)[0] ** 2).sum() / max((size[0] ** 2).sum(), _WRITTEN_M**2)))
+        one_rests = (moves[0] and ratio > _TIMES_REST) or (true_moves[0] and ratio < 1 / _TIMES_REST)
+        return Resemblance(ratio, 1.0, 0.0, 1.0) if one_rests else None
+    moving = size > 0.5 * np.sqrt((size**2).mean(axis=1, keepdims=True))
+    scale = float(np.median(_sizes(A)[0, moving[0]] / size[0, moving[0]]))
+    A[:, :3, 3] /= max(scale, 1e-12)
+    try:
+        X = fit_fixed_transform(A, B).T_log_truth
+    except GpvoError:  # a path too straight to tell
+        X = np.eye(4)
+    steps, true_steps = (P[end, :3, 3] - P[start, :3, 3] for P in (T, T_world))
+    motion, turn, path = list[float](), list[float](), list[float]()
+    for h in np.array_split(np.arange(len(A)), 2):
+        U, _, Vt = np.linalg.svd(steps[h].T @ true_steps[h])  # a mirrored path is the same one
+        left = np.linalg.norm(steps[h] / max(scale, 1e-12) - true_steps[h] @ (U @ Vt).T, axis=1)
+        share = np.vstack([_errors(A[h], B[h], X), left]) / np.maximum(size[[0, 1, 0]][:, h], 1e-12)
+        for found, of, among in zip((motion, turn, path), share, moving[[0, 1, 0]][:, h], strict=True):
+            found += [float(np.median(of[among]))] if among.any() else []
+    return Resemblance(scale, min(motion), min(turn) if (moves & true_moves)[1] else 0.0, max(path))
+
+
+def _sizes(motions: Array) -> Array:
+    """(2, M) lengths [m] and angles [rad] of motions (M, 4, 4)."""
+    return np.stack([np.linalg.norm(v, axis=1) for v in (motions[:, :3, 3], se3.so3_log(motions[:, :3, :3]))])
+
+
+def _moves(T: Array, start: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(2,) whether poses (N, 4, 4) travel, and turn, over windows of more than one frame by more than their noise."""
+    half = (start + end) // 2
+    whole, part = (np.sqrt((_sizes(_between(T, start, e)) ** 2).mean(axis=1)) for e in (end, half))
+    return np.asarray((half > start).all() & (whole > np.maximum(_MOVES * part, _LEAST_MOVES)))
+
+
 def late_by(log: VoLog, truth: TruthLog) -> float | None:
     """Seconds to add to the log's stamps, if without such an offset errors over a second are smaller by what matters,
     in both halves of the run; else None."""
@@ -252,6 +324,37 @@ def _errors(A: Array, B: Array, X: Array) -> Array:
 def _errors_of_halves(A: Array, B: Array) -> Array:
     """(2,) median error [m] in the first and the second half of the run."""
     return np.array([np.median(half) for half in np.array_split(_errors(A, B, np.eye(4))[0], 2)])
+
+
+GROSS_DEG = 90.0
+"""A fixed rotation beyond is rarely a mounting's: a quaternion with w first read as x first, or a body's poses as a
+camera's."""
+
+
+@dataclass(frozen=True)
+class Misread:
+    """What makes the poses of odometry or truth mean something else than they are taken for: at most one, the one that
+    explains most; all None where nothing does. ``unlike``: what no fixed rotation and no inverse explains."""
+
+    turned: FixedRotation | None = None
+    inverse: InversePoses | None = None
+    unlike: Resemblance | None = None
+
+    @property
+    def grossly(self) -> bool:
+        """Whether something is wrong that no mounting explains."""
+        turned = self.turned is not None and self.turned.angle_deg > GROSS_DEG
+        return turned or self.inverse is not None or self.unlike is not None
+
+    @classmethod
+    def of(cls, log: VoLog, truth: TruthLog) -> Misread:
+        """Of a log against its truth on its clock."""
+        turned, inverse, like = fixed_rotation(log, truth), inverse_poses(log, truth), resemblance(log, truth)
+        if inverse and not (turned and turned.error_change <= inverse.error_change):
+            return cls(inverse=inverse)
+        if like is not None and not like.alike and not turn_without_truth_deg(log, truth):
+            return cls(unlike=like)
+        return cls(turned=turned)
 
 
 _SLIGHT, _WRITTEN_M = 1e-3, 1e-6

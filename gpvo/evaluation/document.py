@@ -48,6 +48,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``}: between truth and odometry,
       None if it does not matter; ``lever_m`` between their origins, 0 if that does not; ``error_change``: relative
       change of the errors over a second without them.
+    * ``unlike`` {``scale``, ``motion``, ``turn``, ``path``}: how little odometry and truth resemble each other
+      (:class:`gpvo.dataset.hand_eye.Resemblance`), None where they do.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
       {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
       frame or a second do not reach across a gap in the truth.
@@ -115,6 +117,7 @@ def run_document(e: Evaluation) -> dict[str, Any]:
         "truth_tells_from_m": e.tells_from_m,
         "fixed_rotation": None if e.turned is None else asdict(e.turned),
         "inverse_poses": None if e.inverse is None else asdict(e.inverse),
+        "unlike": None if e.unlike is None else asdict(e.unlike),
         "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},
         "segments": [asdict(s) for s in t.segments],
         "poses": nees_document(e.poses),

@@ -24,7 +24,7 @@ from gpvo.dataset.errors import (
     turn_without_truth_deg,
     velocity_path,
 )
-from gpvo.dataset.hand_eye import FixedRotation, InversePoses, fixed_rotation, inverse_poses, late_by
+from gpvo.dataset.hand_eye import FixedRotation, InversePoses, Misread, Resemblance, late_by
 from gpvo.errors import SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements
@@ -59,8 +59,9 @@ class Evaluation:
     ``truth_sigma`` (6,): noise of the truth's poses by axis, as counted in; ``truth_sigma_stated`` (6,): as its source
     states. ``tells_from_m``: length of path from which odometry's errors outweigh it. ``late_s``: offset between the
     clocks, where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise;
-    ``inverse``: poses of one of the two seem to be inverse. ``in_domain``: share of the predicted frames that lie in
-    the model's training domain, None without a model. ``poses``: scores of the covariances of poses that a log states.
+    ``inverse``: poses of one of the two seem to be inverse; ``unlike``: how little the two resemble each other, where
+    they do not. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a
+    model. ``poses``: scores of the covariances of poses that a log states.
     """
 
     run: Run
@@ -77,6 +78,7 @@ class Evaluation:
     tells_from_m: float = 0.0
     turned: FixedRotation | None = None
     inverse: InversePoses | None = None
+    unlike: Resemblance | None = None
     late_s: float | None = None
     unscored: int = 0
     odd: Sequence[Stretch] = ()
@@ -145,7 +147,7 @@ def evaluate_run(
         sigma = np.maximum.reduce([stated, *shown])
     late_s = late_by(scored, truth) if options.time_offset_s == 0.0 else None
     on_its_clock = on_clock_of_log(truth, late_s) if late_s else truth
-    turned, inverse = _misread(scored, on_its_clock) if options.align == "none" else (None, None)
+    misread = Misread.of(scored, on_its_clock)
     T_est = log.trajectory()
     made = [*statements(log, predictions, predictor), *further]
     by_velocity = velocity_path(truth, log.t_ns) if options.truth_sigma is None else None
@@ -169,8 +171,9 @@ def evaluate_run(
         truth_sigma=sigma,
         truth_sigma_stated=stated,
         tells_from_m=telling_distance_m(scored, T_true, known, sigma),
-        turned=turned,
-        inverse=inverse,
+        turned=misread.turned if options.align == "none" else None,
+        inverse=misread.inverse,
+        unlike=misread.unlike,
         time_offset_s=offset_s,
         late_s=late_s,
         unscored=0 if blind else int(log.usable.sum() - scored.usable.sum()),
@@ -183,14 +186,6 @@ def evaluate_run(
 def _unscored(log: VoLog) -> VoLog:
     """The log with every motion called lost: a truth of positions alone judges none."""
     return replace(log, records=[r.with_status(Status.LOST, "truth has no attitude") for r in log])
-
-
-def _misread(log: VoLog, truth: TruthLog) -> tuple[FixedRotation | None, InversePoses | None]:
-    """What makes poses of one of the two mean something else, if anything: the one that explains more."""
-    turned, inverse = fixed_rotation(log, truth), inverse_poses(log, truth)
-    if turned and inverse:
-        return (None, inverse) if inverse.error_change < turned.error_change else (turned, None)
-    return turned, inverse
 
 
 def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:

@@ -17,7 +17,7 @@ from gpvo.dataset.errors import (
     turn_without_truth_deg,
     without_held,
 )
-from gpvo.dataset.hand_eye import FixedRotation
+from gpvo.dataset.hand_eye import GROSS_DEG, FixedRotation, Resemblance
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes
@@ -231,7 +231,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             f"Odometry and truth never differ in {_listed(unseen)} of the camera (x right, y down, z ahead; planar?):"
             " those axes are not judged."
         )
-    if e.late_s is not None:
+    if e.late_s is not None and not _are_strangers(e):
         yield (
             f"The clocks of odometry and truth seem to differ by {abs(e.late_s):.3g} s: with --time-offset auto, errors"
             " over a second are smaller."
@@ -242,6 +242,8 @@ def _conditions(e: Evaluation) -> Iterator[str]:
             f"The poses of the {e.inverse.of} seem to be inverse, T_cam_world: the other way round, errors over a"
             f" second are {-100 * e.inverse.error_change:.0f} % smaller. Write them as T_world_cam{backwards}."
         )
+    if e.unlike is not None:
+        yield _of_unlike(e.unlike)
     yield from _of_truth_and_path(e)
     if e.turned is not None and len(unseen) < len(AXES):
         yield _of_frames(e.turned)
@@ -249,7 +251,7 @@ def _conditions(e: Evaluation) -> Iterator[str]:
 
 def _of_frames(turned: FixedRotation) -> str:
     # So large, it is rarely a mounting: a quaternion with w first read as x first, or a body's poses as a camera's.
-    asked = "; are the quaternion's order and --frame right?" if turned.angle_deg > 90 else ""
+    asked = "; are the quaternion's order and --frame right?" if turned.angle_deg > GROSS_DEG else ""
     apart = f" and a lever arm of {turned.lever_m:.3g} m" if turned.lever_m else ""
     return (
         f"Truth and odometry differ by a fixed rotation of {turned.angle_deg:.2f} deg{apart}"
@@ -270,6 +272,28 @@ def _of_few_motions(e: Evaluation) -> Iterator[str]:
             f" by more than {_FAR:g} times the median (slips, or jumps of the truth): they outweigh all others in every"
             " mean."
         )
+
+
+def _are_strangers(e: Evaluation) -> bool:
+    """Whether not even the paths of odometry and truth are alike, so that neither a clock nor a unit explains it."""
+    return e.unlike is not None and not e.unlike.in_path_alone
+
+
+def _of_unlike(found: Resemblance) -> str:
+    """What to look for where odometry and truth do not move alike."""
+    shares = {"motion": found.motion, "turn": found.turn}
+    apart = " and ".join(f"{100 * share:.0f} % of the {what}" for what, share in shares.items() if share > 0.05)
+    told = f"over a second they differ by {apart}, however their frames are turned against each other"
+    if found.in_path_alone:
+        return (
+            f"Odometry and truth take the same path, but not with the same attitudes: {told}. Are the quaternions of"
+            " both in the right order (TUM and --map: x y z w) and not conjugate, positions and attitudes in one"
+            " right-handed frame, and --frame right?"
+        )
+    return (
+        f"Odometry and truth do not move alike: {told}. Are they of one flight, on one clock and at the rate of their"
+        " stamps, poses of one body and not increments, with the quaternions in the right order?"
+    )
 
 
 def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
@@ -296,8 +320,11 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
-    if true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
-        yield f"The odometry's path is {size / true_size:.2g} times as large as the truth's: are both in metres?"
+    is_one_path = e.inverse is None and not _are_strangers(e)
+    if is_one_path and true_size > _LEAST_PATH_M and not 1 / _MOST_SCALE < size / true_size < _MOST_SCALE:
+        own_scale = " Are the baseline and the focal length right?" if e.run.log.camera is not None else ""
+        told = f"The odometry's path is {size / true_size:.2g} times as large as the truth's: are both in metres?"
+        yield told + own_scale
 
 
 def _up_to(sigma: Array) -> str:

@@ -33,6 +33,11 @@ class ClockShift:
     given: float
     shifted: float
 
+    @property
+    def at_limit(self) -> bool:
+        """Whether it is the largest that is tried, so that they may be later."""
+        return abs(self.shift_s) > _LATEST_S - 0.5 * _STEP_S
+
 
 class Rotations:
     """``vo`` (M, 3): rotation vectors of VO's motions, in IMU axes [rad], and those of the gyroscope between the same

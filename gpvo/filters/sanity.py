@@ -5,7 +5,7 @@ axes, judged by gravity and by the motion of VO.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
@@ -32,6 +32,8 @@ _RELABELLINGS = sorted(
     key=lambda M: -np.trace(M),
 )
 _AXES_WINDOW_S = 10.0
+_TOGETHER = 0.7  # correlation of all rotations from which names of axes are not chance
+_APART_DEG, _EXPLAINED, _TWO_AXES = 10.0, 0.25, 0.05
 _WINDOWS_S, _MIN_WINDOWS = (2.0, 1.4, 1.0, 0.7), 5  # the first lengths of which a flight holds so many
 
 
@@ -174,6 +176,11 @@ def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
     steady = float(np.linalg.norm(imu.acc_mps2.mean(axis=0)) / np.linalg.norm(imu.acc_mps2, axis=1).mean())
     if 0.6 < ratio < 1.6:
         return
+    turning = float(np.median(np.linalg.norm(imu.gyro_radps, axis=1)))
+    if ratio < 0.5 and 0.7 < turning / STANDARD_GRAVITY_MPS2 < 1.4:
+        text = f"the gyroscope's median reading is {turning:.3g} and the accelerometer's {g:.3g}: they are exchanged"
+        yield Finding("acc_unit", text, "the order is gyroscope, accelerometer; or give raw specific force")
+        return
     for unit, factor in (("g", 1.0), ("mg", 1e3), ("cm/s^2", 100 * STANDARD_GRAVITY_MPS2)):
         if 0.7 < g / factor < 1.4 and steady > 0.8:
             to_si = STANDARD_GRAVITY_MPS2 / factor
@@ -189,11 +196,14 @@ def _accelerometer_unit(imu: ImuLog) -> Iterator[Finding]:
 
 def _late(clock: ClockShift) -> Finding:
     side = "late" if clock.shift_s > 0 else "early"
+    by, cure = f"{abs(clock.shift_s) * 1e3:.0f} ms", f"add {clock.shift_s:.3f} to timeshift_cam_imu of the calibration"
+    if clock.at_limit:
+        by, cure = f"at least {by}", "bring both to one clock; no larger shift is tried"
     text = (
-        f"the IMU's stamps seem {abs(clock.shift_s) * 1e3:.0f} ms too {side}: gyroscope and VO then turn together"
+        f"the IMU's stamps seem {by} too {side}: gyroscope and VO then turn together"
         f" (correlation {clock.shifted:.2f}, as given {clock.given:.2f})"
     )
-    return Finding("clock", text, f"add {clock.shift_s:.3f} to timeshift_cam_imu of the calibration", fatal=False)
+    return Finding("clock", text, cure, fatal=False)
 
 
 def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
@@ -221,9 +231,11 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     correlation = vo.T @ gyro / (np.linalg.norm(vo, axis=0)[:, None] * np.linalg.norm(gyro, axis=0) + 1e-300)
     agreement = [float((M * correlation).sum() / 3.0) for M in _RELABELLINGS]
     best = int(np.argmax(agreement))
-    if np.abs(correlation).max() < 0.5:
+    renamed = best != 0 and agreement[best] - agreement[0] > 0.2
+    together = float((vo * (gyro @ _RELABELLINGS[best].T)).sum() / np.sqrt(energy_vo * energy_gyro))
+    if np.abs(correlation).max() < 0.5 or (renamed and together < _TOGETHER):
         text = f"gyroscope and VO do not turn together (correlation {agreement[0]:.2f} as given)"
-        yield Finding("gyro_axes", text, "check clock offset and T_imu_cam", fatal=False)
+        yield Finding("gyro_axes", text, "check clock offset and T_imu_cam; is it the IMU of this flight?", fatal=False)
         return
     scale = float(np.sqrt(energy_gyro / energy_vo))
     if 30 < scale < 110:
@@ -231,12 +243,26 @@ def _gyroscope(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
         yield Finding("gyro_unit", text, "multiply it by pi / 180")
     elif not 0.4 < scale < 2.5:
         yield Finding("gyro_unit", f"the gyroscope turns {scale:.3g} times as fast as VO: its unit is wrong")
-    if best != 0 and agreement[best] - agreement[0] > 0.2:
+    if renamed:
         text = (
             f"gyroscope and VO agree only with its axes renamed to {_describe(_RELABELLINGS[best])} "
             f"(correlation {agreement[best]:.2f}, as given {agreement[0]:.2f})"
         )
         yield Finding("gyro_axes", text, "the IMU's axes are swapped, or T_imu_cam is wrong")
+    elif late is None and (angle_deg := _apart_deg(vo, gyro)):
+        text = f"gyroscope and VO turn about axes that are {angle_deg:.0f} degrees apart, always the same way"
+        yield Finding("gyro_axes", text, "T_imu_cam is wrong by that rotation", fatal=False)
+
+
+def _apart_deg(vo: Array, gyro: Array) -> float:
+    """Angle of the rotation that takes the gyroscope's rotations (M, 3) to VO's (W. Kabsch, 1976), where it explains
+    most of their difference, else 0. They must turn about two axes."""
+    U, S, Vt = np.linalg.svd(vo.T @ gyro)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    angle_deg = float(np.rad2deg(np.linalg.norm(se3.so3_log(R))))
+    gyro = gyro * np.sqrt((vo**2).sum() / (gyro**2).sum())
+    explains = ((vo - gyro @ R.T) ** 2).sum() < _EXPLAINED * ((vo - gyro) ** 2).sum()
+    return angle_deg if explains and S[1] > _TWO_AXES * S[0] and angle_deg > _APART_DEG else 0.0
 
 
 def _accelerometer_axes(imu: ImuLog) -> Iterator[Finding]:
@@ -277,19 +303,28 @@ def _accelerometer_sign(flight: Flight, imu: ImuLog) -> Iterator[Finding]:
     Both are compared by their slopes, from which gravity and constant biases are gone. Of short windows, in which VO's
     noise weighs more, nothing fatal is said.
     """
-    for window_s in _WINDOWS_S:
-        jerk, slope = jerks(flight, imu, window_s)
-        if len(jerk) >= _MIN_WINDOWS:
-            break
-    else:
+    counts = ((window_s, len(jerks(flight, imu, window_s)[0])) for window_s in _WINDOWS_S)
+    window_s, n = next((found for found in counts if found[1] >= _MIN_WINDOWS), (0.0, 0))
+    if not n:
         return
-    # No window counts for more than three usual ones: in some VO may have failed.
-    pair = [v / np.maximum(np.linalg.norm(v, axis=1), 3 * _usual(v))[:, None] for v in (jerk, slope)]
-    correlation = float((pair[0] * pair[1]).sum() / np.sqrt((pair[0] ** 2).sum() * (pair[1] ** 2).sum() + 1e-300))
+    correlation = _rises_together(flight, imu, window_s)
     # By chance the correlation of n pairs of values deviates from zero by 1 / sqrt(n).
-    if correlation < -max(0.3, 3.0 / np.sqrt(pair[0].size)):
+    if correlation < -max(0.3, 3.0 / np.sqrt(3 * n)):
+        flipped = (replace(imu, acc_mps2=imu.acc_mps2 * (1 - 2 * axis)) for axis in np.eye(3))
+        shows = [name for name, one in zip("xyz", flipped) if _rises_together(flight, one, window_s) > 0.3]
         text = f"the accelerometer falls where VO's motion rises (correlation {correlation:.2f}): its sign is wrong"
-        yield Finding("acc_sign", text, "multiply its three axes by -1", fatal=window_s == _WINDOWS_S[0])
+        cure = "multiply its three axes by -1"
+        if shows:  # along gravity, which hides the others
+            text += f", as axis {' and '.join(shows)} shows"
+            cure = "multiply by -1 what is wrong: all three axes, or y and z if they are FRD and the gyroscope's FLU"
+        yield Finding("acc_sign", text, cure, fatal=window_s == _WINDOWS_S[0])
+
+
+def _rises_together(flight: Flight, imu: ImuLog, window_s: float) -> float:
+    """Correlation of VO's jerk with the slope of the force."""
+    # No window counts for more than three usual ones: in some VO may have failed.
+    a, b = (v / np.maximum(np.linalg.norm(v, axis=1), 3 * _usual(v))[:, None] for v in jerks(flight, imu, window_s))
+    return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum() + 1e-300))
 
 
 def _usual(v: Array) -> float:

@@ -165,9 +165,10 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
     share = float(np.mean([is_positive_definite(g) for g in growth[1:]])) if len(motions) else 0.0
     if share >= 0.95:
         return IMPORTED, growth, []
+    other = "" if log.topic else " (if they are of single motions, --covariance-of motion)"
     note = (
         f"the covariances are of poses and grow in {100 * share:.0f} % of the steps only, as a filter's do: kept as"
-        " 'imported_pose' and scored as such by gpvo evaluate"
+        f" 'imported_pose' and scored as such by gpvo evaluate{other}"
     )
     return IMPORTED_POSE, C, [note]
 

@@ -28,7 +28,7 @@ from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import growing, in_order
+from gpvo.io.stamps import UNITS_NS, check_interval, growing, in_order, likely_unit
 from gpvo.io.trajectory import GPS_INS, TruthNoise
 from gpvo.types import Array, ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
 
@@ -57,7 +57,7 @@ class TracksSource:
     def __init__(self, path: Path, *, truth_noise: TruthNoise | None = None) -> None:
         self.path, self.name = path, path.stem
         self._data, self.report = load_arrays(path, _REQUIRED, _OPTIONAL), SourceReport()
-        self._t_ns = np.rint(self._array("t_s", None, most=_MAX_STAMP_S) * 1e9).astype(np.int64)
+        self._t_ns = self._stamps()
         self._observations()
         self.camera = self._make_camera()
         self.mask: NDArray[np.bool_] | None = None
@@ -86,6 +86,20 @@ class TracksSource:
         for k, t in enumerate(self._t_ns):
             rows = self._rows[self._starts[k] : self._starts[k + 1]]
             yield TrackFrame(int(t), self._track[rows], self._uv_left[rows], self._uv_right[rows])
+
+    def _stamps(self) -> NDArray[np.int64]:
+        t_s = self._array("t_s", None, most=1e19)
+
+        def cure(unit: str) -> str:
+            return f"'t_s' holds seconds: divide it by {UNITS_NS['s'] // UNITS_NS[unit]:,}"
+
+        most = float(np.abs(t_s).max(initial=0.0))
+        if most > _MAX_STAMP_S:
+            what = f"'t_s' holds {most:.3g}, the limit is {_MAX_STAMP_S:.3g}"
+            raise SourceError(what, where=self.path, cure=cure(likely_unit(str(most)) or "ns"))
+        t_ns = np.rint(t_s * 1e9).astype(np.int64)
+        check_interval(t_ns, self.path, cure, is_stated=True)
+        return t_ns
 
     def _observations(self) -> None:
         """Sort the rows by frame and check them."""

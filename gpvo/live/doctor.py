@@ -30,6 +30,7 @@ from gpvo.types import Array
 
 _LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds up over as many frames as it lasts
 _SWAPPED = "every consumer reads metres where there are radians, and vice versa"
+_UNLIKE = 0.7  # of the motion over a second
 _HUGE, _TINY = 1e3, 0.999e-9  # 1e-9 in single precision is good
 _ZERO_FALLBACK = "FusionCore uses 0.1 m and 0.02 rad instead"
 _RL_FLOOR = "robot_localization uses 1e-9, a sigma of 0.03 mm, and ignores everything else"
@@ -212,7 +213,9 @@ def _motions(s: Stated) -> tuple[NDArray[np.intp], Array, Array] | None:
 def _pose_against_twist(s: Stated, end: NDArray[np.intp], steps: Array, dt: Array) -> Iterator[Finding]:
     """What shows only when one part of the message is compared with another."""
     if s.v is not None and np.isfinite(s.v).all():
-        yield from _twist_against_motion(s.v[end], s.T[end, :3, :3], steps / dt[:, None])
+        moved = steps / dt[:, None]
+        of_twist = list(_twist_against_motion(s.v[end], s.T[end, :3, :3], moved))
+        yield from of_twist or _unlike(s.v[end], moved, dt)
     found: list[Finding] = []
     for name, C in (("pose", s.pose), ("twist", s.twist)):
         if C is not None and np.isfinite(C).all():
@@ -249,6 +252,26 @@ def _twist_against_motion(said: Array, R: Array, moved: Array) -> Iterator[Findi
     if not 0.5 < ratio < 2.0:
         text = "the twist is per frame, in another unit, or on another clock"
         yield Finding("twist-scale", f"the twist is {ratio:.3g} times the motion of the pose", text)
+
+
+def _unlike(said: Array, moved: Array, dt: Array) -> Iterator[Finding]:
+    """Twists (M, 6) that are of other axes, signs or units than velocities (M, 6) from the poses, both taken over
+    seconds, so that the noise of single poses cancels."""
+    first = np.unique(np.floor(np.cumsum(dt)), return_index=True)[1]
+    a, b = (np.add.reduceat(v * dt[:, None], first) for v in (said, moved))
+    for name, part in (("linear", slice(3)), ("angular", slice(3, 6))):
+        size = np.linalg.norm(b[:, part], axis=1)
+        moves = size > 0.05  # [m] or [rad]; the median, as a jump of the pose is no fault of the twist
+        if moves.sum() < 3:
+            continue
+        apart = float(np.median(np.linalg.norm((a - b)[moves, part], axis=1) / size[moves]))
+        if apart > _UNLIKE:
+            what = f"the {name} twist differs from the motion of the pose by {apart:.2g} times the motion"
+            text = (
+                "one of both is wrong for every consumer: axes (optical or FRD where child_frame_id is FLU), a sign,"
+                " degrees, zeros for 'unknown', another clock, or a pose with its quaternion not x y z w, or inverse"
+            )
+            yield Finding(f"twist-{name}-unlike", what, text)
 
 
 def _blocks(name: str, C: Array) -> Iterator[Finding]:

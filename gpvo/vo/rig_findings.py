@@ -61,7 +61,10 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
             " axis"
         )
     if shown(row_focal, fy * half):
-        lines.append(f"rows spread: consistent with focal lengths that differ by {100 * abs(c[row_focal]):.2f} %")
+        lines.append(
+            f"rows spread: consistent with focal lengths that differ by {100 * abs(c[row_focal]):.2f} %, or, if the"
+            " camera moves ahead, with left and right images that were not taken at one time"
+        )
     if state.probability > 0.95:
         if shown(0, fx):
             lines.append(

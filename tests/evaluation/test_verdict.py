@@ -24,6 +24,7 @@ from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3
 from gpvo.io.run_read import Run
 from gpvo.types import IMPORTED, Array, Mounting, Status, TruthLog, VoLog, VoRecord
+from scipy.spatial.transform import Rotation
 
 
 def evaluated(factors: dict[str, float | Array]) -> Evaluation:
@@ -152,6 +153,63 @@ def test_clocks_that_differ_are_named_and_not_taken_for_a_rotation() -> None:
 def test_another_unit_is_named(factor: float, told: bool) -> None:
     lines = verdict(of_truth(lambda truth: scaled(truth, factor))).lines
     assert any("times as large as the truth's: are both in metres?" in line for line in lines) == told
+    assert any("Are the baseline and the focal length right?" in line for line in lines) == told
+
+
+def _other_flight(truth: TruthLog) -> TruthLog:
+    turned = np.arange(len(truth.t_ns))[::-1]
+    back = se3.inverse(truth.T_world_cam[turned[0]]) @ truth.T_world_cam[turned]
+    return replace(truth, T_world_cam=back @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0])))
+
+
+def _with_attitudes(change: Callable[[Array], Array]) -> Callable[[TruthLog], TruthLog]:
+    """Of quaternions (N, 4), x y z w."""
+
+    def changed(truth: TruthLog) -> TruthLog:
+        T = truth.T_world_cam.copy()
+        T[:, :3, :3] = Rotation.from_quat(change(Rotation.from_matrix(T[:, :3, :3]).as_quat())).as_matrix()
+        return replace(truth, T_world_cam=T)
+
+    return changed
+
+
+def _mirrored(truth: TruthLog) -> TruthLog:
+    T = truth.T_world_cam.copy()
+    T[:, 1, 3] *= -1
+    return replace(truth, T_world_cam=T)
+
+
+def _increments(truth: TruthLog) -> TruthLog:
+    T = truth.T_world_cam
+    return replace(truth, T_world_cam=np.concatenate([np.eye(4)[None], se3.inverse(T[:-1]) @ T[1:]]))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (_with_attitudes(lambda q: q[:, [3, 0, 1, 2]]), "not with the same attitudes"),
+        (_with_attitudes(lambda q: q * [-1, -1, -1, 1]), "not with the same attitudes"),
+        (_mirrored, "not with the same attitudes"),
+        (_other_flight, "do not move alike"),
+        (_increments, "do not move alike"),
+        (lambda t: replace(t, t_ns=t.t_ns[0] + 2 * (t.t_ns - t.t_ns[0])), "do not move alike"),
+        (lambda t: scaled(t, 1e3), ""),
+        (lambda t: t, ""),
+    ],
+)
+def test_poses_that_are_not_what_they_are_taken_for_are_named(
+    change: Callable[[TruthLog], TruthLog], told: str
+) -> None:
+    """And neither for a mounting, nor another unit or clock. A truth of another unit is no other flight."""
+    found = of_truth(lambda truth: change(replace(truth, T_world_cam=WORLD @ truth.T_world_cam)))
+    lines = "\n".join(verdict(found).lines)
+    assert (found.unlike is not None) == bool(told)
+    assert told in lines
+    if told:
+        assert not any(other in lines for other in ("fixed rotation", "in metres?", "clocks"))
+
+
+WORLD = se3.exp(np.array([4.0, -2.0, 1.0, 0.3, -0.5, 1.1]))
 
 
 def test_a_truth_slower_than_the_frames_does_not_make_a_covariance_overconfident() -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
+from gpvo.evaluation.flights import flight_of
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import Flight, fuse_flight
 from gpvo.filters.sanity import check_flight, require_sane
+from gpvo.geometry import se3
+from gpvo.io.run import read_run
 from gpvo.types import ImuLog
 from synthetic_flights import ErrorLaw, synthetic_flight, with_geometric
 
@@ -63,6 +67,45 @@ def test_a_wrong_gyroscope_is_named_beside_slow_frames() -> None:
     assert [f for f in check_flight(slow) if f.fatal] == []
     wrong = _with_imu(slow, lambda i: replace(i, gyro_radps=i.gyro_radps[:, [1, 0, 2]]))
     assert [f.kind for f in check_flight(wrong) if f.fatal] == ["gyro_axes"]
+
+
+@pytest.mark.parametrize("signs", [(-1, -1, -1), (1, 1, -1), (1, -1, -1)])
+def test_a_cure_of_wrong_signs_blames_only_what_shows(signs: tuple[int, ...]) -> None:
+    """In a level flight that is the vertical axis: three signs changed for one would make the other two wrong."""
+    level = flight_of(read_run(Path(__file__).parents[2] / "data" / "tunnel-1"))
+    (found,) = check_flight(_with_imu(level, lambda i: replace(i, acc_mps2=i.acc_mps2 * signs)))
+    assert found.kind == "acc_sign"
+    assert "as axis z shows" in found.text
+    assert "FRD" in found.cure
+
+
+def test_gyroscope_and_accelerometer_in_each_other_s_columns(flight: Flight) -> None:
+    wrong = _with_imu(flight, lambda i: replace(i, gyro_radps=i.acc_mps2, acc_mps2=i.gyro_radps))
+    assert "they are exchanged" in check_flight(wrong)[0].text
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.6, 0.0), (0.3, -0.3, 0.5)])
+def test_a_mounting_that_is_turned_by_no_right_angle(flight: Flight, axis: tuple[float, ...]) -> None:
+    assert flight.T_imu_cam is not None
+    turned = se3.exp(np.array([0.0, 0.0, 0.0, *axis]))
+    (found,) = check_flight(replace(flight, T_imu_cam=turned @ flight.T_imu_cam))
+    assert found.kind == "gyro_axes"
+    told_deg = float(re.search(r"are (\d+) degrees apart", found.text)[1])
+    assert told_deg == pytest.approx(np.rad2deg(np.linalg.norm(axis)), abs=3)
+
+
+@pytest.mark.parametrize("seed", range(5, 9))
+def test_the_imu_of_another_flight_has_no_swapped_axes(flight: Flight, seed: int) -> None:
+    """Of 48 names for its axes, one agrees by chance."""
+    found = check_flight(replace(flight, imu=synthetic_flight(seed, duration_s=20).imu))
+    assert not any("axes renamed" in f.text for f in found)
+
+
+def test_a_clock_that_is_off_by_more_than_is_tried(flight: Flight) -> None:
+    found = check_flight(_with_imu(flight, lambda i: replace(i, t_ns=i.t_ns + 230 * 10**6)))
+    (late,) = (f for f in found if "too late" in f.text)
+    assert "at least 200 ms" in late.text
+    assert "timeshift" not in late.cure
 
 
 @pytest.mark.parametrize("late_ms", [-120, -40, 60])

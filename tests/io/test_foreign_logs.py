@@ -118,6 +118,7 @@ def test_pose_covariance_of_a_filter_is_not_passed_off_as_a_motions(tmp_path):
     path = _csv(tmp_path / "a.csv", header, [[1e-4] * N] * 6)
     records, notes = to_records(read_foreign(path))
     assert "imported_pose" in notes[0]
+    assert "if they are of single motions, --covariance-of motion" in notes[0]
     assert set(records[5].covariances) == {"imported_pose"}
 
 

@@ -103,6 +103,16 @@ def test_the_velocity_of_the_camera_is_that_of_the_body_and_its_turning(tmp_path
     assert open_source(save(tmp_path / "b.npz", data)).truth.v_world_mps is None
 
 
+@pytest.mark.parametrize("start_s", [0.0, 1.7e9])
+@pytest.mark.parametrize("factor", [1e3, 1e6, 1e9])
+def test_stamps_in_another_unit_are_refused_with_the_factor(tmp_path, start_s, factor):
+    data = arrays()
+    data["t_s"] = (start_s + data["t_s"] * 3) * factor
+    np.savez(tmp_path / "t.npz", **data)
+    with pytest.raises(SourceError, match=f"divide it by {int(factor):,}"):
+        open_source(tmp_path / "t.npz")
+
+
 def test_stamps_with_disorder(tmp_path):
     data = arrays()
     data["t_s"] = np.array([0.0, 0.1, 0.1, 0.3, 0.25, 0.5])

@@ -119,6 +119,8 @@ FAULTS = {
     "pose-jump": _each(lambda o, k: {"T_odom_body": _moved(o.T_odom_body, 5.0 * (k >= 70))}),
     "twist-in-parent": _each(_in_parent),
     "twist-empty": _each(lambda o, k: {"twist_body": np.zeros(6)}),
+    "twist-linear-unlike": _each(lambda o, k: {"twist_body": o.twist_body * [-1, 1, 1, 1, 1, 1]}),
+    "twist-angular-unlike": _each(lambda o, k: {"twist_body": o.twist_body * [1, 1, 1, 57.3, 57.3, 57.3]}),
     "twist-scale": _each(lambda o, k: {"twist_body": o.twist_body * 0.05}),
 }
 S = np.array([3.0] * 3 + [1.0] * 3)
