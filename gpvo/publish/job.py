@@ -127,6 +127,8 @@ def _require(settings: PublishSettings) -> None:
         raise GpvoError(f"--to is '{settings.to}'", cure=f"choose {', '.join(TARGETS)}")
     if settings.consumer is not None and settings.consumer not in consumers.CONSUMERS:
         raise GpvoError(f"--consumer is '{settings.consumer}'", cure=f"choose {', '.join(consumers.CONSUMERS)}")
+    if settings.consumer is not None and not settings.check:
+        raise GpvoError("--consumer changes nothing that is written", cure="add --check to see what it will do")
     if not 1 <= settings.system <= 255:
         raise GpvoError(f"--system is {settings.system}", cure="give an id of 1 to 255")
     ros.check_topic(settings.topic)

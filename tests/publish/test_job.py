@@ -43,6 +43,13 @@ def test_what_is_stored_is_published_unless_it_is_of_windows(predicted: Path) ->
     np.testing.assert_array_equal(of_windows, plain)
 
 
+def test_a_consumer_that_nothing_would_read_is_refused(predicted: Path, tmp_path: Path) -> None:
+    settings = replace(GEOMETRY, to="bag", out=tmp_path / "out", consumer="px4")
+    with pytest.raises(GpvoError, match="--consumer .*--check"):
+        publish_run(predicted, settings)
+    assert publish_run(predicted, replace(settings, check=True)).verdicts
+
+
 def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -> None:
     settings = replace(GEOMETRY, to="bag", out=tmp_path / "out")
     assert publish_run(predicted, settings).source == "the model"
