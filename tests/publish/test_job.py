@@ -7,15 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gpvo.cli import app
 from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError, ModelError
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
+from gpvo.publish.export import export_model
 from gpvo.publish.job import PublishSettings, odometry_of, publish_run
 from gpvo.types import Prediction, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
+from typer.testing import CliRunner
 
 GEOMETRY = PublishSettings(method="pointing_matching")
 
@@ -115,6 +118,11 @@ def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) 
     model = tmp_path / "windows.gpvo"
     modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
     assert Predictor.load(model).target == "window:1s"
+    for name, to in (("x.h", "c"), ("x.onnx", "onnx")):
+        export_model(model, tmp_path / name, to)
+        assert b"window:1s" in (tmp_path / name).read_bytes()
+    words = ["predict", str(model), str(predicted), "-o", str(tmp_path / "p.parquet")]
+    assert " mrad over window:1s\n" in CliRunner().invoke(app, words, catch_exceptions=False).output
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
         publish_run(predicted, replace(GEOMETRY, model=model))
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
