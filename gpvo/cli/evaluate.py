@@ -40,7 +40,9 @@ class JudgeOptions:
     truth: Annotated[
         Path | None, typer.Option(help="Ground truth (TUM lines, left camera) to use instead of the run's own.")
     ] = None
-    segments: Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")] = None
+    segments: Annotated[
+        str | None, typer.Option(help="Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800.")
+    ] = None
     truth_sigma: Annotated[
         str | None,
         typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),

@@ -36,7 +36,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
-    * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers amount to, in words.
+    * ``verdict`` {``colour``, ``headline``, ``lines``, ``judged``}: what the numbers amount to, in words; ``judged``:
+      whether any covariance could be.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated. ``clocks_differ_by_s``: what seems to
       remain of it, None if it does not matter.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
@@ -45,7 +46,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       then [rad]. ``truth_tells_from_m``: length of path from which odometry's errors outweigh it; 0: every motion;
       None: nowhere.
     * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``}: between truth and odometry, None if it
-      does not matter; ``error_change``: relative change of the errors over a second without it.
+      does not matter; ``error_change``: relative change of the errors over a second without it. ``inverse_poses``
+      {``of``, ``error_change``, ``or_backwards``}: whose poses seem to be inverse; None where nobody's.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
       {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
       frame or a second do not reach across a gap in the truth.
