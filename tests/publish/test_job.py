@@ -15,7 +15,7 @@ from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
 from gpvo.publish.export import export_model
 from gpvo.publish.job import PublishSettings, odometry_of, publish_run
-from gpvo.types import Prediction, VoLog
+from gpvo.types import Prediction, Status, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
 from typer.testing import CliRunner
@@ -51,6 +51,17 @@ def test_a_consumer_that_nothing_would_read_is_refused(predicted: Path, tmp_path
     with pytest.raises(GpvoError, match="--consumer .*--check"):
         publish_run(predicted, settings)
     assert publish_run(predicted, replace(settings, check=True)).verdicts
+
+
+def test_frames_that_their_quality_forbids_are_counted(predicted: Path, tmp_path: Path) -> None:
+    run = read_run(predicted)
+    records = [r.with_status(Status.LOST, "dark") if k == 9 else r for k, r in enumerate(run.log)]
+    stored = [replace(p, in_domain=0.001 if k in (5, 6, 9) else 1.0) for k, p in enumerate(run.predictions)]
+    write_run(tmp_path / "far", VoLog(records), predictions=stored, meta={"source": "made"})
+    told = publish_run(tmp_path / "far", PublishSettings(check=True, consumer="ardupilot"))
+    assert (told.document()["lost"], told.document()["outside"]) == (1, 2)
+    assert "1 lost frames, 2 far outside the model's domain" in str(told)
+    assert "outside" not in str(publish_run(predicted, PublishSettings(check=True)))
 
 
 def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -> None:
