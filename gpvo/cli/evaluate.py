@@ -40,7 +40,9 @@ class JudgeOptions:
     truth: Annotated[
         Path | None, typer.Option(help="Ground truth (TUM lines, left camera) to use instead of the run's own.")
     ] = None
-    segments: Annotated[str | None, typer.Option(help="Segment lengths [m], such as 10,20,50,100.")] = None
+    segments: Annotated[
+        str | None, typer.Option(help="Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800.")
+    ] = None
     truth_sigma: Annotated[
         str | None,
         typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),
@@ -237,10 +239,11 @@ def _print(d: dict[str, Any]) -> None:
         say(f"  {d['truth_moves_at_rest']} motions are not scored: the truth moves while the vehicle rests, or jumps")
     for text in d["odd_stretches"]:
         say(f"  {text}: odometry or truth is wrong there")
-    errors = [(name, r["translation_m"]["rmse"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
+    errors = [(name, r["translation_m"], r["rotation_rad"]["rmse"]) for name, r in d["rpe"].items()]
     spans = {"frame": "over a frame", "1s": "over 1 s", "10m": "over 10 m"}
-    relative = (f"{spans[name]} {cell(m)} m, {cell(math.degrees(rad))} deg" for name, m, rad in errors)
-    say(f"  relative error (rms): {'; '.join(relative)}")
+    relative = [f"{spans[n]} {cell(m['rmse'])} m, {cell(math.degrees(rad))} deg" for n, m, rad in errors if m["count"]]
+    if relative:
+        say(f"  relative error (rms): {'; '.join(relative)}")
     for s in (s for s in d["segments"] if s["count"]):
         say(
             f"  {s['length_m']:g} m segments: {s['translation_percent']:.2f} %, {s['rotation_deg_per_m']:.4f} deg/m"

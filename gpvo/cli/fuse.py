@@ -113,7 +113,10 @@ class PublishOptions:
     )
     topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry"
     system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1
-    consumer: Annotated[str | None, typer.Option(help="px4, ardupilot, robot_localization or fusioncore.")] = None
+    consumer: Annotated[
+        str | None,
+        typer.Option(help="For --check: px4, ardupilot, robot_localization or fusioncore; default: px4 for MAVLink."),
+    ] = None
     check: Annotated[
         bool,
         typer.Option(

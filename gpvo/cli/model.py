@@ -58,11 +58,12 @@ def predict(
     if json_:
         print_json({"schema": 1, **({"runs": documents} if len(runs) > 1 else documents[0])})
         return
+    per = "per motion" if predictor.target == "frame" else f"over {predictor.target}"
     for d in documents:
         inside = 100 * (d["in_domain"] or 0)
         print(f"{d['file']}: {d['predictions']} predictions, {inside:.0f} % inside the training domain")
         length, angle = (1e3 * sum(x**2 for x in sigma) ** 0.5 for sigma in d["median_sigma"].values())
-        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad per motion")
+        print(f"median sigma: {length:.3g} mm, {angle:.3g} mrad {per}")
 
 
 def _summary(predictions: list[Prediction]) -> dict[str, Any]:

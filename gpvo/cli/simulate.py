@@ -68,8 +68,10 @@ def simulate(
     if list_:
         _show_list(json_)
         return
-    if scenario is None or (out is None and preview is None):
+    if scenario is None:
         raise GpvoError("nothing to simulate", cure="gpvo simulate SCENARIO -o OUT, or gpvo simulate --list")
+    if out is None and preview is None:
+        raise GpvoError("nowhere to write", cure="give -o OUT, or --preview PNG for a look at the images")
     if points and preview:
         raise GpvoError("--points draws no images to preview", cure="leave out one of --points, --preview")
     from gpvo.sim.scenario import fly_campaign, load_scenario, stated_seed, warn_of_unused

@@ -141,7 +141,8 @@ class StoredSets:
         except (OSError, KeyError, ValueError, pa.ArrowException) as problem:
             if isinstance(problem, SourceError):
                 raise
-            raise SourceError(f"is not a training set: {problem}", where=path) from None
+            cure = "give run folders, or the .rows.parquet beside a model"
+            raise SourceError(f"is not a training set: {problem}", where=path, cure=cure) from None
 
     def __len__(self) -> int:
         return sum(self.lengths)

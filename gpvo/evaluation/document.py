@@ -37,7 +37,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``in_domain``: share of the frames in the model's training domain.
     * ``poses`` {``count``, ``position``, ``orientation``, ``joint``}: NEES of the pose covariances that a filter's log
       states (see :class:`gpvo.evaluation.trajectory.PoseConsistency`); None where it states none.
-    * ``verdict`` {``colour``, ``headline``, ``lines``}: what the numbers amount to, in words.
+    * ``verdict`` {``colour``, ``headline``, ``lines``, ``judged``}: what the numbers amount to, in words; ``judged``:
+      whether any covariance could be.
     * ``time_offset_s``: what was taken off the truth's clock, given or estimated. ``clocks_differ_by_s``: what seems to
       remain of it, None if it does not matter.
     * ``truth_sigma`` {``translation_m``, ``rotation_rad``}: noise of the truth per pose, root mean square over axes,
@@ -47,7 +48,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       None: nowhere.
     * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``}: between truth and odometry,
       None if it does not matter; ``lever_m`` between their origins, 0 if that does not; ``error_change``: relative
-      change of the errors over a second without them.
+      change of the errors over a second without them. ``inverse_poses`` {``of``, ``error_change``, ``or_backwards``}: whose
+      poses seem to be inverse; None where nobody's.
     * ``unlike`` {``scale``, ``motion``, ``turn``, ``path``}: how little odometry and truth resemble each other
       (:class:`gpvo.dataset.hand_eye.Resemblance`), None where they do.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each

@@ -106,7 +106,7 @@ def fuse_runs(
     unable = [name for name, row in result.scores.items() if not any(row)]
     failed = [f"{name} is left out: {_why_not(name, constants, predictor)}" for name in unable]
     if len(failed) == len(result.scores):
-        raise GpvoError(f"nothing to fuse with: {'; '.join(failed)}")
+        raise GpvoError(f"nothing to fuse with: {failed[-1]}")  # one cure is enough
     diverging = _diverging(result) if any(f.imu is not None for f in flights) else []
     origin = simulated_truth([run.meta for run in runs])
     return FusionReport(result, tuple(traces), tuple(warnings + failed + diverging), origin)

@@ -185,12 +185,17 @@ class _Judgement:
     def line(self) -> str:
         """The figures."""
         wrong = [name for name in self.wrong() if name != "one motion"]
-        over = [f"{h.nees_dof_truth_noise:.2f} over {name}" for name, h in self.spans]
+        over = [f"{_figure(h.nees_dof_truth_noise)} over {name}" for name, h in self.spans]
         if not self.of_motions:
             return f"{self.c.method}: {self.words()}; NEES/dof {', '.join(over)}."
         then = f", not honest over {_listed(wrong)}" if wrong else ""
-        figures = ", ".join((f"{_nees(self.c):.2f}", *over))
+        figures = ", ".join((_figure(_nees(self.c)), *over))
         return f"{self.c.method}: {_per_motion(self.c, sized=True)} per motion{then}; NEES/dof {figures}."
+
+
+def _figure(nees: float) -> str:
+    """To two decimals; of what these do not show, the first digit."""
+    return f"{nees:.1g}" if nees < 0.01 else f"{nees:.2f}"
 
 
 def _listed(names: Sequence[str]) -> str:

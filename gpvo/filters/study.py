@@ -194,7 +194,7 @@ def table(study: Study) -> str:
         values = "".join(_cell(study.mean(name, key), digits, width) for _, key, digits, width in columns)
         diverged = study.diverged(name)
         lines.append(f"{name:<20}{values}{'-' if diverged is None else diverged:>9}")
-    lines.append("NEES p, a: of position and attitude, per degree of freedom; 1 is right.")
+    lines.append("NEES p, a (position, attitude) and NIS: per degree of freedom; 1 is right.")
     if len(study.runs) == 1:
         return "\n".join(lines)
     runs = ", ".join(f"{i + 1}: {run}" for i, run in enumerate(study.runs))

@@ -81,7 +81,8 @@ def read_run(path: str | Path) -> Run:
     """
     p = Path(path)
     if not p.is_dir():
-        raise SourceError("no such run folder", where=p, cure="make one with 'gpvo run SOURCE -o RUN'")
+        what = "is a file, not a run folder" if p.exists() else "no such run folder"
+        raise SourceError(what, where=p, cure="make one with 'gpvo run SOURCE -o RUN'")
     if not (p / "run.json").is_file():
         raise SourceError("is not a run folder: it lacks run.json", where=p, cure="make one with 'gpvo run'")
     meta = read_json(p / "run.json")

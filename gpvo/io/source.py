@@ -160,6 +160,10 @@ def guess(path: str | Path) -> str:
     for name, load in source_kinds().items():
         if load().recognises(p):
             return name
+    if (p / "run.json").is_file():
+        raise SourceError(
+            "is a run, not a sequence", where=p, cure="gpvo evaluate, train and fuse take runs as they are"
+        )
     raise SourceError(
         "not recognised as a stereo sequence",
         where=p,

@@ -54,7 +54,7 @@ def _intro(h: Mapping[str, Any], name: str) -> str:
             "Predicts the error covariance of stereo visual odometry, in the frame of the rectified left camera.",
             "",
             f"* trained on {_today()} with gpvo {h['versions']['gpvo']}",
-            f"* target: {h['target']} ({h['horizon']})" + f", at {h['rate_hz']:.3g} Hz" * (h["target"] == "frame"),
+            f"* target: {h['target']}" + f" (one motion), at {h['rate_hz']:.3g} Hz" * (h["target"] == "frame"),
             f"* base variance: {choices['base']}",
             f"* inputs of the Gaussian process (chosen set: {choices['inputs']}): {inputs}",
         ]
@@ -192,7 +192,8 @@ def _calibration(h: Mapping[str, Any]) -> str:
     return _section(
         "Calibration",
         f"Calibrated by {c['by']} ({c['groups']} left out in turn).{marked}",
-        f"The error of one motion is stated as {shape}; the covariance is its second moment.",
+        f"The error {'of' if h['target'] == 'frame' else 'over'} {h['horizon']} is stated as {shape}; the covariance"
+        " is its second moment.",
         f"Half widths, in sigma, of the intervals that covered left-out data on the first axis: {widths}.",
         *(["The camera's calibration differs between these sequences; a part of the model is for that."] * apart),
     )

@@ -35,12 +35,12 @@ first."""
 class TrainConfig:
     """``features``: ``auto`` (chosen by cross-validation over the training sequences), ``thesis``, ``full`` or a list.
 
-    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``: for positions and for the
-    thesis' model. ``align``: ``rotation`` or ``transform`` first fits that between each log and its truth. ``waits``:
-    ``drop`` leaves out waits in which the truth moves; ``odd`` does the same for stretches in which odometry and truth
-    differ far more than elsewhere. ``inducing``: points of its GP. ``max_rows``: held in memory; the rest of larger
-    files is streamed. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted. ``keep``:
-    folder for finished folds, which an interrupted training does not fit again; None keeps none.
+    ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``, ``inducing``: of positions, the
+    latter the points of its GP. ``align``: ``rotation`` or ``transform`` first fits that between each log and its
+    truth. ``waits``: ``drop`` leaves out waits in which the truth moves; ``odd`` does the same for stretches in which
+    odometry and truth differ far more than elsewhere. ``max_rows``: held in memory; the rest of larger files is
+    streamed. ``jobs``, ``backend`` (``local`` or ``dask``), ``scheduler``: where folds are fitted. ``keep``: folder for
+    finished folds, which an interrupted training does not fit again; None keeps none.
     """
 
     features: str = "auto"

@@ -63,7 +63,8 @@ class TrainedModel:
 def train(
     runs: Sequence[Run], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
-    """Learn from runs with ground truth, and judge by leaving each run out.
+    """Learn from runs with ground truth, and judge by leaving each run out; :func:`gpvo.learning.store.save_model`
+    writes the result.
 
     ``on_fit`` is called with how many fits are done, of how many, for progress bars. Raises GpvoError if a run has no
     truth, or the runs do not belong together.

@@ -70,10 +70,11 @@ def export_model(
     predictor = Predictor.load(model)
     units = tuple(str(u) for u in predictor.header.get("units") or ())
     if to == "c":
-        note = f"Model file SHA-256: {predictor.digest}"
+        over = "" if predictor.target == "frame" else f"; of the error over {predictor.target}, not of one motion"
+        note = f"Model file SHA-256: {predictor.digest}{over}"
         to_c(predictor.model, path, name=prefix, units=units, note=note)
     else:
-        metadata = {"digest": predictor.digest, "units": ",".join(units)}
+        metadata = {"digest": predictor.digest, "units": ",".join(units), "target": predictor.target}
         metadata["nu"] = f"{float(predictor.model.nu[0]):g}"
         to_onnx(predictor.model, path, metadata=metadata)
 

@@ -41,20 +41,22 @@ class PublishSettings:
 
 @dataclass(frozen=True)
 class Published:
-    """What was written, and what the consumer will make of it."""
+    """What was written, and what the consumer will make of it. ``outside``: frames with a motion that are marked by a
+    MAVLink quality of -1 as far outside the model's domain; ArduPilot refuses them."""
 
     run: str
     to: str | None
     out: str | None
     messages: int
     lost: int
+    outside: int
     source: str
     consumer: str | None
     verdicts: Sequence[consumers.Verdict]
 
     def document(self) -> dict[str, Any]:
         """Machine-readable form."""
-        keys = ("run", "to", "out", "messages", "lost", "source", "consumer")
+        keys = ("run", "to", "out", "messages", "lost", "outside", "source", "consumer")
         verdicts = [
             {
                 "quantity": v.quantity,
@@ -72,6 +74,8 @@ class Published:
     def __str__(self) -> str:
         written = f"{self.out}: {self.messages} messages" if self.out else f"{self.run}: nothing written"
         head = f"{written}, covariance from {self.source}, {self.lost} lost frames"
+        if self.outside:
+            head += f", {self.outside} far outside the model's domain (MAVLink quality -1: ArduPilot refuses them)"
         return "\n".join([head, *(f"{self.consumer} {v}" for v in self.verdicts)])
 
 
@@ -93,7 +97,9 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     out, count = (None, 0) if only_check else _write(run, odometry, settings)
     source = "the model" if settings.model or predictions else settings.method
     lost = sum(not o.tracked for o in odometry)
-    return Published(run.name, settings.to, out, count, lost, source, consumer if settings.check else None, verdicts)
+    outside = sum(mavlink.quality(o) < 0 for o in odometry) - lost
+    asked = consumer if settings.check else None
+    return Published(run.name, settings.to, out, count, lost, outside, source, asked, verdicts)
 
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
@@ -127,6 +133,8 @@ def _require(settings: PublishSettings) -> None:
         raise GpvoError(f"--to is '{settings.to}'", cure=f"choose {', '.join(TARGETS)}")
     if settings.consumer is not None and settings.consumer not in consumers.CONSUMERS:
         raise GpvoError(f"--consumer is '{settings.consumer}'", cure=f"choose {', '.join(consumers.CONSUMERS)}")
+    if settings.consumer is not None and not settings.check:
+        raise GpvoError("--consumer changes nothing that is written", cure="add --check to see what it will do")
     if not 1 <= settings.system <= 255:
         raise GpvoError(f"--system is {settings.system}", cure="give an id of 1 to 255")
     ros.check_topic(settings.topic)

@@ -113,6 +113,15 @@ def test_the_table_names_the_methods(capsys, run_folder):
         assert word in out
 
 
+def test_spans_that_the_path_is_too_short_for_are_not_told(capsys, run_folder, tmp_path):
+    run = read_run(run_folder)
+    write_run(tmp_path / "short", replace(run.log, records=run.log.records[:20]), truth=run.truth)
+    _, out, _ = _main(capsys, "evaluate", tmp_path / "short")
+    told = next(line for line in out.splitlines() if "relative error" in line)
+    assert "over a frame" in told
+    assert "10 m" not in told
+
+
 @pytest.mark.parametrize("name", ["flight[red]", "[dim]"])
 def test_a_name_is_printed_as_it_is(capsys, run_folder, tmp_path, name):
     run = read_run(run_folder)

@@ -50,6 +50,11 @@ def test_one_method(factor: float, colour: str, word: str) -> None:
         assert "by a factor of 3." in found.lines[0]
 
 
+def test_a_tiny_nees_is_not_called_nothing() -> None:
+    (line,) = verdict(evaluated({"triangulation": 1000.0})).lines
+    assert re.search(r"NEES/dof 0\.001, 0\.00[1-9] over 1 s", line), line
+
+
 def test_a_run_too_short_for_any_distance_is_judged_per_motion_alone() -> None:
     log, truth = make_run(600)
     short = VoLog(log.records[:12], log.camera)

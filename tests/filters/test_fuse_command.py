@@ -197,6 +197,11 @@ def test_nothing_to_fuse_with_is_an_error(runs: list[Path], policy: str, words: 
         _run("fuse", runs[0], "--policies", policy)
 
 
+def test_of_many_policies_that_cannot_run_one_cure_is_told(runs: list[Path]) -> None:
+    with pytest.raises(GpvoError, match="^nothing to fuse with: constant_best is left out: [^:]*; give --train RUN$"):
+        _run("fuse", runs[0], "--policies", "constant,constant_best")
+
+
 def test_errors_name_the_path_of_a_run(runs: list[Path], tmp_path: Path) -> None:
     (tmp_path / "elsewhere").symlink_to(runs[0])
     with pytest.raises(GpvoError, match="elsewhere: the vehicle is not at rest"):

@@ -232,6 +232,9 @@ def test_missing_column_and_newer_schema(tmp_path):
 def test_not_a_run(tmp_path):
     with pytest.raises(SourceError, match="no such run folder"):
         read_run(tmp_path / "nothing")
+    (tmp_path / "flight.npz").write_bytes(b"x")
+    with pytest.raises(SourceError, match="is a file, not a run folder"):
+        read_run(tmp_path / "flight.npz")
     with pytest.raises(SourceError, match=r"lacks run\.json"):
         read_run(tmp_path)
 

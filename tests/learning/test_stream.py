@@ -72,7 +72,7 @@ def test_same_bytes_again(stored_file, tmp_path):
 
 def test_what_is_no_training_set(tmp_path):
     (tmp_path / "x.parquet").write_bytes(b"PAR1 nothing")
-    with pytest.raises(SourceError, match="not a training set"):
+    with pytest.raises(SourceError, match=r"not a training set: .* \(give run folders"):
         StoredSets(tmp_path / "x.parquet")
     with pytest.raises(GpvoError):
         train_stored(tmp_path / "none.parquet", QUICK)

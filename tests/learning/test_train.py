@@ -265,6 +265,8 @@ def test_the_row_base_is_the_model_with_its_gp_at_the_mean_function(tmp_path):
     assert trained.header["choices"]["inputs"] == "n_inliers"
     assert trained.table["comparison"]["learned_less_base"]["high"] < 0
     assert "the Gaussian process gains" in model_card(trained.header, trained.table, "m")
+    of_windows = {**trained.header, "target": "window:1s", "horizon": "window:1s"}
+    assert "one motion" not in model_card(of_windows, trained.table, "m")
     save_model(trained, tmp_path / "m.gpvo")
     predictor = Predictor.load(tmp_path / "m.gpvo")
     base = predictor.base()

@@ -7,15 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gpvo.cli import app
 from gpvo.dataset.build import predictions_of
 from gpvo.errors import GpvoError, ModelError
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
+from gpvo.publish.export import export_model
 from gpvo.publish.job import PublishSettings, odometry_of, publish_run
-from gpvo.types import Prediction, VoLog
+from gpvo.types import Prediction, Status, VoLog
 from small_model import small_model
 from synthetic_runs import make_run
+from typer.testing import CliRunner
 
 GEOMETRY = PublishSettings(method="pointing_matching")
 
@@ -41,6 +44,24 @@ def test_what_is_stored_is_published_unless_it_is_of_windows(predicted: Path) ->
     plain, of_motions, of_windows = (_covariances(predicted, p) for p in ([], stored, windows))
     assert not np.allclose(of_motions, plain, rtol=0.1)
     np.testing.assert_array_equal(of_windows, plain)
+
+
+def test_a_consumer_that_nothing_would_read_is_refused(predicted: Path, tmp_path: Path) -> None:
+    settings = replace(GEOMETRY, to="bag", out=tmp_path / "out", consumer="px4")
+    with pytest.raises(GpvoError, match="--consumer .*--check"):
+        publish_run(predicted, settings)
+    assert publish_run(predicted, replace(settings, check=True)).verdicts
+
+
+def test_frames_that_their_quality_forbids_are_counted(predicted: Path, tmp_path: Path) -> None:
+    run = read_run(predicted)
+    records = [r.with_status(Status.LOST, "dark") if k == 9 else r for k, r in enumerate(run.log)]
+    stored = [replace(p, in_domain=0.001 if k in (5, 6, 9) else 1.0) for k, p in enumerate(run.predictions)]
+    write_run(tmp_path / "far", VoLog(records), predictions=stored, meta={"source": "made"})
+    told = publish_run(tmp_path / "far", PublishSettings(check=True, consumer="ardupilot"))
+    assert (told.document()["lost"], told.document()["outside"]) == (1, 2)
+    assert "1 lost frames, 2 far outside the model's domain" in str(told)
+    assert "outside" not in str(publish_run(predicted, PublishSettings(check=True)))
 
 
 def test_the_source_of_the_covariance_is_told(predicted: Path, tmp_path: Path) -> None:
@@ -108,6 +129,11 @@ def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) 
     model = tmp_path / "windows.gpvo"
     modelfile.save(model, trained.arrays, {**trained.header, "target": "window:1s"})
     assert Predictor.load(model).target == "window:1s"
+    for name, to in (("x.h", "c"), ("x.onnx", "onnx")):
+        export_model(model, tmp_path / name, to)
+        assert b"window:1s" in (tmp_path / name).read_bytes()
+    words = ["predict", str(model), str(predicted), "-o", str(tmp_path / "p.parquet")]
+    assert " mrad over window:1s\n" in CliRunner().invoke(app, words, catch_exceptions=False).output
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):
         publish_run(predicted, replace(GEOMETRY, model=model))
     with pytest.raises(ModelError, match=r"windows\.gpvo.*window:1s.*--target frame"):

@@ -83,6 +83,7 @@ def test_command(tmp_path):
     made = run(app, ["simulate", "room-t265", "--points", "-o", str(out), "--duration", "5", "--json"])
     assert json.loads(made.output)["flights"][0]["frames"] == 101
     assert out.is_file()
+    assert "nowhere to write" in str(run(app, ["simulate", "room-t265"]).exception)
 
 
 def test_a_worker_that_is_killed_is_one_line():
