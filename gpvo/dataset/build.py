@@ -141,9 +141,9 @@ def build(
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())
     if waits == "drop":
-        known &= ~in_waits(records, wandering_waits(log, truth))
+        known &= ~in_waits(VoLog(records), wandering_waits(log, truth))
     moves_at_rest = with_truth - int(known.sum())
-    is_odd = known & in_waits(records, [s.t_ns for s in odd_stretches(log, truth)])
+    is_odd = known & in_waits(VoLog(records), [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:

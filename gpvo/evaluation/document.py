@@ -91,7 +91,7 @@ def pooled(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def run_document(e: Evaluation) -> dict[str, Any]:
     """One of the ``runs`` of :func:`document`."""
     t = e.trajectory
-    counts = {s.value: sum(r.status is s for r in e.run.log) for s in Status}
+    counts = {s.value: e.run.log.statuses.count(s) for s in Status}
     return {
         "run": e.run.name,
         "source": e.run.meta.get("source"),

@@ -62,7 +62,7 @@ def test_a_truth_that_wanders_at_rest_is_found(flight):
     log, truth = flight
     waits = wandering_waits(log, wandering(truth, 0.2, 0.3, AT_REST_S))
     assert len(waits) == 1
-    hit, s = in_waits(log.records, waits), seconds(log)
+    hit, s = in_waits(log, waits), seconds(log)
     assert hit[(s > 0.3) & (s < AT_REST_S)].all()
     assert not hit[s > AT_REST_S + 1.0].any()
 
@@ -74,7 +74,7 @@ def test_many_waits_are_those_of_each_pair_and_fill_no_memory():
     first = 3 * rng.integers(0, 20_000, 1000)
     waits = np.column_stack([first, first + rng.integers(1, 9, 1000)])
     tracemalloc.start()
-    hit = in_waits(records, waits)
+    hit = in_waits(VoLog(records), waits)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert hit.tolist() == [bool(((r.t_prev_ns < waits[:, 1]) & (r.t_ns > waits[:, 0])).any()) for r in records]
