@@ -46,8 +46,10 @@ def estimate_time_offset(log: VoLog, truth: TruthLog) -> float:
             raise GpvoError(what, cure="give --time-offset in seconds")
     step_s = float(np.median(np.diff(moving.t_ns))) * 1e-9
     window = max(1, round(_WINDOW_S / step_s))
-    coarse = _coarse(moving, truth, min(step_s, _WINDOW_S), window * step_s)
-    return _refine(moving, truth, coarse, window, 1.5 * step_s)
+    longest_s = max(int(t_ns[-1] - t_ns[0]) for t_ns in (log.t_ns, truth.t_ns)) * 1e-9
+    coarse_s = min(max(step_s, longest_s / (_MAX_SAMPLES - 1)), _WINDOW_S)
+    coarse = _coarse(moving, truth, coarse_s, window * step_s)
+    return _refine(moving, truth, coarse, window, 1.5 * max(step_s, coarse_s), step_s)
 
 
 def on_clock_of_log(truth: TruthLog, offset_s: float) -> TruthLog:
@@ -67,7 +69,8 @@ def _on_grid(poses: TruthLog, step_s: float, window: int) -> tuple[Array, int]:
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     count = int((last - first) * 1e-9 / step_s)
     if not 2 * window < count < _MAX_SAMPLES:
-        raise GpvoError(f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset")
+        what = f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset"
+        raise GpvoError(what, cure="give --time-offset in seconds")
     grid = first + np.rint(np.arange(count) * step_s * 1e9).astype(np.int64)
     return _amounts(*interpolate_truth(poses, grid, _gap_s(poses)), window), first
 
@@ -127,8 +130,8 @@ def _correlation(x: Array, y: Array, min_overlap: int) -> Array:
     return np.where(enough, covariance / np.where(enough, power, 1.0), -1.0)
 
 
-def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius_s: float) -> float:
-    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: three nested grids and a parabola."""
+def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius_s: float, step_s: float) -> float:
+    """Minimum of a robust misfit near ``offset_s``, to a fraction of a step: nested grids and a parabola."""
     T = log.T_world_cam
     mine, gap_s = _amounts(T, np.ones(len(T), dtype=bool), window), _gap_s(truth)
 
@@ -146,7 +149,7 @@ def _refine(log: TruthLog, truth: TruthLog, offset_s: float, window: int, radius
         misfit: Array = np.log1p((d / spread) ** 2).mean(axis=(1, 2))
         return misfit
 
-    for _ in range(3):
+    while radius_s > step_s / 16:
         offsets = np.linspace(offset_s - radius_s, offset_s + radius_s, 13)
         cost = misfits(offsets)
         if not cost.any():
