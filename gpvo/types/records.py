@@ -142,13 +142,14 @@ class StoredRecords(Sequence[VoRecord]):
     def __getitem__(self, k: int | slice) -> VoRecord | list[VoRecord]:
         if isinstance(k, slice):
             return [self[i] for i in range(*k.indices(len(self)))]
-        known = {n: c.item(k) if c.ndim == 1 else _unless_nan(c[k]) for n, c in self.columns.items()}
-        of_methods = (
-            {m: C[k][where] for m, C in stated.items() if _unless_nan(C[k]) is not None}
-            for stated, where in ((self.covariances, _PLACE_6), (self.v_t, _PLACE_3))
-        )
+        known: dict[str, Any] = {
+            name: column.item(k) if column.ndim == 1 else _unless_nan(column[k])
+            for name, column in self.columns.items()
+        }
+        for name, stated, place in (("covariances", self.covariances, _PLACE_6), ("v_t", self.v_t, _PLACE_3)):
+            known[name] = {m: C[k][place] for m, C in stated.items() if _unless_nan(C[k]) is not None}
         stage_ms = {s: ms for s, column in self.stage_ms.items() if (ms := column.item(k)) == ms}
-        return VoRecord(**known, **dict(zip(("covariances", "v_t"), of_methods)), stage_ms=stage_ms)
+        return VoRecord(**known, stage_ms=stage_ms)
 
 
 def _places(n: int) -> NDArray[np.int64]:
