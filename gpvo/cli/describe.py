@@ -90,7 +90,7 @@ def _run(path: Path) -> dict[str, Any]:
         "complete": bool(run.meta.get("complete")),
         "source": run.meta.get("source"),
         "frames": len(log),
-        "statuses": {s: int(n) for s, n in zip(*np.unique([r.status.value for r in log], return_counts=True))},
+        "statuses": {s: int(n) for s, n in zip(*np.unique([s.value for s in log.statuses], return_counts=True))},
         "methods": list(log.methods),
         "camera": None if log.camera is None else log.camera.__dict__,
         "odometry": _poses(log.t_ns, log.trajectory()),

@@ -18,7 +18,7 @@ from gpvo.dataset.errors import outweighed_by_truth
 from gpvo.dataset.hand_eye import Misread, late_by
 from gpvo.errors import GpvoError
 from gpvo.files import read_json
-from gpvo.io.run import read_run
+from gpvo.io.run import Run, read_run
 
 if TYPE_CHECKING:
     from gpvo.learning.config import TrainConfig
@@ -90,22 +90,19 @@ def train(
     if statements is not None:
         _check_statements(runs, settings, update)
     drawn = twin_options.asked(ctx, twins, options.seed)
-    for path in _contradictory(runs, settings["align"]):
-        note(
-            f"gpvo: odometry and truth of {path} contradict each other, and a model learns that as the odometry's"
-            f" error; 'gpvo evaluate {path}' says in what"
-        )
+    noisy: list[str] = []
     with in_place_of_runs_without_truth(runs, drawn, jobs) as paths:
         with progress("models") as on_fit:
-            trained = _with_origin(_train(paths, settings, update, on_fit), paths, update)
+            trained = _with_origin(_train(paths, settings, update, on_fit, noisy), paths, update)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
     if trained.header["target"] != "position" and (axes := unseen_axes(trained.sets)):
         note(f"gpvo: log and truth never differ in {', '.join(axes)} (planar?): the model states almost no error there")
-    if settings["target"] == "frame" and (noisy := _noisy_truths(runs)):
+    if noisy:
         note(
-            f"gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of {noisy}: for one"
-            " motion the model states both together, over a distance only the odometry's, as the noise does not add up"
+            "gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of"
+            f" {', '.join(noisy)}: for one motion the model states both together, over a distance only the odometry's,"
+            " as the noise does not add up"
         )
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
@@ -119,19 +116,21 @@ def train(
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
 
 
-def _contradictory(paths: list[Path], align: str) -> Iterator[Path]:
-    """The runs whose poses or stamps, or those of whose truth, seem not to be what they are taken for."""
-    for run in (read_run(p) for p in paths if p.is_dir()):
+def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[Run]:
+    """One run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they are
+    taken for; ``noisy`` gets the names of those whose truth cannot judge single motions."""
+    for path in paths:
+        run = read_run(path)
         if run.truth is not None and len(run.truth.t_ns) > 1:
-            truth = aligned_truth(run.log, run.truth, align)
+            truth = aligned_truth(run.log, run.truth, config.align)
             if late_by(run.log, truth) or Misread.of(run.log, truth).grossly:
-                yield run.path
-
-
-def _noisy_truths(paths: list[Path]) -> str:
-    """Names of the runs whose truth cannot judge single motions."""
-    read = (read_run(p) for p in paths if p.is_dir())
-    return ", ".join(run.name for run in read if run.truth is not None and outweighed_by_truth(run.log, run.truth))
+                note(
+                    f"gpvo: odometry and truth of {path} contradict each other, and a model learns that as the"
+                    f" odometry's error; 'gpvo evaluate {path}' says in what"
+                )
+        yield run
+        if config.target == "frame" and run.truth is not None and outweighed_by_truth(run.log, run.truth):
+            noisy.append(run.name)
 
 
 def _check_statements(runs: list[Path], settings: dict[str, Any], update: Path | None) -> None:
@@ -160,7 +159,10 @@ def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) 
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 
-def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit) -> TrainedModel:
+def _train(
+    paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit, noisy: list[str]
+) -> TrainedModel:
+    """``noisy`` gets the names of runs whose truth cannot judge single motions."""
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
@@ -171,9 +173,9 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_
         raise GpvoError("a model of positions cannot be updated", where=update, cure="train again from all runs")
     if any(p.is_file() for p in paths):
         return _train_file(paths, config, update, on_fit)
+    runs = _each_once(paths, config, noisy)
     if update is None and config.target != "position" and _frames(paths) > config.max_rows:
-        return _train_streaming(paths, config, on_fit)
-    runs = [read_run(p) for p in paths]
+        return _train_streaming(runs, config, on_fit)
     if config.target == "position":
         from gpvo.learning.position import train_position
 
@@ -200,14 +202,14 @@ def _frames(paths: list[Path]) -> int:
     return sum(int(read_json(p / "run.json").get("frames") or 0) for p in paths if (p / "run.json").is_file())
 
 
-def _train_streaming(paths: list[Path], config: TrainConfig, on_fit: OnFit) -> TrainedModel:
+def _train_streaming(runs: Iterator[Run], config: TrainConfig, on_fit: OnFit) -> TrainedModel:
     """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
     from gpvo.dataset.table import write_sets
     from gpvo.learning.store import train_stored
 
     with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
         rows = Path(folder) / "rows.parquet"
-        write_sets(rows, (config.rows_of(read_run(p)) for p in paths))
+        write_sets(rows, map(config.rows_of, runs))
         return train_stored(rows, config, on_fit=on_fit)
 
 

@@ -90,11 +90,17 @@ class TrainingSet:
         return sha.hexdigest()
 
 
-def observe(log: VoLog, names: Sequence[str], target: str = "frame") -> tuple[list[VoRecord], Array]:
+def observe(log: VoLog, names: Sequence[str], target: str = "frame") -> tuple[Sequence[VoRecord], Array]:
     """Replay a log: the records as flight judges (or joins) them and their features (N, d)."""
-    observer = Observer(names, target, log.camera, log.vehicle)
-    seen = [s for s in map(observer.step, log.records) if s is not None]
-    return [r for r, _ in seen], np.array([x for _, x in seen]).reshape(len(seen), len(names))
+    observer, X = Observer(names, target, log.camera, log.vehicle), []
+
+    def seen() -> Iterator[VoRecord]:
+        for record, x in filter(None, map(observer.step, log)):
+            X.append(x)
+            yield record
+
+    judged = log.judged_as(seen()) if Window.of(target) is None else replace(log, records=list(seen()))
+    return judged.records, np.array(X).reshape(len(X), len(names))
 
 
 def build(
@@ -131,15 +137,16 @@ def build(
         require_attitude(log, truth, where or name)
         _require_one_unit(log, truth, where or name)
     records, X = observe(log, names, target)
+    seen = VoLog(records)
     if target == "position":
-        Y, known = position_targets(log, VoLog(records).usable, truth)
+        Y, known = position_targets(log, seen.usable, truth)
     else:
         Y, known = motion_targets(records, truth)
     with_truth = int(known.sum())
     if waits == "drop":
-        known &= ~in_waits(records, false_motions(log, truth))
+        known &= ~in_waits(seen, false_motions(log, truth))
     moves_at_rest = with_truth - int(known.sum())
-    is_odd = known & in_waits(records, [s.t_ns for s in odd_stretches(log, truth)])
+    is_odd = known & in_waits(seen, [s.t_ns for s in odd_stretches(log, truth)])
     if odd == "drop":
         known &= ~is_odd
     if known.sum() < MIN_ROWS:
@@ -151,7 +158,6 @@ def build(
     kept = [r for r, k in zip(records, known) if k]
     n_lost, slips, jumps = lost_of(log)
     as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)
-    n_usable = sum(r.usable for r in records)
     return TrainingSet(
         name=name,
         columns=names,
@@ -165,7 +171,7 @@ def build(
             "frames": len(log),
             "lost": n_lost,
             "slips": len(slips),
-            "without_truth": int(n_usable - with_truth),
+            "without_truth": int(seen.usable.sum()) - with_truth,
             "truth_moves_at_rest": moves_at_rest,
             "odd": int(is_odd.sum()),
         },

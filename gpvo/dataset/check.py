@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,7 +40,7 @@ class Check:
 def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
     problems = [*camera_problems(predictor.camera, run.log.camera), *odometry_problems(predictor, run.settings)]
-    problems += rate_problems(predictor, [r for r in run.log if r.usable])
+    problems += rate_problems(predictor, (r for r in run.log if r.usable))
     twin, known = run.meta.get("twin") or {}, predictor.header.get("simulated_truth") or []
     if any(s.get("of") == twin.get("of") and s.get("seed") == twin.get("seed") for s in known if twin):
         problems.append(f"it learned from these very twins of {twin['of']}: judge it by others, with another --seed")
@@ -86,15 +86,17 @@ def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list
     return [f"the model was trained on odometry with other settings: {'; '.join(other)}"] if other else []
 
 
-def rate_problems(predictor: Predictor, records: Sequence[VoRecord]) -> list[str]:
+def rate_problems(predictor: Predictor, records: Iterable[VoRecord]) -> list[str]:
     """Whether motions, or at least frames, come at the rate that a model was trained at; one line if neither does.
 
     A motion spans several frames where odometry keeps its reference, as at rest.
     """
-    if len(records) < 2 or predictor.target != "frame":
+    times = [(r.t_ns, r.dt_s) for r in records]
+    if len(times) < 2 or predictor.target != "frame":
         return []
-    trained, steps_s = 1.0 / predictor.model.dt_s, 1e-9 * np.diff([r.t_ns for r in records])
-    of_motions, of_frames = (1.0 / float(np.median(s)) for s in ([r.dt_s for r in records], steps_s))
+    t_ns, dt_s = zip(*times)
+    trained = 1.0 / predictor.model.dt_s
+    of_motions, of_frames = (1.0 / float(np.median(s)) for s in (dt_s, 1e-9 * np.diff(t_ns)))
     if any(abs(rate / trained - 1.0) <= _RATE for rate in (of_motions, of_frames)):
         return []
     return [f"the rate is {of_frames:.3g} Hz, the model was trained at {trained:.3g} Hz"]

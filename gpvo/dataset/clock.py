@@ -47,8 +47,9 @@ def estimate_time_offset(log: VoLog, truth: TruthLog) -> float:
             raise GpvoError(what, cure="give --time-offset in seconds")
     step_s = float(np.median(np.diff(moving.t_ns))) * 1e-9
     window = max(1, round(_WINDOW_S / step_s))
-    coarse = _coarse(moving, truth, min(step_s, _WINDOW_S), window * step_s)
-    return _refine(moving, truth, coarse, window)
+    longest_s = max(int(t_ns[-1] - t_ns[0]) for t_ns in (log.t_ns, truth.t_ns)) * 1e-9
+    coarse_s = min(max(step_s, longest_s / (_MAX_SAMPLES - 1)), _WINDOW_S)
+    return _refine(moving, truth, _coarse(moving, truth, coarse_s, window * step_s), window)
 
 
 def on_clock_of_log(truth: TruthLog, offset_s: float) -> TruthLog:
@@ -68,7 +69,8 @@ def _on_grid(poses: TruthLog, step_s: float, window: int) -> tuple[Array, int]:
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     count = int((last - first) * 1e-9 / step_s)
     if not 2 * window < count < _MAX_SAMPLES:
-        raise GpvoError(f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset")
+        what = f"a log of {(last - first) * 1e-9:.1f} s is too short or too long to estimate a time offset"
+        raise GpvoError(what, cure="give --time-offset in seconds")
     grid = first + np.rint(np.arange(count) * step_s * 1e9).astype(np.int64)
     return _amounts(*interpolate_truth(poses, grid, _gap_s(poses)), window), first
 

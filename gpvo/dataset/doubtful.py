@@ -18,8 +18,8 @@ states; how large it is, differences between neighbours tell. Which of the two i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,11 +59,12 @@ def wandering_waits(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     """
     if log.camera is None:
         return np.zeros((0, 2), dtype=np.int64)
-    found, (T_true, known) = [], interpolate_truth(truth, log.t_ns)
-    for first, last in _waits(log, log.trajectory(), log.camera):
+    found, (T_true, known), t_ns = [], interpolate_truth(truth, log.t_ns), log.t_ns
+    scene = _Scene.of(log, log.camera)
+    for first, last in _waits(log, log.trajectory(), scene):
         span = slice(first, last + 1)
-        if known[span].all() and _image_motion_px(_extent(T_true[span]), log.records[last], log.camera) > TRUTH_PX:
-            found.append(log.t_ns[[first, last]])
+        if known[span].all() and scene.motion_px(_extent(T_true[span]), last) > TRUTH_PX:
+            found.append(t_ns[[first, last]])
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
@@ -74,23 +75,26 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
     """Motions in which the truth moves as the vehicle cannot, though odometry does not, and far more of an error than
     usual; those less than a second apart as one, with what lies between."""
     errors = motion_errors(log, truth)
-    true = [
-        VoRecord(log.records[k].t_ns, log.records[k].t_prev_ns, Status.OK, T)
-        for k, T in zip(errors.index, errors.T_true, strict=True)
-    ]
     size = np.linalg.norm(errors.xi.reshape(-1, 2, 3), axis=2)
     large = (size > _JUMP_MEDIANS * np.median(size, axis=0)).any(axis=1) if len(size) else np.zeros(0, dtype=bool)
     if not large.any():
         return []
+    t_ns, t_prev_ns = log.t_ns, log.column("t_prev_ns")
+    true = [
+        VoRecord(int(t_ns[k]), int(t_prev_ns[k]), Status.OK, T)
+        for k, T in zip(errors.index, errors.T_true, strict=True)
+    ]
     far = large & ~flag_slips(replace(log, records=true)).usable & flag_slips(log).usable[errors.index]
     found: list[Stretch] = []
     for k, xi in zip(errors.index[far].tolist(), errors.xi[far], strict=True):
-        first, t_ns = k, (log.records[k].t_prev_ns, log.records[k].t_ns)
-        if found and t_ns[0] - found[-1].t_ns[1] < _BACK_S * 1e9:
-            first, t_ns = found[-1].first, (found[-1].t_ns[0], t_ns[1])
+        first, span_ns = k, (int(t_prev_ns[k]), int(t_ns[k]))
+        if found and span_ns[0] - found[-1].t_ns[1] < _BACK_S * 1e9:
+            first, span_ns = found[-1].first, (found[-1].t_ns[0], span_ns[1])
             found.pop()
         metres, degrees = np.linalg.norm(xi[:3]), np.rad2deg(np.linalg.norm(xi[3:]))
-        found.append(Stretch(first, k, t_ns, f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored"))
+        found.append(
+            Stretch(first, k, span_ns, f"truth jumps, last by {metres:.2g} m and {degrees:.2g} deg; not scored")
+        )
     return found
 
 
@@ -100,11 +104,10 @@ def false_motions(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
     return np.concatenate([waits, np.array(leaps, dtype=np.int64).reshape(-1, 2)])
 
 
-def in_waits(records: Sequence[VoRecord], waits: ArrayLike) -> NDArray[np.bool_]:
+def in_waits(log: VoLog, waits: ArrayLike) -> NDArray[np.bool_]:
     """(N,) which motions, or windows of motions, share time with one of the waits, or odd stretches, (W, 2) [ns]."""
     first, last = np.sort(np.asarray(waits, dtype=np.int64).reshape(-1, 2), axis=0).T
-    start = np.array([r.t_prev_ns for r in records], dtype=np.int64)
-    end = np.array([r.t_ns for r in records], dtype=np.int64)
+    start, end = log.column("t_prev_ns"), log.t_ns
     # More have begun by its end than were over by its start: compared in pairs, a day of stops would fill the memory.
     return np.asarray(np.searchsorted(first, end) > np.searchsorted(last, start, side="right"), dtype=np.bool_)
 
@@ -115,34 +118,65 @@ def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
     waits = false_motions(log, truth)
     if not len(waits):
         return log
-    inside = in_waits(log.records, waits)
-    marked = [r.with_status(Status.LOST, "truth moves otherwise") if i else r for r, i in zip(log.records, inside)]
-    return replace(log, records=marked)
+    marked = zip(log, in_waits(log, waits))
+    return log.judged_as(r.with_status(Status.LOST, "truth moves otherwise") if i else r for r, i in marked)
 
 
-def _waits(log: VoLog, T_est: Array, camera: StereoCamera) -> list[tuple[int, int]]:
+@dataclass(frozen=True)
+class _Scene:
+    """How the image answers to a translation, frame by frame: ``spread`` (N,) mean square of the image coordinates
+    seen, ``inverse_m`` (N,): focal lengths over depth of the near points [px/m]."""
+
+    spread: Array
+    inverse_m: Array
+
+    @classmethod
+    def of(cls, log: VoLog, camera: StereoCamera) -> _Scene:
+        spread = log.column("spread_u") ** 2 + log.column("spread_v") ** 2
+        return cls(spread, log.column("disparity_p90_px") / camera.baseline_m)
+
+    def motion_px(self, extent_m: Array, k: Any) -> Array:
+        """Image motion [px] at frame(s) k that translations (..., 3) along the camera's axes make of the near points:
+        ``f / Z (t_xy - (x, y) t_z)``, in the mean square over the image coordinates (x, y) seen."""
+        x, y, z = np.moveaxis(extent_m, -1, 0)
+        return np.asarray(np.sqrt(x**2 + y**2 + self.spread[k] * z**2) * self.inverse_m[k])
+
+
+def _waits(log: VoLog, T_est: Array, scene: _Scene) -> list[tuple[int, int]]:
     """First and last frame of the longest stretches at rest, one after the other."""
-    sensed, found, first = [ImuMoments.of_record(r) for r in log.records], [], 0
+    found, first, t_ns, usable = [], 0, log.t_ns, log.usable
+    may_begin = _nearby_later(t_ns, T_est, scene)
     while first < len(log) - 1:
-        last = _rests_until(first, log, T_est, sensed, camera)
-        if (log.records[last].t_ns - log.records[first].t_ns) * 1e-9 >= STILL_S:
-            found.append((first, last))
-            first = last
+        if may_begin[first]:
+            last = _rests_until(first, log, usable, T_est, scene)
+            if (t_ns[last] - t_ns[first]) * 1e-9 >= STILL_S:
+                found.append((first, last))
+                first = last
         first += 1
     return found
 
 
-def _rests_until(first: int, log: VoLog, T_est: Array, sensed: Sequence[ImuMoments], camera: StereoCamera) -> int:
+def _nearby_later(t_ns: NDArray[np.int64], T_est: Array, scene: _Scene) -> NDArray[np.bool_]:
+    """(N,) whether a wait may begin: after ``STILL_S``, the vehicle is where it was. To find that out frame by frame
+    takes long where it creeps."""
+    later = np.searchsorted(t_ns, t_ns + round(STILL_S * 1e9))
+    end = np.minimum(later, len(t_ns) - 1)
+    here = np.einsum("ni,nij->nj", T_est[end, :3, 3] - T_est[:, :3, 3], T_est[:, :3, :3])
+    beyond = scene.motion_px(here, end) > STILL_PX * (1 + 1e-6)  # what is unknown, NaN, is looked at
+    return np.asarray((later < len(t_ns)) & ~beyond, dtype=np.bool_)
+
+
+def _rests_until(first: int, log: VoLog, usable: NDArray[np.bool_], T_est: Array, scene: _Scene) -> int:
     """The last frame up to which the vehicle stands from the frame ``first`` on."""
     low, high, moments = np.zeros(3), np.zeros(3), ImuMoments.of(None)
     for k in range(first + 1, len(log)):
         here = (T_est[k, :3, 3] - T_est[first, :3, 3]) @ T_est[first, :3, :3]
-        low, high, moments = np.minimum(low, here), np.maximum(high, here), moments.with_later(sensed[k])
-        moved_px = _image_motion_px(high - low, log.records[k], camera)
+        low, high = np.minimum(low, here), np.maximum(high, here)
+        moments = moments.with_later(ImuMoments.of_record(log.records[k]))
         gyro, acc = np.sqrt(moments.variance).reshape(2, 3).max(axis=1)
         # Written so that what is unknown, NaN, is not at rest; an accelerometer may be missing.
-        still = moved_px <= STILL_PX and gyro <= GYRO_STD_RADPS
-        if not (log.records[k].usable and still) or acc > ACC_STD_MPS2:
+        still = scene.motion_px(high - low, k) <= STILL_PX and gyro <= GYRO_STD_RADPS
+        if not (usable[k] and still) or acc > ACC_STD_MPS2:
             return k - 1
     return len(log) - 1
 
@@ -150,14 +184,6 @@ def _rests_until(first: int, log: VoLog, T_est: Array, sensed: Sequence[ImuMomen
 def _extent(T_world_cam: Array) -> Array:
     """(3,) how far positions (n, 4, 4) spread along the axes of the first."""
     return np.ptp((T_world_cam[:, :3, 3] - T_world_cam[0, :3, 3]) @ T_world_cam[0, :3, :3], axis=0)
-
-
-def _image_motion_px(extent_m: Array, seen: VoRecord, camera: StereoCamera) -> float:
-    """Image motion [px] that translations (3,) along the camera's axes make of the near points seen:
-    ``f / Z (t_xy - (x, y) t_z)``, in the mean square over image coordinates (x, y) of the spread seen."""
-    x, y, z = extent_m
-    forward = (seen.spread_u**2 + seen.spread_v**2) * z**2
-    return float(np.sqrt(x**2 + y**2 + forward) * seen.disparity_p90_px / camera.baseline_m)
 
 
 @dataclass(frozen=True)
@@ -194,9 +220,9 @@ def odd_stretches(log: VoLog, truth: TruthLog) -> list[Stretch]:
     for first, last, _ in found:  # what the share explains is not a matter of direction too
         error[first : last + 1] = 0.0
     found += _of_direction(error, true, noise[:, :3], long)
-    spans = [(errors.index[a], errors.index[b], what) for a, b, what in found]
+    spans = [(int(errors.index[a]), int(errors.index[b]), what) for a, b, what in found]
     return sorted(
-        (Stretch(int(i), int(k), (log.records[i].t_prev_ns, log.records[k].t_ns), what) for i, k, what in spans),
+        (Stretch(i, k, (log.records[i].t_prev_ns, log.records[k].t_ns), what) for i, k, what in spans),
         key=lambda s: s.t_ns,
     )
 
@@ -290,10 +316,10 @@ def _runs(off: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def _stated_m(log: VoLog, errors: MotionErrors) -> Array:
     """(M,) what odometry says of its own noise, by the first covariance that all motions have and their residuals."""
-    records = [log.records[k] for k in errors.index]
-    known = [m for m in log.methods if all(m in r.covariances for r in records)]
-    if not known:
-        return np.ones(len(records))
-    stated = np.sqrt([np.trace(r.covariances[known[0]][:3, :3]) for r in records])
-    noise_px = np.array([r.reproj_rms_px for r in records])
+    covariances = (log.covariance(m)[errors.index] for m in log.methods)
+    known = next((C for C in covariances if not np.isnan(C).all(axis=(1, 2)).any()), None)
+    if known is None:
+        return np.ones(len(errors.index))
+    stated = np.sqrt(np.trace(known[:, :3, :3], axis1=1, axis2=2))
+    noise_px = log.column("reproj_rms_px")[errors.index]
     return np.maximum(stated * np.where(np.isfinite(noise_px), np.maximum(noise_px, 1e-3), 1.0), _NOWHERE_M)

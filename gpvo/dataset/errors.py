@@ -149,7 +149,7 @@ class MotionErrors:
 
 def motion_errors(log: VoLog, truth: TruthLog) -> MotionErrors:
     """Errors of all ``ok`` and ``degraded`` motions with truth at both ends."""
-    t_prev = np.array([r.t_prev_ns for r in log], dtype=np.int64)
+    t_prev = log.column("t_prev_ns").astype(np.int64)
     start, has_start = interpolate_truth(truth, t_prev)
     end, has_end = interpolate_truth(truth, log.t_ns)
     index = np.flatnonzero(log.usable & has_start & has_end)

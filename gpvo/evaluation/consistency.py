@@ -163,8 +163,7 @@ def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) ->
     covered = np.flatnonzero(known)
     chain = _ancestors(int(covered[-1]), int(covered[0]), log.parent)
     pose, independent = PoseError(), np.zeros((6, 6))
-    for k in chain:
-        T = log.records[k].T_prev_cur
+    for k, T in zip(chain, log.T_prev_cur[chain]):
         pose = pose.after(T, statement.errors[k])
         independent = compound(T, independent, statement.errors[k].covariance)
     a, b = (float(np.sqrt(np.trace(C[:3, :3]))) for C in (pose.covariance, independent))

@@ -48,8 +48,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       None: nowhere.
     * ``fixed_rotation`` {``angle_deg``, ``rotvec_rad``, ``error_change``, ``lever_m``}: between truth and odometry,
       None if it does not matter; ``lever_m`` between their origins, 0 if that does not; ``error_change``: relative
-      change of the errors over a second without them. ``inverse_poses`` {``of``, ``error_change``, ``or_backwards``}: whose
-      poses seem to be inverse; None where nobody's.
+      change of the errors over a second without them.
+    * ``inverse_poses`` {``of``, ``error_change``, ``or_backwards``}: whose poses seem inverse; None: nobody's.
     * ``unlike`` {``scale``, ``motion``, ``turn``, ``path``}: how little odometry and truth resemble each other
       (:class:`gpvo.dataset.hand_eye.Resemblance`), None where they do.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
@@ -97,7 +97,7 @@ def pooled(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def run_document(e: Evaluation) -> dict[str, Any]:
     """One of the ``runs`` of :func:`document`."""
     t = e.trajectory
-    counts = {s.value: sum(r.status is s for r in e.run.log) for s in Status}
+    counts = {s.value: e.run.log.statuses.count(s) for s in Status}
     return {
         "run": e.run.name,
         "source": e.run.meta.get("source"),

@@ -185,7 +185,7 @@ def evaluate_run(
 
 def _unscored(log: VoLog) -> VoLog:
     """The log with every motion called lost: a truth of positions alone judges none."""
-    return replace(log, records=[r.with_status(Status.LOST, "truth has no attitude") for r in log])
+    return log.judged_as(r.with_status(Status.LOST, "truth has no attitude") for r in log)
 
 
 def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:
@@ -236,11 +236,10 @@ def _in_domain(predictions: Mapping[int, Prediction]) -> float | None:
 
 def judged(log: VoLog, predictions: Mapping[int, Prediction]) -> VoLog:
     """The log as a flight with the model would write it: each status the worse of odometry's and the model's."""
-    records = []
-    for r in log:
-        p = predictions.get(r.t_ns)
-        records.append(r if p is None or r.status is Status.START else r.with_status(p.status, BY_MODEL))
-    return replace(log, records=records)
+    told = ((r, predictions.get(r.t_ns)) for r in log)
+    return log.judged_as(
+        r if p is None or r.status is Status.START else r.with_status(p.status, BY_MODEL) for r, p in told
+    )
 
 
 def _truth(run: Run, options: EvaluateOptions) -> tuple[TruthLog, float]:

@@ -205,7 +205,8 @@ def _shades(e: Evaluation) -> list[dict[str, Any]]:
     """
     t_s, out = [round(float(t), 3) for t in e.t_s], []
     last: dict[str, dict[str, Any]] = {}
-    for tint, group in groupby(range(1, len(t_s)), lambda k: _SHADES.get(e.run.log.records[k].status)):
+    statuses = e.run.log.statuses
+    for tint, group in groupby(range(1, len(t_s)), lambda k: _SHADES.get(statuses[k])):
         frames = list(group)
         if tint is None:
             continue

@@ -91,7 +91,7 @@ def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = 
     return SequenceScore(
         sequence=stated.stem,
         motions=usable,
-        lost=sum(r.status is Status.LOST for r in log),
+        lost=int(log.lost.sum()),
         axes=tuple(AXES[k] for k in c.axes),
         energy_translation_m=_mean_with(c.energy["translation_m"] or 0.0, c.count, charged_m),
         energy_rotation_rad=_mean_with(c.energy["rotation_rad"] or 0.0, c.count, charged_rad),
@@ -207,7 +207,7 @@ def _charged(log: VoLog, e: Evaluation) -> tuple[Array, Array]:
     """Energy scores of lost motions, translation [m] and rotation [rad]: the length of the true motion, which is what
     the certainty that nothing moved would score."""
     start = log.parent
-    ends = [k for k, r in enumerate(log) if r.status is Status.LOST and e.covered[k] and e.covered[start[k]]]
+    ends = np.flatnonzero(log.lost & e.covered & e.covered[start])
     moved = se3.log(se3.inverse(e.T_true[start[ends]]) @ e.T_true[ends]).reshape(-1, 6)
     return np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)
 
@@ -239,7 +239,7 @@ def write_statements(evaluation: Evaluation, folder: Path, name: str, waits: str
         for first, last in waiting:
             known = known & ~((log.t_ns > first) & (log.t_ns < last))
         # A motion over the whole wait still has truth at both ends.
-        known = known & ~(in_waits(log.records, waiting) & known[log.parent])
+        known = known & ~(in_waits(log, waiting) & known[log.parent])
     truth.parent.mkdir(parents=True, exist_ok=True)
     write_tum(truth, log.t_ns[known], evaluation.T_true[known])
     written = [truth]

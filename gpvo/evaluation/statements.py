@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def statements(
 
 def _frames_bridged(log: VoLog) -> Array:
     """(N,) one, and one more for each lost frame that a motion bridges: a constant is said of the motion of a frame."""
-    lost = np.cumsum([r.status is Status.LOST for r in log])
+    lost = np.cumsum(log.lost)
     start = np.maximum(log.parent, 0)
     return 1.0 + np.where(log.usable, lost - lost[start], 0)
 
@@ -93,12 +93,26 @@ def plain_statement(log: VoLog, method: str, covariance: Array) -> Statement:
     if covariance.shape[-1] == 3:
         return Statement(method, mean, covariance, None)
     # A motion that nobody vouches for enters the sum with what was said of the one before.
-    filled, last = [], np.eye(6) * 1e-6
-    for C in covariance:
-        last = C if np.isfinite(C).all() else last
-        filled.append(last)
-    errors = [MotionError.independent(C, dt_s=r.dt_s) for r, C in zip(log, filled, strict=True)]
-    return Statement(method, mean, np.asarray(covariance), errors)
+    vouched = np.where(np.isfinite(covariance).all(axis=(1, 2)), np.arange(1, len(log) + 1), 0)
+    filled = covariance
+    if not vouched.all():
+        filled = np.concatenate([np.eye(6)[None] * 1e-6, covariance])[np.maximum.accumulate(vouched)]
+    return Statement(method, mean, covariance, _Rows(MotionError.independent(filled, dt_s=log.column("dt_s"))))
+
+
+@dataclass(frozen=True)
+class _Rows(Sequence[MotionError]):
+    """The errors of a batch, each made when it is asked for: as objects, those of a long run would fill the memory."""
+
+    batch: MotionError
+
+    def __len__(self) -> int:
+        return len(self.batch.mean)
+
+    def __getitem__(self, k: Any) -> Any:
+        if not -len(self) <= k < len(self):
+            raise IndexError(k)
+        return self.batch.row(k)
 
 
 def _translation_alone(log: VoLog, method: str) -> Array:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from gpvo.files import replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 _INTEGERS = ("t_ns", "t_prev_ns", "n_detected", "n_stereo", "n_tracked", "n_inliers")
 KIND_OF = {
@@ -39,6 +41,7 @@ _LEVEL = 1  # of gzip: covariances hardly shrink further
 MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
+_BLOCK_ROWS = 50_000
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
 
@@ -199,6 +202,25 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
 
     Raises SourceError where the file is missing, damaged or implausibly large.
     """
+    with _opened(path) as file:
+        table = file.read()
+        metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
+        return _columns(table), metadata
+
+
+def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
+    """The same columns, at most ``_BLOCK_ROWS`` rows at a time; at least one block, which may be empty."""
+    import pyarrow as pa
+
+    with _opened(path) as file:
+        blocks = file.iter_batches(_BLOCK_ROWS) if file.metadata.num_rows else [file.read()]
+        for block in blocks:
+            yield _columns(block if isinstance(block, pa.Table) else pa.Table.from_batches([block]))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[pq.ParquetFile]:
+    """The file, its sizes checked; what goes wrong with it, in one line."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -215,14 +237,16 @@ def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
             cells, packed = shape.num_rows * shape.num_columns, path.stat().st_size
             if 8 * cells > _PLAIN_BYTES + _MAX_RATIO * packed:
                 raise SourceError(f"unpacks {packed} bytes to {cells} numbers: too large for a run", where=path)
-            table = file.read()
-            metadata = {k.decode(): v.decode(errors="replace") for k, v in (table.schema.metadata or {}).items()}
-            return {name: _to_numpy(name, table[name]) for name in table.column_names}, metadata
+            yield file
     except FileNotFoundError:
         raise SourceError("is missing", where=path) from None
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SourceError(f"is damaged: {reason}", where=path, cure="run the sequence again") from None
+
+
+def _columns(table: pa.Table) -> dict[str, NDArray[Any]]:
+    return {name: _to_numpy(name, table[name]) for name in table.column_names}
 
 
 def placed_columns(path: Path) -> RowGroup:

@@ -15,7 +15,7 @@ from gpvo.io import run_table
 from gpvo.io.parquet import RowGroup, placed_columns, read_columns, write_table
 from gpvo.io.run_read import check_log
 from gpvo.io.snapshot import load_snapshot
-from gpvo.types import ImuLog, TruthLog, VoLog, VoRecord
+from gpvo.types import ImuLog, StoredRecords, TruthLog, VoLog
 
 SCHEMA = 1
 FILES = (
@@ -34,7 +34,7 @@ class Kept:
     """What a run that broke off left: its records up to the last chunk whose state was kept, the chunks' tables by
     kind, and that state."""
 
-    records: list[VoRecord]
+    records: StoredRecords
     parts: dict[str, list[RowGroup]]
     state: Any
 
@@ -47,7 +47,7 @@ def take_up(chunks: Path, key: str) -> Kept | None:
         parts = {kind: sorted(chunks.glob(f"{kind}_*.parquet")) for kind in KINDS}
         late = [p for paths in parts.values() for p in paths if int(p.stem.rpartition("_")[2]) >= count]
         kept = {kind: [p for p in paths if p not in late] for kind, paths in parts.items() if paths}
-        records = [r for path in kept["log"] for r in run_table.records_from(read_columns(path)[0])]
+        records = StoredRecords.join([run_table.records_from(read_columns(path)[0]) for path in kept["log"]])
         check_log(VoLog(records), chunks)
         groups = {kind: [placed_columns(path) for path in paths] for kind, paths in kept.items()}
         whole = len(kept["log"]) == count and all(len(g) in (0, count) for g in groups.values())

@@ -16,7 +16,7 @@ from gpvo.errors import CalibrationError, SourceError, printable
 from gpvo.files import read_json, read_toml
 from gpvo.geometry.covariance import are_positive_definite, variances
 from gpvo.io import run_table
-from gpvo.io.parquet import read_columns
+from gpvo.io.parquet import read_blocks, read_columns
 from gpvo.types import (
     Array,
     ImuLog,
@@ -25,6 +25,7 @@ from gpvo.types import (
     Prediction,
     StereoCamera,
     StereoTracks,
+    StoredRecords,
     TruthLog,
     Vehicle,
     VoLog,
@@ -107,7 +108,7 @@ def read_run(path: str | Path) -> Run:
 def read_predictions(path: str | Path) -> list[Prediction]:
     """Predictions of a Parquet file. Raises SourceError where it is damaged or holds something else."""
     p = Path(path)
-    predictions = _read_table(p, run_table.predictions_from)
+    predictions = [q for piece in _read_table(p, run_table.predictions_from) for q in piece]
     if not predictions:
         return []
     numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
@@ -135,7 +136,7 @@ def read_tracks(path: str | Path) -> StereoTracks:
         text = "holds no tracks: poses alone show neither structure nor pixel noise"
         cure = "run the sequence again with 'gpvo run --keep-tracks'; an imported log has none"
         raise SourceError(text, where=p, cure=cure)
-    return StereoTracks.join([_read_table(part, run_table.tracks_from) for part in parts])
+    return StereoTracks.join([piece for part in parts for piece in _read_table(part, run_table.tracks_from)])
 
 
 def _vehicle_of(meta: dict[str, Any], path: Path) -> Vehicle:
@@ -170,9 +171,10 @@ def _parts(path: Path, kind: str) -> list[Path]:
     return [joined] if joined.is_file() else sorted((path / "chunks").glob(f"{kind}_*.parquet"))
 
 
-def _read_table(path: Path, table_from: Callable[[dict[str, NDArray[Any]]], T]) -> T:
+def _read_table(path: Path, table_from: Callable[[dict[str, NDArray[Any]]], T]) -> list[T]:
+    """A table in pieces, as it need not fit into memory as it is stored."""
     with _guarded(path):
-        return table_from(read_columns(path)[0])
+        return [table_from(columns) for columns in read_blocks(path)]
 
 
 def _read_log(path: Path, camera: StereoCamera | None, vehicle: Vehicle) -> VoLog:
@@ -180,7 +182,8 @@ def _read_log(path: Path, camera: StereoCamera | None, vehicle: Vehicle) -> VoLo
     if not parts:
         text = "holds no records: the run broke off before its first chunk"
         raise SourceError(text, where=path, cure="run the sequence again")
-    log = VoLog([r for part in parts for r in _read_table(part, run_table.records_from)], camera, vehicle)
+    pieces = [piece for part in parts for piece in _read_table(part, run_table.records_from)]
+    log = VoLog(StoredRecords.join(pieces), camera, vehicle)
     check_log(log, path / "vo_log.parquet")
     return log
 
@@ -192,13 +195,13 @@ def check_log(log: VoLog, path: Path) -> None:
         raise SourceError("holds no records", where=path)
     if (np.diff(t) <= 0).any():
         raise SourceError("its stamps do not increase", where=path, cure="run the sequence again")
-    known = set(t.tolist())
-    if any(r.t_prev_ns not in known or r.t_prev_ns > r.t_ns for r in log.records[1:]):
+    t_prev = log.column("t_prev_ns")
+    if (~np.isin(t_prev, t) | (t_prev > t))[1:].any():
         raise SourceError("a record starts from a frame that is not in it", where=path, cure="run the sequence again")
     _check_poses(log.T_prev_cur, path)
     for method in log.methods:
-        stated = [r.covariances[method] for r in log if r.usable and method in r.covariances]
-        _check_covariances(np.array(stated).reshape(-1, 6, 6), f"{method} covariance", path)
+        C = log.covariance(method)
+        _check_covariances(C[log.usable & ~np.isnan(C).all(axis=(1, 2))], f"{method} covariance", path)
 
 
 def _check_covariances(C: Array, what: str, path: Path, *, semi: bool = False) -> None:

@@ -27,6 +27,7 @@ from gpvo.types import (
     Prediction,
     Status,
     StereoTracks,
+    StoredRecords,
     TruthLog,
     VoLog,
     VoRecord,
@@ -108,40 +109,33 @@ def record_columns(records: Sequence[VoRecord]) -> Columns:
     return out
 
 
-def records_from(columns: Mapping[str, NDArray[Any]]) -> list[VoRecord]:
+def records_from(columns: Mapping[str, NDArray[Any]]) -> StoredRecords:
     """Records of :func:`record_columns`; nulls come as NaN in float columns.
 
     Raises KeyError or ValueError where a column is absent or a status unknown.
     """
     T = poses_from(columns)
     n = len(T)
-    counts = {c: np.where(np.isnan(f := _float(columns, c, n)), -1, f).astype(np.int64) for c in COUNT_FIELDS}
-    floats = {c: _float(columns, c, n) for c in FLOAT_FIELDS}
-    imu = {c: np.stack([_float(columns, p.format(a), n) for a in _AXES], 1) for c, p in _IMU.items()}
-    cov, v_t = _matrices_from(columns, "cov", 6), _matrices_from(columns, "vt", 3)
-    stages = {c[6:-3]: _float(columns, c, n) for c in columns if c.startswith("stage_") and c.endswith("_ms")}
+    return StoredRecords(
+        columns={
+            **{c: np.array([int(t) for t in columns[c].tolist()], dtype=np.int64) for c in ("t_ns", "t_prev_ns")},
+            "status": _objects(map(Status, columns["status"].tolist()), n),
+            "T_prev_cur": T,
+            "is_reference": np.array([bool(b) for b in columns["is_reference"].tolist()], dtype=bool),
+            "reason": _objects((str(reason or "") for reason in columns["reason"].tolist()), n),
+            **{c: np.where(np.isnan(f := _float(columns, c, n)), -1, f).astype(np.int64) for c in COUNT_FIELDS},
+            **{c: _float(columns, c, n) for c in FLOAT_FIELDS},
+            **{c: np.stack([_float(columns, p.format(a), n) for a in _AXES], 1) for c, p in _IMU.items()},
+        },
+        covariances=_matrices_from(columns, "cov", 6),
+        v_t=_matrices_from(columns, "vt", 3),
+        stage_ms={c[6:-3]: _float(columns, c, n) for c in columns if c.startswith("stage_") and c.endswith("_ms")},
+    )
 
-    def known(k: int) -> dict[str, Any]:
-        out: dict[str, Any] = {c: int(v[k]) for c, v in counts.items()}
-        out.update({c: float(v[k]) for c, v in floats.items()})
-        out.update({c: None if np.isnan(v[k]).all() else v[k] for c, v in imu.items()})
-        return out
 
-    return [
-        VoRecord(
-            t_ns=int(columns["t_ns"][k]),
-            t_prev_ns=int(columns["t_prev_ns"][k]),
-            status=Status(columns["status"][k]),
-            T_prev_cur=T[k],
-            is_reference=bool(columns["is_reference"][k]),
-            reason=str(columns["reason"][k] or ""),
-            **known(k),
-            covariances={m: C[k] for m, C in cov.items() if not np.isnan(C[k]).all()},
-            v_t={m: C[k] for m, C in v_t.items() if not np.isnan(C[k]).all()},
-            stage_ms={s: float(v[k]) for s, v in stages.items() if not np.isnan(v[k])},
-        )
-        for k in range(n)
-    ]
+def _objects(values: Iterable[Any], n: int) -> NDArray[Any]:
+    """(n,) Python objects as they are."""
+    return np.fromiter(values, dtype=object, count=n)
 
 
 def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
@@ -185,7 +179,7 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     if "root_calibration_00" in columns:
         root[:, :, 6:] = _stacked(columns, (f"root_calibration_{i}{j}" for i, j in _ALL6)).reshape(n, 6, 6)
         tau[:, 6:] = _stacked(columns, (f"calibration_tau_{a}_s" for a in _SHORT6))
-    cov = _matrices_from(columns, "cov", 6)
+    cov = {part: from_upper(C, 6) for part, C in _matrices_from(columns, "cov", 6).items()}
     jitter, bias = (cov.get(part, np.zeros((n, 6, 6))) for part in ("jitter", "bias"))
     white = cov["white"] if "white" in cov else cov["total"] - jitter - bias
     finite = np.isfinite(np.concatenate([bias, root], axis=2)).all(axis=(1, 2))
@@ -266,11 +260,11 @@ def _matrix_columns(
 
 
 def _matrices_from(columns: Mapping[str, NDArray[Any]], prefix: str, n: int) -> dict[str, Array]:
-    """Symmetric matrices (N, n, n) by method, of :func:`_matrix_columns` on and above the diagonal."""
+    """(N, n (n + 1) / 2) upper triangles of symmetric (n, n) matrices by method, of :func:`_matrix_columns`."""
     found = (_METHOD.fullmatch(name) for name in columns)
     methods = [match[2] for match in found if match is not None and match[1] == prefix]
     indices = np.transpose(np.triu_indices(n))
-    return {m: from_upper(_stacked(columns, (f"{prefix}_{m}_{i}{j}" for i, j in indices)), n) for m in methods}
+    return {m: _stacked(columns, (f"{prefix}_{m}_{i}{j}" for i, j in indices)).astype(np.float64) for m in methods}
 
 
 def _float(columns: Mapping[str, NDArray[Any]], name: str, n: int) -> Array:

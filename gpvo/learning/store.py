@@ -4,7 +4,7 @@ those of a model with new flights added, and sets larger than memory."""
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 
@@ -82,7 +82,7 @@ def config_of(path: str | Path) -> TrainConfig:
 
 def update(
     path: str | Path,
-    runs: Sequence[Run],
+    runs: Iterable[Run],
     config: TrainConfig,
     *,
     judge: bool = True,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -61,7 +61,7 @@ class TrainedModel:
 
 
 def train(
-    runs: Sequence[Run], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
+    runs: Iterable[Run], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
     """Learn from runs with ground truth, and judge by leaving each run out; :func:`gpvo.learning.store.save_model`
     writes the result.

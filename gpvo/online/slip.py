@@ -141,4 +141,4 @@ def _unflagged(record: VoRecord) -> VoRecord:
 def flag_slips(log: VoLog) -> VoLog:
     """The log with impossible motions called ``lost``; causal, and the same when applied twice."""
     detector = SlipDetector(log.vehicle)
-    return replace(log, records=[detector.step(r) for r in log.records])
+    return log.judged_as(map(detector.step, log))

@@ -104,8 +104,8 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
 
 def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: PublishSettings) -> list[Odometry]:
     """All messages of a run, with ``predictions`` by ``t_ns``; its ``odom`` starts at the body's first pose."""
-    usable = [r for r in run.log if r.usable]
-    if usable and not predictions and not any(r.covariances for r in usable):
+    usable = run.log.usable.any()
+    if usable and not predictions and not any(r.covariances for r in run.log if r.usable):
         raise GpvoError("holds neither predictions nor covariances", where=run.path, cure="give --model")
     builder = OdometryBuilder(T_body_cam=run.mounting.T_body_cam, method=settings.method)
     try:

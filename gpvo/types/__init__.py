@@ -13,6 +13,7 @@ from gpvo.types.records import (
     MotionError,
     Prediction,
     Status,
+    StoredRecords,
     VoLog,
     VoRecord,
 )
@@ -50,6 +51,7 @@ __all__ = [
     "StereoCamera",
     "StereoFrame",
     "StereoTracks",
+    "StoredRecords",
     "TrackFrame",
     "TruthLog",
     "Vehicle",

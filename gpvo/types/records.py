@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,69 @@ class VoRecord:
         return replace(self, status=status, reason="; ".join(filter(None, (self.reason, reason))))
 
 
+@dataclass(frozen=True, eq=False)
+class StoredRecords(Sequence[VoRecord]):
+    """N records as columns, a fifth of what they take as objects; each is made when it is asked for.
+
+    ``columns``: the fields of a record by name, (N,), (N, 4, 4) or (N, 3), an IMU's NaN throughout where there is none.
+    ``covariances`` (N, 21) and ``v_t`` (N, 6), upper triangles, and ``stage_ms`` (N,): NaN where a record has none.
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+    covariances: Mapping[str, Array] = field(default_factory=dict)
+    v_t: Mapping[str, Array] = field(default_factory=dict)
+    stage_ms: Mapping[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def join(cls, parts: Sequence[StoredRecords]) -> StoredRecords:
+        """One after the other, with the methods and stages of all."""
+        lengths = [len(part) for part in parts]
+
+        def joined(maps: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+            shape = {name: column.shape[1:] for m in maps for name, column in m.items()}
+            absent = {name: [np.broadcast_to(np.nan, (n, *of)) for n in lengths] for name, of in shape.items()}
+            return {name: np.concatenate([m.get(name, a) for m, a in zip(maps, absent[name])]) for name in shape}
+
+        return cls(*(joined([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    def __len__(self) -> int:
+        return len(self.columns["t_ns"])
+
+    @overload
+    def __getitem__(self, k: int) -> VoRecord: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> list[VoRecord]: ...
+
+    def __getitem__(self, k: int | slice) -> VoRecord | list[VoRecord]:
+        if isinstance(k, slice):
+            return [self[i] for i in range(*k.indices(len(self)))]
+        known: dict[str, Any] = {
+            name: column.item(k) if column.ndim == 1 else _unless_nan(column[k])
+            for name, column in self.columns.items()
+        }
+        for name, stated, place in (("covariances", self.covariances, _PLACE_6), ("v_t", self.v_t, _PLACE_3)):
+            known[name] = {m: C[k][place] for m, C in stated.items() if _unless_nan(C[k]) is not None}
+        stage_ms = {s: ms for s, column in self.stage_ms.items() if (ms := column.item(k)) == ms}
+        return VoRecord(**known, stage_ms=stage_ms)
+
+
+def _places(n: int) -> NDArray[np.int64]:
+    """(n, n) which element of an upper triangle, row by row, stands where in the symmetric matrix."""
+    i, j = np.triu_indices(n)
+    out = np.zeros((n, n), dtype=np.int64)
+    out[i, j] = out[j, i] = np.arange(len(i))
+    return out
+
+
+_PLACE_3, _PLACE_6 = _places(3), _places(6)
+
+
+def _unless_nan(v: Array) -> Array | None:
+    """Itself; None where it is NaN throughout."""
+    return None if math.isnan(v.item(0)) and np.isnan(v).all() else v
+
+
 @dataclass(frozen=True)
 class VoLog:
     """All records of a run, in time order, with the camera that made them (None for imported poses), and what carried
@@ -120,40 +183,74 @@ class VoLog:
     def __iter__(self) -> Iterator[VoRecord]:
         return iter(self.records)
 
+    def _each(self, name: str) -> NDArray[Any] | list[Any]:
+        """One field of every record."""
+        if isinstance(self.records, StoredRecords):
+            return self.records.columns[name]
+        return [getattr(r, name) for r in self.records]
+
     def column(self, name: str) -> NDArray[Any]:
         """One scalar attribute of every record (``"t_ns"``, ``"dt_s"``, ``"n_inliers"``, ...) as an array (N,)."""
-        return np.array([getattr(r, name) for r in self.records])
+        if name == "dt_s":
+            return np.asarray((self.t_ns - self.column("t_prev_ns")) * 1e-9)
+        return np.array(self._each(name) if name in _FIELDS else [getattr(r, name) for r in self.records])
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
         """(N,) stamps of the frames."""
-        return np.array([r.t_ns for r in self.records], dtype=np.int64)
+        return np.array(self._each("t_ns"), dtype=np.int64)
 
     @property
     def T_prev_cur(self) -> Array:
         """(N, 4, 4) motions; identity for the first frame."""
-        return np.array([r.T_prev_cur for r in self.records], dtype=np.float64).reshape(-1, 4, 4)
+        return np.array(self._each("T_prev_cur"), dtype=np.float64).reshape(-1, 4, 4)
+
+    @property
+    def statuses(self) -> list[Status]:
+        """(N,) those of the records."""
+        return list(self._each("status"))
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """(N,) whether each record holds a measured motion."""
-        return np.array([r.usable for r in self.records], dtype=bool)
+        return np.array([s in (Status.OK, Status.DEGRADED) for s in self.statuses], dtype=bool)
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(N,) whether each record is lost."""
+        return np.array([s is Status.LOST for s in self.statuses], dtype=bool)
 
     @property
     def parent(self) -> NDArray[np.int64]:
         """(N,) index of the frame each motion starts from; -1 for the first."""
-        index = {int(t): k for k, t in enumerate(self.t_ns)}
-        return np.array([-1 if r.t_prev_ns == r.t_ns else index[r.t_prev_ns] for r in self.records], dtype=np.int64)
+        stamps = self.t_ns.tolist()
+        index = {t: k for k, t in enumerate(stamps)}
+        pairs = zip(self.column("t_prev_ns").tolist(), stamps)
+        return np.array([-1 if before == t else index[before] for before, t in pairs], dtype=np.int64)
 
     @property
     def methods(self) -> tuple[str, ...]:
         """Names of the geometric covariance methods present, in first-seen order."""
+        if isinstance(self.records, StoredRecords):
+            known = {m: ~np.isnan(C).all(axis=1) for m, C in self.records.covariances.items()}
+            return tuple(sorted((m for m in known if known[m].any()), key=lambda m: int(known[m].argmax())))
         return tuple(dict.fromkeys(method for record in self.records for method in record.covariances))
 
     def covariance(self, method: str) -> Array:
         """(N, 6, 6) of one method; NaN where a record has none."""
         missing = np.full((6, 6), np.nan)
+        if isinstance(self.records, StoredRecords):
+            elements = self.records.covariances.get(method, np.full((len(self), 21), np.nan))
+            return np.asarray(elements[:, _PLACE_6])
         return np.array([r.covariances.get(method, missing) for r in self.records]).reshape(-1, 6, 6)
+
+    def judged_as(self, records: Iterable[VoRecord]) -> VoLog:
+        """The log with the statuses and reasons of ``records``, which are otherwise its own, in their order."""
+        if not isinstance(self.records, StoredRecords):
+            return replace(self, records=list(records))
+        said = np.array([(r.status, r.reason) for r in records], dtype=object).reshape(-1, 2)
+        columns = {**self.records.columns, "status": said[:, 0], "reason": said[:, 1]}
+        return replace(self, records=replace(self.records, columns=columns))
 
     def trajectory(self) -> Array:
         """(N, 4, 4) ``T_first_cam``: the motions compounded, never corrected by a model."""
@@ -262,6 +359,7 @@ class Prediction(MotionError):
         return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
 
 
+_FIELDS = frozenset(f.name for f in fields(VoRecord))
 COUNT_FIELDS = tuple(f.name for f in fields(VoRecord) if f.default == -1)
 FLOAT_FIELDS = tuple(f.name for f in fields(VoRecord) if f.type == "float")
 IMU_FIELDS = tuple(f.name for f in fields(VoRecord) if f.name.startswith("imu_"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gpvo.dataset import clock
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -51,6 +52,15 @@ def test_slow_logs_and_truths(rate, truth_rate, offset):
     truth = truth_of(np.arange(-5, 70, 1 / truth_rate))
     # Straight lines over a second of slow truth are what limits it.
     assert estimate_time_offset(log_of(s - offset, path(s)), truth) == pytest.approx(offset, abs=0.08)
+
+
+def test_a_log_of_a_day_is_searched_in_longer_steps(monkeypatch):
+    """As one of odometry at 200 Hz that lasts for longer than a quarter of an hour: of more samples than are held."""
+    monkeypatch.setattr(clock, "_MAX_SAMPLES", 900)
+    for offset in (0.0314, -0.47, 3.2):
+        s = np.arange(0, 100, 1 / 30)
+        found = clock.estimate_time_offset(log_of(s - offset, path(s)), truth_of(np.arange(-5, 110, 0.02)))
+        assert found == pytest.approx(offset, abs=4e-3)
 
 
 @pytest.mark.parametrize("count, rate", [(10, 2.0), (12, 3.0)])

@@ -27,12 +27,14 @@ from gpvo.learning.train import estimate_set
 from gpvo.runner import run, steps
 from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nll_per_dim
-from gpvo.types import Status, TruthLog, VoLog, VoRecord
+from gpvo.types import Status, StereoCamera, TruthLog, VoLog, VoRecord
 from gpvo.vo.config import make_config
+from gpvo.vo.imu_moments import ImuMoments
 from synthetic_runs import make_run
 
 # Simulated flights begin at rest.
 AT_REST_S = 2.8
+CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
 
 
 def fly(tmp_path, seed, scenario="tunnel-clean", duration_s=8.0):
@@ -62,7 +64,7 @@ def test_a_truth_that_wanders_at_rest_is_found(flight):
     log, truth = flight
     waits = wandering_waits(log, wandering(truth, 0.2, 0.3, AT_REST_S))
     assert len(waits) == 1
-    hit, s = in_waits(log.records, waits), seconds(log)
+    hit, s = in_waits(log, waits), seconds(log)
     assert hit[(s > 0.3) & (s < AT_REST_S)].all()
     assert not hit[s > AT_REST_S + 1.0].any()
 
@@ -74,12 +76,33 @@ def test_many_waits_are_those_of_each_pair_and_fill_no_memory():
     first = 3 * rng.integers(0, 20_000, 1000)
     waits = np.column_stack([first, first + rng.integers(1, 9, 1000)])
     tracemalloc.start()
-    hit = in_waits(records, waits)
+    hit = in_waits(VoLog(records), waits)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert hit.tolist() == [bool(((r.t_prev_ns < waits[:, 1]) & (r.t_ns > waits[:, 0])).any()) for r in records]
     assert 0.05 < hit.mean() < 0.5
     assert peak < len(records) * 200 < len(records) * len(waits)
+
+
+def test_a_vehicle_that_creeps_is_found_to_move_without_a_search_from_each_frame(monkeypatch):
+    """At 100 Hz, it moves by a pixel in two thirds of a second."""
+    log, truth = make_run(3, n=1500, rate_hz=100.0)
+    none, calm = np.zeros(3), np.full(3, 1e-3)
+    imu = {"imu_gyro_mean_radps": none, "imu_acc_mean_mps2": none}
+    imu |= {"imu_gyro_std_radps": calm, "imu_acc_std_mps2": calm, "spread_u": 0.4, "spread_v": 0.3}
+    T = se3.from_rt(np.eye(3), np.array([1.5e-4 * CAMERA.baseline_m, 0.0, 0.0]))
+    log = replace(log, camera=CAMERA, records=[replace(r, T_prev_cur=T, disparity_p90_px=100.0, **imu) for r in log])
+    looks, later = [0], ImuMoments.with_later
+
+    def counted(self, other):
+        looks[0] += 1
+        return later(self, other)
+
+    monkeypatch.setattr(ImuMoments, "with_later", counted)
+    assert len(wandering_waits(log, truth)) == 0
+    assert looks[0] < len(log)
+    slower = [replace(r, T_prev_cur=se3.from_rt(np.eye(3), 0.1 * T[:3, 3])) for r in log]
+    assert len(wandering_waits(replace(log, records=slower), truth)) > 0
 
 
 def test_an_exact_truth_is_believed(tmp_path):

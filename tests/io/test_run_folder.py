@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
@@ -122,6 +123,48 @@ def test_round_trip_is_bit_exact(tmp_path):
     last = np.array([float(v) for v in lines[-1].split()[1:4]])
     np.testing.assert_allclose(last, run.log.trajectory()[-1, :3, 3], atol=1e-8)
     assert len(lines) == 250
+
+
+def test_a_log_takes_a_kilobyte_a_motion(tmp_path):
+    """As objects, each of its arrays and numbers has a header larger than itself: 4 kB."""
+    write_run(tmp_path / "run", VoLog(make_records(1200), CAMERA))
+    read_run(tmp_path / "run")
+    tracemalloc.start()
+    run = read_run(tmp_path / "run")
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert held < 1024 * len(run.log)
+
+
+def test_parts_that_know_different_methods_make_one_log(tmp_path):
+    bare = [replace(r, covariances={}, v_t={}, stage_ms={}, n_tracked=-1) for r in make_records(90)[:30]]
+    records = [*bare, *make_records(90)[30:60], *(replace(r, v_t={}) for r in make_records(90)[60:])]
+    with RunWriter(tmp_path / "run", camera=CAMERA, chunk=30) as writer:
+        for record in records:
+            writer.append(record)
+        chunked = writer.path / "chunks"
+        run = read_run(tmp_path / "run")
+        assert len(list(chunked.glob("log_*"))) == 3
+    for log in (run.log, read_run(tmp_path / "run").log):
+        for a, b in zip(records, log, strict=True):
+            assert_same(a, b)
+        assert log.methods == VoLog(records).methods
+        np.testing.assert_array_equal(log.covariance("triangulation"), VoLog(records).covariance("triangulation"))
+        assert_same(log.records[-1], records[-1])
+        assert [r.t_ns for r in log.records[3:50:7]] == [r.t_ns for r in records[3:50:7]]
+        with pytest.raises(IndexError):
+            log.records[90]
+
+
+def test_a_log_judged_anew_differs_in_status_and_reason_alone(tmp_path):
+    records = make_records(40)
+    write_run(tmp_path / "run", VoLog(records, CAMERA))
+    log, judged = read_run(tmp_path / "run").log, [r.with_status(Status.LOST, "slip") for r in records]
+    for of in (log, VoLog(records, CAMERA)):
+        for a, b in zip(judged, of.judged_as(r.with_status(Status.LOST, "slip") for r in of), strict=True):
+            assert_same(a, b)
+    assert log.statuses == [r.status for r in records]
+    assert not of.judged_as(judged).usable.any()
 
 
 def test_killed_run_reads_up_to_the_last_chunk(tmp_path):

@@ -311,7 +311,7 @@ def test_rows_of_windows_and_slips_are_found_again_beside_the_model(tmp_path):
         np.testing.assert_array_equal(found.lost_jump, made.lost_jump)
 
 
-def test_an_update_keeps_the_settings_of_the_model(tmp_path):
+def test_an_update_keeps_the_settings_of_the_model_and_reads_each_run_once(tmp_path, monkeypatch):
     path = tmp_path / "m.gpvo"
     config = replace(QUICK, features="velocity", seed=5)
     save_model(train_sets(training_sets(range(3), n=120), config, judge=False), path)
@@ -319,8 +319,13 @@ def test_an_update_keeps_the_settings_of_the_model(tmp_path):
     write_run(tmp_path / "flight9", log, truth=truth)
     out = tmp_path / "more.gpvo"
     command = ["train", str(tmp_path / "flight9"), "--update", str(path), "--seed", "6", "-o", str(out)]
+    read: list[Path] = []
+    monkeypatch.setattr("gpvo.cli.learn.read_run", lambda p: read.append(p) or read_run(p))
+    monkeypatch.setattr("gpvo.cli.learn.outweighed_by_truth", lambda log, truth: True)
     result = CliRunner().invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
+    assert read == [tmp_path / "flight9"]
+    assert "single motions of flight9" in " ".join(result.output.split())
     assert config_of(out) == replace(config, seed=6)
 
 
@@ -349,7 +354,7 @@ def test_an_update_of_a_model_of_windows_says_nothing_of_single_motions(tmp_path
     save_model(train_sets(sets, config, judge=False), path)
     log, truth = make_run(9, n=120)
     write_run(tmp_path / "flight9", log, truth=truth)
-    monkeypatch.setattr("gpvo.cli.learn._noisy_truths", lambda paths: "flight9")
+    monkeypatch.setattr("gpvo.cli.learn.outweighed_by_truth", lambda log, truth: True)
     command = ["train", str(tmp_path / "flight9"), "--update", str(path), "-o", str(tmp_path / "more.gpvo")]
     result = CliRunner().invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -360,7 +365,7 @@ def test_a_model_of_positions_is_not_updated(tmp_path):
     path = tmp_path / "m.gpvo"
     save_model(_of_three(), path)
     with pytest.raises(GpvoError, match="train again"):
-        _train([tmp_path], asdict(replace(QUICK, target="position")), path, print)
+        _train([tmp_path], asdict(replace(QUICK, target="position")), path, print, [])
 
 
 def _as_run(log, truth, name):
@@ -580,7 +585,7 @@ def test_a_run_given_twice_is_refused(tmp_path):
     """Left out in turn, its copy would still be learnt from."""
     run = tmp_path / "run"
     with pytest.raises(GpvoError, match="run.* is given twice"):
-        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], asdict(QUICK), None, print)
+        _train([run, tmp_path / "other", tmp_path / "other" / ".." / "run"], asdict(QUICK), None, print, [])
 
 
 def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> None:
