@@ -151,11 +151,14 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
     pixels = _projected(original, settings, replicate)
     noise = _drawn_noise(original, rng)
     uv_left, uv_right = pixels[0] + noise[:, :2], pixels[1] + noise[:, :2] - noise[:, 2:] * [1.0, 0.0]
+    # An outlier's landmark may lie behind a camera that saw something else there.
+    size = np.array([seen.camera.width, seen.camera.height])
+    in_view = (np.abs(np.stack([uv_left, uv_right]) - 0.5 * size) < 1.5 * size).all(axis=(0, 2))
     t_ns = run.log.t_ns
     starts = np.searchsorted(seen.frame, np.arange(len(t_ns) + 1))
     frames: list[TrackFrame] = []
     for k, t in enumerate(t_ns):
-        rows = slice(starts[k], starts[k + 1])
+        rows = starts[k] + np.flatnonzero(in_view[starts[k] : starts[k + 1]])
         if original.repeats[k] and frames:
             frames.append(replace(frames[-1], t_ns=int(t)))
             continue

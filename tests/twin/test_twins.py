@@ -59,6 +59,19 @@ def test_twins_see_what_the_flight_saw(flown):
         assert (real.log.column("n_stereo") == twin.log.column("n_stereo")).all()
 
 
+def test_an_outlier_whose_landmark_lies_in_the_camera_is_not_seen(flown):
+    folder, _, _ = flown
+    original = estimate(folder / "run")
+    structure, seen = original.structure, original.seen
+    odd = int(np.flatnonzero(structure.weight == 0)[0])
+    points = structure.points_world.copy()
+    points[seen.track[odd]] = structure.T_world_cam[seen.frame[odd]] @ [1.0, 1.0, 1e-14, 1.0] @ np.eye(4, 3)
+    twin = twin_source(replace(original, structure=replace(structure, points_world=points)), TwinSettings(), 0)
+    for frame in twin.frames:
+        assert (np.abs(np.stack([frame.uv_left, frame.uv_right])) < 2 * seen.camera.width).all()
+    assert seen.track[odd] not in twin.frames[seen.frame[odd]].track
+
+
 def test_noise_of_a_point_seen_twice_keeps_the_difference_of_its_measurements(flown):
     original = estimate(flown[0] / "run")
     length = np.bincount(original.seen.track)
