@@ -13,9 +13,7 @@ import typer
 from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
-from gpvo.dataset.build import aligned_truth
 from gpvo.dataset.errors import outweighed_by_truth
-from gpvo.dataset.hand_eye import Misread, late_by
 from gpvo.errors import GpvoError
 from gpvo.files import read_json
 from gpvo.io.run import Run, read_run
@@ -119,6 +117,9 @@ def train(
 def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[Run]:
     """One run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they are
     taken for; ``noisy`` gets the names of those whose truth cannot judge single motions."""
+    from gpvo.dataset.build import aligned_truth
+    from gpvo.dataset.hand_eye import Misread, late_by
+
     for path in paths:
         run = read_run(path)
         if run.truth is not None and len(run.truth.t_ns) > 1:

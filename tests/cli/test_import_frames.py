@@ -131,7 +131,7 @@ def test_a_quaternion_in_the_wrong_order_is_asked_about(tmp_path):
     (tmp_path / "log.tum").write_text("".join(" ".join([*r[:4], r[7], *r[4:7]]) + "\n" for r in rows))
     _call("import", tmp_path / "log.tum", "--truth", tmp_path / "gt.tum", "-o", tmp_path / "run")
     out, _ = _call("evaluate", tmp_path / "run")
-    assert "quaternion's order and --frame right?" in " ".join(out.split())
+    assert "Are the quaternions of both in the right order" in " ".join(out.split())
 
 
 @pytest.mark.parametrize("inverse", ["log", "gt", None])
