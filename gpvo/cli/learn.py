@@ -158,7 +158,7 @@ def _train(paths: list[Path], settings: dict[str, Any], update: Path | None, on_
         return _train_streaming(paths, config, on_fit)
     runs = [read_run(p) for p in paths]
     if config.target == "position":
-        from gpvo.learning.position import train_position
+        from gpvo.learning.train import train_position
 
         return train_position([config.rows_of(r) for r in runs], config)
     if update is not None:
