@@ -9,15 +9,15 @@ The residuals of a motion (measured minus moved, ``e = r_k - G r_{k-1}``, whiten
 out, say of the 18 modes F ``S_k = F' (1 - A A^+) e``, to which increments ``c_k`` of a field add ``N_k c_k``, with
 ``N_k = F' (1 - A A^+) F``. The mean over the run is taken off: a fit to noisy points is biased, and so are twins of
 their own. Energies of sums of S over blocks of several lengths are compared with those of draws of the twins' noise. If
-they exceed them beyond chance (a randomisation test: E. Pitman, "Significance tests which may be applied to samples
-from any populations", 1937), non-negative least squares finds the variances that explain by how much. What lies within
-the six directions is unseen; it is taken to be as strong as the rest.
+they exceed them beyond chance (the randomisation test of E. Pitman, 1937), non-negative least squares finds the
+variances that explain by how much. What lies within the six directions is unseen: it is taken to be as strong.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +31,12 @@ from gpvo.types import Array
 from gpvo.vo.points import point_jacobian
 
 KINDS = ("level", "white", "1 s", "10 s")
-"""``level``: white noise of each frame's measurements; ``white``: white increments, which a point accumulates from its
-first view; and increments with a time constant of 1 s and of 10 s."""
+"""White noise of each frame; and increments that a point accumulates from its first view: white, or correlated."""
 _TAU_S = (0.0, 0.0, 1.0, 10.0)
 _BLOCKS_S = (0.0, 0.25, 1.0, 3.0, 10.0)
 _GROUPS = (0, 1, 3, 6, 7, 9, 12, 13, 15)  # where those of u, v, d by order 0, 1, 2 begin among the 18
 _CHANNELS = np.repeat(np.eye(2), (12, 6), axis=1)  # of (u, v), of d
-_DRAWS = 99  # a run is beyond all of them by chance once in a hundred
-_FIELDS = 24
+_DRAWS, _FIELDS = 99, 24  # a run is beyond all the draws by chance once in a hundred
 _MIN_PAIRS, _MIN_MOTIONS, _MIN_BLOCKS = 20, 40, 4
 _MAX_GAP = 3  # frames between two views of a pair, as over a repeat
 _LARGEST = 4.0  # whitened residuals count no more
@@ -46,17 +44,18 @@ _LARGEST = 4.0  # whitened residuals count no more
 
 @dataclass(frozen=True)
 class CommonField:
-    """``variance_px2`` (4, 2) of the coefficients by kind, for (u, v) and for d; zero where there is none. ``step_s``:
-    the median time between frames."""
+    """``variance_px2`` (4, 2) by kind, of (u, v) and of d; zero where none is. ``step_s``: median between frames."""
 
     variance_px2: Array
     step_s: float
 
     @classmethod
-    def of(cls, seen: Observations, structure: Structure, noise_px: Array, signs: Array, t_ns: Array) -> CommonField:
+    def of(
+        cls, seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8], t_ns: NDArray[np.int64]
+    ) -> CommonField:
         """The field that a run shows, beyond what draws of the noise (M, 3) with ``signs`` (N, draws) of tracks would.
 
-        ``t_ns`` (F,) stamps of the frames. None is found where fewer than forty motions have twenty points.
+        ``t_ns`` (F,) stamps. None is found where fewer than forty motions have twenty points.
         """
         step_s = max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-6) if len(t_ns) > 1 else 1.0
         S, N = _modes(seen, structure, noise_px, signs)
@@ -94,7 +93,7 @@ class CommonField:
         return field
 
     def about(self) -> dict[str, list[float]]:
-        """The variances [px^2] for (u, v) and for d, of the kinds that were found."""
+        """The variances [px^2] for (u, v) and d, of the kinds found."""
         return {kind: v.tolist() for kind, v in zip(KINDS, self.variance_px2) if v.any()}
 
 
@@ -104,7 +103,7 @@ def drawn_signs(count: int, neighbours: Neighbours) -> NDArray[np.int8]:
     return np.stack([draw_signs(count, neighbours, rng).astype(np.int8) for _ in range(_DRAWS)], axis=1)
 
 
-def _block_energies(S: Array, N: Array, lengths: list[int]) -> Array:
+def _block_energies(S: NDArray[Any], N: Array, lengths: list[int]) -> Array:
     """(R, lengths x 9) mean squares of sums over blocks of R series S (F, R, 18), by group; takes off their means."""
     told = N[:, 0, 0] > 0
     S -= (S.sum(axis=0, dtype=np.float64) / told.sum()).astype(S.dtype)
@@ -146,7 +145,9 @@ def _pairs(seen: Observations, structure: Structure) -> tuple[NDArray[np.int64],
     return a[paired][by_frame], b[paired][by_frame]
 
 
-def _modes(seen: Observations, structure: Structure, noise_px: Array, signs: Array) -> tuple[Array, Array]:
+def _modes(
+    seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8]
+) -> tuple[NDArray[Any], Array]:
     """S (F, 1 + draws, 18) of the run and of the draws, and N (F, 18, 18)."""
     first, second = _pairs(seen, structure)
     P, R, B = structure.in_camera(seen), structure.T_world_cam[:, :3, :3], _basis(seen)

@@ -11,18 +11,19 @@ from gpvo.io import open_source
 from gpvo.io.run import read_run
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
-from gpvo.twin.bundle import Estimate, Observations, transform
+from gpvo.twin.bundle import WHITEN, Estimate, Observations, transform
 from gpvo.twin.common import KINDS, CommonField
 from gpvo.twin.noise import Structure
 from gpvo.twin.replicate import TwinSettings, estimate, make_twins, twin_source
 from gpvo.types import StereoCamera
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)
-STEP_S, LIFE, PER_FRAME = 0.1, 8, 60
+STEP_S, LIFE, PER_FRAME = 0.1, 8, 160
 
 
 def flight(seed: int, n_frames: int, field: CommonField | None = None) -> tuple[Observations, Structure]:
-    """Tracks of eight frames past which a camera flies forwards, with independent noise of 0.2 px and a field."""
+    """Tracks of eight frames past which a camera flies forwards, with independent noise of 0.2 px
+    of each image coordinate, and a field."""
     rng = np.random.default_rng(seed)
     T = np.stack([se3.exp([0.002 * k, 0.0, 0.05 * k, 0.0, 0.001 * k, 0.0]) for k in range(n_frames)])
     begin = np.repeat(np.arange(1 - LIFE, n_frames), PER_FRAME // LIFE + 1)
@@ -35,7 +36,9 @@ def flight(seed: int, n_frames: int, field: CommonField | None = None) -> tuple[
     used = np.ones(len(order), bool)
     seen = Observations(CAMERA, frame[order], track[order], np.zeros((len(order), 3)), used)
     seen = replace(seen, uvd=CAMERA.project(Estimate(T, points).in_camera(seen)))
-    noise = 0.2 * rng.standard_normal((len(order), 3)) + (0.0 if field is None else field.draw(seen, rng))
+    noise = 0.2 * rng.standard_normal((len(order), 3)) @ np.linalg.inv(WHITEN).T + (
+        0.0 if field is None else field.draw(seen, rng)
+    )
     return seen, Structure(T, points, noise, used.astype(float), np.full(n_frames, 0.2), True)
 
 
@@ -52,20 +55,18 @@ def common(sd_px: dict[str, tuple[float, float]], step_s: float = STEP_S) -> Com
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_size_of_a_field_is_found(kind):
-    field = common({kind: (0.1, 0.06)})
-    each = [found(*flight(seed, 600, field)).variance_px2 for seed in range(4)]
-    # A field of long duration may be told for one of the other; what counts is its size.
-    like = (2, 3) if kind in KINDS[2:] else (KINDS.index(kind),)
-    size = np.mean(each, axis=0)
-    ratio = np.sqrt(size[list(like)].sum(axis=0)) / [0.1, 0.06]
-    print(kind, np.sqrt(np.mean(each, axis=0)).round(3).tolist(), ratio)
-    assert ((ratio > 0.8) & (ratio < 1.25)).all()
-    assert (size.sum(axis=0) < 1.3 * size[list(like)].sum(axis=0)).all()
+    each = [found(*flight(seed, 500, common({kind: (0.08, 0.06)}))).variance_px2 for seed in range(3)]
+    # Over 50 s, slow increments may be told for those of the other time constant.
+    same = {"level": [0], "white": [1]}.get(kind, [2, 3])
+    square = np.mean(each, axis=0)
+    # Less by what the draws hold of it already, point by point: a tenth of the energy or more, with 160 points.
+    ratio = np.sqrt(square[same].sum(axis=0)) / [0.08, 0.06]
+    assert ((ratio > 0.65) & (ratio < 1.2)).all()
+    assert (np.delete(square, same, axis=0).sum(axis=0) < np.square([0.05, 0.04])).all()
 
 
 def test_independent_noise_makes_no_field():
-    none = [not found(*flight(seed, 200), seed).variance_px2.any() for seed in range(12)]
-    print(none)
+    none = [not found(*flight(seed, 150), seed).variance_px2.any() for seed in range(12)]
     # One in a hundred is beyond all draws by chance.
     assert sum(none) >= 11
 
@@ -75,8 +76,8 @@ def test_a_short_run_tells_of_none():
     assert found(*flight(1, 60, field)).variance_px2.any()
     assert not found(*flight(1, 35, field)).variance_px2.any()
     seen, structure = flight(1, 60, field)
-    few = np.bincount(seen.track, minlength=len(structure.points_world))[seen.track] * (seen.track % 4 == 0) > 0
-    assert not found(seen, replace(structure, weight=few * 1.0)).variance_px2.any()
+    few = (seen.track % 10 == 0).astype(float)
+    assert not found(seen, replace(structure, weight=few)).variance_px2.any()
 
 
 @pytest.fixture(scope="module")
@@ -105,21 +106,20 @@ def test_twins_without_a_field_are_those_of_independent_noise(clean):
 def test_twins_err_as_much_as_a_flight_whose_points_err_alike(clean, tmp_path):
     folder, original = clean
     field = common({"level": (0.0, 0.05), "1 s": (0.06, 0.01)}, original.common.step_s)
-    real, drawn, alone = [], [], []
-    for k in range(3):
+    real, drawn = [], []
+    for k in range(2):
         flown = twin_source(replace(original, common=field), TwinSettings(seed=7), k)
         run(flown, tmp_path / f"flown{k}", keep_tracks=True)
         real.append(over_a_second(read_run(tmp_path / f"flown{k}")))
         made = make_twins(tmp_path / f"flown{k}", tmp_path / f"twins{k}", TwinSettings(replicates=2))
         drawn += [over_a_second(read_run(p)) for p in made]
         assert read_run(made[0]).meta["twin"]["common_variance_px2"]
-    made = make_twins(folder / "run", tmp_path / "alone", TwinSettings(replicates=3))
+    made = make_twins(folder / "run", tmp_path / "alone", TwinSettings(replicates=2))
     alone = [over_a_second(read_run(p)) for p in made]
-    rms_real, rms_drawn, rms_alone = (np.mean(x, axis=0) for x in (real, drawn, alone))
-    print(np.exp(np.log(rms_drawn / rms_real).mean()), (rms_drawn / rms_real).round(2))
-    print(np.exp(np.log(rms_alone / rms_real).mean()), (rms_alone / rms_real).round(2))
-    assert 0.5 < np.exp(np.log(rms_drawn / rms_real).mean()) < 2.0
-    assert np.exp(np.log(rms_alone / rms_real).mean()) < 0.4
+    mean_real, mean_drawn, mean_alone = (np.mean(x, axis=0) for x in (real, drawn, alone))
+    # Measured: 0.83 and 0.02.
+    assert 0.5 < np.exp(np.log(mean_drawn / mean_real).mean()) < 2.0
+    assert np.exp(np.log(mean_alone / mean_real).mean()) < 0.4
 
 
 def over_a_second(flown) -> np.ndarray:
