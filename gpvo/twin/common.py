@@ -9,8 +9,8 @@ The residuals of a motion (measured minus moved, ``e = r_k - G r_{k-1}``, whiten
 out, say of the 18 modes F ``S_k = F' (1 - A A^+) e``, to which increments ``c_k`` of a field add ``N_k c_k``, with
 ``N_k = F' (1 - A A^+) F``. The mean over the run is taken off: a fit to noisy points is biased, and so are twins of
 their own. Energies of sums of S over blocks of several lengths are compared with those of draws of the twins' noise. If
-they exceed them beyond chance (the randomisation test of E. Pitman, 1937), non-negative least squares finds the
-variances that explain by how much. What lies within the six directions is unseen: it is taken to be as strong.
+they exceed them by a quarter and beyond chance (the randomisation test of E. Pitman, 1937), non-negative least squares
+finds the variances that explain it. What lies within the six directions is unseen: it is taken to be as strong.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _BLOCKS_S = (0.0, 0.25, 1.0, 3.0, 10.0)
 _GROUPS = (0, 1, 3, 6, 7, 9, 12, 13, 15)  # where those of u, v, d by order 0, 1, 2 begin among the 18
 _CHANNELS = np.repeat(np.eye(2), (12, 6), axis=1)  # of (u, v), of d
 _DRAWS, _FIELDS = 99, 24  # a run is beyond all the draws by chance once in a hundred
+_WORTH = 1.25  # less changes sigma by no more than an eighth
 _MIN_PAIRS, _MIN_MOTIONS, _MIN_BLOCKS = 20, 40, 4
-_MAX_GAP = 3  # frames between two views of a pair, as over a repeat
-_LARGEST = 4.0  # whitened residuals count no more
+_MAX_GAP, _LARGEST = 3, 4.0  # frames between two views of a pair, as over a repeat; whitened residuals count no more
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,6 @@ class CommonField:
         cls, seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8], t_ns: NDArray[np.int64]
     ) -> CommonField:
         """The field that a run shows, beyond what draws of the noise (M, 3) with ``signs`` (N, draws) of tracks would.
-
         ``t_ns`` (F,) stamps. None is found where fewer than forty motions have twenty points.
         """
         step_s = max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-6) if len(t_ns) > 1 else 1.0
@@ -66,7 +65,7 @@ class CommonField:
             return cls(variance, step_s)
         energy = _block_energies(S, N, lengths)
         total = (energy / energy.std(axis=0)).sum(axis=1)
-        if total[0] > total[1:].max():
+        if total[0] > total[1:].max() and (energy[0] / energy[1:].mean(axis=0)).mean() > _WORTH:
             scatter, rng = energy[1:].std(axis=0), np.random.default_rng(29)
             units = np.zeros((len(KINDS), 2, len(scatter)))
             for kind, channel in itertools.product(range(len(KINDS)), range(2)):
@@ -80,9 +79,9 @@ class CommonField:
 
     def draw(self, seen: Observations, rng: np.random.Generator) -> Array:
         """(M, 3) the field [px] at the observations."""
-        n_frames = int(seen.frame.max(initial=-1)) + 1
+        shape = (int(seen.frame.max(initial=-1)) + 1, 18)
         level, *steps = (
-            _drawn(kind, (n_frames, 18), self.step_s, rng) * np.sqrt(variance @ _CHANNELS)
+            _drawn(kind, shape, self.step_s, rng) * np.sqrt(variance @ _CHANNELS)
             for kind, variance in enumerate(self.variance_px2)
         )
         order = np.lexsort((seen.frame, seen.track))
@@ -93,7 +92,7 @@ class CommonField:
         return field
 
     def about(self) -> dict[str, list[float]]:
-        """The variances [px^2] for (u, v) and d, of the kinds found."""
+        """The variances [px^2] of the kinds found."""
         return {kind: v.tolist() for kind, v in zip(KINDS, self.variance_px2) if v.any()}
 
 
