@@ -178,7 +178,7 @@ def _train(
     if update is None and config.target != "position" and _frames(paths) > config.max_rows:
         return _train_streaming(runs, config, on_fit)
     if config.target == "position":
-        from gpvo.learning.position import train_position
+        from gpvo.learning.train import train_position
 
         return train_position([config.rows_of(r) for r in runs], config)
     if update is not None:

@@ -27,10 +27,10 @@ from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
 from gpvo.learning.regressors.numerics import fixed_threads
 from gpvo.learning.sample import draw_sample
-from gpvo.learning.thesis import fit_thesis
+from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online import modelfile
 from gpvo.online.estimate import ErrorModel
-from gpvo.online.features import AXES, known_columns
+from gpvo.online.features import AXES, THESIS, known_columns, resolve
 from gpvo.online.predictor import Predictor
 from gpvo.parallel import map_jobs
 from gpvo.stats.consistency import nees, seen_axes
@@ -304,3 +304,33 @@ def _header(
         "by_few_sequences": len(sets) < MIN_SEQUENCES,
         "comparison": table.get("comparison"),
     }
+
+
+def train_position(sets: Sequence[TrainingSet], config: TrainConfig, *, judge: bool = True) -> TrainedModel:
+    """The thesis' model of positions: a GP of the residuals (n, 3) [m] on velocity and feature count, isotropic;
+    ``features="auto"`` means these."""
+    model = _fit_position(sets, config)
+    folds: list[dict[str, Any]] = []
+    for held_out, others in leave_one_out(list(sets)) if judge and len(sets) > 1 else ():
+        fitted = _fit_position(others, config)
+        stated = fitted.predict(held_out.select(fitted.columns))
+        methods: dict[str, Any] = {m: empty() for m in METHODS} | {"gp_thesis": score(held_out.Y, *stated)}
+        folds.append(
+            {"held_out": held_out.name, "rows": len(held_out), "lost": held_out.counts["lost"], "methods": methods}
+        )
+    X = np.concatenate([s.select(model.columns) for s in sets])
+    X = X[np.isfinite(X).all(axis=1)]
+    header = {
+        **header_of_sets(sets, config, model.columns, (X.min(axis=0), X.max(axis=0)), folds),
+        "horizon": "from the first frame",
+        "frame": "first camera",
+    }
+    mean = {m: average([f["methods"][m] for f in folds]) if folds else empty() for m in METHODS}
+    table = {"schema": 1, "model": None, "features": header["features"], "folds": folds, "mean": mean}
+    return TrainedModel(model.to_arrays(), header, {**table, "comparison": None}, sets)
+
+
+def _fit_position(sets: Sequence[TrainingSet], config: TrainConfig) -> ThesisModel:
+    columns = THESIS if config.features == "auto" else resolve(config.features)
+    regressor = "sparse" if config.regressor == "auto" else config.regressor
+    return fit_thesis(sets, columns, regressor, shared=True, seed=config.seed, inducing=config.inducing)

@@ -14,8 +14,7 @@ from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.files import write_arrays
 from gpvo.io.run import read_run
 from gpvo.learning.config import TrainConfig
-from gpvo.learning.position import train_position
-from gpvo.learning.train import train_sets
+from gpvo.learning.train import train_position, train_sets
 from gpvo.online import modelfile
 from gpvo.online.features import resolve
 from gpvo.online.predictor import Predictor

@@ -107,7 +107,7 @@ def _least_depth_m(camera: StereoCamera) -> float:
     return min(0.05, 0.5 * camera.baseline_m)
 
 
-def _projection_jacobian(P: Array, camera: StereoCamera) -> Array:
+def projection_jacobian(P: Array, camera: StereoCamera) -> Array:
     """Derivative (M, 3, 3) of (u, v, d) [px] by points (M, 3) in the camera [m]."""
     X, Y, Z = P.T
     J = np.zeros((len(P), 3, 3))
@@ -177,7 +177,7 @@ class NormalEquations:
         for rows, part in seen.parts():
             P, root = now.in_camera(part), root_weight[rows]
             r = (root[:, None] * ((part.uvd - seen.camera.project(P)) @ WHITEN.T))[:, :, None]
-            slope = root[:, None, None] * (WHITEN @ _projection_jacobian(P, seen.camera))
+            slope = root[:, None, None] * (WHITEN @ projection_jacobian(P, seen.camera))
             A = slope @ np.concatenate([-np.broadcast_to(np.eye(3), (len(P), 3, 3)), se3.skew(P)], axis=2)
             A[part.frame == 0] = 0.0  # the first pose stays
             D = slope @ np.swapaxes(R[part.frame], 1, 2) @ lift[part.track]

@@ -21,6 +21,7 @@ from gpvo.parallel import map_jobs
 from gpvo.runner import config_of
 from gpvo.runner import run as run_odometry
 from gpvo.twin.bundle import Observations
+from gpvo.twin.common import CommonField, drawn_signs
 from gpvo.twin.gap import Gap, restated
 from gpvo.twin.noise import Neighbours, Structure, adjust, draw_signs, without_loose_frames
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
@@ -35,9 +36,9 @@ MIN_POINTS = 12
 @dataclass(frozen=True)
 class Original:
     """A run with its structure. ``noise_px`` (M, 3): residuals of the observations as large as the noise was;
-    ``neighbours``: which tracks may err alike; ``first`` (M,) the first observation of each track; ``repeats`` (F,)
-    frames that repeat the one before. ``rig``: what odometry found of its calibration's errors; measurements are
-    ``seen`` without them."""
+    ``neighbours``: which tracks may err alike; ``common``: how all err alike; ``first`` (M,) the first observation of
+    each track; ``repeats`` (F,) frames that repeat the one before. ``rig``: what odometry found of its calibration's
+    errors; measurements are ``seen`` without them."""
 
     run: Run
     config: VoConfig
@@ -46,6 +47,7 @@ class Original:
     structure: Structure
     noise_px: Array
     neighbours: Neighbours
+    common: CommonField
     first: NDArray[np.bool_]
     repeats: NDArray[np.bool_]
 
@@ -76,7 +78,9 @@ def estimate(path: Path) -> Original:
     if not np.isfinite(structure.residual_px).all():
         raise SourceError("its structure cannot be estimated: the fit fails", where=path, cure="look at the run")
     neighbours = Neighbours.of(seen, structure)
-    return Original(run, config_of(path), rig, seen, structure, _noise(seen, structure), neighbours, first, repeats)
+    noise = _noise(seen, structure)
+    common = CommonField.of(seen, structure, noise, drawn_signs(len(structure.points_world), neighbours), t_ns)
+    return Original(run, config_of(path), rig, seen, structure, noise, neighbours, common, first, repeats)
 
 
 def _refuse_too_few(frame: NDArray[np.int64], path: Path) -> None:
@@ -150,6 +154,9 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
     rng = np.random.default_rng([settings.seed, replicate, 29])
     pixels = _projected(original, settings, replicate)
     noise = _drawn_noise(original, rng)
+    if original.common.variance_px2.any():
+        drawn = original.common.draw(seen, np.random.default_rng([settings.seed, replicate, 37]))
+        noise += np.where(original.structure.weight[:, None] > 0, drawn, 0.0)
     uv_left, uv_right = pixels[0] + noise[:, :2], pixels[1] + noise[:, :2] - noise[:, 2:] * [1.0, 0.0]
     # An outlier's landmark may lie behind a camera that saw something else there.
     size = np.array([seen.camera.width, seen.camera.height])
@@ -227,6 +234,7 @@ def make_twins(
 def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: Path) -> Path:
     source = twin_source(original, settings, replicate)
     about = {**asdict(settings), "of": original.run.name, "replicate": replicate}
+    about["common_variance_px2"] = original.common.about()
     conditions, truth = _Conditions(original), source.truth
     factor = np.ones(6) if settings.gap is None else settings.gap.factors(settings.replicates)[replicate]
 

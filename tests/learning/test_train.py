@@ -427,8 +427,8 @@ def test_window_target():
 
 def test_position_target_has_its_own_type(tmp_path):
     from gpvo.dataset.build import build
-    from gpvo.learning.position import train_position
     from gpvo.learning.thesis import ThesisModel
+    from gpvo.learning.train import train_position
 
     sets = [build(*make_run(k, n=100), name=str(k), target="position") for k in range(3)]
     trained = train_position(sets, TrainConfig(target="position"))

@@ -1,0 +1,170 @@
+"""Errors that the points of a frame share: a smooth random field over the image, added to the noise of a twin.
+
+Noise with a sign of its own on each track averages out over a frame. Imperfect matching that depends on the place in
+the image, jitter between the cameras, objects and foreshortening do not. Each channel u, v, d of the field is
+``c_k . (1, x, y, x^2, xy, y^2)`` [px] in frame k, with the image scaled to [-1, 1]; the 18 coefficients have one
+variance for (u, v) and one for d, of each kind (:data:`KINDS`) of dependence on time.
+
+The residuals of a motion (measured minus moved, ``e = r_k - G r_{k-1}``, whitened), with its six directions A projected
+out, say of the 18 modes F ``S_k = F' (1 - A A^+) e``, to which increments ``c_k`` of a field add ``N_k c_k``, with
+``N_k = F' (1 - A A^+) F``. The mean over the run is taken off: a fit to noisy points is biased, and so are twins of
+their own. Energies of sums of S over blocks of several lengths are compared with those of draws of the twins' noise. If
+they exceed them by a quarter and beyond chance (the randomisation test of E. Pitman, 1937), non-negative least squares
+finds the variances that explain it. What lies within the six directions is unseen: it is taken to be as strong.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.signal import lfilter
+
+from gpvo.geometry import se3
+from gpvo.twin.bundle import WHITEN, Observations, projection_jacobian
+from gpvo.twin.noise import Neighbours, Structure, draw_signs
+from gpvo.types import Array
+from gpvo.vo.points import point_jacobian
+
+KINDS = ("level", "white", "1 s", "10 s")
+"""White noise of each frame; and increments that a point accumulates from its first view: white, or correlated."""
+_TAU_S = (0.0, 0.0, 1.0, 10.0)
+_BLOCKS_S = (0.0, 0.25, 1.0, 3.0, 10.0)
+_GROUPS = (0, 1, 3, 6, 7, 9, 12, 13, 15)  # where those of u, v, d by order 0, 1, 2 begin among the 18
+_CHANNELS = np.repeat(np.eye(2), (12, 6), axis=1)  # of (u, v), of d
+_DRAWS, _FIELDS = 99, 24  # a run is beyond all the draws by chance once in a hundred
+_WORTH = 1.25  # less changes sigma by no more than an eighth
+_MIN_PAIRS, _MIN_MOTIONS, _MIN_BLOCKS = 20, 40, 4
+_MAX_GAP, _LARGEST = 3, 4.0  # frames between two views of a pair, as over a repeat; whitened residuals count no more
+
+
+@dataclass(frozen=True)
+class CommonField:
+    """``variance_px2`` (4, 2) by kind, of (u, v) and of d; zero where none is. ``step_s``: median between frames."""
+
+    variance_px2: Array
+    step_s: float
+
+    @classmethod
+    def of(
+        cls, seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8], t_ns: NDArray[np.int64]
+    ) -> CommonField:
+        """The field that a run shows, beyond what draws of the noise (M, 3) with ``signs`` (N, draws) of tracks would.
+        ``t_ns`` (F,) stamps. None is found where fewer than forty motions have twenty points.
+        """
+        step_s = max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-6) if len(t_ns) > 1 else 1.0
+        S, N = _modes(seen, structure, noise_px, signs)
+        lengths = [max(1, round(s / step_s)) for s in _BLOCKS_S]
+        lengths = [n for n in dict.fromkeys(lengths) if len(S) // n >= _MIN_BLOCKS]
+        variance = np.zeros((len(KINDS), 2))
+        if (N[:, 0, 0] > 0).sum() < _MIN_MOTIONS:
+            return cls(variance, step_s)
+        energy = _block_energies(S, N, lengths)
+        total = (energy / energy.std(axis=0)).sum(axis=1)
+        if total[0] > total[1:].max() and (energy[0] / energy[1:].mean(axis=0)).mean() > _WORTH:
+            scatter, rng = energy[1:].std(axis=0), np.random.default_rng(29)
+            units = np.zeros((len(KINDS), 2, len(scatter)))
+            for kind, channel in itertools.product(range(len(KINDS)), range(2)):
+                if _TAU_S[kind] <= lengths[-1] * step_s:  # longer than the blocks, it could not be told
+                    c = _drawn(kind, (len(S), _FIELDS, 18), step_s, rng) * _CHANNELS[channel]
+                    c = np.diff(c, axis=0, prepend=0.0) if kind == 0 else c
+                    units[kind, channel] = _block_energies(c @ N, N, lengths).mean(axis=0) / scatter
+            excess = (energy[0] - energy[1:].mean(axis=0)) / scatter
+            variance = nnls(units.reshape(-1, len(scatter)).T, excess)[0].reshape(-1, 2)
+        return cls(variance, step_s)
+
+    def draw(self, seen: Observations, rng: np.random.Generator) -> Array:
+        """(M, 3) the field [px] at the observations."""
+        shape = (int(seen.frame.max(initial=-1)) + 1, 18)
+        level, *steps = (
+            _drawn(kind, shape, self.step_s, rng) * np.sqrt(variance @ _CHANNELS)
+            for kind, variance in enumerate(self.variance_px2)
+        )
+        order = np.lexsort((seen.frame, seen.track))
+        first = np.diff(seen.track[order], prepend=-1) != 0
+        gathered = np.where(first[:, None], 0.0, _at(sum(steps, np.zeros_like(level)), seen)[order]).cumsum(axis=0)
+        field = _at(level, seen)
+        field[order] += gathered - gathered[first][np.cumsum(first) - 1]
+        return field
+
+    def about(self) -> dict[str, list[float]]:
+        """The variances [px^2] of the kinds found."""
+        return {kind: v.tolist() for kind, v in zip(KINDS, self.variance_px2) if v.any()}
+
+
+def drawn_signs(count: int, neighbours: Neighbours) -> NDArray[np.int8]:
+    """(count, draws) signs of tracks, for :meth:`CommonField.of`."""
+    rng = np.random.default_rng(29)
+    return np.stack([draw_signs(count, neighbours, rng).astype(np.int8) for _ in range(_DRAWS)], axis=1)
+
+
+def _block_energies(S: NDArray[Any], N: Array, lengths: list[int]) -> Array:
+    """(R, lengths x 9) mean squares of sums over blocks of R series S (F, R, 18), by group; takes off their means."""
+    told = N[:, 0, 0] > 0
+    S -= (S.sum(axis=0, dtype=np.float64) / told.sum()).astype(S.dtype)
+    S[~told] = 0.0
+    out = []
+    for n in lengths:
+        last = len(S) // n * n
+        sums = np.add.reduceat(S[:last], np.arange(0, last, n), axis=0)
+        out.append(np.add.reduceat(np.square(sums, out=sums).mean(axis=0, dtype=np.float64), _GROUPS, axis=1))
+    return np.concatenate(out, axis=1)
+
+
+def _drawn(kind: int, shape: tuple[int, ...], step_s: float, rng: np.random.Generator) -> Array:
+    """Coefficients (F, ...) of unit variance, stationary in time."""
+    x, keep = rng.standard_normal(shape), np.exp(-step_s / _TAU_S[kind]) if _TAU_S[kind] else 0.0
+    x[1:] *= np.sqrt(1 - keep**2)
+    return np.asarray(lfilter([1.0], [1.0, -keep], x, axis=0))
+
+
+def _basis(seen: Observations) -> Array:
+    """(M, 6) the smooth functions at the observations."""
+    x, y = (seen.uvd[:, :2] / [seen.camera.width / 2, seen.camera.height / 2] - 1.0).T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+
+def _at(c: Array, seen: Observations) -> Array:
+    """(M, 3) fields of coefficients c (F, 18) at the observations."""
+    B = _basis(seen)
+    return np.stack([np.einsum("mb,mb->m", B, c[seen.frame, i : i + 6]) for i in (0, 6, 12)], axis=1)
+
+
+def _pairs(seen: Observations, structure: Structure) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Consecutive observations of a track that the fit used, in order of the later frame."""
+    order = np.lexsort((seen.frame, seen.track))
+    order = order[structure.weight[order] > 0]
+    a, b = order[:-1], order[1:]
+    paired = (seen.track[a] == seen.track[b]) & (seen.frame[b] - seen.frame[a] <= _MAX_GAP)
+    by_frame = np.argsort(b[paired])
+    return a[paired][by_frame], b[paired][by_frame]
+
+
+def _modes(
+    seen: Observations, structure: Structure, noise_px: Array, signs: NDArray[np.int8]
+) -> tuple[NDArray[Any], Array]:
+    """S (F, 1 + draws, 18) of the run and of the draws, and N (F, 18, 18)."""
+    first, second = _pairs(seen, structure)
+    P, R, B = structure.in_camera(seen), structure.T_world_cam[:, :3, :3], _basis(seen)
+    S, N = np.zeros((len(R), 1 + signs.shape[1], 18), np.float32), np.zeros((len(R), 18, 18))
+    starts = np.searchsorted(seen.frame[second], np.arange(len(R) + 1))
+    for k in np.flatnonzero(np.diff(starts) >= _MIN_PAIRS):
+        a, b = (of[starts[k] : starts[k + 1]] for of in (first, second))
+        J, W = projection_jacobian(P[b], seen.camera), WHITEN / structure.sigma_px[k]
+        G = J @ R[k].T @ R[seen.frame[a]] @ point_jacobian(seen.camera.project(P[a]), seen.camera)
+        run, noise = ((r[b] - (G @ r[a][:, :, None])[:, :, 0]) @ W.T for r in (structure.residual_px, noise_px))
+        # Huber's weights: the same for a residual and its opposite, so for all draws.
+        w = np.minimum(1.0, _LARGEST / np.maximum(np.linalg.norm(run, axis=1), 1e-9))[:, None, None]
+        A = w * (W @ J @ np.concatenate([-np.broadcast_to(np.eye(3), J.shape), se3.skew(P[b])], axis=2))
+        F = (w * (W[:, :, None] * B[b, None, None, :]).reshape(len(a), 3, 18)).reshape(-1, 18)
+        Q = np.linalg.qr(A.reshape(-1, 6))[0]
+        F -= Q @ (Q.T @ F)
+        by_point = np.swapaxes(w * F.reshape(-1, 3, 18), 1, 2)
+        S[k, 0] = (by_point @ run[:, :, None]).sum(axis=0)[:, 0]
+        S[k, 1:] = signs[seen.track[a]].T @ (by_point @ noise[:, :, None])[:, :, 0]
+        N[k] = F.T @ F
+    return S, N
