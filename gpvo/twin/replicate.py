@@ -160,7 +160,8 @@ def twin_source(original: Original, settings: TwinSettings, replicate: int) -> T
     uv_left, uv_right = pixels[0] + noise[:, :2], pixels[1] + noise[:, :2] - noise[:, 2:] * [1.0, 0.0]
     # An outlier's landmark may lie behind a camera that saw something else there.
     size = np.array([seen.camera.width, seen.camera.height])
-    in_view = (np.abs(np.stack([uv_left, uv_right]) - 0.5 * size) < 1.5 * size).all(axis=(0, 2))
+    off = np.stack([uv_left, uv_right], axis=1) / size - 0.5
+    in_view = np.abs(off).reshape(-1, 4).max(axis=1) < 1.5
     t_ns = run.log.t_ns
     starts = np.searchsorted(seen.frame, np.arange(len(t_ns) + 1))
     frames: list[TrackFrame] = []
