@@ -18,6 +18,7 @@ states; how large it is, differences between neighbours tell. Which of the two i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -75,8 +76,7 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
     """Motions in which the truth moves as the vehicle cannot, though odometry does not, and far more of an error than
     usual; those less than a second apart as one, with what lies between."""
     errors = motion_errors(log, truth)
-    size = np.linalg.norm(errors.xi.reshape(-1, 2, 3), axis=2)
-    large = (size > _JUMP_MEDIANS * np.median(size, axis=0)).any(axis=1) if len(size) else np.zeros(0, dtype=bool)
+    large = errors.far(_JUMP_MEDIANS)
     if not large.any():
         return []
     t_ns, t_prev_ns = log.t_ns, log.column("t_prev_ns")
@@ -98,10 +98,10 @@ def jumps(log: VoLog, truth: TruthLog) -> list[Stretch]:
     return found
 
 
-def false_motions(log: VoLog, truth: TruthLog) -> NDArray[np.int64]:
-    """(W, 2) times [ns] of waits during which the truth moves, and of its jumps."""
-    waits, leaps = wandering_waits(log, truth), [s.t_ns for s in jumps(log, truth)]
-    return np.concatenate([waits, np.array(leaps, dtype=np.int64).reshape(-1, 2)])
+def false_motions(log: VoLog, truth: TruthLog, leaps: Sequence[Stretch] | None = None) -> NDArray[np.int64]:
+    """(W, 2) times [ns] of waits during which the truth moves, and of its jumps: ``leaps`` if they are known."""
+    found = [s.t_ns for s in (jumps(log, truth) if leaps is None else leaps)]
+    return np.concatenate([wandering_waits(log, truth), np.array(found, dtype=np.int64).reshape(-1, 2)])
 
 
 def in_waits(log: VoLog, waits: ArrayLike) -> NDArray[np.bool_]:
@@ -112,10 +112,10 @@ def in_waits(log: VoLog, waits: ArrayLike) -> NDArray[np.bool_]:
     return np.asarray(np.searchsorted(first, end) > np.searchsorted(last, start, side="right"), dtype=np.bool_)
 
 
-def without_wandering_truth(log: VoLog, truth: TruthLog) -> VoLog:
-    """The log with what falls into such waits, or jumps of the truth, called lost, so that neither an error nor a sum
-    of errors reaches over it; for statistics alone."""
-    waits = false_motions(log, truth)
+def without_wandering_truth(log: VoLog, truth: TruthLog, leaps: Sequence[Stretch] | None = None) -> VoLog:
+    """The log with such :func:`false_motions` called lost, so that neither an error nor a sum of errors reaches over
+    them; for statistics alone."""
+    waits = false_motions(log, truth, leaps)
     if not len(waits):
         return log
     marked = zip(log, in_waits(log, waits))

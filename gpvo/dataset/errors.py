@@ -146,6 +146,17 @@ class MotionErrors:
     T_est: Array
     dt_s: Array
 
+    @property
+    def sizes(self) -> Array:
+        """(M, 2) of translation [m] and rotation [rad]."""
+        return np.linalg.norm(self.xi.reshape(-1, 2, 3), axis=2)
+
+    def far(self, medians: float) -> NDArray[np.bool_]:
+        """(M,) whether translation or rotation is wrong by more than so many times its median error."""
+        if not len(self.xi):
+            return np.zeros(0, dtype=bool)
+        return np.asarray((self.sizes > medians * np.median(self.sizes, axis=0)).any(axis=1))
+
 
 def motion_errors(log: VoLog, truth: TruthLog) -> MotionErrors:
     """Errors of all ``ok`` and ``degraded`` motions with truth at both ends."""

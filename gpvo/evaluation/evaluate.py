@@ -138,7 +138,8 @@ def evaluate_run(
     T_true, known = interpolate_truth(truth, log.t_ns)
     _refuse_too_little(run, truth, int(known.sum()))
     blind = turn_without_truth_deg(log, truth) > 0.0
-    scored = _unscored(log) if blind else without_wandering_truth(log, truth)
+    leaps = [] if blind else jumps(log, truth)
+    scored = _unscored(log) if blind else without_wandering_truth(log, truth, leaps)
     errors = motion_errors(scored, truth)
     stated = np.repeat(options.truth_sigma or (truth.sigma_translation_m, truth.sigma_rotation_rad), 3)
     sigma = stated
@@ -177,7 +178,7 @@ def evaluate_run(
         time_offset_s=offset_s,
         late_s=late_s,
         unscored=0 if blind else int(log.usable.sum() - scored.usable.sum()),
-        odd=[] if blind else [*jumps(log, truth), *odd_stretches(scored, truth)],
+        odd=[] if blind else [*leaps, *odd_stretches(scored, truth)],
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=_in_domain(predictions),
     )

@@ -268,9 +268,8 @@ def _of_frames(turned: FixedRotation) -> str:
 
 def _of_few_motions(e: Evaluation) -> Iterator[str]:
     """Motions so few and so wrong that every mean is theirs."""
-    size = np.linalg.norm(e.errors.xi.reshape(-1, 2, 3), axis=2)
-    far = (size > _FAR * np.median(size, axis=0)).any(axis=1) if len(size) else np.zeros(0, dtype=bool)
-    if 0 < far.sum() <= _FEW_FAR * len(far) and ((size[far] ** 2).sum(0) > _OUTWEIGH * (size**2).sum(0)).any():
+    far, square = e.errors.far(_FAR), e.errors.sizes**2
+    if 0 < far.sum() <= _FEW_FAR * len(far) and (square[far].sum(axis=0) > _OUTWEIGH * square.sum(axis=0)).any():
         at = e.errors.index[np.flatnonzero(far)[0]]
         yield (
             f"In {far.sum()} of {len(far)} motions, first at frame {at} ({e.t_s[at]:.2f} s), odometry and truth differ"
@@ -321,7 +320,7 @@ def _of_truth_and_path(e: Evaluation) -> Iterator[str]:
     if every := interpolated_between(e.run.truth):
         yield (
             f"The ground truth runs in straight pieces of {every} poses: it was interpolated, and looks more exact than"
-            " it is. Give the poses as they were without_held."
+            " it is. Give the poses as they were measured."
         )
     own, true = (T[e.covered, :3, 3] for T in (e.T_est, e.T_true))
     size, true_size = (float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())) for p in (own, true))
