@@ -118,7 +118,7 @@ def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iter
     """One run after the other, with a note if its poses or stamps, or those of its truth, seem not to be what they are
     taken for; ``noisy`` gets the names of those whose truth cannot judge single motions."""
     from gpvo.dataset.build import aligned_truth
-    from gpvo.dataset.hand_eye import Misread, late_by
+    from gpvo.dataset.misread import Misread, late_by
 
     for path in paths:
         run = read_run(path)

@@ -51,7 +51,7 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
       change of the errors over a second without them.
     * ``inverse_poses`` {``of``, ``error_change``, ``or_backwards``}: whose poses seem inverse; None: nobody's.
     * ``unlike`` {``scale``, ``motion``, ``turn``, ``path``}: how little odometry and truth resemble each other
-      (:class:`gpvo.dataset.hand_eye.Resemblance`), None where they do.
+      (:class:`gpvo.dataset.misread.Resemblance`), None where they do.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
       {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
       frame or a second do not reach across a gap in the truth.

@@ -24,7 +24,7 @@ from gpvo.dataset.errors import (
     turn_without_truth_deg,
     velocity_path,
 )
-from gpvo.dataset.hand_eye import FixedRotation, InversePoses, Misread, Resemblance, late_by
+from gpvo.dataset.misread import FixedRotation, InversePoses, Misread, Resemblance, late_by
 from gpvo.errors import SourceError
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, consistency
 from gpvo.evaluation.statements import Statement, statements

@@ -17,7 +17,7 @@ from gpvo.dataset.errors import (
     turn_without_truth_deg,
     without_held,
 )
-from gpvo.dataset.hand_eye import GROSS_DEG, FixedRotation, Resemblance
+from gpvo.dataset.misread import GROSS_DEG, FixedRotation, Resemblance
 from gpvo.evaluation.consistency import BY_MODEL, Consistency, Horizon
 from gpvo.online.features import AXES
 from gpvo.stats.consistency import seen_axes

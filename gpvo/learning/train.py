@@ -21,11 +21,11 @@ from gpvo.files import read_json, write_json
 from gpvo.geometry.covariance import variances
 from gpvo.io.run_read import Run
 from gpvo.io.snapshot import code_digest
-from gpvo.learning.checked import checked
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.fit import NONE, Learned, fit_model
 from gpvo.learning.methods import METHODS, average, empty, method_arrays, score, simple_covariances, stated_and_actual
 from gpvo.learning.regressors.numerics import fixed_threads
+from gpvo.learning.rows import checked
 from gpvo.learning.sample import draw_sample
 from gpvo.learning.thesis import ThesisModel, fit_thesis
 from gpvo.online import modelfile

@@ -20,7 +20,7 @@ from gpvo.dataset.errors import (
     telling_distance_m,
     without_held,
 )
-from gpvo.dataset.hand_eye import fixed_rotation
+from gpvo.dataset.misread import fixed_rotation
 from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3

@@ -13,7 +13,7 @@ import pytest
 from evaluation_runs import START_NS, make_run
 from gpvo.dataset.build import build
 from gpvo.dataset.errors import interpolate_truth, turn_without_truth_deg
-from gpvo.dataset.hand_eye import FixedRotation
+from gpvo.dataset.misread import FixedRotation
 from gpvo.errors import GpvoError, SourceError
 from gpvo.evaluation.consistency import BY_MODEL
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, evaluate_run, unjudged_run
