@@ -14,11 +14,13 @@ are a part of the prior covariance. A Kalman filter of constant state estimates 
 dx from the residuals of each motion, with the motion as an unknown without a prior, and dy from the rows, which need no
 motion. What cannot be told apart from motion: the depth's scale.
 
-Two things keep it honest. Errors of neighbouring frames are alike (a feature is off in the same way for as long as it
+Three things keep it honest. Errors of neighbouring frames are alike (a feature is off in the same way for as long as it
 is tracked): blocks of frames are compared with their expected scatter, and all information is divided by
-the ratio. And rigs are of several kinds, exact or not, with a mounting and with lenses from good to bad: the
-estimate is the mean over the kinds by their probability, so that an exact rig keeps its exact geometry, and a camera
-knocked out of place keeps its lens.
+the ratio. What persists of a point's disparity error dilutes the translation, as any error in a variable does (R.
+Carroll et al., "Measurement error in nonlinear models", 2006, chapter 3), and over level ground a diluted translation
+looks like a wrong disparity: the score may be off by a tenth of this dilution. And rigs are of several kinds, exact or
+not, with a mounting and with lenses from good to bad: the estimate is the mean over the kinds by their probability, so
+that an exact rig keeps its exact geometry, and a camera knocked out of place keeps its lens.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.types import Array, StereoCamera
-from gpvo.vo.motion import Motion, Whitened, apply_whitener
+from gpvo.vo.motion import Motion, Whitened, apply_whitener, persistent_direction
 
 _HIGHEST = 4  # order
 POWERS = np.array([(n - j, j) for n in range(_HIGHEST + 1) for j in range(n + 1)])  # of x and y, order by order
@@ -49,6 +51,7 @@ _ROLLS = (1.0, 16.0)  # the same of the turn about the optical axis, which rows 
 _NEGLIGIBLE = 1e-12  # probability of a kind
 _BLOCK = 20  # motions, longer than most features live
 _EXCESS = 16.0, 2.0  # of scatter to begin with, and the number of blocks that this guess is worth
+_DILUTION = 0.1  # share of it, standard deviation: noise differs by direction, so what persists is known no better
 _NEAR = 6.0  # disparity of the points used, in standard deviations of noise: that of far ones says nothing for sure
 
 
@@ -175,25 +178,33 @@ class RigError:
         B = apply_whitener(white.W, M)
         root = np.sqrt(np.minimum(1.0, 3.2 / np.sqrt((z**2).sum(0) + 1e-9)))
         A, B = white.A * (root / scale_px), B * (root / scale_px)
+        # The derivatives by the translation are in proportion to the disparity, and so to its error.
+        g = apply_whitener(white.W, persistent_direction(moved.G)) * (root / scale_px)
+        dilution = (A[:, :3] * g[:, None]).sum(0) * motion.noise.persistent * motion.scale_px**2 / motion.uvd_prev[:, 2]
         A = A.transpose(0, 2, 1).reshape(-1, 6)
         B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, N_TERMS), (z * root).reshape(-1)])
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
         if self._learn:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
-            near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px, 3)
-            if near.sum() >= 3 * 8:
-                self._learn_disparities(A[near], B[near])
+            near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
+            if near.sum() >= 8:
+                rows = np.tile(near, 3)
+                self._learn_disparities(A[rows], B[rows], dilution[:, near].sum(axis=1))
             self._learn_rows(phi * self._camera.fy_px, row_error)
             self._conclude()
         return added
 
-    def _learn_disparities(self, A: Array, B: Array) -> None:
-        """``A`` (n, 6) and ``B`` (n, 16): whitened derivatives by the motion, by dx, and residuals."""
-        rest = B - A @ np.linalg.solve(A.T @ A, A.T @ B)
+    def _learn_disparities(self, A: Array, B: Array, dilution: Array) -> None:
+        """``A`` (n, 6) and ``B`` (n, 16): whitened derivatives by the motion, by dx, and residuals; ``dilution``
+        (3,) of the translation's score.
+        """
+        K = np.linalg.solve(A.T @ A, A.T @ B)
+        rest = B - A @ K
         sums = rest.T @ rest
         information = sums[:-1, :-1]
-        self._blocks[0].add(information, sums[:-1, -1] + information @ self.state.mean[_DX])
+        score = sums[:-1, -1] + information @ self.state.mean[_DX]
+        self._blocks[0].add(information, score, -K[:3, :-1].T @ dilution)
 
     def _learn_rows(self, rows: Array, row_error: Array) -> None:
         """``rows`` (15, M): derivatives of the row errors by dy. Far points tell as much as near ones."""
@@ -206,8 +217,7 @@ class RigError:
         """The state given all that was learnt."""
         information, score = np.zeros((2 * N_TERMS, 2 * N_TERMS)), np.zeros(2 * N_TERMS)
         for part, block in zip((_DX, _DY), self._blocks, strict=True):
-            information[part, part] = block.information / block.excess
-            score[part] = block.score / block.excess
+            information[part, part], score[part] = block.believed()
         self.state = self._mixed(information, score)
         for part, block in zip((_DX, _DY), self._blocks, strict=True):
             block.close(self.state.mean[part], self.state.covariance[part, part])
@@ -274,6 +284,7 @@ class _Blocks:
     def __init__(self, precision: Array) -> None:
         self.information: Array = np.zeros((N_TERMS, N_TERMS))
         self.score: Array = np.zeros(N_TERMS)
+        self._dilution: Array = np.zeros(N_TERMS)
         self._freedom = _EXCESS[1] * N_TERMS
         self._chi2 = _EXCESS[0] * self._freedom
         self._floor = 1e-6 * precision
@@ -284,9 +295,20 @@ class _Blocks:
         """Variance of a block's score over its information."""
         return self._chi2 / self._freedom
 
-    def add(self, information: Array, score: Array) -> None:
+    def believed(self) -> tuple[Array, Array]:
+        """Information and score, of which the excess and a share of the dilution may be no signal."""
+        dilution = _DILUTION * self._dilution
+        diluted = np.linalg.solve(self.information + self._floor, dilution)
+        part = dilution / (self.excess + dilution @ diluted)
+        return (
+            (self.information - np.outer(part, dilution)) / self.excess,
+            (self.score - part * (diluted @ self.score)) / self.excess,
+        )
+
+    def add(self, information: Array, score: Array, dilution: Array | float = 0.0) -> None:
         """Take in one motion; the score is that of a state of zero."""
         self.information, self.score = self.information + information, self.score + score
+        self._dilution = self._dilution + dilution
         self._count += 1
 
     def close(self, mean: Array, covariance: Array) -> None:
