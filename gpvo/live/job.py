@@ -14,7 +14,7 @@ from typing import Any
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import GpvoError
 from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, ODOMETRY_TYPE, POSE_TYPE, open_bag
-from gpvo.io.bags import info_topic, say
+from gpvo.io.bags import has_word, info_topic
 from gpvo.live.engine import Engine, EngineSettings, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
@@ -231,7 +231,7 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     if isinstance(stage, PoseStage):
         return {stage.topic: settings.pose_type, **truth}
     assert isinstance(stage, StereoStage)
-    images = {t: IMAGE_TYPES[say("compressed", t)] for t in (stage.left, stage.right)}
+    images = {t: IMAGE_TYPES[has_word("compressed", t)] for t in (stage.left, stage.right)}
     infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
     return {**images, **infos, **({stage.imu: IMU_TYPE} if stage.imu else {}), **truth}
 

@@ -15,7 +15,7 @@ from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.io.bag_images import PairQueue, decode_message, encoding_of
 from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.bags import camera_info_of, info_topic, say
+from gpvo.io.bags import camera_info_of, has_word, info_topic
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import Depth, SourceReport
@@ -113,9 +113,9 @@ class StereoStage:
             self._take_imu(message)
         elif topic in (self.left, self.right):
             missing = self._report.missing
-            pair = self._pairs.push(topic, message)
+            pairs = self._pairs.push(topic, message)
             self.counts["unpaired"] += self._report.missing - missing
-            if pair is not None:
+            for pair in pairs:
                 self._take_size(pair[1])
                 if self._rectifier is not None:
                     yield from self.flush()
@@ -189,7 +189,7 @@ class StereoStage:
         self._infos[topic] = camera_info_of(message, topic, topic)
         names = [info_topic(t) for t in (self.left, self.right)]
         if all(n in self._infos for n in names):
-            rectified = say("rect", self.left, self.right)
+            rectified = has_word("rect", self.left, self.right)
             self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
 
     @property

@@ -16,9 +16,10 @@ from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.bag_images import decode_message, pair_streams
 from gpvo.io.bag_reader import pose_of, stamp_ns
-from gpvo.io.bags import say
+from gpvo.io.bags import has_word
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport
+from gpvo.io.stamps import match_nearest
 from gpvo.io.stated import to_records
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 
@@ -118,6 +119,25 @@ def test_a_wide_tolerance_joins_no_neighbours_where_an_image_is_lost():
     apart = [stamp_ns(right) - t_ns for t_ns, _, right in pairs]
     assert len(pairs) > 270
     assert set(apart) == {5_000_000}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_wide_tolerance_joins_no_neighbours_at_the_start_or_where_both_cameras_lose_images(seed):
+    """A fifth of the images of each camera lost; the right one is 5 ms behind, at 30 Hz."""
+    rng, late_ns = np.random.default_rng(seed), {"left": 0, "right": 5_000_000}
+    sides = [
+        [seq.START_NS + k * 33_333_333 + late for k in range(40) if rng.random() > 0.2] for late in late_ns.values()
+    ]
+    listed = [[(t, str(t)) for t in side] for side in sides]
+    by_file = match_nearest(*listed, 40_000_000, SourceReport(), "folder")
+    assert {int(b) - int(a) for _, a, b in by_file} == {5_000_000}
+    maker = BagMaker(ros1=False)
+    for side, stamps in zip(late_ns, sides):
+        for t in stamps:
+            maker.image(side, t, GREY, "mono8")
+    stream = [(topic, message) for _, topic, message in sorted(maker.messages, key=lambda m: m[0])]
+    pairs = pair_streams(stream, "left", 40_000_000, SourceReport(), "bag")
+    assert [stamp_ns(right) - t_ns for t_ns, _, right in pairs] == [5_000_000] * len(by_file)
 
 
 GREY = np.random.default_rng(0).integers(20, 235, (24, 32), dtype=np.uint8)
@@ -322,9 +342,9 @@ def test_one_imu_stamp_far_ahead_costs_one_sample(tmp_path, where):
 @pytest.mark.parametrize("name", ["direct/{}/image_raw", "correct_{}/image", "{}/image_unrectified"])
 def test_a_word_that_ends_in_rect_makes_no_image_rectified(name):
     sides = [f"/{name.format(side)}" for side in ("left", "right")]
-    assert not say("rect", *sides)
-    assert not say("rect", sides[0], "/right/image_rect")
-    assert say("rect", "/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
+    assert not has_word("rect", *sides)
+    assert not has_word("rect", sides[0], "/right/image_rect")
+    assert has_word("rect", "/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
 
 
 def test_bag_without_images(tmp_path):
