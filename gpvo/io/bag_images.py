@@ -77,8 +77,8 @@ def _raw_pixels(message: Any) -> tuple[NDArray[Any] | None, bool]:
 
 
 class PairQueue:
-    """Pairs the messages of two image topics as they come in, by stamps at most :func:`reach_ns` apart. With a tolerance
-    that might join neighbours, the first messages wait until the interval is known.
+    """Pairs the messages of two image topics as they come in, by stamps at most :func:`reach_ns` apart. Where the
+    tolerance might join neighbours, the first ones wait until the interval is known.
 
     A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
     ``nearest_ns``: the closest that two stamps of both sides ever were.

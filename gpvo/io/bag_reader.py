@@ -7,6 +7,7 @@ An IMU is one topic, or two where a driver publishes gyroscope and accelerometer
 from __future__ import annotations
 
 import bz2
+import re
 import sqlite3
 from array import array
 from collections import Counter
@@ -31,6 +32,10 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", POSE_TYPE, "geometry_msgs/msg/TransformStamped")
+SENSOR_TYPES = (*IMAGE_TYPES, IMU_TYPE, *POSE_TYPES)
+_NOT_YET = (".bag.active", ".db3.zstd", ".mcap.zstd")
+_PACKED = re.compile(r"compression_mode[\"']?:\s*[\"']?file\b", re.IGNORECASE)
+_PAUSE_S = 10.0  # between the bags of one recording
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
 _BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
@@ -43,46 +48,94 @@ _ALLOWED = ("CREATE TABLE %", "CREATE INDEX %", "CREATE UNIQUE INDEX %")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS 1 bag, a ROS 2 storage file, or a ROS 2 bag folder."""
-    return _has_storage(path) and (path.is_file() or (path / "metadata.yaml").is_file())
+    """Whether a path is a ROS 1 bag, a ROS 2 storage file, a ROS 2 bag folder, or a folder of these."""
+    return bool(_parts(path))
 
 
-def _has_storage(path: Path) -> bool:
-    if path.is_dir():
-        return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
-    return path.suffix.lower() in (".bag", ".db3", ".mcap")
+def _parts(path: Path) -> list[Path]:
+    """The bags that a path stands for: itself, or those in a folder, of a split recording or of several recorders."""
+    if not path.is_dir() or _is_whole(path):
+        return [path] if _is_whole(path) or path.name.lower().endswith(_NOT_YET) else []
+    inside = sorted(p for p in path.iterdir() if not p.name.startswith("."))
+    bags = [p for p in inside if _is_whole(p)]
+    packed = [p for p in inside if p.name.lower().endswith(_NOT_YET) and p.with_suffix("") not in bags]
+    # 'rosbag reindex' keeps the bag of before as NAME.orig.bag.
+    return packed or [p for p in bags if not (p.stem.endswith(".orig") and p.with_name(p.name[:-9] + ".bag") in bags)]
+
+
+def _is_whole(path: Path) -> bool:
+    if not path.is_dir():
+        return path.suffix.lower() in (".bag", ".db3", ".mcap") and path.is_file()
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file() or not any(f for end in ("db3", "mcap") for f in path.glob(f"*.{end}*")):
+        return False
+    with metadata.open(errors="replace") as file:
+        return not _PACKED.search(file.read(_MAX_METADATA_BYTES))
+
+
+def _check_parts(path: Path, parts: list[Path]) -> None:
+    """Raise SourceError where a path is no bag, where a part is unfinished or packed, and for parts of ROS 1 and 2."""
+    if not path.exists():
+        raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
+    if not parts:
+        raise SourceError("is not a bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
+    for part in parts:
+        if part.name.lower().endswith(".active"):
+            cure = f"end the recorder; else 'rosbag reindex {part.name}', then rename it to {part.stem}"
+            raise SourceError("is still recorded, or the recorder was killed", where=part, cure=cure)
+        if part.suffix.lower() == ".zstd":
+            cure = f"unpack it beside: 'zstd -d {part.parent / '*.zstd'}', then give the same folder"
+            raise SourceError("is compressed as a whole file", where=part, cure=cure)
+        metadata = part / "metadata.yaml"
+        if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
+            reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
+            raise SourceError(reason, where=metadata, cure="name one .mcap or .db3 file inside the folder")
+        require_tables(part)
+    if len({part.is_file() and part.suffix.lower() == ".bag" for part in parts}) > 1:
+        raise SourceError("holds bags of ROS 1 and of ROS 2", where=path, cure="name one of them")
+
+
+def _check_one_recording(path: Path, reader: Any) -> None:
+    """Raise SourceError for bags with a pause between them, or that hold one sensor at one time."""
+    readers = sorted((r for r in reader.readers if r.message_count), key=lambda r: r.start_time)
+    cure = "name one of them, or a folder that holds the bags of one recording alone"
+    for k, after in enumerate(readers[1:], 1):
+        pause_s = (after.start_time - max(r.end_time for r in readers[:k])) * 1e-9
+        if pause_s > _PAUSE_S:
+            text = f"holds several recordings: {after.path.name} begins {pause_s:.0f} s after those before end"
+            raise SourceError(text, where=path, cure=cure)
+        for before in readers[:k]:
+            twice = set(topics_of(before, SENSOR_TYPES)) & set(topics_of(after, SENSOR_TYPES))
+            if twice and before.end_time - after.start_time > _BACK_NS:
+                text = f"{before.path.name} and {after.path.name} both hold '{min(twice)}' at one time"
+                raise SourceError(text, where=path, cure=cure)
 
 
 class _AnyCase(type(Path())):  # type: ignore[misc]
-    """A path by whose suffix rosbags tells the kind of a bag, also where it is in capitals."""
+    """A path by whose suffix rosbags tells the kind of a bag, also where it is in capitals, or of a folder."""
 
     @property
     def suffix(self) -> str:
-        return str(super().suffix).lower()
+        return "" if self.is_dir() else str(super().suffix).lower()
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """An open ``rosbags`` reader.
+    """An open ``rosbags`` reader of a bag, or of all the bags in a folder together, as :func:`is_bag` has it.
 
     Raises SourceError where the bag cannot be read, at opening or later inside the block; one line in any case.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    if not path.exists():
-        raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
-    if not _has_storage(path):
-        raise SourceError("is not a bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
-    metadata = path / "metadata.yaml"
-    if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
-        reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
-        raise SourceError(reason, where=metadata, cure="name one .mcap or .db3 file inside the folder")
     bound_chunks()
     try:
-        require_tables(path)
+        parts = _parts(path)
+        _check_parts(path, parts)
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
-        with AnyReader([_AnyCase(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        typestore = get_typestore(Stores.ROS2_HUMBLE)
+        with AnyReader([_AnyCase(part) for part in parts], default_typestore=typestore) as reader:
+            _check_one_recording(path, reader)
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
@@ -109,17 +162,18 @@ def raw_messages(reader: Any, topics: Container[str]) -> Iterator[tuple[Any, int
     whose QoS in metadata.yaml, as people edit it, is not that of the file beside.
     """
     connections = [c for c in reader.connections if c.topic in topics]
-    silent = {c.topic for c in connections if c.msgcount}
+    silent = {(str(c.owner.path), c.topic) for c in connections if c.msgcount}
     for connection, recorded_ns, raw in reader.messages(connections=connections):
-        silent.discard(connection.topic)
+        silent.discard((str(connection.owner.path), connection.topic))
         if reader.is2 and raw[:4] == _ZSTD:
             text, cure = "its messages are compressed one by one, as metadata.yaml tells", "name the bag's folder"
-            raise SourceError(text, where=reader.paths[0], cure=cure)
+            raise SourceError(text, where=connection.owner.path, cure=cure)
         yield connection, recorded_ns, raw
     if silent:
-        text = f"its index does not fit the messages on '{min(silent)}': none of those it counts is found"
+        where, topic = min(silent)
+        text = f"its index does not fit the messages on '{topic}': none of those it counts is found"
         cure = "if metadata.yaml was edited, name the .mcap or .db3 file inside; else 'ros2 bag reindex'"
-        raise SourceError(text, where=reader.paths[0], cure=cure)
+        raise SourceError(text, where=where, cure=cure)
 
 
 def messages(

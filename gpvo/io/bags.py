@@ -115,7 +115,7 @@ class BagSource(ImageSource):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """A ``.bag``, ``.db3`` or ``.mcap`` file, or a ROS 2 bag folder."""
+        """A ``.bag``, ``.db3`` or ``.mcap`` file, a ROS 2 bag folder, or a folder of those of one recording."""
         return is_bag(path)
 
     def __len__(self) -> int:

@@ -22,6 +22,7 @@ from gpvo.io.source import SourceReport
 from gpvo.io.stamps import match_nearest
 from gpvo.io.stated import to_records
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
+from rosbags.rosbag2.storage_mcap import zstd
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
 
@@ -74,6 +75,73 @@ def test_suffixes_in_capitals_are_suffixes(tmp_path, kind):
     path = _write(tmp_path, kind)
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
     assert len(seq.frames_of(open_source(file.rename(tmp_path / f"A{file.suffix.upper()}")))) == 12
+
+
+def _write_apart(folder, kind, name_of, slower=1):
+    """The messages of one recording, each in the bag that ``name_of`` (share of the recording, topic) says."""
+    ros1, mcap, _ = KINDS[kind]
+    recorded = [(slower * (t - seq.START_NS) + seq.START_NS, *m) for t, *m in stereo_bag(ros1).messages]
+    recorded = sorted(recorded, key=lambda m: m[0])
+    makers = {}
+    for k, message in enumerate(recorded):
+        makers.setdefault(name_of(k / len(recorded), message[1]), BagMaker(ros1)).messages.append(message)
+    folder.mkdir()
+    for name, maker in makers.items():
+        maker.write(folder / (f"{name}.bag" if ros1 else name), mcap=mcap)
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name_of", [lambda share, topic: f"x_{int(3 * share)}", lambda share, topic: topic[1:4]])
+def test_a_recording_in_several_bags_is_read_as_one(tmp_path, kind, name_of):
+    one, parts = open_source(_write(tmp_path, kind)), _write_apart(tmp_path / "parts", kind, name_of)
+    assert guess(parts) == "rosbag"
+    assert seq.frames_of(open_source(parts)) == seq.frames_of(one)
+    assert np.array_equal(open_source(parts).imu.t_ns, one.imu.t_ns)
+    poses = [read_foreign(p, topic="/vicon/head/head").t_ns for p in (parts, one.path)]
+    assert np.array_equal(*poses)
+    (parts / "mav0" / "cam0").mkdir(parents=True)
+    (parts / "mav0" / "cam0" / "data.csv").touch()
+    assert guess(parts) == "euroc"
+
+
+def test_bags_of_several_recordings_or_of_one_twice_are_refused(tmp_path):
+    folder = _write_apart(tmp_path / "parts", "ros1", lambda share, topic: "a" if share < 0.2 else "c", slower=40)
+    assert len(open_source(folder)) == 12
+    again = _write_apart(tmp_path / "again", "ros1", lambda share, topic: "b" if share > 0.7 else "a", slower=40)
+    shutil.copy(again / "b.bag", folder)
+    with pytest.raises(SourceError, match=r"c\.bag and b\.bag both hold '/camera/left/image_raw' at one time"):
+        open_source(folder)
+    (folder / "c.bag").unlink()
+    with pytest.raises(SourceError, match=r"several recordings: b\.bag begins 1\d s after those before end"):
+        open_source(folder)
+    (folder / "a.bag").unlink()
+    shutil.copy(folder / "b.bag", folder / "b.orig.bag")
+    assert len(open_source(folder)) < 6
+
+
+def test_a_bag_that_is_still_recorded_or_compressed_as_a_file_is_refused_with_the_cure(tmp_path):
+    folder = _write_apart(tmp_path / "parts", "ros1", lambda share, topic: f"x_{int(2 * share)}")
+    active = (folder / "x_1.bag").rename(folder / "x_1.bag.active")
+    for path in (folder, active):
+        with pytest.raises(
+            SourceError, match=r"x_1\.bag\.active: is still recorded.*'rosbag reindex x_1\.bag\.active'"
+        ):
+            open_source(path)
+    packed = _write(tmp_path, "sqlite3")
+    metadata = packed / "metadata.yaml"
+    text = metadata.read_text().replace("a.db3", "a.db3.zstd").replace("compression_mode: ''", "compression_mode: FILE")
+    metadata.write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+    (packed / "a.db3.zstd").write_bytes(zstd.compress((packed / "a.db3").read_bytes()))
+    unpacked = (packed / "a.db3").read_bytes()
+    (packed / "a.db3").unlink()
+    for path in (packed, packed / "a.db3.zstd"):
+        with pytest.raises(
+            SourceError, match=r"is compressed as a whole file \(unpack it beside: 'zstd -d .*\*\.zstd'"
+        ):
+            open_source(path)
+    (packed / "a.db3").write_bytes(unpacked)
+    assert len(list(open_source(packed))) == 12
 
 
 def test_missing_images_shift_nothing(tmp_path):
