@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.io.stamps import Stamps
+from gpvo.io.stamps import BACK_NS, Stamps, astray
 from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
 
@@ -37,7 +38,6 @@ _NOT_YET = (".bag.active", ".db3.zstd", ".mcap.zstd")
 _PACKED = re.compile(r"compression_mode[\"']?:\s*[\"']?file\b", re.IGNORECASE)
 _PAUSE_S = 10.0  # between the bags of one recording
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
-_BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
 MAX_CHUNK_BYTES = 1 << 28
 """No recorder makes chunks of more than a few megabytes, or of one message where that is larger."""
@@ -106,7 +106,7 @@ def _check_one_recording(path: Path, reader: Any) -> None:
             raise SourceError(text, where=path, cure=cure)
         for before in readers[:k]:
             twice = set(topics_of(before, SENSOR_TYPES)) & set(topics_of(after, SENSOR_TYPES))
-            if twice and before.end_time - after.start_time > _BACK_NS:
+            if twice and before.end_time - after.start_time > BACK_NS:
                 text = f"{before.path.name} and {after.path.name} both hold '{min(twice)}' at one time"
                 raise SourceError(text, where=path, cure=cure)
 
@@ -214,9 +214,9 @@ def read_poses(
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
     ``remark`` is told how many were dropped, or out of order. Messages that hold no pose, as some odometries send when
-    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, and a few
-    between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes frames, and
-    where its clock goes back by more than a second or gives many messages one stamp.
+    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, or with a wrong
+    one, and a few between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes
+    frames, and where its clock goes back by more than a second or gives many messages one stamp.
     """
     with open_bag(path) as reader:
         available = topics_of(reader, POSE_TYPES)
@@ -225,7 +225,12 @@ def read_poses(
             raise SourceError(f"has no poses on '{topic}' (topics with poses: {found})", where=path)
         kept = [message for _, message in messages(reader, [topic])]
     kept = _of_one_odometry(kept, topic, path, remark)
-    t, data = np.array([stamp_ns(m) for m in kept], dtype=np.int64), np.array([pose_of(m) for m in kept])
+    t = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
+    wrong = astray(t)
+    if remark is not None and wrong.any():
+        remark(f"{int(wrong.sum())} of {len(t)} messages on '{topic}' are stamped seconds off and were left out")
+    t, kept = t[~wrong], list(compress(kept, ~wrong))
+    data = np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)
     good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
     if bad := int((~good).sum()):
@@ -241,7 +246,7 @@ def read_poses(
 def _of_one_odometry(messages: list[Any], topic: str, path: Path, remark: Callable[[str], None] | None) -> list[Any]:
     """Those with a stamp, if any has one, and of the frames that most are between."""
     kept = [m for m in messages if stamp_ns(m)]
-    if not kept or min(map(stamp_ns, kept)) < _BACK_NS:  # on a clock that starts there, zero is a stamp
+    if not kept or min(map(stamp_ns, kept)) < BACK_NS:  # on a clock that starts there, zero is a stamp
         kept = messages
     if remark is not None and (unset := len(messages) - len(kept)):
         remark(f"{unset} of {len(messages)} messages on '{topic}' carry no stamp and were left out")
@@ -261,7 +266,7 @@ def _in_time(
 ) -> NDArray[np.intp]:
     """Indices of the messages at (N,) stamps, of (N, 7) poses, in order of time, the first of those that share one."""
     where, steps = f"on '{topic}'", np.diff(t_ns)
-    if len(steps) and -steps.min() > _BACK_NS:
+    if len(steps) and -steps.min() > BACK_NS:
         text = f"the stamps {where} go back by {-steps.min() * 1e-9:.3f} s at message {int(steps.argmin()) + 2}"
         raise SourceError(text, where=path, cure="the clock was set or restarted: split the bag there")
     order = np.argsort(t_ns, kind="stable")

@@ -19,6 +19,7 @@ Stamps = NDArray[np.int64]
 """Nanoseconds (N,)."""
 
 GAP_FACTOR = 1.75
+BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
 _WINDOW = 51
 _MAX_BYTES = 2_000_000_000
@@ -178,6 +179,19 @@ def growing(t_ns: Stamps) -> NDArray[np.bool_]:
     rest = t_ns[keep]
     keep[np.flatnonzero(keep)[1:]] = rest[1:] > np.maximum.accumulate(rest)[:-1]
     return keep
+
+
+def astray(t_ns: Stamps) -> NDArray[np.bool_]:
+    """(N,) whether a stamp alone is wrong: more than a second ahead of the next or behind the one before, where these
+    two are in order."""
+    out = np.zeros(len(t_ns), dtype=bool)
+    if len(t_ns) < 3:
+        return out
+    before, now, after = t_ns[:-2], t_ns[1:-1], t_ns[2:]
+    out[1:-1] = (before <= after) & ((now > after + BACK_NS) | (now < before - BACK_NS))
+    out[0] = t_ns[0] > t_ns[1] + BACK_NS and not out[1]
+    out[-1] = t_ns[-1] < t_ns[-2] - BACK_NS and not out[-2]
+    return out
 
 
 def usual_interval(t_ns: Iterable[int]) -> float | None:

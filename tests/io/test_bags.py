@@ -610,6 +610,27 @@ def test_a_clock_that_does_not_run_is_refused(tmp_path, stamps_s, reason):
         read_foreign(_stamped(tmp_path, stamps_s))
 
 
+@pytest.mark.parametrize("wrong_s", [-40.0, 3600.0])
+@pytest.mark.parametrize("where", [0, 1, 9, 18, 19])
+def test_one_wrong_stamp_costs_one_pose_of_a_bag_and_is_named_in_a_file(tmp_path, wrong_s, where):
+    stamps_s = [100 + 0.1 * k for k in range(where)] + [100 + wrong_s] + [100 + 0.1 * k for k in range(where + 1, 20)]
+    is_order = (where, wrong_s) in ((0, -40.0), (19, 3600.0))  # then it is a pause
+    log = read_foreign(_stamped(tmp_path, stamps_s))
+    left = [s for k, s in enumerate(stamps_s) if is_order or k != where]
+    np.testing.assert_allclose(log.t_ns * 1e-9, left)
+    note = "1 of 20 messages on '/odom' are stamped seconds off and were left out"
+    assert (note in log.notes) is not is_order
+    lines = tmp_path / "log.tum"
+    lines.write_text("".join(f"{t:.9f} {k} 0 0 0 0 0 1\n" for k, t in enumerate(stamps_s)))
+    if is_order:
+        assert len(read_foreign(lines).t_ns) == 20
+        return
+    with pytest.raises(
+        SourceError, match=rf"line {where + 1}: the stamp .* far from those around it \(remove the line"
+    ):
+        read_foreign(lines)
+
+
 def test_messages_out_of_order_are_sorted_and_counted(tmp_path):
     stamps_s = [0.1 * k for k in range(20)]
     stamps_s[4:6] = stamps_s[5], stamps_s[4]
