@@ -286,15 +286,19 @@ def _in_time(
 
 
 def imu_topics(topics: list[str]) -> list[tuple[str, ...]]:
-    """What can serve as IMU, the best first: whole topics, then gyroscopes with the accelerometer beside them.
-
-    realsense-ros publishes ``/camera/gyro/sample`` and ``/camera/accel/sample``, each with the other's fields zero.
-    """
-    pairs = []
-    for gyro, acc in (("gyro", "accel"), ("Gyro", "Accel")):
-        pairs += [(t, t.replace(gyro, acc)) for t in topics if gyro in t and t.replace(gyro, acc) in topics]
+    """What can serve as IMU, the best first: whole topics, then gyroscopes with the accelerometer beside them."""
+    pairs = [(t, acc) for t in topics if (acc := accelerometer_beside(t)) in topics and acc is not None]
     halves = {topic for pair in pairs for topic in pair}
     return [*((t,) for t in topics if t not in halves), *pairs]
+
+
+def accelerometer_beside(gyroscope: str) -> str | None:
+    """The topic of the accelerometer of a driver that publishes gyroscope and accelerometer apart, None by other names.
+
+    realsense-ros has ``/camera/gyro/sample`` and ``/camera/accel/sample``, each with the other's fields zero.
+    """
+    names = (("gyro", "accel"), ("Gyro", "Accel"))
+    return next((gyroscope.replace(gyro, acc) for gyro, acc in names if gyro in gyroscope), None)
 
 
 def read_imu(
@@ -308,7 +312,7 @@ def read_imu(
     for topics in candidates:
         t_ns, data = _samples(path, topics[0])
         if len(topics) == 2:
-            t_ns, data = _with_accelerometer(t_ns, data, *_samples(path, topics[1]))
+            t_ns, data = with_accelerometer(t_ns, data, *_samples(path, topics[1]))
         no_acc = bool(np.isnan(data[:, 3:]).all())
         good = np.isfinite(data[:, :3]).all(axis=1) & (no_acc | np.isfinite(data[:, 3:]).all(axis=1))
         if not good.any():
@@ -343,7 +347,9 @@ def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
     return np.array(stamps, dtype=np.int64), data[:, :, :3].reshape(-1, 6)
 
 
-def _with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:
+def with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:
+    """Stamps and samples (N, 6) of a gyroscope with accelerations (M, 6) interpolated onto them, where both cover; as
+    they were where nothing measures any."""
     good = np.isfinite(acc_data[:, 3:]).all(axis=1)
     t_acc, first = np.unique(t_acc_ns[good], return_index=True)
     if len(t_acc) == 0:
