@@ -226,7 +226,7 @@ class StereoStage:
         # As bags are read: what has been nothing but zeros so far is not measured.
         self._measures |= np.isfinite(row).all(axis=1) & row.any(axis=1)
         row[~self._measures] = np.nan
-        known = np.isfinite(row).all(axis=1)
+        known = np.asarray(np.isfinite(row).all(axis=1))
         t_ns = stamp_ns(message)
         seen = self._imu_watch.see(t_ns)
         if seen.dropped or not known[0] or known[1] != self._measures[1]:
