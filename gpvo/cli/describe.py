@@ -36,7 +36,7 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
             return _calibration(path)
         if path.suffix.lower() in (".txt", ".csv", ".tum"):
             return _projections(path) or _trajectory(path)
-        if is_bag(path):
+        if is_bag(path) and guess(path) == "rosbag":
             return _bag(path, options or {})
         if path.is_file() and path.suffix.lower() != ".npz" and _is_safetensors(path):
             return _model(path)

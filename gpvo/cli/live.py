@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 def live(
     model: Annotated[Path, typer.Option(help="Error model of this camera, or of this odometry.")],
     stereo: Annotated[tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the images.")] = None,
-    imu: Annotated[str | None, typer.Option(help="Topic of the IMU, with --stereo.")] = None,
+    imu: Annotated[
+        str | None, typer.Option(help="Topic of the IMU, with --stereo; .../gyro/... is joined by .../accel/....")
+    ] = None,
     odometry: Annotated[
         str | None, typer.Option(help="Topic of another odometry, to be republished with an honest covariance.")
     ] = None,

@@ -57,6 +57,9 @@ _STATE = CLONE.stop  # core and clone; what follows is VO's
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
 
 
+_UNSEEN_TURN_RAD, _UNSEEN_TILT_RAD = 1.0, 0.2  # about and from the vertical, while nothing is heard
+
+
 class ErrorStateFilter:
     """The state, its covariance and the three things that happen to them: propagate, update, clone.
 
@@ -150,6 +153,19 @@ class ErrorStateFilter:
         m/s^2] over the interval just passed, as where its samples are missing: they act as biases do."""
         G = self._F[:, : BA.start, BA.start :] * np.roll(sigma, 3)
         self.P[:, : BA.start, : BA.start] += G @ kernels.transpose(G)
+
+    def lose_track(self, dt: float) -> None:
+        """Widen by what may have happened in ``dt`` seconds of which nothing is known, if they have passed at all and
+        no clock was set: the vehicle has gone on as fast as before, or at a metre per second, in any direction, or
+        stopped, or turned."""
+        speed = np.maximum(np.linalg.norm(self.x.velocity, axis=1), 1.0)[:, None]
+        up = self.x.R_world_imu[:, 2, :, None]  # in the axes of the body
+        turned = _UNSEEN_TILT_RAD**2 * np.eye(3) + (_UNSEEN_TURN_RAD**2 - _UNSEEN_TILT_RAD**2) * (
+            up * up[:, None, :, 0]
+        )
+        self.P[:, range(P.start, P.stop), range(P.start, P.stop)] += (dt * speed) ** 2
+        self.P[:, range(V.start, V.stop), range(V.start, V.stop)] += speed**2
+        self.P[:, TH, TH] += turned
 
     def decay_bias(self, dt: float, tau_s: Array) -> None:
         """Let the normalised VO bias forget over ``dt`` by its time constants (P,), variance kept at one."""

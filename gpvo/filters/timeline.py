@@ -27,6 +27,8 @@ from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 _GAP_FACTOR, _GAP_S = 5.0, 0.05
 _NEARBY = 1000  # samples that tell how far a guess over a gap may be off
 _GUESS_NS = 250_000_000  # longest step of a guess
+_SILENCE_NS, _LONGEST_SILENCE_S = 4_000_000_000, 1e3  # without sample and record: no guess holds so long
+_SLOWEST_NS = 20_000_000_000  # records are no further apart, where nothing else is heard
 _LONGEST_STEP_NS, _LONGEST_GAP_NS = round(LONGEST_STEP_S * 1e9), round(LONGEST_GAP_S * 1e9)
 
 
@@ -237,13 +239,22 @@ class Timeline:
         if end_ns <= start_ns:
             return
         if not self._with_imu:
-            filter.propagate_constant_velocity((end_ns - start_ns) * 1e-9)
+            if end_ns - start_ns > _SLOWEST_NS:
+                self._over_silence(filter, end_ns - start_ns, counts)
+            else:
+                filter.propagate_constant_velocity((end_ns - start_ns) * 1e-9)
             return
         if not self._imu_t:
             raise ValueError("no IMU sample has arrived; give the timeline with_imu=False to do without")
         i = bisect.bisect_right(self._imu_t, start_ns)
         t, sample = start_ns, self._at(start_ns, i)
         while t < end_ns:
+            heard_ns = min([end_ns, *self._imu_t[i : i + 1]])
+            if heard_ns - t > _SILENCE_NS:
+                self._over_silence(filter, heard_ns - t, counts)
+                t, i = heard_ns, bisect.bisect_right(self._imu_t, heard_ns)
+                sample = self._at(t, i)
+                continue
             t1 = min(end_ns, t + _GUESS_NS, *self._imu_t[i : i + 1])
             arrived = self._imu_t[i : i + 1] == [t1]
             after = self._imu[i] if arrived else self._at(t1, i)
@@ -255,6 +266,12 @@ class Timeline:
                 filter.doubt_readings(over[1])
                 counts["imu_gaps"] += 1
             t, sample, i = t1, after, i + arrived
+
+    @staticmethod
+    def _over_silence(filter: ErrorStateFilter, ns: int, counts: Counter[str]) -> None:
+        """Readings held for so long would say anything. A clock set ahead while all runs on looks the same."""
+        filter.lose_track(min(ns * 1e-9, _LONGEST_SILENCE_S))
+        counts["silences"] += 1
 
     def _at(self, t_ns: int, i: int) -> Array:
         """Sample at ``t_ns``, between samples i-1 and i; held beyond the ends."""

@@ -14,7 +14,7 @@ from gpvo.errors import printable
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.images import Image8, decode_stored, to_grey8
 from gpvo.io.source import Depth, SourceReport
-from gpvo.io.stamps import no_pair
+from gpvo.io.stamps import PAIR_TOLERANCE_S, no_pair, reach_ns, steps_ns
 
 # OpenCV names the pattern by its second row and column.
 _BAYER = {
@@ -38,6 +38,7 @@ _LUMA = {
 }
 # Pairs arrive within a few messages of one another; beyond that a message has lost its partner.
 _WAITING = 12
+_ENOUGH = 8  # intervals, of both cameras, that tell the usual one
 
 
 def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
@@ -76,8 +77,8 @@ def _raw_pixels(message: Any) -> tuple[NDArray[Any] | None, bool]:
 
 
 class PairQueue:
-    """Pairs the messages of two image topics as they come in, by stamps that agree to ``tolerance_ns``, and to half the
-    usual interval: what is further off belongs to a neighbour, whose partner was lost.
+    """Pairs the messages of two image topics as they come in, by stamps at most :func:`reach_ns` apart. Where the
+    tolerance might join neighbours, the first ones wait until the interval is known.
 
     A message that finds no partner among the next dozen is counted as missing; so are those it was overtaken by.
     ``nearest_ns``: the closest that two stamps of both sides ever were.
@@ -87,35 +88,38 @@ class PairQueue:
         self._left, self._tolerance_ns, self._report = left, tolerance_ns, report
         self._waiting: dict[bool, deque[tuple[int, Any]]] = {True: deque(), False: deque()}
         self._stamps: dict[bool, deque[int]] = {side: deque(maxlen=_WAITING) for side in (True, False)}
+        self._is_sure = tolerance_ns <= PAIR_TOLERANCE_S * 1e9
         self.nearest_ns: float = np.inf
 
-    def push(self, topic: str, message: Any) -> tuple[int, Any, Any] | None:
-        """(left stamp, left message, right message) where this message completes a pair."""
-        is_left = topic == self._left
-        t = stamp_ns(message)
+    def push(self, topic: str, message: Any) -> list[tuple[int, Any, Any]]:
+        """(left stamp, left message, right message) of the pairs that this message completes."""
+        is_left, t = topic == self._left, stamp_ns(message)
         own, others = self._waiting[is_left], self._waiting[not is_left]
         self.nearest_ns = min([self.nearest_ns, *(abs(s - t) for s, _ in others)])
         self._stamps[is_left].append(t)
-        reach_ns = self._reach_ns()
-        match = next((i for i, (s, _) in enumerate(others) if abs(s - t) <= reach_ns), None)
-        if match is None:
-            own.append((t, message))
-            if len(own) > _WAITING:
-                _drop(own, 1, self._report)
-            return None
-        _drop(others, match, self._report)
-        _drop(own, len(own), self._report)
-        s, other = others.popleft()
-        return (t, message, other) if is_left else (s, other, message)
+        own.append((t, message))
+        self._is_sure = self._is_sure or len(steps_ns(*self._stamps.values())) >= _ENOUGH
+        pairs = self._matched() if self._is_sure else []
+        if len(own) > _WAITING:
+            _drop(own, 1, self._report)
+        return pairs
 
-    def _reach_ns(self) -> float:
-        steps = np.concatenate([np.diff(np.unique(stamps)) for stamps in self._stamps.values()])
-        return min(self._tolerance_ns, 0.5 * float(np.median(steps))) if len(steps) > 2 else self._tolerance_ns
+    def _matched(self) -> list[tuple[int, Any, Any]]:
+        reach, out = reach_ns(self._tolerance_ns, *self._stamps.values()), []
+        left, right = self._waiting[True], self._waiting[False]
+        while found := next(((i, j) for i, (s, _) in enumerate(left) for j, (t, _) in enumerate(right)
+                             if abs(s - t) <= reach), None):  # fmt: skip
+            for queue, before in zip((left, right), found):
+                _drop(queue, before, self._report)
+            out.append((*left.popleft(), right.popleft()[1]))
+        return out
 
-    def clear(self) -> None:
-        """Count what still waits as missing, and forget it."""
+    def end(self) -> list[tuple[int, Any, Any]]:
+        """The pairs among what waits; what stays alone is counted as missing, and forgotten."""
+        pairs = self._matched()
         for queue in self._waiting.values():
             _drop(queue, len(queue), self._report)
+        return pairs
 
 
 def pair_streams(
@@ -130,9 +134,9 @@ def pair_streams(
     for topic, message in stream:
         if stamp_ns(message) == 0:
             report.count("missing", f"an image on '{topic}' carries no stamp")
-        elif (pair := queue.push(topic, message)) is not None:
-            yield pair
-    queue.clear()
+        else:
+            yield from queue.push(topic, message)
+    yield from queue.end()
     if tolerance_ns < queue.nearest_ns < np.inf:
         raise no_pair(tolerance_ns, int(queue.nearest_ns), where)
 

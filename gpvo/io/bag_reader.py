@@ -7,12 +7,14 @@ An IMU is one topic, or two where a driver publishes gyroscope and accelerometer
 from __future__ import annotations
 
 import bz2
+import re
 import sqlite3
 from array import array
 from collections import Counter
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.io.stamps import Stamps
+from gpvo.io.stamps import BACK_NS, Stamps, astray
 from gpvo.io.trajectory import make_imu
 from gpvo.types import Array, ImuLog
 
@@ -31,8 +33,11 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", POSE_TYPE, "geometry_msgs/msg/TransformStamped")
+SENSOR_TYPES = (*IMAGE_TYPES, IMU_TYPE, *POSE_TYPES)
+_NOT_YET = (".bag.active", ".db3.zstd", ".mcap.zstd")
+_PACKED = re.compile(r"compression_mode[\"']?:\s*[\"']?file\b", re.IGNORECASE)
+_PAUSE_S = 10.0  # between the bags of one recording
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
-_BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 _LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
 MAX_CHUNK_BYTES = 1 << 28
 """No recorder makes chunks of more than a few megabytes, or of one message where that is larger."""
@@ -43,46 +48,94 @@ _ALLOWED = ("CREATE TABLE %", "CREATE INDEX %", "CREATE UNIQUE INDEX %")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS 1 bag, a ROS 2 storage file, or a ROS 2 bag folder."""
-    return _has_storage(path) and (path.is_file() or (path / "metadata.yaml").is_file())
+    """Whether a path is a ROS 1 bag, a ROS 2 storage file, a ROS 2 bag folder, or a folder of these."""
+    return bool(_parts(path))
 
 
-def _has_storage(path: Path) -> bool:
-    if path.is_dir():
-        return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
-    return path.suffix.lower() in (".bag", ".db3", ".mcap")
+def _parts(path: Path) -> list[Path]:
+    """The bags that a path stands for: itself, or those in a folder, of a split recording or of several recorders."""
+    if not path.is_dir() or _is_whole(path):
+        return [path] if _is_whole(path) or path.name.lower().endswith(_NOT_YET) else []
+    inside = sorted(p for p in path.iterdir() if not p.name.startswith("."))
+    bags = [p for p in inside if _is_whole(p)]
+    packed = [p for p in inside if p.name.lower().endswith(_NOT_YET) and p.with_suffix("") not in bags]
+    # 'rosbag reindex' keeps the bag of before as NAME.orig.bag.
+    return packed or [p for p in bags if not (p.stem.endswith(".orig") and p.with_name(p.name[:-9] + ".bag") in bags)]
+
+
+def _is_whole(path: Path) -> bool:
+    if not path.is_dir():
+        return path.suffix.lower() in (".bag", ".db3", ".mcap") and path.is_file()
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file() or not any(f for end in ("db3", "mcap") for f in path.glob(f"*.{end}*")):
+        return False
+    with metadata.open(errors="replace") as file:
+        return not _PACKED.search(file.read(_MAX_METADATA_BYTES))
+
+
+def _check_parts(path: Path, parts: list[Path]) -> None:
+    """Raise SourceError where a path is no bag, where a part is unfinished or packed, and for parts of ROS 1 and 2."""
+    if not path.exists():
+        raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
+    if not parts:
+        raise SourceError("is not a bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
+    for part in parts:
+        if part.name.lower().endswith(".active"):
+            cure = f"end the recorder; else 'rosbag reindex {part.name}', then rename it to {part.stem}"
+            raise SourceError("is still recorded, or the recorder was killed", where=part, cure=cure)
+        if part.suffix.lower() == ".zstd":
+            cure = f"unpack it beside: 'zstd -d {part.parent / '*.zstd'}', then give the same folder"
+            raise SourceError("is compressed as a whole file", where=part, cure=cure)
+        metadata = part / "metadata.yaml"
+        if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
+            reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
+            raise SourceError(reason, where=metadata, cure="name one .mcap or .db3 file inside the folder")
+        require_tables(part)
+    if len({part.is_file() and part.suffix.lower() == ".bag" for part in parts}) > 1:
+        raise SourceError("holds bags of ROS 1 and of ROS 2", where=path, cure="name one of them")
+
+
+def _check_one_recording(path: Path, reader: Any) -> None:
+    """Raise SourceError for bags with a pause between them, or that hold one sensor at one time."""
+    readers = sorted((r for r in reader.readers if r.message_count), key=lambda r: r.start_time)
+    cure = "name one of them, or a folder that holds the bags of one recording alone"
+    for k, after in enumerate(readers[1:], 1):
+        pause_s = (after.start_time - max(r.end_time for r in readers[:k])) * 1e-9
+        if pause_s > _PAUSE_S:
+            text = f"holds several recordings: {after.path.name} begins {pause_s:.0f} s after those before end"
+            raise SourceError(text, where=path, cure=cure)
+        for before in readers[:k]:
+            twice = set(topics_of(before, SENSOR_TYPES)) & set(topics_of(after, SENSOR_TYPES))
+            if twice and before.end_time - after.start_time > BACK_NS:
+                text = f"{before.path.name} and {after.path.name} both hold '{min(twice)}' at one time"
+                raise SourceError(text, where=path, cure=cure)
 
 
 class _AnyCase(type(Path())):  # type: ignore[misc]
-    """A path by whose suffix rosbags tells the kind of a bag, also where it is in capitals."""
+    """A path by whose suffix rosbags tells the kind of a bag, also where it is in capitals, or of a folder."""
 
     @property
     def suffix(self) -> str:
-        return str(super().suffix).lower()
+        return "" if self.is_dir() else str(super().suffix).lower()
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """An open ``rosbags`` reader.
+    """An open ``rosbags`` reader of a bag, or of all the bags in a folder together, as :func:`is_bag` has it.
 
     Raises SourceError where the bag cannot be read, at opening or later inside the block; one line in any case.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    if not path.exists():
-        raise SourceError("no such file or folder", where=path, cure="give a bag of ROS 1 or ROS 2")
-    if not _has_storage(path):
-        raise SourceError("is not a bag", where=path, cure="give a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
-    metadata = path / "metadata.yaml"
-    if metadata.is_file() and (size := metadata.stat().st_size) > _MAX_METADATA_BYTES:
-        reason = f"has {size} bytes, at most {_MAX_METADATA_BYTES} are read"
-        raise SourceError(reason, where=metadata, cure="name one .mcap or .db3 file inside the folder")
     bound_chunks()
     try:
-        require_tables(path)
+        parts = _parts(path)
+        _check_parts(path, parts)
         # Bags of ROS 2 before Jazzy hold no message definitions: those of Humble serve.
-        with AnyReader([_AnyCase(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        typestore = get_typestore(Stores.ROS2_HUMBLE)
+        with AnyReader([_AnyCase(part) for part in parts], default_typestore=typestore) as reader:
+            _check_one_recording(path, reader)
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
@@ -109,17 +162,18 @@ def raw_messages(reader: Any, topics: Container[str]) -> Iterator[tuple[Any, int
     whose QoS in metadata.yaml, as people edit it, is not that of the file beside.
     """
     connections = [c for c in reader.connections if c.topic in topics]
-    silent = {c.topic for c in connections if c.msgcount}
+    silent = {(str(c.owner.path), c.topic) for c in connections if c.msgcount}
     for connection, recorded_ns, raw in reader.messages(connections=connections):
-        silent.discard(connection.topic)
+        silent.discard((str(connection.owner.path), connection.topic))
         if reader.is2 and raw[:4] == _ZSTD:
             text, cure = "its messages are compressed one by one, as metadata.yaml tells", "name the bag's folder"
-            raise SourceError(text, where=reader.paths[0], cure=cure)
+            raise SourceError(text, where=connection.owner.path, cure=cure)
         yield connection, recorded_ns, raw
     if silent:
-        text = f"its index does not fit the messages on '{min(silent)}': none of those it counts is found"
+        where, topic = min(silent)
+        text = f"its index does not fit the messages on '{topic}': none of those it counts is found"
         cure = "if metadata.yaml was edited, name the .mcap or .db3 file inside; else 'ros2 bag reindex'"
-        raise SourceError(text, where=reader.paths[0], cure=cure)
+        raise SourceError(text, where=where, cure=cure)
 
 
 def messages(
@@ -160,9 +214,9 @@ def read_poses(
     """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
 
     ``remark`` is told how many were dropped, or out of order. Messages that hold no pose, as some odometries send when
-    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, and a few
-    between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes frames, and
-    where its clock goes back by more than a second or gives many messages one stamp.
+    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, or with a wrong
+    one, and a few between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes
+    frames, and where its clock goes back by more than a second or gives many messages one stamp.
     """
     with open_bag(path) as reader:
         available = topics_of(reader, POSE_TYPES)
@@ -171,7 +225,12 @@ def read_poses(
             raise SourceError(f"has no poses on '{topic}' (topics with poses: {found})", where=path)
         kept = [message for _, message in messages(reader, [topic])]
     kept = _of_one_odometry(kept, topic, path, remark)
-    t, data = np.array([stamp_ns(m) for m in kept], dtype=np.int64), np.array([pose_of(m) for m in kept])
+    t = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
+    wrong = astray(t)
+    if remark is not None and wrong.any():
+        remark(f"{int(wrong.sum())} of {len(t)} messages on '{topic}' are stamped seconds off and were left out")
+    t, kept = t[~wrong], list(compress(kept, ~wrong))
+    data = np.array([pose_of(m) for m in kept])
     order = _in_time(t, data, topic, path, remark)
     good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
     if bad := int((~good).sum()):
@@ -187,7 +246,7 @@ def read_poses(
 def _of_one_odometry(messages: list[Any], topic: str, path: Path, remark: Callable[[str], None] | None) -> list[Any]:
     """Those with a stamp, if any has one, and of the frames that most are between."""
     kept = [m for m in messages if stamp_ns(m)]
-    if not kept or min(map(stamp_ns, kept)) < _BACK_NS:  # on a clock that starts there, zero is a stamp
+    if not kept or min(map(stamp_ns, kept)) < BACK_NS:  # on a clock that starts there, zero is a stamp
         kept = messages
     if remark is not None and (unset := len(messages) - len(kept)):
         remark(f"{unset} of {len(messages)} messages on '{topic}' carry no stamp and were left out")
@@ -207,7 +266,7 @@ def _in_time(
 ) -> NDArray[np.intp]:
     """Indices of the messages at (N,) stamps, of (N, 7) poses, in order of time, the first of those that share one."""
     where, steps = f"on '{topic}'", np.diff(t_ns)
-    if len(steps) and -steps.min() > _BACK_NS:
+    if len(steps) and -steps.min() > BACK_NS:
         text = f"the stamps {where} go back by {-steps.min() * 1e-9:.3f} s at message {int(steps.argmin()) + 2}"
         raise SourceError(text, where=path, cure="the clock was set or restarted: split the bag there")
     order = np.argsort(t_ns, kind="stable")
@@ -227,15 +286,19 @@ def _in_time(
 
 
 def imu_topics(topics: list[str]) -> list[tuple[str, ...]]:
-    """What can serve as IMU, the best first: whole topics, then gyroscopes with the accelerometer beside them.
-
-    realsense-ros publishes ``/camera/gyro/sample`` and ``/camera/accel/sample``, each with the other's fields zero.
-    """
-    pairs = []
-    for gyro, acc in (("gyro", "accel"), ("Gyro", "Accel")):
-        pairs += [(t, t.replace(gyro, acc)) for t in topics if gyro in t and t.replace(gyro, acc) in topics]
+    """What can serve as IMU, the best first: whole topics, then gyroscopes with the accelerometer beside them."""
+    pairs = [(t, acc) for t in topics if (acc := accelerometer_beside(t)) in topics and acc is not None]
     halves = {topic for pair in pairs for topic in pair}
     return [*((t,) for t in topics if t not in halves), *pairs]
+
+
+def accelerometer_beside(gyroscope: str) -> str | None:
+    """The topic of the accelerometer of a driver that publishes gyroscope and accelerometer apart, None by other names.
+
+    realsense-ros has ``/camera/gyro/sample`` and ``/camera/accel/sample``, each with the other's fields zero.
+    """
+    names = (("gyro", "accel"), ("Gyro", "Accel"))
+    return next((gyroscope.replace(gyro, acc) for gyro, acc in names if gyro in gyroscope), None)
 
 
 def read_imu(
@@ -249,7 +312,7 @@ def read_imu(
     for topics in candidates:
         t_ns, data = _samples(path, topics[0])
         if len(topics) == 2:
-            t_ns, data = _with_accelerometer(t_ns, data, *_samples(path, topics[1]))
+            t_ns, data = with_accelerometer(t_ns, data, *_samples(path, topics[1]))
         no_acc = bool(np.isnan(data[:, 3:]).all())
         good = np.isfinite(data[:, :3]).all(axis=1) & (no_acc | np.isfinite(data[:, 3:]).all(axis=1))
         if not good.any():
@@ -284,7 +347,9 @@ def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
     return np.array(stamps, dtype=np.int64), data[:, :, :3].reshape(-1, 6)
 
 
-def _with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:
+def with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:
+    """Stamps and samples (N, 6) of a gyroscope with accelerations (M, 6) interpolated onto them, where both cover; as
+    they were where nothing measures any."""
     good = np.isfinite(acc_data[:, 3:]).all(axis=1)
     t_acc, first = np.unique(t_acc_ns[good], return_index=True)
     if len(t_acc) == 0:

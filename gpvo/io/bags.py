@@ -94,12 +94,12 @@ class BagSource(ImageSource):
         with open_bag(path) as reader:
             asked = (left_topic, right_topic, imu_topic, truth_topic)
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
-            sizes, span = _first_images(reader, path, self._topics)
+            sizes, first = _first_images(reader, path, self._topics)
             rig = read_stereo_yaml(chain, size=sizes[0]) if chain else _rig_from_bag(reader, path, self._topics)
             for size, lens, topic in zip(sizes, (rig.left, rig.right), (self._topics.left, self._topics.right)):
                 check_size(f"images on '{topic}' are", size, lens, path)
         super().__init__(path, path.stem if path.is_file() else path.resolve().name, rig, **options)
-        self.span_ns = span
+        self.span_ns = span = _span(first, self._topics.count)
         self._tolerance_ns = tolerance_ns(tolerance_s)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
         if self.imu is not None and not _overlap(self.imu.t_ns, span):
@@ -115,7 +115,7 @@ class BagSource(ImageSource):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """A ``.bag``, ``.db3`` or ``.mcap`` file, or a ROS 2 bag folder."""
+        """A ``.bag``, ``.db3`` or ``.mcap`` file, a ROS 2 bag folder, or a folder of those of one recording."""
         return is_bag(path)
 
     def __len__(self) -> int:
@@ -220,7 +220,7 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
     )
     # Raw before rectified before compressed.
     pairs = [
-        (say("compressed", topic), say("rect", topic), rank, topic, partner)
+        (has_word("compressed", topic), has_word("rect", topic), rank, topic, partner)
         for topic, partner, rank in sides
         if partner != topic and partner in images and "depth" not in topic
     ]
@@ -229,11 +229,8 @@ def _guess_pair(images: list[str], chain: Path | None) -> tuple[str, str] | None
     return (images[0], images[1]) if len(images) == 2 else None
 
 
-def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """(width, height) of the first readable image of each camera, and about the first and last stamp [ns].
-
-    The end is reckoned from the first intervals: the bag's own times are those of recording, of all its topics.
-    """
+def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[int, int]], list[int]]:
+    """(width, height) of the first readable image of each camera, and the first stamps [ns] of one."""
     sizes: list[tuple[int, int]] = []
     for topic in (topics.left, topics.right):
         stamps, image = [], None
@@ -247,7 +244,15 @@ def _first_images(reader: Any, path: Path, topics: _Topics) -> tuple[list[tuple[
         stamps = [t for t in stamps if t]
         if not stamps:
             raise SourceError(f"images on '{topic}' carry no stamp", where=path, cure="the driver must set them")
-    return sizes, (min(stamps), min(stamps) + round((usual_interval(stamps) or 0.0) * (topics.count - 1)))
+    return sizes, stamps
+
+
+def _span(first: list[int], count: int) -> tuple[int, int]:
+    """About the first and last of ``count`` stamps [ns], even if one of the ``first`` is wrong: the bag's own times are
+    those of recording, of all its topics."""
+    usual_ns = usual_interval(first) or 0.0
+    begin = sorted(first)[len(first) // 2] - round(usual_ns * (len(first) // 2))
+    return begin, begin + round(usual_ns * (count - 1))
 
 
 def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
@@ -261,11 +266,11 @@ def _rig_from_bag(reader: Any, path: Path, topics: _Topics) -> StereoRig:
             raise CalibrationError(text, where=path, cure=cure)
         _, message = next(messages(reader, [name]))
         infos.append(camera_info_of(message, path, name))
-    rectified = say("rect", topics.left, topics.right)
+    rectified = has_word("rect", topics.left, topics.right)
     return rig_from_camera_info(infos[0], infos[1], rectified=rectified, where=path)
 
 
-def say(word: str, *topics: str) -> bool:
+def has_word(word: str, *topics: str) -> bool:
     """Whether all topics hold a word that begins so: of "rect", neither "direct" nor "unrectified" does."""
     return all(re.search(f"(?<![a-z]){word}", topic) for topic in topics)
 

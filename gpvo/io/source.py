@@ -120,13 +120,13 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[StereoFrame | TrackFrame]: ...
 
 
-# Order of the guesses: the strictest test first. Modules are imported when asked.
+# Order of the guesses: the strictest test first; bags may lie in a sequence's folder. Modules are imported when asked.
 BUILT_IN: dict[str, str] = {
     "tracks": "gpvo.io.tracks:TracksSource",
-    "rosbag": "gpvo.io.bags:BagSource",
     "euroc": "gpvo.io.datasets:EurocSource",
     "kitti": "gpvo.io.datasets:KittiSource",
     "folder": "gpvo.io.folder:FolderSource",
+    "rosbag": "gpvo.io.bags:BagSource",
 }
 
 
@@ -168,7 +168,7 @@ def guess(path: str | Path) -> str:
         "not recognised as a stereo sequence",
         where=p,
         cure="known are EuRoC/ASL (mav0/), KITTI odometry (calib.txt, image_0/), ROS bags (.bag, .db3, .mcap, or a"
-        " folder of these with metadata.yaml), image pairs with a camchain.yaml, and tracks (.npz); name one with"
+        " folder of those of one recording), image pairs with a camchain.yaml, and tracks (.npz); name one with"
         " --source",
     )
 

@@ -19,6 +19,7 @@ Stamps = NDArray[np.int64]
 """Nanoseconds (N,)."""
 
 GAP_FACTOR = 1.75
+BACK_NS = 1_000_000_000  # messages overtake each other on the way to the bag, but not by so much
 PAIR_TOLERANCE_S = 0.002  # between the stamps of left and right
 _WINDOW = 51
 _MAX_BYTES = 2_000_000_000
@@ -180,6 +181,19 @@ def growing(t_ns: Stamps) -> NDArray[np.bool_]:
     return keep
 
 
+def astray(t_ns: Stamps) -> NDArray[np.bool_]:
+    """(N,) whether a stamp alone is wrong: more than a second ahead of the next or behind the one before, where these
+    two are in order."""
+    out = np.zeros(len(t_ns), dtype=bool)
+    if len(t_ns) < 3:
+        return out
+    before, now, after = t_ns[:-2], t_ns[1:-1], t_ns[2:]
+    out[1:-1] = (before <= after) & ((now > after + BACK_NS) | (now < before - BACK_NS))
+    out[0] = t_ns[0] > t_ns[1] + BACK_NS and not out[1]
+    out[-1] = t_ns[-1] < t_ns[-2] - BACK_NS and not out[-2]
+    return out
+
+
 def usual_interval(t_ns: Iterable[int]) -> float | None:
     """Median interval of stamps [ns], whatever their order; None for fewer than three."""
     stamps = np.unique(np.fromiter(t_ns, dtype=np.int64))
@@ -217,7 +231,7 @@ def tolerance_ns(seconds: float) -> int:
 def match_nearest(
     left: list[tuple[int, str]], right: list[tuple[int, str]], tolerance_ns: int, report: SourceReport, where: object
 ) -> list[tuple[int, str, str]]:
-    """(left stamp, left name, right name) of images each other's nearest and at most ``tolerance_ns`` apart.
+    """(left stamp, left name, right name) of images each other's nearest and at most :func:`reach_ns` apart.
 
     In order of time. Images that stay alone are counted as missing, repeated stamps as duplicate. Raises SourceError
     where no image has a partner.
@@ -228,15 +242,28 @@ def match_nearest(
         return []
     partner = _nearest(t_left, t_right)
     apart = np.abs(t_right[partner] - t_left)
-    paired = (apart <= tolerance_ns) & (_nearest(t_right, t_left)[partner] == np.arange(len(t_left)))
+    reach = reach_ns(tolerance_ns, t_left, t_right)
+    paired = (apart <= reach) & (_nearest(t_right, t_left)[partner] == np.arange(len(t_left)))
     if not paired.any():
-        raise no_pair(tolerance_ns, int(apart.min()), where)
+        raise no_pair(int(reach), int(apart.min()), where)
     for t in t_left[~paired]:
         report.count("missing", f"no right image for {t} ns")
     for t in np.delete(t_right, partner[paired]):
         report.count("missing", f"no left image for {t} ns")
     both = zip(t_left[paired].tolist(), t_right[partner[paired]].tolist(), strict=True)
     return [(a, names[0][a], names[1][b]) for a, b in both]
+
+
+def reach_ns(tolerance_ns: int, left: Iterable[int], right: Iterable[int]) -> float:
+    """How far the stamps of a pair may be apart: the tolerance, but no more than half the usual interval, as what is
+    further off belongs to a neighbour whose partner was lost."""
+    steps = steps_ns(left, right)
+    return min(tolerance_ns, 0.5 * float(np.median(steps))) if len(steps) > 2 else tolerance_ns
+
+
+def steps_ns(left: Iterable[int], right: Iterable[int]) -> Stamps:
+    """Intervals (N,) between the stamps of either camera, whatever their order."""
+    return np.concatenate([np.diff(np.unique(np.fromiter(side, dtype=np.int64))) for side in (left, right)])
 
 
 def no_pair(tolerance_ns: int, nearest_ns: int, where: object) -> SourceError:

@@ -15,6 +15,7 @@ from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.io.stamps import (
     Stamps,
+    astray,
     check_interval,
     cure_of_seconds,
     cure_of_unit,
@@ -177,8 +178,11 @@ def _read_poses(
 
 
 def check_growing(path: Path, t_ns: Stamps, lines: list[int]) -> None:
-    """Refuse stamps that repeat or go back, naming the line."""
+    """Refuse stamps that repeat or go back, naming the line, or the one with the wrong stamp."""
     bad = np.flatnonzero(np.diff(t_ns) <= 0)
+    if len(wrong := np.flatnonzero(astray(t_ns))) and wrong[0] <= bad[0] + 1:
+        text = f"line {lines[wrong[0]]}: the stamp {ns_to_seconds_text(t_ns[wrong[0]])} s is far from those around it"
+        raise SourceError(text, where=path, cure=REMOVE)
     if len(bad):
         k = int(bad[0])
         word = "repeats" if t_ns[k + 1] == t_ns[k] else "goes back"

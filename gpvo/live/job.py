@@ -13,8 +13,16 @@ from typing import Any
 
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import GpvoError
-from gpvo.io.bag_reader import IMAGE_TYPES, IMU_TYPE, INFO_TYPE, ODOMETRY_TYPE, POSE_TYPE, open_bag
-from gpvo.io.bags import info_topic, say
+from gpvo.io.bag_reader import (
+    IMAGE_TYPES,
+    IMU_TYPE,
+    INFO_TYPE,
+    ODOMETRY_TYPE,
+    POSE_TYPE,
+    accelerometer_beside,
+    open_bag,
+)
+from gpvo.io.bags import has_word, info_topic
 from gpvo.live.engine import Engine, EngineSettings, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
@@ -169,7 +177,8 @@ class Live:
         if path is not None:
             with open_bag(path) as reader:
                 present = set(reader.topics)
-            wanted = [t for t, kind in topics.items() if kind not in _LASTING or t in present]
+            accelerometer = accelerometer_beside(self._settings.imu or "")  # that there is one, its name only suggests
+            wanted = [t for t, kind in topics.items() if t in present or (kind not in _LASTING and t != accelerometer)]
             return replay(path, wanted, stop, self.engine.counts, fast=self._settings.fast)
         assert wire is not None
         self._mailbox.open([t for t, kind in topics.items() if kind in _LASTING])
@@ -231,9 +240,9 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     if isinstance(stage, PoseStage):
         return {stage.topic: settings.pose_type, **truth}
     assert isinstance(stage, StereoStage)
-    images = {t: IMAGE_TYPES[say("compressed", t)] for t in (stage.left, stage.right)}
+    images = {t: IMAGE_TYPES[has_word("compressed", t)] for t in (stage.left, stage.right)}
     infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
-    return {**images, **infos, **({stage.imu: IMU_TYPE} if stage.imu else {}), **truth}
+    return {**images, **infos, **dict.fromkeys(filter(None, (stage.imu, stage.accelerometer)), IMU_TYPE), **truth}
 
 
 def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ from gpvo.cameras.readers import CameraInfo, read_projections, read_stereo_yaml,
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.io.bag_images import PairQueue, decode_message, encoding_of
-from gpvo.io.bag_reader import stamp_ns
-from gpvo.io.bags import camera_info_of, info_topic, say
+from gpvo.io.bag_reader import accelerometer_beside, stamp_ns, with_accelerometer
+from gpvo.io.bags import camera_info_of, has_word, info_topic
 from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.io.images import SWAPPED, Image8, OrderCheck
 from gpvo.io.source import Depth, SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, no_pair, tolerance_ns
-from gpvo.live.intake import Arrival, Sequence, StampWatch
+from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, no_pair, tolerance_ns
+from gpvo.live.intake import AHEAD_S, Arrival, Sequence, StampWatch
 from gpvo.live.stages import Taken
 from gpvo.types import Array, ImuLog, StereoCamera, StereoFrame
 from gpvo.vo.config import VoConfig
@@ -29,6 +29,7 @@ from gpvo.vo.rig_error import RigState
 from gpvo.vo.rig_findings import read_state
 
 _IMU_KEPT = 4000
+_LATE_NS = 1_000_000_000  # without an accelerometer: there is none
 _PAIRS_KEPT = 10  # while no CameraInfo has come
 _UNUSED = 20  # motions on end without a sample, after which the IMU is called out
 
@@ -79,6 +80,7 @@ class StereoStage:
         stated = self.settings.config.stated
         self.method = "pointing_matching" if "pointing_matching" in stated else stated[0]
         self.topic, self.left, self.right, self.imu = left, left, right, imu
+        self.accelerometer = accelerometer_beside(imu or "")
         self.counts: Counter[str] = Counter()
         self._infos: dict[str, CameraInfo] = {}
         self._rectifier: Rectifier | None = None
@@ -103,6 +105,8 @@ class StereoStage:
         self._without_imu = 0  # motions on end
         self._measures = np.zeros(2, dtype=bool)  # rates, accelerations
         self._samples: deque[tuple[int, Array]] = deque(maxlen=_IMU_KEPT)
+        self._rates = self._samples.copy()  # that wait for the accelerometer of a driver that publishes it apart
+        self._accelerations, self._has_accelerometer = self._samples.copy(), self.accelerometer is not None
         self._waiting: deque[tuple[int, Any, Any, int]] = deque(maxlen=_PAIRS_KEPT)  # with time of arrival
         self._restart()
 
@@ -111,11 +115,13 @@ class StereoStage:
         topic, message = arrival.topic, arrival.message
         if topic == self.imu:
             self._take_imu(message)
+        elif topic == self.accelerometer:
+            self._take_acceleration(message)
         elif topic in (self.left, self.right):
             missing = self._report.missing
-            pair = self._pairs.push(topic, message)
+            pairs = self._pairs.push(topic, message)
             self.counts["unpaired"] += self._report.missing - missing
-            if pair is not None:
+            for pair in pairs:
                 self._take_size(pair[1])
                 if self._rectifier is not None:
                     yield from self.flush()
@@ -189,7 +195,7 @@ class StereoStage:
         self._infos[topic] = camera_info_of(message, topic, topic)
         names = [info_topic(t) for t in (self.left, self.right)]
         if all(n in self._infos for n in names):
-            rectified = say("rect", self.left, self.right)
+            rectified = has_word("rect", self.left, self.right)
             self._calibrate(rig_from_camera_info(*(self._infos[n] for n in names), rectified=rectified, where=names[1]))
 
     @property
@@ -216,21 +222,44 @@ class StereoStage:
         self.T_body_cam = T_FLU_OPTICAL if place is None else place
 
     def _take_imu(self, message: Any) -> None:
-        rates = (message.angular_velocity, message.angular_velocity_covariance)
-        forces = (message.linear_acceleration, message.linear_acceleration_covariance)
-        row = np.array([[np.nan] * 3 if C[0] == -1 else [v.x, v.y, v.z] for v, C in (rates, forces)])
+        row = _imu_row(message)
         # As bags are read: what has been nothing but zeros so far is not measured.
         self._measures |= np.isfinite(row).all(axis=1) & row.any(axis=1)
         row[~self._measures] = np.nan
-        known = np.isfinite(row).all(axis=1)
+        known = np.asarray(np.isfinite(row).all(axis=1))
         t_ns = stamp_ns(message)
         seen = self._imu_watch.see(t_ns)
         if seen.dropped or not known[0] or known[1] != self._measures[1]:
             self.counts["imu_dropped"] += 1
             return
         if seen is Sequence.RESTART:
-            self._samples.clear()
-        self._samples.append((t_ns - self._shift_ns, row.ravel()))
+            for kept in (self._samples, self._rates, self._accelerations):
+                kept.clear()
+        self._rates.append((t_ns - self._shift_ns, row.ravel()))
+        if self._measures[1] or (not self._accelerations and t_ns - self._shift_ns - self._rates[0][0] > _LATE_NS):
+            self._has_accelerometer = False
+        self._complete()
+
+    def _take_acceleration(self, message: Any) -> None:
+        row, t_ns = _imu_row(message), stamp_ns(message) - self._shift_ns
+        last_ns = self._accelerations[-1][0] if self._accelerations else t_ns - 1
+        if self._has_accelerometer and np.isfinite(row[1]).all() and 0 < t_ns - last_ns <= AHEAD_S * 1e9:
+            self._accelerations.append((t_ns, row.ravel()))
+            self._complete()
+
+    def _complete(self) -> None:
+        """Pass on the rates that wait, with the accelerations interpolated where these are measured apart."""
+        if self._has_accelerometer and not self._accelerations:
+            return
+        until_ns = self._accelerations[-1][0] if self._has_accelerometer else self._rates[-1][0]
+        ready = [self._rates.popleft() for _ in range(sum(t <= until_ns for t, _ in self._rates))]
+        if not self._has_accelerometer or not ready:
+            self._samples.extend(ready)
+            return
+        t, data = with_accelerometer(*_columns(ready), *_columns(self._accelerations))
+        self._samples.extend(zip(t.tolist(), data))
+        while len(self._accelerations) > 1 and self._accelerations[1][0] <= ready[-1][0]:
+            self._accelerations.popleft()
 
     def _imu_since(self, t_ns: int) -> ImuLog | None:
         chosen = [s for s in self._samples if self._t_last_ns < s[0] <= t_ns]
@@ -239,5 +268,18 @@ class StereoStage:
         self._without_imu = 0 if chosen else self._without_imu + 1
         if not chosen:
             return None
-        data = np.array([row for _, row in chosen])
-        return ImuLog(np.array([t for t, _ in chosen], dtype=np.int64), data[:, :3], data[:, 3:])
+        t, data = _columns(chosen)
+        return ImuLog(t, data[:, :3], data[:, 3:])
+
+
+def _imu_row(message: Any) -> Array:
+    """(2, 3) rates and accelerations, NaN where not measured, as ROS has it."""
+    rates = (message.angular_velocity, message.angular_velocity_covariance)
+    forces = (message.linear_acceleration, message.linear_acceleration_covariance)
+    return np.array([[np.nan] * 3 if C[0] == -1 else [v.x, v.y, v.z] for v, C in (rates, forces)])
+
+
+def _columns(samples: Iterable[tuple[int, Array]]) -> tuple[Stamps, Array]:
+    """Stamps (N,) and samples (N, 6)."""
+    t_ns, rows = zip(*samples, strict=True)
+    return np.array(t_ns, dtype=np.int64), np.array(rows)

@@ -180,7 +180,7 @@ class PairWatch:
         cause = "swapped" if right.behind > 0.5 * lost else "rows" if right.off_row > 0.5 * lost else "few"
         # A point that is not found may be in the dark; one found where it cannot be says that the images are no pair.
         if lost > (0.4 if cause == "few" else 0.2) * right.sought:
-            self._seen[cause] += lost > 0.4 * right.sought
+            self._seen[cause] += lost > 0.4 * right.sought and not self.late  # which moves points out of their rows
             doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
         return doubts
 

@@ -185,9 +185,9 @@ def test_a_silence_of_camera_and_imu_is_as_uncertain_as_it_is(silence_s: float, 
     assert np.median(later, axis=0).max() < 3 * most
 
 
-@pytest.mark.parametrize("back_s", [1.2, 3.0, 3600.0])
+@pytest.mark.parametrize("back_s", [1.2, 3.0, 3600.0, -5.0, -30.0, -3600.0])
 @pytest.mark.parametrize("late", [0, 2])
-def test_the_filter_goes_on_when_the_clock_is_set_back(flight: Flight, back_s: float, late: int) -> None:
+def test_the_filter_goes_on_when_the_clock_is_set_back_or_ahead(flight: Flight, back_s: float, late: int) -> None:
     """``late``: records that are on their way then."""
     imu, begin_ns = flight.imu, flight.records[0].t_ns
     assert imu is not None
@@ -204,11 +204,44 @@ def test_the_filter_goes_on_when_the_clock_is_set_back(flight: Flight, back_s: f
             again = replace(r, t_ns=told(r.t_ns), t_prev_ns=told(r.t_prev_ns))
             timeline.add_vo(again, flight.predictions.get(r.t_ns))
     assert timeline.t_ns == told(flight.records[99].t_ns)
-    assert timeline.counts["clock_set_back"] == 1
+    assert timeline.counts["clock_set_back" if back_s > 0 else "silences"] == 1
     assert timeline.counts["used"] >= 96 - late
     error = timeline.filter.x.position[0] - flight.T_world_imu[99, :3, 3]
     C = timeline.filter.covariance[0, P, P]
     assert error @ np.linalg.solve(C, error) / 3 < 3.0
+
+
+def test_after_a_long_silence_the_filter_is_as_unsure_as_it_is_wrong() -> None:
+    """Ten seconds without a sample or record; the vehicle flew on."""
+    for seed in range(3):
+        flight = synthetic_flight(seed, duration_s=16)
+        imu, begin_ns = flight.imu, flight.records[0].t_ns
+        assert imu is not None
+        heard, seen = (
+            [not 3 * 10**9 < t - begin_ns < 13 * 10**9 for t in stamps]
+            for stamps in (imu.t_ns.tolist(), [r.t_ns for r in flight.records])
+        )
+        timeline = _timeline(flight)
+        for t, w, f in zip(imu.t_ns[heard], imu.gyro_radps[heard], imu.acc_mps2[heard]):
+            timeline.add_imu(int(t), w, f)
+        _feed(timeline, flight, np.flatnonzero(seen).tolist())
+        error = timeline.filter.x.position[0] - flight.T_world_imu[len(seen) - 1, :3, 3]
+        assert error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3 < 3.0
+        assert timeline.counts["silences"] == 1
+        assert timeline.counts["used"] > 100
+
+
+@pytest.mark.parametrize("ahead_s", [30, 3600])
+def test_without_an_imu_a_clock_set_ahead_turns_nothing_over(ahead_s: int) -> None:
+    for seed in range(3):
+        flight = replace(synthetic_flight(seed, duration_s=6), imu=None, T_imu_cam=None)
+        timeline, begin_ns = _timeline(flight, with_imu=False), flight.records[0].t_ns
+        for r in flight.records:
+            late, before = (t + ahead_s * 10**9 * (t - begin_ns > 3 * 10**9) for t in (r.t_ns, r.t_prev_ns))
+            timeline.add_vo(replace(r, t_ns=late, t_prev_ns=before), flight.predictions.get(r.t_ns))
+        error = timeline.filter.x.position[0] - flight.T_world_imu[-1, :3, 3]
+        assert np.linalg.norm(error) < 3.0 * np.sqrt(np.trace(timeline.filter.covariance[0, P, P]))
+        assert timeline.counts["used"] > len(flight.records) - 4
 
 
 def test_the_jitter_of_a_slow_imus_stamps_is_no_gap() -> None:

@@ -16,11 +16,13 @@ from gpvo.geometry import se3
 from gpvo.io import guess, open_source
 from gpvo.io.bag_images import decode_message, pair_streams
 from gpvo.io.bag_reader import pose_of, stamp_ns
-from gpvo.io.bags import say
+from gpvo.io.bags import has_word
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport
+from gpvo.io.stamps import match_nearest
 from gpvo.io.stated import to_records
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
+from rosbags.rosbag2.storage_mcap import zstd
 
 KINDS = {"ros1": (True, False, "a.bag"), "sqlite3": (False, False, "a"), "mcap": (False, True, "a")}
 
@@ -75,6 +77,73 @@ def test_suffixes_in_capitals_are_suffixes(tmp_path, kind):
     assert len(seq.frames_of(open_source(file.rename(tmp_path / f"A{file.suffix.upper()}")))) == 12
 
 
+def _write_apart(folder, kind, name_of, slower=1):
+    """The messages of one recording, each in the bag that ``name_of`` (share of the recording, topic) says."""
+    ros1, mcap, _ = KINDS[kind]
+    recorded = [(slower * (t - seq.START_NS) + seq.START_NS, *m) for t, *m in stereo_bag(ros1).messages]
+    recorded = sorted(recorded, key=lambda m: m[0])
+    makers = {}
+    for k, message in enumerate(recorded):
+        makers.setdefault(name_of(k / len(recorded), message[1]), BagMaker(ros1)).messages.append(message)
+    folder.mkdir()
+    for name, maker in makers.items():
+        maker.write(folder / (f"{name}.bag" if ros1 else name), mcap=mcap)
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name_of", [lambda share, topic: f"x_{int(3 * share)}", lambda share, topic: topic[1:4]])
+def test_a_recording_in_several_bags_is_read_as_one(tmp_path, kind, name_of):
+    one, parts = open_source(_write(tmp_path, kind)), _write_apart(tmp_path / "parts", kind, name_of)
+    assert guess(parts) == "rosbag"
+    assert seq.frames_of(open_source(parts)) == seq.frames_of(one)
+    assert np.array_equal(open_source(parts).imu.t_ns, one.imu.t_ns)
+    poses = [read_foreign(p, topic="/vicon/head/head").t_ns for p in (parts, one.path)]
+    assert np.array_equal(*poses)
+    (parts / "mav0" / "cam0").mkdir(parents=True)
+    (parts / "mav0" / "cam0" / "data.csv").touch()
+    assert guess(parts) == "euroc"
+
+
+def test_bags_of_several_recordings_or_of_one_twice_are_refused(tmp_path):
+    folder = _write_apart(tmp_path / "parts", "ros1", lambda share, topic: "a" if share < 0.2 else "c", slower=40)
+    assert len(open_source(folder)) == 12
+    again = _write_apart(tmp_path / "again", "ros1", lambda share, topic: "b" if share > 0.7 else "a", slower=40)
+    shutil.copy(again / "b.bag", folder)
+    with pytest.raises(SourceError, match=r"c\.bag and b\.bag both hold '/camera/left/image_raw' at one time"):
+        open_source(folder)
+    (folder / "c.bag").unlink()
+    with pytest.raises(SourceError, match=r"several recordings: b\.bag begins 1\d s after those before end"):
+        open_source(folder)
+    (folder / "a.bag").unlink()
+    shutil.copy(folder / "b.bag", folder / "b.orig.bag")
+    assert len(open_source(folder)) < 6
+
+
+def test_a_bag_that_is_still_recorded_or_compressed_as_a_file_is_refused_with_the_cure(tmp_path):
+    folder = _write_apart(tmp_path / "parts", "ros1", lambda share, topic: f"x_{int(2 * share)}")
+    active = (folder / "x_1.bag").rename(folder / "x_1.bag.active")
+    for path in (folder, active):
+        with pytest.raises(
+            SourceError, match=r"x_1\.bag\.active: is still recorded.*'rosbag reindex x_1\.bag\.active'"
+        ):
+            open_source(path)
+    packed = _write(tmp_path, "sqlite3")
+    metadata = packed / "metadata.yaml"
+    text = metadata.read_text().replace("a.db3", "a.db3.zstd").replace("compression_mode: ''", "compression_mode: FILE")
+    metadata.write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+    (packed / "a.db3.zstd").write_bytes(zstd.compress((packed / "a.db3").read_bytes()))
+    unpacked = (packed / "a.db3").read_bytes()
+    (packed / "a.db3").unlink()
+    for path in (packed, packed / "a.db3.zstd"):
+        with pytest.raises(
+            SourceError, match=r"is compressed as a whole file \(unpack it beside: 'zstd -d .*\*\.zstd'"
+        ):
+            open_source(path)
+    (packed / "a.db3").write_bytes(unpacked)
+    assert len(list(open_source(packed))) == 12
+
+
 def test_missing_images_shift_nothing(tmp_path):
     path = _write(tmp_path, "ros1", skip={(2, "left"), (5, "right"), (6, "right"), (9, "left")})
     source = open_source(path)
@@ -118,6 +187,25 @@ def test_a_wide_tolerance_joins_no_neighbours_where_an_image_is_lost():
     apart = [stamp_ns(right) - t_ns for t_ns, _, right in pairs]
     assert len(pairs) > 270
     assert set(apart) == {5_000_000}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_wide_tolerance_joins_no_neighbours_at_the_start_or_where_both_cameras_lose_images(seed):
+    """A fifth of the images of each camera lost; the right one is 5 ms behind, at 30 Hz."""
+    rng, late_ns = np.random.default_rng(seed), {"left": 0, "right": 5_000_000}
+    sides = [
+        [seq.START_NS + k * 33_333_333 + late for k in range(40) if rng.random() > 0.2] for late in late_ns.values()
+    ]
+    listed = [[(t, str(t)) for t in side] for side in sides]
+    by_file = match_nearest(*listed, 40_000_000, SourceReport(), "folder")
+    assert {int(b) - int(a) for _, a, b in by_file} == {5_000_000}
+    maker = BagMaker(ros1=False)
+    for side, stamps in zip(late_ns, sides):
+        for t in stamps:
+            maker.image(side, t, GREY, "mono8")
+    stream = [(topic, message) for _, topic, message in sorted(maker.messages, key=lambda m: m[0])]
+    pairs = pair_streams(stream, "left", 40_000_000, SourceReport(), "bag")
+    assert [stamp_ns(right) - t_ns for t_ns, _, right in pairs] == [5_000_000] * len(by_file)
 
 
 GREY = np.random.default_rng(0).integers(20, 235, (24, 32), dtype=np.uint8)
@@ -322,9 +410,9 @@ def test_one_imu_stamp_far_ahead_costs_one_sample(tmp_path, where):
 @pytest.mark.parametrize("name", ["direct/{}/image_raw", "correct_{}/image", "{}/image_unrectified"])
 def test_a_word_that_ends_in_rect_makes_no_image_rectified(name):
     sides = [f"/{name.format(side)}" for side in ("left", "right")]
-    assert not say("rect", *sides)
-    assert not say("rect", sides[0], "/right/image_rect")
-    assert say("rect", "/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
+    assert not has_word("rect", *sides)
+    assert not has_word("rect", sides[0], "/right/image_rect")
+    assert has_word("rect", "/left/image_rect_color", "/rectified/right", "/infra2/image_rect_raw")
 
 
 def test_bag_without_images(tmp_path):
@@ -520,6 +608,27 @@ def _stamped(tmp_path, stamps_s):
 def test_a_clock_that_does_not_run_is_refused(tmp_path, stamps_s, reason):
     with pytest.raises(SourceError, match=reason):
         read_foreign(_stamped(tmp_path, stamps_s))
+
+
+@pytest.mark.parametrize("wrong_s", [-40.0, 3600.0])
+@pytest.mark.parametrize("where", [0, 1, 9, 18, 19])
+def test_one_wrong_stamp_costs_one_pose_of_a_bag_and_is_named_in_a_file(tmp_path, wrong_s, where):
+    stamps_s = [100 + 0.1 * k for k in range(where)] + [100 + wrong_s] + [100 + 0.1 * k for k in range(where + 1, 20)]
+    is_order = (where, wrong_s) in ((0, -40.0), (19, 3600.0))  # then it is a pause
+    log = read_foreign(_stamped(tmp_path, stamps_s))
+    left = [s for k, s in enumerate(stamps_s) if is_order or k != where]
+    np.testing.assert_allclose(log.t_ns * 1e-9, left)
+    note = "1 of 20 messages on '/odom' are stamped seconds off and were left out"
+    assert (note in log.notes) is not is_order
+    lines = tmp_path / "log.tum"
+    lines.write_text("".join(f"{t:.9f} {k} 0 0 0 0 0 1\n" for k, t in enumerate(stamps_s)))
+    if is_order:
+        assert len(read_foreign(lines).t_ns) == 20
+        return
+    with pytest.raises(
+        SourceError, match=rf"line {where + 1}: the stamp .* far from those around it \(remove the line"
+    ):
+        read_foreign(lines)
 
 
 def test_messages_out_of_order_are_sorted_and_counted(tmp_path):

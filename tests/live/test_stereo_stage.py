@@ -94,6 +94,38 @@ def test_what_a_run_reads_is_read_live(which: str, tmp_path: Path) -> None:
     assert not stage.problems()
 
 
+@pytest.mark.parametrize("which", ["apart", "gyroscope alone", "whole"])
+def test_gyroscope_and_accelerometer_apart_are_joined_as_in_a_bag(which: str, tmp_path: Path) -> None:
+    maker = stereo_bag(ros1=False, n=28)
+    maker.messages = [m for m in maker.messages if "imu" not in m[1]]
+    for k in range(-4, 280):
+        t = seq.START_NS + k * 5_000_000
+        maker.imu("/gyro/sample", t, (0.01 * k, 0.2, 0.3), (0.0, 0.1 * k, 9.8) if which == "whole" else (0, 0, 0))
+        if which == "apart" and k % 3 == 0:
+            maker.imu("/accel/sample", t + 1_000_000, (0, 0, 0), (0.1 * k, 0.0, 9.8))
+    bag = maker.write(tmp_path / "bag")
+    stage = StereoStage(LEFT, RIGHT, "/gyro/sample")
+    settings = LiveSettings(tmp_path, stereo=(LEFT, RIGHT), imu="/gyro/sample", replay=bag)
+    assert topics_in(stage, settings)["/accel/sample"] == "sensor_msgs/msg/Imu"
+    records = [t.record for a in replay(bag, _present(bag, topics_in(stage, settings)), threading.Event(), fast=True)
+               for t in stage.take(a)]  # fmt: skip
+    records += [t.record for t in stage.flush()]
+    log = [s.record for s in runner.steps(open_source(bag, prefetch=False), make_config())]
+    assert len(records) == len(log) == 28
+    if which == "gyroscope alone":  # for a second, an accelerometer might follow
+        assert all(r.imu_gyro_mean_radps is not None for r in records[22:])
+        assert all(np.isnan(r.imu_acc_mean_mps2).all() for r in records[22:])
+        return
+    for ours, run in list(zip(records, log))[1:]:
+        for name in ("imu_gyro_mean_radps", "imu_acc_mean_mps2"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(run, name), atol=1e-12, err_msg=name)
+
+
+def _present(bag: Path, topics: dict[str, str]) -> list[str]:
+    with open_bag(bag) as reader:
+        return [t for t in topics if t in reader.topics]
+
+
 def test_an_imu_whose_clock_is_set_back_leaves_no_samples_of_before() -> None:
     early, late, stage, records = BagMaker(False), stereo_bag(False, n=50), StereoStage(LEFT, RIGHT, "/imu0"), []
     for k in range(40):  # before the cameras run, on a clock that is 1.5 s ahead

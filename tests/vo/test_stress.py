@@ -111,6 +111,16 @@ def test_rows_that_lag_behind_are_a_delay() -> None:
     assert watch.step(good, RightSearch(200, 200, 0, 0, rng.normal(0, 0.2, 200), motion)) == []
 
 
+def test_points_out_of_their_rows_for_a_delay_speak_of_no_calibration() -> None:
+    rng = np.random.default_rng(0)
+    watch = PairWatch(pinhole(480, 360))
+    for _ in range(9):
+        motion = rng.normal(0, 4, 50)
+        watch.step(Observation(None, False), RightSearch(100, 50, 0, 45, -motion, motion))
+    (finding,) = watch.findings()
+    assert "a frame apart" in finding
+
+
 def test_wrong_partners_speak_louder_than_missing_ones() -> None:
     """A quarter of the points has no partner on the right: mostly not found at all, or mostly found in another row."""
     nothing = np.zeros(0)
