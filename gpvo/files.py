@@ -93,7 +93,7 @@ def is_writable(path: Path) -> bool:
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
     """Write a text file whole or not at all; lines end as in ``text``. Raises as :func:`replacing`."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding=encoding)
+        temporary.write_bytes(text.encode(encoding))
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -120,8 +120,10 @@ class FolderLock:
             raise OutputError(f"cannot be written: {error.strerror}", where=where or path) from None
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except OSError as error:
             self.release()
+            if not isinstance(error, BlockingIOError | PermissionError):
+                return  # a file system that knows no locks, as a network's may be: as on Windows
             cure = "wait for it, or choose another folder with -o"
             raise OutputError("is being written by another process", where=where or path, cure=cure) from None
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
 
 import numpy as np
@@ -36,7 +36,8 @@ class Feature:
 class FeatureGroup:
     """Columns computed together. ``start(camera)`` gives a step function with its own, empty memory.
 
-    The step function is called once per record, in time order, and returns one number per column. Several groups may
+    The step function is called once per record, in time order, and returns one number per column; where it has a
+    memory, it is an object, so that a predictor can be copied and pickled. Several groups may
     share a ``name``, by which they are selected: each is computed only if one of its own columns is wanted.
     """
 
@@ -45,42 +46,54 @@ class FeatureGroup:
     start: Callable[[StereoCamera | None], Step]
 
 
-def _stateless(values: Callable[[VoRecord, float], Sequence[float]]) -> Callable[[StereoCamera | None], Step]:
-    """A group without memory; ``values`` gets the record and the focal length [px] (NaN where there is no camera)."""
-
-    def start(camera: StereoCamera | None) -> Step:
-        focal = camera.fx_px if camera is not None else math.nan
-        return lambda record: values(record, focal)
-
-    return start
+def _stateless(values: Callable[[float, VoRecord], Sequence[float]]) -> Callable[[StereoCamera | None], Step]:
+    """A group without memory; ``values`` gets the focal length [px] (NaN where there is no camera) and the record."""
+    return lambda camera: partial(values, math.nan if camera is None else camera.fx_px)
 
 
-def _counts(r: VoRecord, _: float) -> Sequence[float]:
+def _velocity(_: float, r: VoRecord) -> Sequence[float]:
+    return twist(r).tolist()[:3]
+
+
+def _rotation(_: float, r: VoRecord) -> Sequence[float]:
+    return twist(r).tolist()[3:]
+
+
+def _counts(_: float, r: VoRecord) -> Sequence[float]:
     counts = (r.n_detected, r.n_stereo, r.n_tracked, r.n_inliers)
     return (*(float(n) if n >= 0 else math.nan for n in counts), r.inlier_ratio)
 
 
-def _seen(r: VoRecord, focal: float) -> Sequence[float]:
+def _seen(focal: float, r: VoRecord) -> Sequence[float]:
     disparities = [log_of(d / focal) for d in (r.disparity_p10_px, r.disparity_p50_px, r.disparity_p90_px)]
     return [*disparities, r.spread_u, r.spread_v, log_of(r.reproj_rms_px / focal), r.log10_condition]
 
 
+def _image(_: float, r: VoRecord) -> Sequence[float]:
+    return r.brightness, r.contrast, r.sharpness, r.noise_level
+
+
+def _residual(_: float, r: VoRecord) -> Sequence[float]:
+    return (log_of(r.reproj_rms_px),)
+
+
+def _variances(method: str, _: float, r: VoRecord) -> Sequence[float]:
+    C = _finite(r, method)
+    return (math.nan,) * 6 if C is None else [log_of(c) for c in C.diagonal().tolist()]
+
+
+def _determinant(method: str, _: float, r: VoRecord) -> Sequence[float]:
+    C = _finite(r, method)
+    sign, log_det = (0.0, 0.0) if C is None else np.linalg.slogdet(C)
+    return (float(log_det) if sign > 0 else math.nan,)
+
+
 def _stated(name: str, method: str) -> tuple[FeatureGroup, FeatureGroup]:
     """Logs of the variances that a record states by a method, and of the covariance's determinant."""
-
-    def variances(r: VoRecord, _: float) -> Sequence[float]:
-        C = _finite(r, method)
-        return (math.nan,) * 6 if C is None else [log_of(c) for c in C.diagonal().tolist()]
-
-    def determinant(r: VoRecord, _: float) -> Sequence[float]:
-        C = _finite(r, method)
-        sign, log_det = (0.0, 0.0) if C is None else np.linalg.slogdet(C)
-        return (float(log_det) if sign > 0 else math.nan,)
-
     units = ", ".join(f"ln_var_{method}_{a} [ln {'rad' if a.startswith('r') else 'm'}^2]" for a in AXES)
     return (
-        FeatureGroup(name, _columns(units), _stateless(variances)),
-        FeatureGroup(name, _columns(f"ln_det_{method} [ln]"), _stateless(determinant)),
+        FeatureGroup(name, _columns(units), _stateless(partial(_variances, method))),
+        FeatureGroup(name, _columns(f"ln_det_{method} [ln]"), _stateless(partial(_determinant, method))),
     )
 
 
@@ -89,12 +102,12 @@ def _finite(r: VoRecord, method: str) -> Array | None:
     return C if C is not None and np.isfinite(C).all() else None
 
 
-def _imu(r: VoRecord, _: float) -> Sequence[float]:
+def _imu(_: float, r: VoRecord) -> Sequence[float]:
     vectors = (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps, r.imu_acc_std_mps2, r.imu_gyro_std_radps)
     return [math.nan if v is None else math.hypot(*v) for v in vectors]
 
 
-def _imu_axes(r: VoRecord, _: float) -> Sequence[float]:
+def _imu_axes(_: float, r: VoRecord) -> Sequence[float]:
     means = (r.imu_acc_mean_mps2, r.imu_gyro_mean_radps)
     return [x for v in means for x in ((math.nan,) * 3 if v is None else v)]
 
@@ -110,8 +123,8 @@ def _of_axes(name: str, unit: str) -> str:
 
 
 BUILT_IN = (
-    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), lambda c: lambda r: twist(r).tolist()[:3]),
-    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), lambda c: lambda r: twist(r).tolist()[3:]),
+    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), _stateless(_velocity)),
+    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), _stateless(_rotation)),
     FeatureGroup(
         "counts",
         _columns("n_detected [1], n_stereo [1], n_tracked [1], n_inliers [1], inlier_ratio [1]"),
@@ -130,7 +143,7 @@ BUILT_IN = (
     FeatureGroup(
         "image",
         _columns("brightness [0..1], contrast [0..1], sharpness [log10], noise_level [0..1]"),
-        _stateless(lambda r, _: (r.brightness, r.contrast, r.sharpness, r.noise_level)),
+        _stateless(_image),
     ),
     FeatureGroup(
         "trend",
@@ -150,7 +163,7 @@ BUILT_IN = (
     ),
     *_stated(IMPORTED, IMPORTED),
     # In pixels, as the geometric covariance at one pixel is scaled by it.
-    FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(lambda r, _: (log_of(r.reproj_rms_px),))),
+    FeatureGroup("residual", _columns("ln_residual_px [ln px]"), _stateless(_residual)),
     # Magnitudes of the vectors: they survive a change of the IMU's mounting; its axes (imu_axes) do not.
     FeatureGroup(
         "imu",

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from gpvo.errors import GpvoError
 from gpvo.online.stored import Stored
 from gpvo.stats import student_t
 from gpvo.types import Array, StereoCamera
@@ -108,10 +109,14 @@ class AdaptiveScale:
     Steps are in the log of the scale, so the factor stays positive; it is kept within [1/100, 100]. I. Gibbs, E.
     Candes, "Adaptive Conformal Inference Under Distribution Shift" (2021), equation 2, in the form that moves the
     interval itself: A. Angelopoulos, E. Candes, R. Tibshirani, "Conformal PID Control" (2023), equation 4.
+    ``scale`` (6,): where to begin, by default ones. Raises GpvoError unless it is six positive numbers.
     """
 
-    def __init__(self, scale: Array | None = None) -> None:
-        self._log_scale = np.zeros(6) if scale is None else np.log(scale)
+    def __init__(self, scale: ArrayLike | None = None) -> None:
+        start = np.ones(6) if scale is None else np.asarray(scale, dtype=np.float64)
+        if start.shape != (6,) or not ((start > 0) & (start < np.inf)).all():
+            raise GpvoError(f"a scale of {start.tolist()} is not possible", cure="give six positive factors")
+        self._log_scale = np.log(start)
 
     @property
     def scale(self) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -126,7 +127,7 @@ class Window:
         # Where the reference is an older frame, the motions that came after it are dropped.
         while self._motions and self._motions[-1].t_ns != record.t_prev_ns:
             self._motions.pop()
-        self._motions.append(record)
+        self._motions.append(deepcopy(record))  # its giver may write the next motion into the same arrays
         while len(self._motions) > 1 and self._extent() - self._measure(self._motions[0]) >= self.size * (1 - 1e-9):
             self._motions.popleft()
         return joined(list(self._motions)) if self._extent() >= self.size * (1 - 1e-9) else None

@@ -83,6 +83,10 @@ class VoRecord:
     v_t: Mapping[str, Array] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if type(self.status) is not Status:  # a text is equal to one, but not the same
+            object.__setattr__(self, "status", Status(self.status))
+
     @property
     def dt_s(self) -> float:
         """Duration of the motion [s]; 0 for the first frame."""
@@ -294,9 +298,9 @@ class MotionError:
         cls, covariance: Array, mean: Array | None = None, *, dt_s: float | Array = 0.0, status: Status = Status.OK
     ) -> MotionError:
         """An error (..., 6, 6) that has nothing to do with that of any other motion; ``mean`` (..., 6) or zero."""
-        C = np.asarray(covariance, dtype=np.float64)
+        C = np.array(covariance, dtype=np.float64)  # a copy: whoever gives it may write the next one there
         return MotionError(
-            mean=np.zeros(C.shape[:-1]) if mean is None else np.broadcast_to(mean, C.shape[:-1]),
+            mean=np.zeros(C.shape[:-1]) if mean is None else np.array(np.broadcast_to(mean, C.shape[:-1])),
             jitter=np.zeros(C.shape),
             white=C,
             persistent_root=np.zeros((*C.shape[:-1], 0)),

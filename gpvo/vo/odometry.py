@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
@@ -31,7 +32,7 @@ from gpvo.vo.quality import (
 from gpvo.vo.rig_error import RigError, RigState
 from gpvo.vo.rivals import Choice, areas, choose, unexplained
 from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
-from gpvo.vo.state import State, Stopwatch, check_frame
+from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
 
 _RIVAL_STAYS = 0.85  # per frame
@@ -44,7 +45,7 @@ class StereoOdometry:
     ----------
     camera : the rectified pair.
     config : settings; default the preset ``fast``.
-    mask : (H, W) bool, True where the left image may be used.
+    mask : (H, W) bool, True where the left image may be used. CalibrationError for one of another size.
     known : what is known about errors of the calibration; by default nothing, or, with ``self_calibration`` off, that
         there are none.
 
@@ -61,7 +62,10 @@ class StereoOdometry:
     ) -> None:
         self.camera = camera
         self.config = config or VoConfig()
-        self._mask = mask
+        self._mask = None if mask is None else np.array(mask, bool)
+        if self._mask is not None and self._mask.shape != (camera.height, camera.width):
+            size = f"{self._mask.shape}, the camera's images {(camera.height, camera.width)}"
+            raise CalibrationError(f"the mask is {size}", cure="rows before columns: give one of the image's size")
         if self.config.self_calibration:
             self.rig_error = RigError(camera, known)
         else:
@@ -81,10 +85,10 @@ class StereoOdometry:
 
         ``imu`` holds the samples since the last frame, if any. The record gets the mean and spread of all samples since
         the reference, so that they cover the same interval as its motion. Raises SourceError if the frame is not later
-        than the last one, or not of the camera's size.
+        than the last one, its stamp no whole number, or its images not of the camera's size. The images are copied.
         """
         clock = Stopwatch()
-        check_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
+        frame = own_frame(frame, self.camera, None if self._state is None else self._state.t_last_ns)
         frontend = self._frontend = self._frontend or self._new_frontend(frame)
         seen = frontend.observe(frame)
         clock.lap("observe")

@@ -5,7 +5,7 @@ it asks of a frame: its order and size, and its time in each stage.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,18 +109,26 @@ class Stopwatch:
         self._since = now
 
 
-def check_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns: int | None) -> None:
-    """Refuse a frame out of order or of another size than the camera's."""
+def own_frame(frame: StereoFrame | TrackFrame, camera: StereoCamera, t_last_ns: int | None) -> StereoFrame | TrackFrame:
+    """The frame with images of its own, as its giver may write the next pair into the same memory.
+
+    Raises SourceError for a stamp that is no whole number or not later than the last, and for images of another size.
+    """
+    if not isinstance(frame.t_ns, int | np.integer):
+        cure = "give whole nanoseconds: round(1e9 * seconds)"
+        raise SourceError(f"the frame's t_ns is {frame.t_ns!r}, no whole number", cure=cure)
     if t_last_ns is not None and frame.t_ns <= t_last_ns:
         raise SourceError(
             f"frame at t_ns={frame.t_ns} is not later than the one before ({t_last_ns})",
             cure="feed frames in time order",
         )
-    if isinstance(frame, StereoFrame):
-        for side, image in (("left", frame.left), ("right", frame.right)):
-            dtype, shape = getattr(image, "dtype", type(image).__name__), getattr(image, "shape", ())
-            if dtype != np.uint8 or shape != (camera.height, camera.width):
-                raise SourceError(
-                    f"the {side} image is {dtype} {shape}, the camera takes uint8 {(camera.height, camera.width)}",
-                    cure="rows before columns: give grey images of the calibration's resolution",
-                )
+    if isinstance(frame, TrackFrame):
+        return replace(frame, t_ns=int(frame.t_ns))
+    for side, image in (("left", frame.left), ("right", frame.right)):
+        dtype, shape = getattr(image, "dtype", type(image).__name__), getattr(image, "shape", ())
+        if dtype != np.uint8 or shape != (camera.height, camera.width):
+            raise SourceError(
+                f"the {side} image is {dtype} {shape}, the camera takes uint8 {(camera.height, camera.width)}",
+                cure="rows before columns: give grey images of the calibration's resolution",
+            )
+    return replace(frame, t_ns=int(frame.t_ns), left=np.array(frame.left), right=np.array(frame.right))

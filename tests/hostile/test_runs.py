@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import _pyio
+import errno
+import io
 import os
 import subprocess
 import sys
@@ -14,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from gpvo.errors import GpvoError, SourceError
-from gpvo.files import read_json, write_json
+from gpvo.files import read_json, write_csv, write_json
 from gpvo.io.run import RunWriter, is_finished, read_run, write_run
 from gpvo.online.predictor import Predictor
 from gpvo.types import VoLog
@@ -135,6 +138,28 @@ def test_a_full_disk_names_the_file_and_leaves_nothing_half_written(
     with pytest.raises(SourceError, match=r"log_000000\.parquet: cannot be written"):
         write_run(tmp_path / "run", log)
     assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_file_system_without_locks_is_written_all_the_same(
+    log: VoLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Lustre without ``-o flock``, or a share mounted from a cloud: nobody else was writing there."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    write_run(tmp_path / "run", log)
+    assert is_finished(tmp_path / "run")
+
+
+def test_lines_end_alike_on_every_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows, text files turn each line end into two characters unless told not to."""
+    monkeypatch.setattr(io, "open", _pyio.open)
+    monkeypatch.setattr(os, "linesep", "\r\n")
+    write_csv(tmp_path / "t.csv", {"a": [1, 2]})
+    assert (tmp_path / "t.csv").read_bytes() == b"a\n1\n2\n"
 
 
 def test_two_writers_do_not_mix(log: VoLog, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.dataset.build import build
-from gpvo.errors import ModelError
+from gpvo.errors import GpvoError, ModelError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import is_positive_definite
 from gpvo.online.division import divide, ln_faster
 from gpvo.online.guard import AdaptiveScale
-from gpvo.online.observer import joined
+from gpvo.online.observer import Observer, joined
 from gpvo.online.predictor import Predictor
-from gpvo.types import Status, VoLog
+from gpvo.types import MotionError, Status, VoLog
 from small_model import small_model, training_sets
 from synthetic_runs import CAMERA, make_run
 
@@ -375,3 +377,47 @@ def test_a_window_knows_a_count_if_all_its_motions_do(flight):
     counts = [r.n_inliers for r in motions]
     assert joined(motions).n_inliers == sum(counts) // 3
     assert joined([replace(motions[0], n_inliers=-1), *motions[1:]]).n_inliers == -1
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
+def test_a_copy_goes_on_where_it_stands(predictor, flight, copied):
+    records = list(flight[0])
+    for record in records[:20]:
+        predictor.step(record)
+    other = copied(predictor)
+    for record in records[20:40]:
+        np.testing.assert_array_equal(other.step(record).covariance, predictor.step(record).covariance)
+
+
+def test_arrays_of_records_may_be_used_again(predictor, flight):
+    """As a node does that fills the same matrices for each motion."""
+    records, T = list(flight[0])[:60], np.empty((4, 4))
+    wanted, got = (Observer(predictor.features, "window:1s", CAMERA) for _ in range(2))
+    for record in records:
+        T[:] = record.T_prev_cur
+        one, other = wanted.step(record), got.step(replace(record, T_prev_cur=T))
+        if one is not None:
+            np.testing.assert_array_equal(other[0].T_prev_cur, one[0].T_prev_cur)
+    C = np.eye(6)
+    stated = MotionError.independent(C)
+    C *= 9.0
+    np.testing.assert_array_equal(stated.covariance, np.eye(6))
+
+
+def test_what_late_truth_cannot_mean_is_refused(predictor, flight):
+    """A column had made the scale a matrix, and a scale of zero or NaN the covariance."""
+    for record in list(flight[0])[:3]:
+        predictor.step(record)
+    for wrong in (np.zeros((6, 1)), np.zeros(3)):
+        with pytest.raises(GpvoError, match=r"shape \(\d, ?1?\).* \(give \(6,\)"):
+            predictor.observe(wrong)
+    for wrong in (np.zeros(6), -np.ones(6), np.full(6, np.nan), np.ones(3)):
+        with pytest.raises(GpvoError, match="not possible"):
+            predictor.reset(scale=wrong)
+
+
+def test_a_status_may_be_given_as_text(flight):
+    record = replace(flight[0].records[1], status="lost")
+    assert record.status is Status.LOST
+    with pytest.raises(ValueError, match="'fine' is not a valid Status"):
+        replace(record, status="fine")

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gpvo.errors import GpvoError, SourceError
+from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.runner import RunSummary
 from gpvo.sim.points import simulate_points
@@ -183,6 +183,17 @@ def test_points_too_far_away_are_named() -> None:
     assert re.fullmatch(r"only \d of \d+ points are near enough to show .* \(disparity over 1 px\)", records[1].reason)
 
 
+@pytest.mark.parametrize("preset", ["fast", "thesis"])
+def test_a_driver_may_write_the_next_pair_into_the_same_memory(clip: Clip, preset: str) -> None:
+    """It saw each image in place of the one before: no motion at all, and was sure of it."""
+    both = np.empty((clip.camera.height, 2 * clip.camera.width), np.uint8)
+    odometry = StereoOdometry(clip.camera, make_config(preset))
+    for frame, wanted in zip(clip.frames[:4], run(clip, clip.frames[:4], preset), strict=True):
+        both[:] = np.hstack([frame.left, frame.right])
+        got = odometry.step(StereoFrame(frame.t_ns, *np.hsplit(both, 2)))
+        np.testing.assert_array_equal(got.T_prev_cur, wanted.T_prev_cur)
+
+
 def test_refuses_what_it_cannot_mean(clip: Clip) -> None:
     odometry = StereoOdometry(clip.camera)
     odometry.step(clip.frames[0])
@@ -191,6 +202,11 @@ def test_refuses_what_it_cannot_mean(clip: Clip) -> None:
     small = replace(clip.frames[1], left=clip.frames[1].left[:100])
     with pytest.raises(SourceError, match="the camera takes"):
         odometry.step(small)
+    seconds = replace(clip.frames[1], t_ns=clip.frames[1].t_ns * 1e-9)  # type: ignore[arg-type]
+    with pytest.raises(SourceError, match=r"no whole number \(give whole nanoseconds"):
+        odometry.step(seconds)
+    with pytest.raises(CalibrationError, match="rows before columns"):
+        StereoOdometry(clip.camera, mask=np.ones((clip.camera.width, clip.camera.height), bool))
     for wrong in ({"preset": "best"}, {"nonsense": 1}, {"methods": ("magic",)}, {"sigma_px": -1.0}):
         with pytest.raises(GpvoError):
             make_config(**wrong)  # type: ignore[arg-type]

@@ -247,8 +247,9 @@ def build_world(kind: str, seed: int, **params: object) -> World:
 
 def cache_folder() -> Path:
     """Where worlds are kept: ``$XDG_CACHE_HOME/gpvo/worlds``, by default under ``~/.cache``."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "gpvo" / "worlds"
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    # A user without a home, as in a container run under a number: nothing can be kept below a device.
+    return Path(os.devnull if base.startswith("~") else base) / "gpvo" / "worlds"
 
 
 def _save_world(world: World, path: Path) -> None:
