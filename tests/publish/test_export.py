@@ -255,6 +255,19 @@ def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> 
     assert "missing inputs are NaN" in refused.stderr
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler 'cc' on this machine")
+def test_a_header_is_skipped_only_if_it_is_the_same_again(tmp_path: Path) -> None:
+    for name, case in (("a", "of conditions"), ("b", "of conditions"), ("c", "no geometry")):
+        to_c(CASES[case], tmp_path / f"{name}.h")
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "-o", str(tmp_path / "x.o")]
+    for second, compiles in (("b", True), ("c", False)):
+        source = tmp_path / "x.c"
+        # A file that takes the types alone has nothing to be warned of either.
+        source.write_text(f'#include "a.h"\n#include "{second}.h"\ngpvo_estimate e;\n')
+        built = subprocess.run(["cc", *flags, str(source)], capture_output=True, text=True, check=False)
+        assert (built.returncode == 0) == compiles, built.stderr
+
+
 def test_onnx_has_no_prefix(tmp_path: Path) -> None:
     with pytest.raises(GpvoError, match="only with c"):
         export_model(tmp_path / "model", tmp_path / "out", "onnx", prefix="mine")
