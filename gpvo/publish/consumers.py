@@ -1,8 +1,9 @@
 """What popular filters do with the published numbers, and which parameter hides the covariance.
 
 PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
-libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026) and
-libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the clamps).
+libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026),
+libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the parameters' clamps) and libraries/AP_NavEKF3 (the filter's own, in
+AP_NavEKF3_PosVelFusion.cpp, ``FuseVelPosNED``, and AP_NavEKF3_Measurements.cpp, ``writeExtNavData``).
 robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: the stated diagonal drives its
 chi-square gate, and a zero falls back to a constant.
 """
@@ -39,12 +40,18 @@ class Px4Parameters:
 
 @dataclass(frozen=True)
 class ArduPilotParameters:
-    """ArduPilot's parameters of visual odometry, at their defaults."""
+    """ArduPilot's parameters of visual odometry, at their defaults; ``minimum`` is the least sigma EKF3 works with,
+    whatever they are set to."""
 
     VISO_POS_M_NSE: float = 0.2
     VISO_YAW_M_NSE: float = 0.2
     VISO_VEL_M_NSE: float = 0.1
     VISO_QUAL_MIN: int = 0
+
+    @staticmethod
+    def minimum(name: str) -> float:
+        """Smallest value that makes a difference."""
+        return {"VISO_POS_M_NSE": 0.01, "VISO_YAW_M_NSE": float(np.deg2rad(5.0)), "VISO_VEL_M_NSE": 0.05}[name]
 
 
 FUSIONCORE_FALLBACK = (0.1, 0.02)
@@ -133,14 +140,15 @@ def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
         ("angle", "VISO_YAW_M_NSE", np.cbrt((pose[:, 3:] ** 2).sum(1)), np.sqrt(pose[:, 3:].sum(1)), "rad"),
     ):
-        value = getattr(p, name)
-        out.append(_verdict(quantity, name, value, new, unit))
-        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit))
-    predicted = _percentiles(np.sqrt(twist[:, :3]).max(axis=1))
+        value, minimum = getattr(p, name), p.minimum(name)
+        out.append(_verdict(quantity, name, value, new, unit, minimum=minimum))
+        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit, minimum=minimum))
+    predicted, least = _percentiles(np.sqrt(twist[:, :3]).max(axis=1)), p.minimum("VISO_VEL_M_NSE")
     advice = (
         "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request 32478), or "
-        f"set VISO_VEL_M_NSE to {predicted[1]:.2g}; VISO_QUAL_MIN lets quality decide frame by frame; below 0 it "
-        "would accept lost frames"
+        f"set VISO_VEL_M_NSE to {max(predicted[1], least):.2g}; EKF3 takes no sigma below {least:g}. From 1 on, "
+        "VISO_QUAL_MIN lets ODOMETRY's quality decide frame by frame, but drops every VISION_SPEED_ESTIMATE, which has "
+        "none; below 0 it would accept frames far outside the model's domain"
     )
     return [*out, Verdict("velocity", "VISO_VEL_M_NSE", p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
 

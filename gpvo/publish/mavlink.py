@@ -111,7 +111,8 @@ class Sender:
 
         None where the quality is -1: this message carries none by which a receiver could refuse it.
 
-        LOCAL_FRD serves as the local NED frame where the vehicle's heading is given to the autopilot by vision too.
+        LOCAL_FRD serves as the local NED frame where the vehicle's heading is given to the autopilot by vision too
+        (EK3_SRC1_YAW 6): AP_VisualOdom_MAV.cpp rotates no velocity.
         """
         if odometry.twist_body is None or odometry.twist_covariance is None or quality(odometry) < 0:
             return None

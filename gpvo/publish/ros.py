@@ -213,8 +213,8 @@ def vehicle_odometry(odometry: Odometry, types: dict[str, Any]) -> Any:
     """``px4_msgs/VehicleOdometry`` for PX4 over uXRCE-DDS, on ``/fmu/in/vehicle_visual_odometry``.
 
     Pose in FRD of arbitrary heading, velocity in the body's FRD, diagonals only; unknown values are NaN, and a lost
-    frame is NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; the agent turns Unix
-    time into the flight controller's.
+    frame is NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; PX4's client turns the
+    time of the agent's machine, Unix time, into its own.
     """
     pose, twist = frd(odometry)
     nan = np.full(6, np.nan)

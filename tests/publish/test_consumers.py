@@ -94,6 +94,12 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     ardupilot = [str(v) for v in consumers.check(odometry, "ardupilot")]
     assert any("VISO_POS_M_NSE" in line for line in ardupilot)
     assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
+    # EKF3 takes no less than 5 degrees of yaw, 1 cm and 5 cm/s: to set a parameter lower changes nothing.
+    still = [replace(o, pose_covariance=np.eye(6) * 1e-6, twist_covariance=np.eye(6) * 1e-4) for o in odometry]
+    position, _, angle, _, velocity = consumers.check(still, "ardupilot")
+    assert "Set VISO_POS_M_NSE to 0.01, the smallest it accepts" in position.advice
+    assert "Set VISO_YAW_M_NSE to 0.087, the smallest it accepts" in angle.advice
+    assert "set VISO_VEL_M_NSE to 0.05;" in velocity.advice
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
     lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9, 1e-9)) for o in odometry]
     assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
