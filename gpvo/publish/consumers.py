@@ -4,8 +4,8 @@ PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_extern
 libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026),
 libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the parameters' clamps) and libraries/AP_NavEKF3 (the filter's own, in
 AP_NavEKF3_PosVelFusion.cpp, ``FuseVelPosNED``, and AP_NavEKF3_Measurements.cpp, ``writeExtNavData``).
-robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: the stated diagonal drives its
-chi-square gate, and a zero falls back to a constant.
+robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: fusioncore_ros/src/fusion_node.cpp (its
+inputs) and fusioncore_core/include/fusioncore/sensors/vslam.hpp (floors, and what stands in for zeros).
 """
 
 from __future__ import annotations
@@ -55,13 +55,17 @@ class ArduPilotParameters:
 
 
 FUSIONCORE_FALLBACK = (0.1, 0.02)
-"""Standard deviations [m, rad] that FusionCore takes where a variance is zero."""
+"""Standard deviations [m, rad] that FusionCore takes for a position or an attitude of which a variance is zero."""
+FUSIONCORE_LEAST = (0.01, 0.001)
+"""Smallest standard deviations [m, rad] that it takes."""
 
 
 def fusioncore_sigmas(covariance: Array) -> Array:
-    """(6,) standard deviations that FusionCore's gate and update use: of the diagonal alone, zeros replaced."""
-    variance = variances(covariance)
-    return np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.repeat(FUSIONCORE_FALLBACK, 3))
+    """(6,) standard deviations that FusionCore's gate and update use of a pose's: of the diagonal alone."""
+    variance = variances(covariance).reshape(2, 3)
+    least, fallback = (np.array(sigmas)[:, None] for sigmas in (FUSIONCORE_LEAST, FUSIONCORE_FALLBACK))
+    stated = np.maximum(np.sqrt(np.maximum(variance, 0.0)), least)
+    return np.where((variance > 0).all(axis=1, keepdims=True), stated, fallback).reshape(6)
 
 
 @dataclass(frozen=True)
@@ -118,18 +122,23 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
-    """No floor hides anything; what is lost are the correlations, which make some combinations of axes more certain.
+    """What is lost are correlations, which make some combinations of axes more certain, and a pose's small sigmas.
 
-    ``hidden_percent``: frames whose most certain combination of axes, in units of their sigmas, is taken for more than
-    twice as uncertain as it is.
+    ``hidden_percent``: frames whose most certain combination of axes, in units of the sigmas used, is taken for more
+    than twice as uncertain as it is.
     """
-    out = []
-    for quantity, C, unit in (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad")):
-        sigma = np.array([fusioncore_sigmas(c) for c in C])
-        correlated = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
-        advice = "It reads only the diagonal, and its chi-square gate is only as good as these sigmas; send no zeros"
-        hidden = 100.0 * float(correlated.mean())
-        out.append(Verdict(quantity, "diagonal only", 0.0, hidden, _percentiles(sigma.min(axis=1)), unit, advice))
+    out, read = [], [0, 1, 5]
+    planar = twist[:, read][:, :, read]
+    used = np.array([fusioncore_sigmas(C) for C in pose])
+    for quantity, C, sigma, unit, reads in (
+        ("twist", planar, np.sqrt(variances(planar)), "m/s, rad/s", "vx, vy and the yaw rate as an encoder's"),
+        ("pose", pose, used, "m, rad", "the pose as VSLAM's, to no less than 0.01 m and 0.001 rad"),
+    ):
+        hidden = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
+        predicted = _percentiles(np.sqrt(variances(C)).min(axis=1))
+        gate = "its chi-square gate is only as good as these sigmas; send no zeros"
+        advice = f"It reads {reads}, by the diagonal alone, and {gate}"
+        out.append(Verdict(quantity, "diagonal only", 0.0, 100.0 * float(hidden.mean()), predicted, unit, advice))
     return out
 
 

@@ -107,17 +107,23 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
         consumers.check(odometry, "betaflight")
 
 
-def test_fusioncore_reads_the_diagonal_and_replaces_zeros(odometry: list[Odometry]) -> None:
-    C = np.array(odometry[0].pose_covariance)
-    C[2, :] = C[:, 2] = C[4, :] = C[:, 4] = 0.0
-    want = np.sqrt(np.diagonal(C))
-    want[2], want[4] = 0.1, 0.02
-    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), want)
+def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[Odometry]) -> None:
+    """vslam_pose_noise_matrix in fusioncore_core/include/fusioncore/sensors/vslam.hpp."""
+    C = np.diag([4.0, 1e-6, 9.0, 1e-8, 0.25, 0.16])
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [2.0, 0.01, 3.0, 0.001, 0.5, 0.4])
+    C[4, 4] = 0.0
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [2.0, 0.01, 3.0, 0.02, 0.02, 0.02])
+    C[2, 2] = 0.0
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [0.1, 0.1, 0.1, 0.02, 0.02, 0.02])
+    sharp = [replace(o, twist_covariance=np.eye(6), pose_covariance=np.eye(6) * 1e-8) for o in odometry]
+    twist, pose = consumers.check(sharp, "fusioncore")
+    assert (twist.hidden_percent, pose.hidden_percent) == (0.0, 100.0)
+    assert pose.predicted == pytest.approx((1e-4, 1e-4, 1e-4))
 
 
 def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:
     R = np.eye(6)
-    R[0, 4] = R[4, 0] = 0.9
+    R[0, 5] = R[5, 0] = 0.9  # of those that fusion_node.cpp's encoder_callback reads: vx, vy, yaw rate
     flat, slanted = (
         [replace(o, twist_covariance=C, pose_covariance=np.eye(6)) for o in odometry] for C in (np.eye(6), R)
     )
