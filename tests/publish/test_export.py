@@ -236,15 +236,15 @@ def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> 
     model = tmp_path / "errors.gpvo"
     trained = small_model()
     modelfile.save(model, trained.arrays, trained.header)
-    for prefix in ("predict", "fuse"):
+    for prefix in ("predict", "myGPVO_fuse"):
         command = ["export", str(model), "--to", "c", "--prefix", prefix, "-o", str(tmp_path / f"{prefix}.h")]
         result = CliRunner().invoke(app, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
     source = tmp_path / "both.c"
     source.write_text(
-        '#include "predict.h"\n#include "fuse.h"\n'
-        "void run(const double *f, predict_estimate *a, fuse_estimate *b)"
-        " { predict_predict(f, 0, 0.0, a); fuse_predict(f, 0, 0.0, b); }\n"
+        '#include "predict.h"\n#include "myGPVO_fuse.h"\n'
+        "void run(const double *f, predict_estimate *a, myGPVO_fuse_estimate *b)"
+        " { predict_predict(f, 0, 0.0, a); myGPVO_fuse_predict(f, 0, 0.0, b); }\n"
     )
     flags = ["-std=c99", "-Wall", "-Wdouble-promotion", "-Werror", "-c"]
     command = ["cc", *flags, str(source), "-o", str(tmp_path / "both.o")]
