@@ -1,9 +1,10 @@
 """What popular filters do with the published numbers, and which parameter hides the covariance.
 
 PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
-libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026),
-libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the parameters' clamps) and libraries/AP_NavEKF3 (the filter's own, in
-AP_NavEKF3_PosVelFusion.cpp, ``FuseVelPosNED``, and AP_NavEKF3_Measurements.cpp, ``writeExtNavData``).
+libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars of a pose, before and after pull request 32084 of February 2026,
+and that of a velocity, since pull request 32478), libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the parameters'
+clamps) and libraries/AP_NavEKF3 (the filter's own, in AP_NavEKF3_PosVelFusion.cpp, ``FuseVelPosNED``, and
+AP_NavEKF3_Measurements.cpp, ``writeExtNavData``).
 robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: fusioncore_ros/src/fusion_node.cpp (its
 inputs) and fusioncore_core/include/fusioncore/sensors/vslam.hpp (floors, and what stands in for zeros).
 """
@@ -152,14 +153,17 @@ def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
         value, minimum = getattr(p, name), p.minimum(name)
         out.append(_verdict(quantity, name, value, new, unit, minimum=minimum))
         out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit, minimum=minimum))
-    predicted, least = _percentiles(np.sqrt(twist[:, :3]).max(axis=1)), p.minimum("VISO_VEL_M_NSE")
+    name, least = "VISO_VEL_M_NSE", p.minimum("VISO_VEL_M_NSE")
+    predicted, speed = _percentiles(np.sqrt(twist[:, :3]).max(axis=1)), np.sqrt(twist[:, :3].sum(1))
+    read = "velocity of VISION_SPEED_ESTIMATE since pull request 32478"
+    out.append(_verdict(read, name, p.VISO_VEL_M_NSE, speed, "m/s", minimum=least, typical=0.05))
     advice = (
-        "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request 32478), or "
-        f"set VISO_VEL_M_NSE to {max(predicted[1], least):.2g}; EKF3 takes no sigma below {least:g}. From 1 on, "
-        "VISO_QUAL_MIN lets ODOMETRY's quality decide frame by frame, but drops every VISION_SPEED_ESTIMATE, which has "
-        "none; below 0 it would accept frames far outside the model's domain"
+        "ODOMETRY's velocity covariance is never read, VISION_SPEED_ESTIMATE's not in older releases: set "
+        f"{name} to {max(predicted[1], least):.2g}; EKF3 takes no sigma below {least:g}. From 1 on, VISO_QUAL_MIN lets "
+        "ODOMETRY's quality decide frame by frame, but drops every VISION_SPEED_ESTIMATE, which has none; below 0 it "
+        "would accept frames far outside the model's domain"
     )
-    return [*out, Verdict("velocity", "VISO_VEL_M_NSE", p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
+    return [*out, Verdict("velocity otherwise", name, p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
 
 
 def _percentiles(sigma: Array) -> tuple[float, float, float]:

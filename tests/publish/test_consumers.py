@@ -96,10 +96,16 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
     # EKF3 takes no less than 5 degrees of yaw, 1 cm and 5 cm/s: to set a parameter lower changes nothing.
     still = [replace(o, pose_covariance=np.eye(6) * 1e-6, twist_covariance=np.eye(6) * 1e-4) for o in odometry]
-    position, _, angle, _, velocity = consumers.check(still, "ardupilot")
+    position, _, angle, _, speed, velocity = consumers.check(still, "ardupilot")
     assert "Set VISO_POS_M_NSE to 0.01, the smallest it accepts" in position.advice
     assert "Set VISO_YAW_M_NSE to 0.087, the smallest it accepts" in angle.advice
     assert "set VISO_VEL_M_NSE to 0.05;" in velocity.advice
+    # VISION_SPEED_ESTIMATE's covariance is taken for one sigma, the root of its trace, but not below the parameter.
+    assert "Set VISO_VEL_M_NSE to 0.05, the smallest it accepts" in speed.advice
+    assert speed.hidden_percent == 100.0
+    assert speed.predicted == pytest.approx(((3e-4) ** 0.5,) * 3)
+    loud = [replace(o, twist_covariance=np.eye(6) * 0.06**2) for o in odometry]
+    assert consumers.check(loud, "ardupilot")[4].hidden_percent == 0.0
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
     lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9, 1e-9)) for o in odometry]
     assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
