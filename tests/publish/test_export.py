@@ -24,7 +24,8 @@ from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner
 
-FIELDS = ("mean", "covariance", *PARTS, "epistemic", "in_domain", "confidence", "distance")
+MATRICES = ("covariance", *PARTS, "calibration_root")
+FIELDS = ("mean", *MATRICES, "epistemic", "in_domain", "confidence", "distance")
 
 
 def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> ProjectedGP:
@@ -131,10 +132,14 @@ def assert_equal(got: dict[str, np.ndarray], wanted: Prediction) -> None:
         if name == "distance":
             expected = np.sqrt(-2.0 * np.log(np.maximum(wanted.in_domain, 1e-300)))
             got = got | {name: np.minimum(got[name], np.sqrt(600.0 * np.log(10.0)))}
+        elif name == "calibration_root":
+            expected = wanted.persistent_root[:, :, -6:]
         else:
             expected = getattr(wanted, {"bias": "persistent"}.get(name, name))
         scale = np.sqrt(np.diagonal(wanted.covariance, axis1=1, axis2=2))
-        if name in ("covariance", *PARTS):
+        if name == "calibration_root":
+            unit = scale[:, :, None]
+        elif name in MATRICES:
             unit = scale[:, :, None] * scale[:, None, :]
         elif name in ("mean", "epistemic"):
             unit = scale if name == "mean" else scale**2
@@ -210,7 +215,7 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
         )
         for name in FIELDS
     }
-    for name in ("covariance", *PARTS):
+    for name in MATRICES:
         shaped[name] = shaped[name].reshape(-1, 6, 6)
     assert_equal(shaped, model.estimate(X, geometry, dt_s))
     assert {o.nu for o in found} == {model.nu[0]}
@@ -219,7 +224,7 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(none.covariance).reshape(6, 6), model.estimate(X[:1]).covariance[0], rtol=1e-5)
 
 
-_VECTORS = ("mean", "covariance", *PARTS, "epistemic")
+_VECTORS = ("mean", *MATRICES, "epistemic")
 
 
 def test_the_flag_for_filters_changes_nothing(tmp_path: Path) -> None:
