@@ -84,6 +84,13 @@ def test_a_pose_message_names_what_its_twist_is_the_motion_of(frame: str) -> Non
     assert {(o.frame_id, o.child_frame_id) for o in kept.frames} == {expected}
 
 
+@pytest.mark.parametrize("given", [{"mavlink": "udp:127.0.0.1:14550"}, {"px4": True}])
+def test_a_flight_controller_is_not_told_that_a_pose_does_not_drift(given: dict[str, Any]) -> None:
+    """EKF2 and EKF3 fuse a pose as it stands; neither knows differences of poses."""
+    with pytest.raises(GpvoError, match="not of an increment"):
+        job._outputs(LiveSettings(Path("m"), engine=EngineSettings(increment=True), **given), None)
+
+
 def _of_a_planar_robot(
     of: str, tilt_rad: float, place: np.ndarray, folder: Path
 ) -> tuple[list[VoRecord], list[VoRecord]]:
