@@ -3,7 +3,7 @@
 robot_localization: src/ros_filter.cpp, src/ekf.cpp (variances below 1e-9 become 1e-9, negative ones positive, NaN is
 not checked for). PX4: src/modules/ekf2/EKF/aid_sources/external_vision and params_external_vision.yaml (floors).
 ArduPilot: libraries/GCS_MAVLink/GCS_Common.cpp, AP_VisualOdom_MAV.cpp (clamps). FusionCore: what is stated drives its
-chi-square gate, zeros fall back to 0.1 m and 0.02 rad, off-diagonal elements are not read.
+chi-square gate, zeros fall back to parameters, off-diagonal elements are not read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LEAST, _MOST = 0.02, 300.0  # jitter of frames cancels in the pose; a bias adds
 _SWAPPED = "every consumer reads metres where there are radians, and vice versa"
 _UNLIKE = 0.7  # of the motion over a second
 _HUGE, _TINY = 1e3, 0.999e-9  # 1e-9 in single precision is good
-_ZERO_FALLBACK = "FusionCore uses 0.1 m and 0.02 rad instead"
+_ZERO_FALLBACK = "FusionCore uses its parameters instead (pose: 0.1 m and 0.02 rad)"
 _RL_FLOOR = "robot_localization uses 1e-9, a sigma of 0.03 mm, and ignores everything else"
 _PX4_FLOOR = "PX4 uses EKF2_EVP_NOISE, EKF2_EVV_NOISE and EKF2_EVA_NOISE (0.1) instead"
 _AP_FLOOR = "ArduPilot uses VISO_POS_M_NSE (0.2 m) and VISO_YAW_M_NSE (0.2 rad)"
@@ -116,7 +116,7 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
         ("negative", "variances of the {} are negative", (D < 0).any(axis=1),
          "robot_localization takes the absolute value; PX4 and ArduPilot take their floors; Cholesky fails elsewhere"),
         ("tiny", "variances of the {} are below 1e-9: a placeholder, not a measurement",
-         ((D > 0) & (D < _TINY)).any(axis=1), f"{_RL_FLOOR}; {_PX4_FLOOR}; FusionCore's gate rejects good data"),
+         ((D > 0) & (D < _TINY)).any(axis=1), f"{_RL_FLOOR}; {_PX4_FLOOR}; FusionCore's gate rejects good twists"),
         ("huge", "variances of the {} are above 1e3 (9999, 1e6: 'unknown' or 'lost')", (D > _HUGE).any(axis=1),
          "no filter knows the flag: robot_localization fuses it with almost no weight and its correlations blow up; "
          "ArduPilot clamps it at 100 m and 1.5 rad and goes on fusing"),

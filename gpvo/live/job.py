@@ -189,6 +189,9 @@ class Live:
 def _outputs(settings: LiveSettings, wire: Wire | None) -> list[Output]:
     for topic in (settings.topic, *([settings.pose_topic] if settings.pose_topic else [])):
         check_topic(topic)
+    if settings.engine.increment and (settings.px4 or settings.mavlink):
+        what = "a flight controller takes the covariance of a pose for that of the whole way, not of an increment"
+        raise GpvoError(what, cure="leave out --pose-covariance increment")
     outputs: list[Output] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
     if settings.px4:
         if wire is None or wire.ros1:

@@ -152,7 +152,10 @@ class PoseStage:
             self._last = None
         begins = self._last is None
         record = self._record(t_ns, T_parent_body @ self.T_body_cam, message, seen)
-        yield Taken(record, begins, arrival.received_ns, T_parent_body, frames[0] or "odom", frames[1] or "base_link")
+        parent, child = frames
+        if not child and is_optical(parent):  # a pose message's one name is that of what moves
+            parent, child = child, parent
+        yield Taken(record, begins, arrival.received_ns, T_parent_body, parent or "odom", child or "base_link")
 
     def flush(self) -> Iterator[Taken]:
         """Nothing: a pose waits for nothing."""

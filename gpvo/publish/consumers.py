@@ -1,10 +1,12 @@
 """What popular filters do with the published numbers, and which parameter hides the covariance.
 
 PX4: src/modules/mavlink/mavlink_receiver.cpp and src/modules/ekf2/params_external_vision.yaml. ArduPilot:
-libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars, before and after pull request 32084 of February 2026) and
-libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the clamps).
-robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: the stated diagonal drives its
-chi-square gate, and a zero falls back to a constant.
+libraries/GCS_MAVLink/GCS_Common.cpp (the two scalars of a pose, before and after pull request 32084 of February 2026,
+and that of a velocity, since pull request 32478), libraries/AP_VisualOdom/AP_VisualOdom_MAV.cpp (the parameters'
+clamps) and libraries/AP_NavEKF3 (the filter's own, in AP_NavEKF3_PosVelFusion.cpp, ``FuseVelPosNED``, and
+AP_NavEKF3_Measurements.cpp, ``writeExtNavData``).
+robot_localization: src/ros_filter.cpp and src/ekf.cpp, branch ros2. FusionCore: fusioncore_ros/src/fusion_node.cpp (its
+inputs) and fusioncore_core/include/fusioncore/sensors/vslam.hpp (floors, and what stands in for zeros).
 """
 
 from __future__ import annotations
@@ -39,22 +41,32 @@ class Px4Parameters:
 
 @dataclass(frozen=True)
 class ArduPilotParameters:
-    """ArduPilot's parameters of visual odometry, at their defaults."""
+    """ArduPilot's parameters of visual odometry, at their defaults; ``minimum`` is the least sigma EKF3 works with,
+    whatever they are set to."""
 
     VISO_POS_M_NSE: float = 0.2
     VISO_YAW_M_NSE: float = 0.2
     VISO_VEL_M_NSE: float = 0.1
     VISO_QUAL_MIN: int = 0
 
+    @staticmethod
+    def minimum(name: str) -> float:
+        """Smallest value that makes a difference."""
+        return {"VISO_POS_M_NSE": 0.01, "VISO_YAW_M_NSE": float(np.deg2rad(5.0)), "VISO_VEL_M_NSE": 0.05}[name]
+
 
 FUSIONCORE_FALLBACK = (0.1, 0.02)
-"""Standard deviations [m, rad] that FusionCore takes where a variance is zero."""
+"""Standard deviations [m, rad] that FusionCore takes for a position or an attitude of which a variance is zero."""
+FUSIONCORE_LEAST = (0.01, 0.001)
+"""Smallest standard deviations [m, rad] that it takes."""
 
 
 def fusioncore_sigmas(covariance: Array) -> Array:
-    """(6,) standard deviations that FusionCore's gate and update use: of the diagonal alone, zeros replaced."""
-    variance = variances(covariance)
-    return np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.repeat(FUSIONCORE_FALLBACK, 3))
+    """(6,) standard deviations that FusionCore's gate and update use of a pose's: of the diagonal alone."""
+    variance = variances(covariance).reshape(2, 3)
+    least, fallback = (np.array(sigmas)[:, None] for sigmas in (FUSIONCORE_LEAST, FUSIONCORE_FALLBACK))
+    stated = np.maximum(np.sqrt(np.maximum(variance, 0.0)), least)
+    return np.where((variance > 0).all(axis=1, keepdims=True), stated, fallback).reshape(6)
 
 
 @dataclass(frozen=True)
@@ -111,18 +123,23 @@ def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
-    """No floor hides anything; what is lost are the correlations, which make some combinations of axes more certain.
+    """What is lost are correlations, which make some combinations of axes more certain, and a pose's small sigmas.
 
-    ``hidden_percent``: frames whose most certain combination of axes, in units of their sigmas, is taken for more than
-    twice as uncertain as it is.
+    ``hidden_percent``: frames whose most certain combination of axes, in units of the sigmas used, is taken for more
+    than twice as uncertain as it is.
     """
-    out = []
-    for quantity, C, unit in (("twist", twist, "m/s, rad/s"), ("pose", pose, "m, rad")):
-        sigma = np.array([fusioncore_sigmas(c) for c in C])
-        correlated = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
-        advice = "It reads only the diagonal, and its chi-square gate is only as good as these sigmas; send no zeros"
-        hidden = 100.0 * float(correlated.mean())
-        out.append(Verdict(quantity, "diagonal only", 0.0, hidden, _percentiles(sigma.min(axis=1)), unit, advice))
+    out, read = [], [0, 1, 5]
+    planar = twist[:, read][:, :, read]
+    used = np.array([fusioncore_sigmas(C) for C in pose])
+    for quantity, C, sigma, unit, reads in (
+        ("twist", planar, np.sqrt(variances(planar)), "m/s, rad/s", "vx, vy and the yaw rate as an encoder's"),
+        ("pose", pose, used, "m, rad", "the pose as VSLAM's, to no less than 0.01 m and 0.001 rad"),
+    ):
+        hidden = np.linalg.eigvalsh(C / (sigma[:, :, None] * sigma[:, None, :]))[:, 0] < 0.25
+        predicted = _percentiles(np.sqrt(variances(C)).min(axis=1))
+        gate = "its chi-square gate is only as good as these sigmas; send no zeros"
+        advice = f"It reads {reads}, by the diagonal alone, and {gate}"
+        out.append(Verdict(quantity, "diagonal only", 0.0, 100.0 * float(hidden.mean()), predicted, unit, advice))
     return out
 
 
@@ -133,16 +150,20 @@ def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
         ("angle", "VISO_YAW_M_NSE", np.cbrt((pose[:, 3:] ** 2).sum(1)), np.sqrt(pose[:, 3:].sum(1)), "rad"),
     ):
-        value = getattr(p, name)
-        out.append(_verdict(quantity, name, value, new, unit))
-        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit))
-    predicted = _percentiles(np.sqrt(twist[:, :3]).max(axis=1))
+        value, minimum = getattr(p, name), p.minimum(name)
+        out.append(_verdict(quantity, name, value, new, unit, minimum=minimum))
+        out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit, minimum=minimum))
+    name, least = "VISO_VEL_M_NSE", p.minimum("VISO_VEL_M_NSE")
+    predicted, speed = _percentiles(np.sqrt(twist[:, :3]).max(axis=1)), np.sqrt(twist[:, :3].sum(1))
+    read = "velocity of VISION_SPEED_ESTIMATE since pull request 32478"
+    out.append(_verdict(read, name, p.VISO_VEL_M_NSE, speed, "m/s", minimum=least, typical=0.05))
     advice = (
-        "ODOMETRY's velocity covariance is never read: send VISION_SPEED_ESTIMATE (read since pull request 32478), or "
-        f"set VISO_VEL_M_NSE to {predicted[1]:.2g}; VISO_QUAL_MIN lets quality decide frame by frame; below 0 it "
-        "would accept lost frames"
+        "ODOMETRY's velocity covariance is never read, VISION_SPEED_ESTIMATE's not in older releases: set "
+        f"{name} to {max(predicted[1], least):.2g}; EKF3 takes no sigma below {least:g}. From 1 on, VISO_QUAL_MIN lets "
+        "ODOMETRY's quality decide frame by frame, but drops every VISION_SPEED_ESTIMATE, which has none; below 0 it "
+        "would accept frames far outside the model's domain"
     )
-    return [*out, Verdict("velocity", "VISO_VEL_M_NSE", p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
+    return [*out, Verdict("velocity otherwise", name, p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
 
 
 def _percentiles(sigma: Array) -> tuple[float, float, float]:

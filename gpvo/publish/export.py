@@ -4,6 +4,7 @@ constants, then plain C99 that needs ``math.h`` alone.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from importlib.resources import files
@@ -97,8 +98,10 @@ def to_c(
         raise GpvoError(f"the prefix {name!r} is not a C identifier", cure="a letter first, then letters, digits, _")
     template = files("gpvo.publish").joinpath("predictor.c").read_text(encoding="utf-8")
     code = "\n".join([*_preamble(model, units, note), *_constants(model), template.rstrip(), "", "#endif", ""])
-    code = code.replace("gpvo_", f"{name}_").replace("GPVO_", f"{name.upper()}_")
-    write_text(Path(path), code)
+    code = re.sub("gpvo_|GPVO_", lambda m: f"{name if m[0].islower() else name.upper()}_", code)
+    # Another model under the same prefix must collide, not be skipped as if it were this one included again.
+    guard = hashlib.sha256(code.encode()).hexdigest()[:16].upper()
+    write_text(Path(path), code.replace(f"{name.upper()}_MODEL_H", f"{name.upper()}_{guard}_H"))
 
 
 def _preamble(model: ErrorModel, units: tuple[str, ...], note: str) -> list[str]:

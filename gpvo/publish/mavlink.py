@@ -10,7 +10,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +22,8 @@ from gpvo.errors import GpvoError, MissingExtraError, require
 from gpvo.files import replacing
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import upper
-from gpvo.geometry.se3 import R_FRD_FLU, rotate_covariance
+from gpvo.geometry.se3 import R_FLU_OPTICAL, R_FRD_FLU, rotate_covariance
+from gpvo.io.foreign import T_FLU_OPTICAL, is_optical
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
 
@@ -52,8 +53,21 @@ def quality(odometry: Odometry) -> int:
     return int(np.clip(round(100 * odometry.confidence), 1, 100))
 
 
+def flu(odometry: Odometry) -> Odometry:
+    """In FLU axes: x ahead, where a frame is a camera's by its name. Flight controllers know no other frames."""
+    T, pose, twist, C = odometry.T_odom_body, odometry.pose_covariance, odometry.twist_body, odometry.twist_covariance
+    if is_optical(odometry.frame_id):
+        T, pose = T_FLU_OPTICAL @ T, rotate_covariance(R_FLU_OPTICAL, pose)
+    if is_optical(odometry.child_frame_id):
+        T = T @ se3.inverse(T_FLU_OPTICAL)
+        twist = None if twist is None else (twist.reshape(2, 3) @ R_FLU_OPTICAL.T).ravel()
+        C = None if C is None else rotate_covariance(R_FLU_OPTICAL, C)
+    return replace(odometry, T_odom_body=T, pose_covariance=pose, twist_body=twist, twist_covariance=C)
+
+
 def frd(odometry: Odometry) -> tuple[Array, Array]:
-    """Pose (7,), position then quaternion w, x, y, z, and twist (6,) in FRD; NaN where there is none."""
+    """Pose (7,), position then quaternion w, x, y, z, and twist (6,) in FRD, of an odometry in FLU; NaN where there is
+    none."""
     pose, twist = np.full(7, np.nan), np.full(6, np.nan)
     if odometry.tracked:
         R = R_FRD_FLU @ odometry.T_odom_body[:3, :3] @ R_FRD_FLU
@@ -87,6 +101,7 @@ class Sender:
         PX4 skips what is not finite. Its quality alone would not keep a lost frame out: with EKF2_EV_QMIN at 0, the
         default, every quality passes (src/modules/ekf2/EKF/aid_sources/external_vision/ev_control.cpp).
         """
+        odometry = flu(odometry)
         pose, twist = frd(odometry)
         velocity_covariance = None
         if odometry.twist_covariance is not None:
@@ -111,8 +126,10 @@ class Sender:
 
         None where the quality is -1: this message carries none by which a receiver could refuse it.
 
-        LOCAL_FRD serves as the local NED frame where the vehicle's heading is given to the autopilot by vision too.
+        LOCAL_FRD serves as the local NED frame where the vehicle's heading is given to the autopilot by vision too
+        (EK3_SRC1_YAW 6): AP_VisualOdom_MAV.cpp rotates no velocity.
         """
+        odometry = flu(odometry)
         if odometry.twist_body is None or odometry.twist_covariance is None or quality(odometry) < 0:
             return None
         R = R_FRD_FLU @ odometry.T_odom_body[:3, :3]

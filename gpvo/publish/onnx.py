@@ -26,9 +26,10 @@ def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[s
     """Write the graph.
 
     Inputs, all double: ``features`` (N, d), NaN where missing; ``geometry`` (N, 6, 6), NaN where unknown; ``dt_s``
-    (N,). Outputs: ``mean`` (N, 6), ``covariance`` (N, 6, 6), its parts ``jitter``, ``white``, ``bias``, ``epistemic``
-    (N, 6), ``in_domain``, ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names; the degrees
-    of freedom ``nu``, 0 for a Gaussian, are among it. Raises MissingExtraError without the package onnx.
+    (N,). Outputs: ``mean`` (N, 6), ``covariance`` (N, 6, 6), its parts ``jitter``, ``white``, ``bias``, the root
+    ``calibration_root`` of what a wrong calibration makes of the bias, ``epistemic`` (N, 6), ``in_domain``,
+    ``confidence``, ``distance`` (N,). ``metadata``: stored beside the feature names; the degrees of freedom ``nu``, 0
+    for a Gaussian, are among it. Raises MissingExtraError without the package onnx.
 
     It is for motions that were measured: the error of a lost one is far larger, and depends on how fast the vehicle
     was, which the graph does not know.
@@ -39,7 +40,7 @@ def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[s
     graph = _Graph(onnx)
     _predict(graph, model)
     shapes: dict[str, list[Any]] = {"features": ["N", len(model.columns)], "geometry": ["N", 6, 6], "dt_s": ["N"]}
-    square: dict[str, list[Any]] = {name: ["N", 6, 6] for name in ("covariance", *PARTS)}
+    square: dict[str, list[Any]] = {name: ["N", 6, 6] for name in ("covariance", *PARTS, "calibration_root")}
     scalar: dict[str, list[Any]] = {name: ["N"] for name in ("in_domain", "confidence", "distance")}
     outputs: dict[str, list[Any]] = {"mean": ["N", 6], **square, "epistemic": ["N", 6], **scalar}
     names = {"features": ",".join(model.columns), **(metadata or {})}

@@ -1,5 +1,5 @@
-#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
-#error "missing inputs are NaN, which -ffast-math and -ffinite-math-only do away with: compile without them"
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
+#error "missing inputs are NaN, which -ffast-math, -ffinite-math-only and /fp:fast do away with: compile without them"
 #endif
 
 /* What the arithmetic below needs of a motion, and what it gives back. Tangent order: translation x y z [m], rotation
@@ -201,7 +201,7 @@ static void gpvo_divide(int j, double variance, double faster, double part[3][6]
  * far larger than this says, as it depends on how fast the vehicle was: leave it out. features: GPVO_N_FEATURES values in the
  * order above, NAN where missing. geometry: 6x6 covariance by the model's geometric method for the correlations, or NULL. dt_s:
  * duration of the motion; what is none, such as 0, means the training's. Never fails; uses no heap and no state. */
-static void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
+static inline void gpvo_predict(const double *features, const double *geometry, double dt_s, gpvo_estimate *out) {
     double inside[GPVO_N_FEATURES], inputs[GPVO_N_INPUTS], ratio[6], spread[6], base[6], plain[6], R[3][36], part[3][6], limit[2], distance, outside, growth;
     double duration = dt_s >= GPVO_SHORTEST_S && dt_s <= GPVO_LONGEST_S ? dt_s : GPVO_DT_S, faster = gpvo_faster(features);
     int i, j;

@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.io.bag_reader import open_bag
-from gpvo.publish.mavlink import frd, quality
+from gpvo.publish.mavlink import flu, frd, quality
 from gpvo.publish.odometry import Odometry
 
 TOPIC = "/gpvo/odometry"
@@ -213,9 +213,10 @@ def vehicle_odometry(odometry: Odometry, types: dict[str, Any]) -> Any:
     """``px4_msgs/VehicleOdometry`` for PX4 over uXRCE-DDS, on ``/fmu/in/vehicle_visual_odometry``.
 
     Pose in FRD of arbitrary heading, velocity in the body's FRD, diagonals only; unknown values are NaN, and a lost
-    frame is NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; the agent turns Unix
-    time into the flight controller's.
+    frame is NaN throughout, with quality -1. github.com/PX4/px4_msgs, msg/VehicleOdometry.msg; PX4's client turns the
+    time of the agent's machine, Unix time, into its own.
     """
+    odometry = flu(odometry)
     pose, twist = frd(odometry)
     nan = np.full(6, np.nan)
     # FLU and FRD differ in signs, which variances have not.

@@ -12,8 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gpvo.errors import GpvoError
+from gpvo.geometry import se3
+from gpvo.geometry.se3 import R_FLU_OPTICAL, rotate_covariance
+from gpvo.io.foreign import T_FLU_OPTICAL
 from gpvo.publish.mavlink import COMPONENT, Link, Sender, quality, write_tlog
 from gpvo.publish.odometry import Odometry
+from gpvo.publish.ros import register_px4, vehicle_odometry
+from rosbags.typesys import Stores, get_typestore
 
 pytest.importorskip("pymavlink")
 from pymavlink import mavutil
@@ -96,6 +101,42 @@ def test_speed_is_in_local_axes_with_nine_covariances(odometry: list[Odometry], 
         np.testing.assert_allclose([message.x, message.y, message.z], R @ sent.twist_body[:3], rtol=1e-5, atol=1e-6)
         C = R @ sent.twist_covariance[:3, :3] @ R.T
         np.testing.assert_allclose(np.reshape(message.covariance, (3, 3)), C, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("frames", [("odom", "cam_optical_frame"), ("left_optical", "Left_Optical")])
+def test_the_axes_of_a_camera_become_those_of_a_body(
+    frames: tuple[str, str], odometry: list[Odometry], received: list, tmp_path: Path
+) -> None:
+    """REP 103's optical frames: the same flight, told by a camera that looks ahead."""
+    R, turned = R_FLU_OPTICAL.T, []
+    for o in odometry:
+        T, pose = o.T_odom_body @ T_FLU_OPTICAL, o.pose_covariance
+        if "optical" in frames[0]:
+            T, pose = se3.inverse(T_FLU_OPTICAL) @ T, rotate_covariance(R, pose)
+        twist = None if o.twist_body is None else np.concatenate([R @ o.twist_body[:3], R @ o.twist_body[3:]])
+        C = None if o.twist_covariance is None else rotate_covariance(R, o.twist_covariance)
+        turned.append(
+            replace(
+                o,
+                T_odom_body=T,
+                pose_covariance=pose,
+                twist_body=twist,
+                twist_covariance=C,
+                frame_id=frames[0],
+                child_frame_id=frames[1],
+            )
+        )
+    write_tlog(tmp_path / "turned.tlog", turned)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    register_px4(store)
+    for ours, theirs in zip(turned, odometry, strict=True):
+        one, other = (vars(vehicle_odometry(o, store.types)) for o in (ours, theirs))
+        for name in ("position", "velocity", "angular_velocity", "position_variance", "velocity_variance"):
+            np.testing.assert_allclose(one[name], other[name], rtol=1e-4, atol=1e-6)
+    for message, want in zip(_read(tmp_path / "turned.tlog"), received, strict=True):
+        for name in message.get_fieldnames():
+            ours, theirs = (np.atleast_1d(getattr(m, name)) for m in (message, want))
+            np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_a_heartbeat_a_second_and_no_gap_in_the_sequence(received: list) -> None:

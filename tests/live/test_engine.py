@@ -70,6 +70,27 @@ def test_the_shim_equals_the_imported_run(stated: np.ndarray | None, child: str,
     assert "sigma x" in kept.reports[-1].values["driven_by"]
 
 
+@pytest.mark.parametrize("frame", ["map", "cam0_optical_frame"])
+def test_a_pose_message_names_what_its_twist_is_the_motion_of(frame: str) -> None:
+    stamps, T = flight()
+    live, kept, _ = engine()
+    for arrival in flown(stamps, T):
+        pose = arrival.message.pose.pose
+        header = replace(arrival.message.header, frame_id=frame)
+        live.take(replace(arrival, message=SimpleNamespace(header=header, pose=pose)))
+    moved = se3.log(se3.inverse(T[-2]) @ T[-1]) / ((stamps[-1] - stamps[-2]) * 1e-9)
+    np.testing.assert_allclose(kept.frames[-1].twist_body, moved, atol=1e-9)
+    expected = ("odom", frame) if "optical" in frame else (frame, "base_link")
+    assert {(o.frame_id, o.child_frame_id) for o in kept.frames} == {expected}
+
+
+@pytest.mark.parametrize("given", [{"mavlink": "udp:127.0.0.1:14550"}, {"px4": True}])
+def test_a_flight_controller_is_not_told_that_a_pose_does_not_drift(given: dict[str, Any]) -> None:
+    """EKF2 and EKF3 fuse a pose as it stands; neither knows differences of poses."""
+    with pytest.raises(GpvoError, match="not of an increment"):
+        job._outputs(LiveSettings(Path("m"), engine=EngineSettings(increment=True), **given), None)
+
+
 def _of_a_planar_robot(
     of: str, tilt_rad: float, place: np.ndarray, folder: Path
 ) -> tuple[list[VoRecord], list[VoRecord]]:

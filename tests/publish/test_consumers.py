@@ -94,6 +94,18 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     ardupilot = [str(v) for v in consumers.check(odometry, "ardupilot")]
     assert any("VISO_POS_M_NSE" in line for line in ardupilot)
     assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
+    # EKF3 takes no less than 5 degrees of yaw, 1 cm and 5 cm/s: to set a parameter lower changes nothing.
+    still = [replace(o, pose_covariance=np.eye(6) * 1e-6, twist_covariance=np.eye(6) * 1e-4) for o in odometry]
+    position, _, angle, _, speed, velocity = consumers.check(still, "ardupilot")
+    assert "Set VISO_POS_M_NSE to 0.01, the smallest it accepts" in position.advice
+    assert "Set VISO_YAW_M_NSE to 0.087, the smallest it accepts" in angle.advice
+    assert "set VISO_VEL_M_NSE to 0.05;" in velocity.advice
+    # VISION_SPEED_ESTIMATE's covariance is taken for one sigma, the root of its trace, but not below the parameter.
+    assert "Set VISO_VEL_M_NSE to 0.05, the smallest it accepts" in speed.advice
+    assert speed.hidden_percent == 100.0
+    assert speed.predicted == pytest.approx(((3e-4) ** 0.5,) * 3)
+    loud = [replace(o, twist_covariance=np.eye(6) * 0.06**2) for o in odometry]
+    assert consumers.check(loud, "ardupilot")[4].hidden_percent == 0.0
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
     lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9, 1e-9)) for o in odometry]
     assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
@@ -101,17 +113,23 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
         consumers.check(odometry, "betaflight")
 
 
-def test_fusioncore_reads_the_diagonal_and_replaces_zeros(odometry: list[Odometry]) -> None:
-    C = np.array(odometry[0].pose_covariance)
-    C[2, :] = C[:, 2] = C[4, :] = C[:, 4] = 0.0
-    want = np.sqrt(np.diagonal(C))
-    want[2], want[4] = 0.1, 0.02
-    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), want)
+def test_fusioncore_floors_a_pose_and_replaces_what_holds_a_zero(odometry: list[Odometry]) -> None:
+    """vslam_pose_noise_matrix in fusioncore_core/include/fusioncore/sensors/vslam.hpp."""
+    C = np.diag([4.0, 1e-6, 9.0, 1e-8, 0.25, 0.16])
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [2.0, 0.01, 3.0, 0.001, 0.5, 0.4])
+    C[4, 4] = 0.0
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [2.0, 0.01, 3.0, 0.02, 0.02, 0.02])
+    C[2, 2] = 0.0
+    np.testing.assert_allclose(consumers.fusioncore_sigmas(C), [0.1, 0.1, 0.1, 0.02, 0.02, 0.02])
+    sharp = [replace(o, twist_covariance=np.eye(6), pose_covariance=np.eye(6) * 1e-8) for o in odometry]
+    twist, pose = consumers.check(sharp, "fusioncore")
+    assert (twist.hidden_percent, pose.hidden_percent) == (0.0, 100.0)
+    assert pose.predicted == pytest.approx((1e-4, 1e-4, 1e-4))
 
 
 def test_fusioncore_loses_what_lies_in_correlations(odometry: list[Odometry]) -> None:
     R = np.eye(6)
-    R[0, 4] = R[4, 0] = 0.9
+    R[0, 5] = R[5, 0] = 0.9  # of those that fusion_node.cpp's encoder_callback reads: vx, vy, yaw rate
     flat, slanted = (
         [replace(o, twist_covariance=C, pose_covariance=np.eye(6)) for o in odometry] for C in (np.eye(6), R)
     )

@@ -24,7 +24,8 @@ from gpvo.types import Prediction
 from small_model import small_model
 from typer.testing import CliRunner
 
-FIELDS = ("mean", "covariance", *PARTS, "epistemic", "in_domain", "confidence", "distance")
+MATRICES = ("covariance", *PARTS, "calibration_root")
+FIELDS = ("mean", *MATRICES, "epistemic", "in_domain", "confidence", "distance")
 
 
 def random_gp(rng: np.random.Generator, d: int, m: int, scale: float) -> ProjectedGP:
@@ -131,10 +132,14 @@ def assert_equal(got: dict[str, np.ndarray], wanted: Prediction) -> None:
         if name == "distance":
             expected = np.sqrt(-2.0 * np.log(np.maximum(wanted.in_domain, 1e-300)))
             got = got | {name: np.minimum(got[name], np.sqrt(600.0 * np.log(10.0)))}
+        elif name == "calibration_root":
+            expected = wanted.persistent_root[:, :, -6:]
         else:
             expected = getattr(wanted, {"bias": "persistent"}.get(name, name))
         scale = np.sqrt(np.diagonal(wanted.covariance, axis1=1, axis2=2))
-        if name in ("covariance", *PARTS):
+        if name == "calibration_root":
+            unit = scale[:, :, None]
+        elif name in MATRICES:
             unit = scale[:, :, None] * scale[:, None, :]
         elif name in ("mean", "epistemic"):
             unit = scale if name == "mean" else scale**2
@@ -210,7 +215,7 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
         )
         for name in FIELDS
     }
-    for name in ("covariance", *PARTS):
+    for name in MATRICES:
         shaped[name] = shaped[name].reshape(-1, 6, 6)
     assert_equal(shaped, model.estimate(X, geometry, dt_s))
     assert {o.nu for o in found} == {model.nu[0]}
@@ -219,7 +224,7 @@ def test_c_compiles_to_the_same_numbers(case: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(none.covariance).reshape(6, 6), model.estimate(X[:1]).covariance[0], rtol=1e-5)
 
 
-_VECTORS = ("mean", "covariance", *PARTS, "epistemic")
+_VECTORS = ("mean", *MATRICES, "epistemic")
 
 
 def test_the_flag_for_filters_changes_nothing(tmp_path: Path) -> None:
@@ -236,15 +241,15 @@ def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> 
     model = tmp_path / "errors.gpvo"
     trained = small_model()
     modelfile.save(model, trained.arrays, trained.header)
-    for prefix in ("predict", "fuse"):
+    for prefix in ("predict", "myGPVO_fuse"):
         command = ["export", str(model), "--to", "c", "--prefix", prefix, "-o", str(tmp_path / f"{prefix}.h")]
         result = CliRunner().invoke(app, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
     source = tmp_path / "both.c"
     source.write_text(
-        '#include "predict.h"\n#include "fuse.h"\n'
-        "void run(const double *f, predict_estimate *a, fuse_estimate *b)"
-        " { predict_predict(f, 0, 0.0, a); fuse_predict(f, 0, 0.0, b); }\n"
+        '#include "predict.h"\n#include "myGPVO_fuse.h"\n'
+        "void run(const double *f, predict_estimate *a, myGPVO_fuse_estimate *b)"
+        " { predict_predict(f, 0, 0.0, a); myGPVO_fuse_predict(f, 0, 0.0, b); }\n"
     )
     flags = ["-std=c99", "-Wall", "-Wdouble-promotion", "-Werror", "-c"]
     command = ["cc", *flags, str(source), "-o", str(tmp_path / "both.o")]
@@ -253,6 +258,19 @@ def test_headers_with_their_own_prefixes_go_into_one_program(tmp_path: Path) -> 
     refused = subprocess.run([*command, "-ffast-math"], capture_output=True, text=True, check=False)
     assert refused.returncode != 0
     assert "missing inputs are NaN" in refused.stderr
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler 'cc' on this machine")
+def test_a_header_is_skipped_only_if_it_is_the_same_again(tmp_path: Path) -> None:
+    for name, case in (("a", "of conditions"), ("b", "of conditions"), ("c", "no geometry")):
+        to_c(CASES[case], tmp_path / f"{name}.h")
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "-o", str(tmp_path / "x.o")]
+    for second, compiles in (("b", True), ("c", False)):
+        source = tmp_path / "x.c"
+        # A file that takes the types alone has nothing to be warned of either.
+        source.write_text(f'#include "a.h"\n#include "{second}.h"\ngpvo_estimate e;\n')
+        built = subprocess.run(["cc", *flags, str(source)], capture_output=True, text=True, check=False)
+        assert (built.returncode == 0) == compiles, built.stderr
 
 
 def test_onnx_has_no_prefix(tmp_path: Path) -> None:
