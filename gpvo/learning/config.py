@@ -10,7 +10,7 @@ from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.online.base import ACCELERATION_COLUMNS, RESIDUAL_COLUMN, TWIST_COLUMNS
-from gpvo.online.features import AXES, GEOMETRIC_METHODS, resolve
+from gpvo.online.features import AXES, GEOMETRIC_METHODS, groups, resolve
 from gpvo.types import IMPORTED
 
 AGILITY = ("ln_speed", "ln_turn_rate", "ln_jerk", "ln_angular_jerk", "ln_jerk_lately", "ln_angular_jerk_lately")
@@ -100,6 +100,17 @@ def guarded(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[str, ...]
     varied is among them: nothing was learned at any other value."""
     known = known_to_all(sets)
     return tuple(n for n in GUARDED if n in known) if config.features == "auto" else ()
+
+
+def lacking(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, list[str]]:
+    """By sequence, the groups of features that other sequences know and it does not, for which no model learns from
+    them: a base covariance or an input of the settings, or what tells other surroundings."""
+    asked = GUARDED if config.features == "auto" else resolve(config.features)
+    wanted = {*asked, RESIDUAL_COLUMN, *(f"ln_var_{m}_{a}" for m in (*GEOMETRIC_METHODS, IMPORTED) for a in AXES)}
+    known = set.union(*(s.supported() for s in sets)) & wanted
+    of = {c.name: name for name, parts in groups().items() for group in parts for c in group.columns}
+    out = {s.name: sorted({of[column] for column in known - s.supported()}) for s in sets}
+    return {name: missing for name, missing in out.items() if missing}
 
 
 def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:

@@ -3,12 +3,14 @@ what there is to select from."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
+from gpvo.cli.learn import _tell
 from gpvo.learning.basefit import learn_domain
-from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded
+from gpvo.learning.config import TrainConfig, base_candidates, candidates, guarded, lacking
 from gpvo.learning.rows import significant_gain, simplest_sufficient
+from gpvo.learning.train import TrainedModel
 from small_model import training_sets
 
 
@@ -54,3 +56,16 @@ def test_a_covariance_of_some_axes_alone_is_no_base() -> None:
     whole = base_candidates(sets)
     method = next(m for m, _ in whole if m is not None)
     assert method not in [m for m, _ in base_candidates(_with(sets, **{f"ln_var_{method}_rx": np.nan}))]
+
+
+def test_what_one_sequence_lacks_and_others_know_is_named(capsys) -> None:
+    sets, config = training_sets(range(3), n=60), TrainConfig()
+    assert lacking(sets, config) == {}
+    poor = _with(sets[:1], n_inliers=np.nan, inlier_ratio=np.nan)
+    assert lacking([*poor, *sets[1:]], config) == {sets[0].name: ["counts"]}
+    assert lacking([*poor, *sets[1:]], TrainConfig(features="velocity")) == {}
+    assert lacking(poor, config) == {}
+    _tell(TrainedModel({}, {"target": "frame"}, sets=[*poor, *sets[1:]]), asdict(config), [])
+    said = capsys.readouterr().err
+    assert f"{sets[0].name} holds no counts, as other runs do" in " ".join(said.split())
+    assert said.count("gpvo:") == 1
