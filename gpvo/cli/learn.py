@@ -77,7 +77,6 @@ def train(
     Example: gpvo train runs/a runs/b runs/c -o errors.gpvo
     """
     from gpvo.learning.store import check_writable, config_of, folds_path, save_model
-    from gpvo.learning.train import unseen_axes
 
     check_writable(out)
     settings = asdict(options)
@@ -94,14 +93,7 @@ def train(
             trained = _with_origin(_train(paths, settings, update, on_fit, noisy), paths, update)
         if statements is not None:
             _write_statements(trained, paths, settings, statements)
-    if trained.header["target"] != "position" and (axes := unseen_axes(trained.sets)):
-        note(f"gpvo: log and truth never differ in {', '.join(axes)} (planar?): the model states almost no error there")
-    if noisy:
-        note(
-            "gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of"
-            f" {', '.join(noisy)}: for one motion the model states both together, over a distance only the odometry's,"
-            " as the noise does not add up"
-        )
+    _tell(trained, settings, noisy)
     save_model(trained, out)
     document = {**trained.table, "model": str(out)}
     if json_:
@@ -112,6 +104,30 @@ def train(
         given = trained.header.get("rows", {}).get("given", kept)
         streamed = f", sampled from {given}" if given > kept else ""
         print(f"{out}: {kept} rows of {len(trained.sets)} runs{streamed}")
+
+
+def _tell(trained: TrainedModel, settings: dict[str, Any], noisy: list[str]) -> None:
+    """Notes on what a model could not learn; ``noisy``: runs whose truth cannot judge single motions."""
+    from gpvo.learning.config import TrainConfig, lacking
+    from gpvo.learning.train import unseen_axes
+
+    if trained.header["target"] != "position":
+        if axes := unseen_axes(trained.sets):
+            note(
+                f"gpvo: log and truth never differ in {', '.join(axes)} (planar?): the model states almost no error"
+                " there"
+            )
+        for name, missing in lacking(trained.sets, TrainConfig(**settings)).items():
+            note(
+                f"gpvo: {name} holds no {', '.join(missing)}, as other runs do: the model does without them. If it is"
+                " another odometry's, train a model for each"
+            )
+    if noisy:
+        note(
+            "gpvo: the noise of the ground truth outweighs the odometry's errors in single motions of"
+            f" {', '.join(noisy)}: for one motion the model states both together, over a distance only the odometry's,"
+            " as the noise does not add up"
+        )
 
 
 def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iterator[Run]:

@@ -276,6 +276,7 @@ def _calibration(rows: Rows, scale: Scale, found: _Consistent, score: Array) -> 
         "geometry_correlation_weight": float(found.model.division.geometry_weight[0]),
         "interval_levels": LEVELS,
         "interval_sigmas": [widths for widths, _ in axes],
-        "interval_guaranteed": [sure for _, sure in axes],
+        # Blocks of a flight are no sample of flights.
+        "interval_guaranteed": [[known and rows.grouped_by == "sequences" for known in sure] for _, sure in axes],
         "parts": {"spans_frames": found.parts.spans, "seen_over_stated": found.parts.ratio},
     }

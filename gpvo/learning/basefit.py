@@ -109,7 +109,9 @@ def learn_domain(X: Array, *, margin: float = 0.02) -> Domain:
     spread = np.nanstd(X, axis=0)
     # A feature that mostly rests at one value has no quartiles to speak of.
     scale = np.where((q75 - q25) / 1.349 > 0.1 * spread, (q75 - q25) / 1.349, spread)
-    scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, 1.0)
+    # Of one that never varied, a tenth of its value counts as one deviation, of zero its unit.
+    of_constant = np.where(centre == 0.0, 1.0, 0.1 * np.abs(centre))
+    scale = np.where(scale > 1e-12 * np.maximum(np.abs(centre), 1.0), scale, of_constant)
     U = (X - centre) / scale
     low, high = np.nanquantile(U, [_RARE, 1.0 - _RARE], axis=0)
     pad = margin * (high - low)

@@ -10,7 +10,7 @@ from gpvo.dataset.build import TrainingSet, build_run
 from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.online.base import ACCELERATION_COLUMNS, RESIDUAL_COLUMN, TWIST_COLUMNS
-from gpvo.online.features import AXES, GEOMETRIC_METHODS, resolve
+from gpvo.online.features import AXES, GEOMETRIC_METHODS, groups, resolve
 from gpvo.types import IMPORTED
 
 AGILITY = ("ln_speed", "ln_turn_rate", "ln_jerk", "ln_angular_jerk", "ln_jerk_lately", "ln_angular_jerk_lately")
@@ -66,9 +66,14 @@ class TrainConfig:
         return build_run(run, target=self.target, align=self.align, waits=self.waits, odd=self.odd)
 
 
+def known_to_all(sets: Sequence[TrainingSet]) -> set[str]:
+    """Columns that every log knows in 95 of 100 rows."""
+    return set.intersection(*(s.supported() for s in sets))
+
+
 def supported_columns(sets: Sequence[TrainingSet], wanted: Sequence[str]) -> tuple[str, ...]:
     """Those of the wanted columns that every log knows and that are not constant."""
-    known = set.intersection(*(s.supported() for s in sets))
+    known = known_to_all(sets)
 
     def varies(name: str) -> bool:
         values = [s.select((name,)) for s in sets]
@@ -91,17 +96,30 @@ def candidates(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, tu
 
 
 def guarded(sets: Sequence[TrainingSet], config: TrainConfig) -> tuple[str, ...]:
-    """Those of :data:`GUARDED` that the logs know; none besides those that were asked for by name."""
-    return supported_columns(sets, GUARDED) if config.features == "auto" else ()
+    """Those of :data:`GUARDED` that the logs know; none besides those that were asked for by name. One that never
+    varied is among them: nothing was learned at any other value."""
+    known = known_to_all(sets)
+    return tuple(n for n in GUARDED if n in known) if config.features == "auto" else ()
+
+
+def lacking(sets: Sequence[TrainingSet], config: TrainConfig) -> dict[str, list[str]]:
+    """By sequence, the groups of features that other sequences know and it does not, for which no model learns from
+    them: a base covariance or an input of the settings, or what tells other surroundings."""
+    asked = GUARDED if config.features == "auto" else resolve(config.features)
+    wanted = {*asked, RESIDUAL_COLUMN, *(f"ln_var_{m}_{a}" for m in (*GEOMETRIC_METHODS, IMPORTED) for a in AXES)}
+    known = set.union(*(s.supported() for s in sets)) & wanted
+    of = {c.name: name for name, parts in groups().items() for group in parts for c in group.columns}
+    out = {s.name: sorted({of[column] for column in known - s.supported()}) for s in sets}
+    return {name: missing for name, missing in out.items() if missing}
 
 
 def base_candidates(sets: Sequence[TrainingSet]) -> list[tuple[str | None, bool]]:
     """Bases to choose among, from columns that every log knows in 95 of 100 rows: geometric and imported covariances,
     at one pixel and at the noise of the residuals, and the motion alone. A covariance that never changes says nothing
     about a motion."""
-    known = set.intersection(*(s.supported() for s in sets))
+    known = known_to_all(sets)
     columns = {m: {f"ln_var_{m}_{a}" for a in AXES} for m in (*GEOMETRIC_METHODS, IMPORTED)}
     tell = supported_columns(sets, sorted(set.union(*columns.values())))
-    methods = [m for m, own in columns.items() if own.intersection(tell)]
+    methods = [m for m, own in columns.items() if own <= known and own.intersection(tell)]
     noise = (False, True) if RESIDUAL_COLUMN in known else (False,)
     return [*((m, residual) for m in methods for residual in noise), (None, False)]

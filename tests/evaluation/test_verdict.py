@@ -381,6 +381,15 @@ def test_nothing_is_learned_from_a_truth_in_another_unit(factor: float, told: st
     assert len(build(log, noisy, name="hall")) == 200
 
 
+def test_a_truth_at_rest_but_for_rounding_is_in_no_other_unit() -> None:
+    log, truth = make_run(200)
+    rng, shape = np.random.default_rng(1), (len(truth.t_ns), 6)
+    still = [replace(r, T_prev_cur=se3.exp(1e-3 * rng.standard_normal(6))) for r in log]
+    for _ in range(4):  # by chance, half of them go with the odometry's noise
+        rounded = replace(truth, T_world_cam=se3.exp(1e-13 * rng.standard_normal(shape)))
+        assert len(build(replace(log, records=still), rounded, name="hover")) > 100
+
+
 def test_no_filter_starts_from_a_truth_without_attitude_nor_takes_a_constant_from_it() -> None:
     log, truth = make_run(600, v_t=False)
     T = truth.T_world_cam.copy()

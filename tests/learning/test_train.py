@@ -376,6 +376,7 @@ def _as_run(log, truth, name):
 def test_few_sequences_are_calibrated_by_blocks_and_marked():
     trained = train_sets(training_sets([0], n=200), QUICK)
     assert trained.header["calibration"]["by"] == "time blocks"
+    assert not np.any(trained.header["calibration"]["interval_guaranteed"])
     assert trained.header["by_few_sequences"]
     assert trained.table["folds_are"] == "time blocks"
     assert [f["held_out"][-6:] for f in trained.table["folds"]] == ["part 1", "part 2", "part 3"]

@@ -94,9 +94,9 @@ def test_single_frames_as_blocks_are_overconfident():
     assert _share([block_bootstrap(x, block=1, draws=400) for x in series], 0.0) < 0.65
 
 
-@pytest.mark.parametrize(("n", "least"), [(3, 0.72), (5, 0.90), (12, 0.92), (24, 0.92)])
+@pytest.mark.parametrize(("n", "least"), [(3, 0.92), (4, 0.92), (5, 0.90), (12, 0.92), (24, 0.92)])
 def test_sequence_bootstrap_covers_the_mean_over_sequences(n, least):
-    """Nominal 95 %. The widest that three or four can say is from the least to the largest."""
+    """Nominal 95 %. From the least to the largest of three or four is 75 and 88 %."""
     rng = np.random.default_rng(0)
     intervals = [sequence_bootstrap(1.0 + rng.standard_normal(n), draws=2000) for _ in range(TRIALS)]
     assert least < _share(intervals, 1.0) < 0.98
