@@ -95,7 +95,7 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     assert any("VISO_POS_M_NSE" in line for line in ardupilot)
     assert any("VISION_SPEED_ESTIMATE" in line and "VISO_QUAL_MIN" in line for line in ardupilot)
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
-    lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9, 1e-9)) for o in odometry]
+    lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9)) for o in odometry]
     assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
     with pytest.raises(GpvoError, match="unknown consumer"):
         consumers.check(odometry, "betaflight")
