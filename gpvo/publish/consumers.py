@@ -21,32 +21,10 @@ from gpvo.types import Array
 
 CONSUMERS = ("px4", "ardupilot", "robot_localization", "fusioncore")
 
-
-@dataclass(frozen=True)
-class Px4Parameters:
-    """PX4's parameters of external vision, at their defaults; ``*_minimum`` is the least each may be set to."""
-
-    EKF2_EV_NOISE_MD: int = 0
-    EKF2_EVP_NOISE: float = 0.1
-    EKF2_EVV_NOISE: float = 0.1
-    EKF2_EVA_NOISE: float = 0.1
-
-    @staticmethod
-    def minimum(name: str) -> float:
-        """Smallest value that the parameter accepts."""
-        return {"EKF2_EVP_NOISE": 0.01, "EKF2_EVV_NOISE": 0.01, "EKF2_EVA_NOISE": 0.05}[name]
-
-
-@dataclass(frozen=True)
-class ArduPilotParameters:
-    """ArduPilot's parameters of visual odometry, at their defaults."""
-
-    VISO_POS_M_NSE: float = 0.2
-    VISO_YAW_M_NSE: float = 0.2
-    VISO_VEL_M_NSE: float = 0.1
-    VISO_QUAL_MIN: int = 0
-
-
+PX4 = {"EKF2_EVP_NOISE": (0.1, 0.01), "EKF2_EVV_NOISE": (0.1, 0.01), "EKF2_EVA_NOISE": (0.1, 0.05)}
+"""Of external vision: the default of each parameter, and the least that it may be set to."""
+ARDUPILOT = {"VISO_POS_M_NSE": 0.2, "VISO_YAW_M_NSE": 0.2, "VISO_VEL_M_NSE": 0.1}
+"""Of visual odometry: the default of each parameter."""
 FUSIONCORE_FALLBACK = (0.1, 0.02)
 """Standard deviations [m, rad] that FusionCore takes where a variance is zero."""
 
@@ -97,16 +75,16 @@ def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
-    p, pose, twist = Px4Parameters(), np.sqrt(variances(pose)), np.sqrt(variances(twist))
+    pose, twist = np.sqrt(variances(pose)), np.sqrt(variances(twist))
     out = []
     for quantity, name, sigma, unit in (
         ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
         ("position", "EKF2_EVP_NOISE", pose[:, :3], "m"),
         ("yaw", "EKF2_EVA_NOISE", pose[:, 5:6], "rad"),
     ):
-        value = getattr(p, name)
+        value, minimum = PX4[name]
         typical = 0.05 if quantity == "velocity" else 0.5
-        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=p.minimum(name), typical=typical))
+        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=minimum, typical=typical))
     return out
 
 
@@ -127,13 +105,13 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
-    p, pose, twist = ArduPilotParameters(), variances(pose), variances(twist)
+    pose, twist = variances(pose), variances(twist)
     out = []
     for quantity, name, old, new, unit in (
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
         ("angle", "VISO_YAW_M_NSE", np.cbrt((pose[:, 3:] ** 2).sum(1)), np.sqrt(pose[:, 3:].sum(1)), "rad"),
     ):
-        value = getattr(p, name)
+        value = ARDUPILOT[name]
         out.append(_verdict(quantity, name, value, new, unit))
         out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit))
     predicted = _percentiles(np.sqrt(twist[:, :3]).max(axis=1))
@@ -142,7 +120,8 @@ def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
         f"set VISO_VEL_M_NSE to {predicted[1]:.2g}; VISO_QUAL_MIN lets quality decide frame by frame; below 0 it "
         "would accept lost frames"
     )
-    return [*out, Verdict("velocity", "VISO_VEL_M_NSE", p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
+    value = ARDUPILOT["VISO_VEL_M_NSE"]
+    return [*out, Verdict("velocity", "VISO_VEL_M_NSE", value, 100.0, predicted, "m/s", advice)]
 
 
 def _percentiles(sigma: Array) -> tuple[float, float, float]:
