@@ -151,9 +151,12 @@ def forecast(
     predictor = Predictor.load(model).require_motions(model)
     found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
     if out is not None:
-        _write_forecast(out, found)
+        (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(found))
     if plot is not None:
-        _draw_forecast(plot, found, path.name)
+        from gpvo.evaluation import plots
+
+        with replacing(plot) as temporary:
+            plots.forecast(found, path.name).savefig(temporary, dpi=110, format="png")
     if json_:
         print_json(_forecast_document(found, model, path, frame))
     else:
@@ -194,10 +197,8 @@ def _columns(f: Forecast) -> dict[str, Any]:
 
 def _rows(f: Forecast) -> list[dict[str, float]]:
     """A few poses for a short table, evenly spaced in time and including the last."""
-    from numpy import linspace
-
     columns, n = _columns(f), len(f.plan.t_s)
-    stops = sorted({int(k) for k in linspace(0, n - 1, min(n, _LINES)).round()})
+    stops = sorted({int(k) for k in np.linspace(0, n - 1, min(n, _LINES)).round()})
     return [{name: float(columns[name][k]) for name in _TOLD} for k in stops]
 
 
@@ -219,14 +220,3 @@ def _print_forecast(f: Forecast, path: Path) -> None:
     if f.mean[-1].any():
         x, y, z = f.mean_error_m[-1]
         say(f"expected error at the end: {x:.3g}, {y:.3g}, {z:.3g} m")
-
-
-def _write_forecast(out: Path, f: Forecast) -> None:
-    (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(f))
-
-
-def _draw_forecast(plot: Path, f: Forecast, title: str) -> None:
-    from gpvo.evaluation import plots
-
-    with replacing(plot) as temporary:
-        plots.forecast(f, title).savefig(temporary, dpi=110, format="png")
