@@ -179,7 +179,7 @@ def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict
         "predicted_final_error_m": float(f.sigma_m[-1]),
         "predicted_final_error_independent_m": f.independent_m,
         "final_sigma_m": dict(zip("xyz", f.position_sigma_m[-1].tolist(), strict=True)),
-        "final_mean_error_m": dict(zip("xyz", f.mean_error_m[-1].tolist(), strict=True)),
+        "final_mean_error_m": dict.fromkeys("xyz", 0.0),  # of a model that stated one
         "along": _rows(f),
     }
 
@@ -217,6 +217,3 @@ def _print_forecast(f: Forecast, path: Path) -> None:
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
     show(table)
     say("1 sigma of the position relative to the first pose, in the axes of the plan's world")
-    if f.mean[-1].any():
-        x, y, z = f.mean_error_m[-1]
-        say(f"expected error at the end: {x:.3g}, {y:.3g}, {z:.3g} m")
