@@ -59,7 +59,7 @@ class Plan:
         return se3.path_length_m(self.T_world_cam[:, :3, 3])
 
 
-def read_plan(path: str | Path, dt_s: float, frame: str = "cam") -> Plan:
+def read_plan(path: Path, dt_s: float, frame: str = "cam") -> Plan:
     """A TUM file of poses at any spacing, resampled every ``dt_s``.
 
     ``frame``: ``cam``, poses of the left camera (x right, y down, z forward), or ``body`` (FLU), whose camera then

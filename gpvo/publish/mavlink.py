@@ -154,9 +154,8 @@ class Sender:
         return packed
 
 
-def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
+def write_tlog(path: Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
     """Write a telemetry log: every message after its time, 8 bytes big-endian microseconds. Returns frames."""
-    path = Path(path)
     if path.is_dir():
         raise GpvoError("is a folder, and a telemetry log is a file", where=path, cure="choose another -o")
     path.parent.mkdir(parents=True, exist_ok=True)
