@@ -179,7 +179,7 @@ def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict
         "predicted_final_error_m": float(f.sigma_m[-1]),
         "predicted_final_error_independent_m": f.independent_m,
         "final_sigma_m": dict(zip("xyz", f.position_sigma_m[-1].tolist(), strict=True)),
-        "final_mean_error_m": dict.fromkeys("xyz", 0.0),  # of a model that stated one
+        "final_mean_error_m": dict.fromkeys("xyz", 0.0),  # for scripts that read it: no model states one
         "along": _rows(f),
     }
 
