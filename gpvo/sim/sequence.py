@@ -55,7 +55,7 @@ _TRUTH_HEAD = (
 
 
 def simulate(
-    scenario: Scenario, seed: int, target: Path, *, threads: int = 2, on_frame: Callable[[], None] | None = None
+    scenario: Scenario, seed: int, target: Path, *, threads: int = 2, on_frame: Callable[[], None] = lambda: None
 ) -> Flight:
     """Write a sequence folder; a finished one with the same scenario and seed is left as it is.
 
@@ -75,7 +75,7 @@ def simulate(
         shutil.rmtree(part, ignore_errors=True)
         try:
             part.mkdir(parents=True)
-            frames, distance, drawn = _write(scenario, seed, part, threads, on_frame or (lambda: None))
+            frames, distance, drawn = _write(scenario, seed, part, threads, on_frame)
             (part / "scenario.toml").write_text(resolved + "\n" + to_toml({"drawn": drawn}), encoding="utf-8")
             if target.is_dir():
                 target.rmdir()
