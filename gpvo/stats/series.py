@@ -104,10 +104,6 @@ class Interval:
         low, high = (x if np.isfinite(x) else None for x in (self.low, self.high))
         return {"mean": self.mean, "low": low, "high": high}
 
-    def contains(self, value: float) -> bool:
-        """Whether ``value`` lies inside, ends included."""
-        return self.low <= value <= self.high
-
 
 def block_bootstrap(values: Array, block: int | None = None, *, draws: int = 2000, seed: int = 0) -> Interval:
     """Interval for the mean of one autocorrelated series (n,), by circular blocks.
