@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gpvo.accumulation import PoseError, frame_jitter
 from gpvo.errors import GpvoError
@@ -45,7 +44,7 @@ LEAST_VARIANCE = 1e-9
 larger one would hide predictions: a second between two frames leaves 1e-4 rad/s of sigma."""
 
 
-def lift(covariance: Array, least: ArrayLike) -> Array:
+def lift(covariance: Array, least: Array | float) -> Array:
     """Raise variances (6, 6) to at least ``least``, one for all or (6,), on the diagonal only.
 
     Adding to a diagonal keeps a matrix positive definite; clipping it would not keep its correlations valid.
