@@ -42,7 +42,8 @@ class Groups(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write one section per group."""
-        for title, commands in groupby(self.commands.items(), lambda item: item[1].rich_help_panel):
+        known: Mapping[str, Any] = self.commands  # typer's, which have a panel
+        for title, commands in groupby(known.items(), lambda item: item[1].rich_help_panel):
             with formatter.section(title):
                 formatter.write_dl([(name, (c.help or "").split("\n\n")[0].strip()) for name, c in commands])
 
