@@ -20,6 +20,7 @@ from gpvo.files import TooLarge, read_bounded
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuNoise
 
+_PAIR = ("cam0", "cam1")
 _MAX_BYTES = 100_000  # a calibration has a few thousand
 # Chained and direct transforms of one calibration agree to the digits printed; a mistaken meaning does not.
 _CHAIN_TOLERANCE_M, _CHAIN_TOLERANCE = 5e-3, 0.1  # the latter of the baseline: that of an endoscope is 4 mm
@@ -99,37 +100,36 @@ def get_numbers(block: dict[str, Any], key: str, count: int | tuple[int, ...], w
     return [float(v) for v in values]
 
 
-def read_camchain(path: Path, *, left: str = "cam0", right: str = "cam1") -> StereoRig:
-    """The stereo pair ``left``, ``right`` of a camera chain.
+def read_camchain(path: Path) -> StereoRig:
+    """The stereo pair ``cam0``, ``cam1`` of a camera chain.
 
     ``T_cn_cnm1`` (previous camera to this one) and ``T_cam_imu`` (or its inverse ``T_imu_cam``, never both) are read;
     where both give the baseline they must agree, since published files have put other things under ``T_cn_cnm1``.
     Raises CalibrationError where a key is missing, a model unknown, or the rig impossible.
     """
     document = read_yaml(path)
-    blocks = {}
-    for name in (left, right):
+    for name in _PAIR:
         if not isinstance(document.get(name), dict):
             found = ", ".join(k for k in document if str(k).startswith("cam")) or "none"
             cure = "a stereo pair needs two cameras"
             raise CalibrationError(f"has no block '{name}' (cameras found: {found})", where=path, cure=cure)
-        blocks[name] = document[name]
-    T_left_imu, T_right_imu = (_cam_imu(blocks[n], f"{path}: {n}") for n in (left, right))
-    shift_s = get_numbers({"timeshift_cam_imu": 0.0, **blocks[left]}, "timeshift_cam_imu", 1, path)[0]
+    left, right = (document[name] for name in _PAIR)
+    T_left_imu, T_right_imu = (_cam_imu(document[name], f"{path}: {name}") for name in _PAIR)
+    shift_s = get_numbers({"timeshift_cam_imu": 0.0, **left}, "timeshift_cam_imu", 1, path)[0]
     return StereoRig(
-        left=_lens(blocks[left], f"{path}: {left}"),
-        right=_lens(blocks[right], f"{path}: {right}"),
-        T_right_left=_right_left(document, left, right, T_left_imu, T_right_imu, path),
+        left=_lens(left, f"{path}: cam0"),
+        right=_lens(right, f"{path}: cam1"),
+        T_right_left=_right_left(right, T_left_imu, T_right_imu, path),
         T_imu_left=None if T_left_imu is None else se3.inverse(T_left_imu),
         timeshift_cam_imu_s=shift_s,
         where=str(path),
     )
 
 
-def camchain_topics(path: Path, *, left: str = "cam0", right: str = "cam1") -> tuple[str | None, str | None]:
+def camchain_topics(path: Path) -> tuple[str | None, str | None]:
     """The ``rostopic`` of both cameras, None where not given."""
     document = read_yaml(path)
-    topics = (document[n].get("rostopic") if isinstance(document.get(n), dict) else None for n in (left, right))
+    topics = (document[n].get("rostopic") if isinstance(document.get(n), dict) else None for n in _PAIR)
     first, second = (t if isinstance(t, str) else None for t in topics)
     return first, second
 
@@ -211,18 +211,16 @@ def _cam_imu(block: dict[str, Any], where: str) -> Array | None:
     return None
 
 
-def _right_left(
-    document: dict[str, Any], left: str, right: str, T_left_imu: Array | None, T_right_imu: Array | None, path: Path
-) -> Array:
+def _right_left(right: dict[str, Any], T_left_imu: Array | None, T_right_imu: Array | None, path: Path) -> Array:
     """Left to right camera by the chain, by the IMU, or by both where they agree."""
-    chained = _chain(document, left, right, path)
+    chained = check_pose(right["T_cn_cnm1"], "T_cn_cnm1", f"{path}: cam1") if "T_cn_cnm1" in right else None
     if T_left_imu is not None and T_right_imu is not None:
         by_imu = T_right_imu @ se3.inverse(T_left_imu)
     elif chained is not None:
         return chained
     else:
         cure = "add T_cn_cnm1 to the second camera, or T_cam_imu to both"
-        raise CalibrationError(f"does not say where '{right}' sits relative to '{left}'", where=path, cure=cure)
+        raise CalibrationError("does not say where 'cam1' sits relative to 'cam0'", where=path, cure=cure)
     if chained is None:
         return by_imu
     difference = se3.log(se3.inverse(by_imu) @ chained)
@@ -236,21 +234,6 @@ def _right_left(
             cure="T_cn_cnm1 maps points of the previous camera to this one; T_cam_imu those of the IMU",
         )
     return chained
-
-
-def _chain(document: dict[str, Any], left: str, right: str, path: Path) -> Array | None:
-    """Product of ``T_cn_cnm1`` from one camera to the other, None where a link is missing."""
-    try:
-        first, last = int(left.removeprefix("cam")), int(right.removeprefix("cam"))
-    except ValueError:
-        raise CalibrationError("cameras are named cam0, cam1, ...", where=path) from None
-    T = np.eye(4)
-    for n in range(min(first, last) + 1, max(first, last) + 1):
-        block = document.get(f"cam{n}")
-        if not isinstance(block, dict) or "T_cn_cnm1" not in block:
-            return None
-        T = check_pose(block["T_cn_cnm1"], "T_cn_cnm1", f"{path}: cam{n}") @ T
-    return T if first < last else se3.inverse(T)
 
 
 def read_sensor_pose(path: Path) -> Array:

@@ -57,29 +57,15 @@ def _root(
     """Options that come before the command."""
 
 
-for command in (
-    simulate.simulate,
-    run.run,
-    run.calibration,
-    files.info,
-    files.import_,
-    twin.twin,
-    learn.train,
-    model.predict,
-    model.check,
-    model.export,
-    evaluate.evaluate,
-    evaluate.report,
-    score.score,
-    model.forecast,
-    fuse.fuse,
-    fuse.publish,
-    live.live,
-    live.doctor,
-    reproduce.reproduce,
-    selftest.selftest,
-):
-    app.command(command.__name__.rstrip("_"))(common.with_common_options(command))
+for group, commands in {
+    "Record": (run.run, files.import_, simulate.simulate, files.info, run.calibration),
+    "Judge": (evaluate.evaluate, evaluate.report, score.score, live.doctor),
+    "Learn": (learn.train, twin.twin, model.check, model.predict, model.forecast),
+    "Fly": (fuse.fuse, fuse.publish, live.live, model.export),
+    "More": (selftest.selftest, reproduce.reproduce),
+}.items():
+    for command in commands:
+        app.command(command.__name__.rstrip("_"), rich_help_panel=group)(common.with_common_options(command))
 
 
 _ANY_CLICK_ERROR: Any = typer.BadParameter.__mro__[1]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -24,14 +25,6 @@ if TYPE_CHECKING:
     from gpvo.vo.config import VoConfig
     from gpvo.vo.rig_error import RigState
 
-GROUPS = {
-    "Record": ("run", "import", "simulate", "info", "calibration"),
-    "Judge": ("evaluate", "report", "score", "doctor"),
-    "Learn": ("train", "twin", "check", "predict", "forecast"),
-    "Fly": ("fuse", "publish", "live", "export"),
-    "More": ("selftest", "reproduce"),
-}
-
 
 class Groups(TyperGroup):
     """The commands grouped by purpose; options from a file come before those of the command line."""
@@ -44,15 +37,15 @@ class Groups(TyperGroup):
         paths += [a.partition("=")[2] for a in args if a.startswith("--config=")]
         if command is not None and paths:
             at = args.index(str(name)) + 1
-            args = [*args[:at], *options_of_file(Path(paths[-1]), str(name), command), *args[at:]]
+            args = [*args[:at], *options_of_file(Path(paths[-1]), str(name), self.commands), *args[at:]]
         return list(super().parse_args(ctx, args))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write one section per group."""
-        for title, names in GROUPS.items():
-            commands = ((name, self.get_command(ctx, name)) for name in names)
+        known: Mapping[str, Any] = self.commands  # typer's, which have a panel
+        for title, commands in groupby(known.items(), lambda item: item[1].rich_help_panel):
             with formatter.section(title):
-                formatter.write_dl([(n, (c.help or "").split("\n\n")[0].strip()) for n, c in commands if c is not None])
+                formatter.write_dl([(name, (c.help or "").split("\n\n")[0].strip()) for name, c in commands])
 
 
 Config = Annotated[
@@ -97,17 +90,18 @@ def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
 _PLAIN = (str, int, float, bool, list, Path)
 
 
-def options_of_file(path: Path, name: str, command: Any) -> list[str]:
-    """Options of a command called ``name`` from its table in a TOML file, as words of a command line.
+def options_of_file(path: Path, name: str, commands: Mapping[str, Any]) -> list[str]:
+    """Options of the command called ``name`` from its table in a TOML file, as words of a command line.
 
     Raises GpvoError, in one line, for a table that belongs to no command, an unknown option or a bad value.
     """
     found = read_toml(path)
     words: list[str] = []
     for key, value in found.items():
-        if not isinstance(value, dict) or not any(key in group for group in GROUPS.values()):
+        if not isinstance(value, dict) or key not in commands:
             cure = f"write options under [{name}]"
             raise GpvoError(f"'{key}' is not the table of any command", where=path, cure=cure)
+    command = commands[name]
     known = {word.lstrip("-").replace("-", "_"): p for p in command.params for word in p.opts if word.startswith("--")}
     del known["config"]
     context = command.context_class(command, info_name=name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -72,7 +71,7 @@ def fuse(
         report = fuse_runs(
             flown,
             replace(settings, training=tuple(taught)),
-            tell=_teller(),
+            tell=_tell,
             on_run=lambda fused: write_log(log / f"{fused.name}_{fused.policy}.csv", fused) if log else None,
         )
     for warning in report.warnings:
@@ -144,8 +143,7 @@ def publish(
             say(line)
 
 
-def _teller() -> Callable[[str], None] | None:
+def _tell(what: str) -> None:
     """One line of progress on a terminal; silence in a pipe."""
-    if not sys.stderr.isatty():
-        return None
-    return lambda what: print(f"\r\033[K{what}", end="\r", file=sys.stderr, flush=True)
+    if sys.stderr.isatty():
+        print(f"\r\033[K{what}", end="\r", file=sys.stderr, flush=True)

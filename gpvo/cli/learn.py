@@ -180,6 +180,8 @@ def _train(
     paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit, noisy: list[str]
 ) -> TrainedModel:
     """``noisy`` gets the names of runs whose truth cannot judge single motions."""
+    from gpvo.learning import store
+    from gpvo.learning import train as learning
     from gpvo.learning.config import TrainConfig
 
     config = TrainConfig(**settings)
@@ -189,29 +191,17 @@ def _train(
     if update is not None and config.target == "position":
         raise GpvoError("a model of positions cannot be updated", where=update, cure="train again from all runs")
     if any(p.is_file() for p in paths):
-        return _train_file(paths, config, update, on_fit)
+        if len(paths) > 1 or update is not None:
+            raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
+        return store.train_stored(paths[0], config, on_fit=on_fit)
     runs = _each_once(paths, config, noisy)
-    if update is None and config.target != "position" and _frames(paths) > config.max_rows:
-        return _train_streaming(runs, config, on_fit)
     if config.target == "position":
-        from gpvo.learning.train import train_position
-
-        return train_position([config.rows_of(r) for r in runs], config)
+        return learning.train_position([config.rows_of(r) for r in runs], config)
     if update is not None:
-        from gpvo.learning.store import update as update_model
-
-        return update_model(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
-    from gpvo.learning.train import train as train_model
-
-    return train_model(runs, config, on_fit=on_fit)
-
-
-def _train_file(paths: list[Path], config: TrainConfig, update: Path | None, on_fit: OnFit) -> TrainedModel:
-    from gpvo.learning.store import train_stored
-
-    if len(paths) > 1 or update is not None:
-        raise GpvoError("a file of training rows must be given alone", where=paths[0], cure="or give run folders")
-    return train_stored(paths[0], config, on_fit=on_fit)
+        return store.update(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
+    if _frames(paths) > config.max_rows:
+        return _train_streaming(runs, config, on_fit)
+    return learning.train(runs, config, on_fit=on_fit)
 
 
 def _frames(paths: list[Path]) -> int:

@@ -151,9 +151,12 @@ def forecast(
     predictor = Predictor.load(model).require_motions(model)
     found = run_forecast(predictor, read_plan(path, predictor.model.dt_s, frame), draws=draws, seed=seed)
     if out is not None:
-        _write_forecast(out, found)
+        (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(found))
     if plot is not None:
-        _draw_forecast(plot, found, path.name)
+        from gpvo.evaluation import plots
+
+        with replacing(plot) as temporary:
+            plots.forecast(found, path.name).savefig(temporary, dpi=110, format="png")
     if json_:
         print_json(_forecast_document(found, model, path, frame))
     else:
@@ -176,7 +179,7 @@ def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict
         "predicted_final_error_m": float(f.sigma_m[-1]),
         "predicted_final_error_independent_m": f.independent_m,
         "final_sigma_m": dict(zip("xyz", f.position_sigma_m[-1].tolist(), strict=True)),
-        "final_mean_error_m": dict(zip("xyz", f.mean_error_m[-1].tolist(), strict=True)),
+        "final_mean_error_m": dict.fromkeys("xyz", 0.0),  # for scripts that read it: no model states one
         "along": _rows(f),
     }
 
@@ -194,10 +197,8 @@ def _columns(f: Forecast) -> dict[str, Any]:
 
 def _rows(f: Forecast) -> list[dict[str, float]]:
     """A few poses for a short table, evenly spaced in time and including the last."""
-    from numpy import linspace
-
     columns, n = _columns(f), len(f.plan.t_s)
-    stops = sorted({int(k) for k in linspace(0, n - 1, min(n, _LINES)).round()})
+    stops = sorted({int(k) for k in np.linspace(0, n - 1, min(n, _LINES)).round()})
     return [{name: float(columns[name][k]) for name in _TOLD} for k in stops]
 
 
@@ -216,17 +217,3 @@ def _print_forecast(f: Forecast, path: Path) -> None:
         table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
     show(table)
     say("1 sigma of the position relative to the first pose, in the axes of the plan's world")
-    if f.mean[-1].any():
-        x, y, z = f.mean_error_m[-1]
-        say(f"expected error at the end: {x:.3g}, {y:.3g}, {z:.3g} m")
-
-
-def _write_forecast(out: Path, f: Forecast) -> None:
-    (write_table if out.suffix == ".parquet" else write_csv)(out, _columns(f))
-
-
-def _draw_forecast(plot: Path, f: Forecast, title: str) -> None:
-    from gpvo.evaluation import plots
-
-    with replacing(plot) as temporary:
-        plots.forecast(f, title).savefig(temporary, dpi=110, format="png")

@@ -67,14 +67,11 @@ def say(text: str) -> None:
     print(text if len(text) <= width else textwrap.fill(text, int(width), subsequent_indent=indent))
 
 
-def show(what: str | Table) -> None:
-    """Print a table or a line, as wide as the terminal, 80 columns in a pipe; a table never narrower than those, where
-    its numbers would break."""
+def show(table: Table) -> None:
+    """Print a table as wide as the terminal, 80 columns in a pipe; never narrower, where its numbers would break."""
     from rich.console import Console
-    from rich.table import Table
 
-    width = max(Console().width, 80) if isinstance(what, Table) else None
-    Console(width=width, highlight=False, markup=False).print(what)
+    Console(width=max(Console().width, 80), highlight=False, markup=False).print(table)
 
 
 def new_table(*columns: str) -> Table:

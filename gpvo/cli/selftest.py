@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from gpvo.errors import EXTRA_OF, GpvoError
@@ -14,19 +13,8 @@ from gpvo.io.source import open_source
 from gpvo.online.predictor import Predictor
 
 _FLIGHTS = 3
+_LAST, _MODEL = f"run{_FLIGHTS - 1}", "model.gpvo"
 _SECONDS, _RATE_HZ = 15.0, 10.0
-
-
-@dataclass
-class _Bench:
-    """Where each part leaves what the next ones need."""
-
-    folder: Path
-    runs: list[Path] = field(default_factory=list)
-
-    @property
-    def model(self) -> Path:
-        return self.folder / "model.gpvo"
 
 
 class _Wrong(Exception):
@@ -46,13 +34,12 @@ def selftest() -> None:
     )  # fmt: skip
     failed, missing = [], ""
     with tempfile.TemporaryDirectory(prefix="gpvo-selftest-") as folder:
-        bench = _Bench(Path(folder))
         for name, part in parts:
             began = time.monotonic()
             if missing:
                 print(f"[SKIP] {name}: needs {missing}")
                 continue
-            verdict, said = _try(part, bench)
+            verdict, said = _try(part, Path(folder))
             print(f"[{verdict}] {name}: {said} ({time.monotonic() - began:.1f} s)", flush=True)
             if verdict != "PASS":
                 missing = name
@@ -62,9 +49,9 @@ def selftest() -> None:
         raise GpvoError(f"{', '.join(failed)} failed", cure="reinstall gpvo; if that does not help, report these lines")
 
 
-def _try(part: Callable[[_Bench], str], bench: _Bench) -> tuple[str, str]:
+def _try(part: Callable[[Path], str], folder: Path) -> tuple[str, str]:
     try:
-        return "PASS", part(bench)
+        return "PASS", part(folder)
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRA_OF:
@@ -79,71 +66,70 @@ def _require(holds: bool, what: str) -> None:
         raise _Wrong(what)
 
 
-def _simulate(bench: _Bench) -> str:
+def _simulate(folder: Path) -> str:
     from gpvo.sim.points import simulate_points
 
     for seed in range(_FLIGHTS):
         flight = simulate_points("tunnel-bursts", seed, duration_s=_SECONDS, rate_hz=_RATE_HZ)
-        flight.save(bench.folder / f"flight{seed}.npz")
+        flight.save(folder / f"flight{seed}.npz")
     return f"{_FLIGHTS} flights of {_SECONDS:g} s"
 
 
-def _odometry(bench: _Bench) -> str:
+def _odometry(folder: Path) -> str:
     from gpvo import runner
 
     said = []
     for seed in range(_FLIGHTS):
-        bench.runs.append(bench.folder / f"run{seed}")
-        summary = runner.run(open_source(bench.folder / f"flight{seed}.npz"), bench.runs[-1])
+        summary = runner.run(open_source(folder / f"flight{seed}.npz"), folder / f"run{seed}")
         moved = summary.status.get("ok", 0) + summary.status.get("degraded", 0)
         _require(moved >= 0.8 * summary.frames, f"only {moved} of {summary.frames} frames have a motion")
         said.append(summary.frames_per_s)
     return f"{sum(said) / len(said):.0f} frames/s"
 
 
-def _evaluate(bench: _Bench) -> str:
+def _evaluate(folder: Path) -> str:
     from gpvo.evaluation.evaluate import evaluate_run
 
-    t = evaluate_run(read_run(bench.runs[-1])).trajectory
+    t = evaluate_run(read_run(folder / _LAST)).trajectory
     _require(t.ate_rmse_m < 0.05 * t.path_length_m, f"ATE of {t.ate_rmse_m:.2g} m over {t.path_length_m:.3g} m")
     return f"ATE {t.ate_rmse_m:.3f} m over {t.path_length_m:.0f} m"
 
 
-def _train(bench: _Bench) -> str:
+def _train(folder: Path) -> str:
     from gpvo.learning.config import TrainConfig
     from gpvo.learning.store import save_model
     from gpvo.learning.train import train_sets
 
     config = TrainConfig()
-    sets = [config.rows_of(read_run(path)) for path in bench.runs[:-1]]
-    save_model(train_sets(sets, config, judge=False), bench.model)
-    return f"a model of {sum(map(len, sets))} motions, {bench.model.stat().st_size / 1e3:.0f} kB"
+    sets = [config.rows_of(read_run(folder / f"run{seed}")) for seed in range(_FLIGHTS - 1)]
+    save_model(train_sets(sets, config, judge=False), folder / _MODEL)
+    return f"a model of {sum(map(len, sets))} motions, {(folder / _MODEL).stat().st_size / 1e3:.0f} kB"
 
 
-def _predict(bench: _Bench) -> str:
+def _predict(folder: Path) -> str:
     from gpvo.evaluation.evaluate import evaluate_run
 
-    learned = evaluate_run(read_run(bench.runs[-1]), Predictor.load(bench.model)).consistency["learned"]
+    learned = evaluate_run(read_run(folder / _LAST), Predictor.load(folder / _MODEL)).consistency["learned"]
     nees = learned.nees_dof["joint"]
     _require(nees is not None and 0.2 < nees.mean < 5.0, f"NEES/dof {nees} on a flight left out")
     return f"NEES/dof {nees} on a flight left out (1 is right)"
 
 
-def _filter(bench: _Bench) -> str:
+def _filter(folder: Path) -> str:
     from gpvo.evaluation.fusion import FusionSettings, fuse_runs
 
-    report = fuse_runs([bench.runs[-1]], FusionSettings(model=bench.model, policies=("learned",)))
+    report = fuse_runs([folder / _LAST], FusionSettings(model=folder / _MODEL, policies=("learned",)))
     score = report.study.scores["learned"][0]
     _require(score is not None and not score.diverged, "the filter diverged")
     assert score is not None
     return f"ATE {score.ate_rmse_m:.3f} m with an IMU"
 
 
-def _messages(bench: _Bench) -> str:
+def _messages(folder: Path) -> str:
     from gpvo.publish.odometry import OdometryBuilder
 
-    run = read_run(bench.runs[-1])
-    predictor, builder = Predictor.load(bench.model), OdometryBuilder(run.mounting.T_body_cam)
+    run = read_run(folder / _LAST)
+    predictor, builder = Predictor.load(folder / _MODEL), OdometryBuilder(run.mounting.T_body_cam)
     predictor.reset(run.log.camera)
     messages = [builder.step(record, predictor.step(record)) for record in run.log]
     return f"{len(messages)} odometry messages"

@@ -3,7 +3,7 @@
 The plan says how fast the camera moves and turns. What else the model looks at (points, texture, noise) is not known
 before the flight: it is drawn, several times, from training rows of like motion, and each draw keeps to few training
 sequences, so that what differs between flights stays together along the path. Draws are joined by the law of total
-variance: the mean of their covariances plus the covariance of their means.
+variance, the mean of their covariances: a model states no mean error that could differ between them.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Plan:
         return se3.path_length_m(self.T_world_cam[:, :3, 3])
 
 
-def read_plan(path: str | Path, dt_s: float, frame: str = "cam") -> Plan:
+def read_plan(path: Path, dt_s: float, frame: str = "cam") -> Plan:
     """A TUM file of poses at any spacing, resampled every ``dt_s``.
 
     ``frame``: ``cam``, poses of the left camera (x right, y down, z forward), or ``body`` (FLU), whose camera then
@@ -103,14 +103,13 @@ class Outside:
 class Forecast:
     """Of the N poses of a plan, the first known exactly.
 
-    ``covariance`` (N, 6, 6): of each pose's error, right perturbation, in ``cam`` there [m, rad]; ``mean`` (N, 6):
-    error to be expected, zero unless the model states one. ``independent_m``: the last pose's position sigma if
-    motions were independent. ``in_domain`` (N - 1,): of each motion, averaged over the draws, in [0, 1].
+    ``covariance`` (N, 6, 6): of each pose's error, right perturbation, in ``cam`` there [m, rad]; its mean is zero.
+    ``independent_m``: the last pose's position sigma if motions were independent. ``in_domain`` (N - 1,): of each
+    motion, averaged over the draws, in [0, 1].
     """
 
     plan: Plan
     covariance: Array
-    mean: Array
     independent_m: float
     in_domain: Array
     outside: tuple[Outside, ...]
@@ -132,11 +131,6 @@ class Forecast:
         return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
 
     @property
-    def mean_error_m(self) -> Array:
-        """(N, 3) expected error of the position, in the axes of the plan's world [m]."""
-        return np.einsum("nij,nj->ni", self.plan.T_world_cam[:, :3, :3], self.mean[:, :3])
-
-    @property
     def outside_share(self) -> float:
         """Share of the motions that lie outside the training domain."""
         return float((self.in_domain < DEGRADED_BELOW).mean())
@@ -152,12 +146,10 @@ def forecast(predictor: Predictor, plan: Plan, *, draws: int = DRAWS, seed: int 
     sample = TrainingSample.from_arrays(predictor.arrays, len(predictor.features))
     rng = np.random.default_rng(seed)
     flown = [_fly(predictor, plan, sample, rng) for _ in range(draws)]
-    C, m, independent_m2 = (np.array(of_draws) for of_draws in zip(*(_sum_up(*f, plan) for f in flown), strict=True))
-    spread = m - m.mean(axis=0)
+    C, independent_m2 = (np.array(of_draws) for of_draws in zip(*(_sum_up(*f, plan) for f in flown), strict=True))
     return Forecast(
         plan=plan,
-        covariance=symmetrise(C.mean(axis=0) + np.einsum("dni,dnj->nij", spread, spread) / draws),
-        mean=m.mean(axis=0),
+        covariance=symmetrise(C.mean(axis=0)),
         independent_m=float(np.sqrt(independent_m2.mean())),
         in_domain=np.mean(np.array([said.in_domain for _, said in flown]), axis=0),
         outside=_outside(predictor, plan),
@@ -222,14 +214,14 @@ def _features(names: list[str], plan: Plan) -> Array:
     return np.array([stream.step(r) for r in records]).reshape(-1, len(names))
 
 
-def _sum_up(parent: NDArray[np.int64], said: Prediction, plan: Plan) -> tuple[Array, Array, float]:
-    """Covariance (N, 6, 6) and mean (N, 6) of every pose's error, and the last position's variance if independent."""
+def _sum_up(parent: NDArray[np.int64], said: Prediction, plan: Plan) -> tuple[Array, float]:
+    """Covariance (N, 6, 6) of every pose's error, and the last position's variance if motions were independent."""
     T = se3.inverse(plan.T_world_cam[parent]) @ plan.T_world_cam
     nothing = MotionError.independent(np.zeros((6, 6)))
     errors = [nothing, *(said.row(k) for k in range(len(parent) - 1))]
-    mean, covariance = along(T, errors, parent)
+    _, covariance = along(T, errors, parent)
     _, plain = along(T, [MotionError.independent(error.covariance) for error in errors], parent)
-    return covariance, mean, float(np.trace(plain[-1, :3, :3]))
+    return covariance, float(np.trace(plain[-1, :3, :3]))
 
 
 def _outside(predictor: Predictor, plan: Plan) -> tuple[Outside, ...]:

@@ -69,14 +69,13 @@ def fuse_runs(
     paths: Sequence[Path],
     settings: FusionSettings,
     *,
-    tell: Callable[[str], None] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
     on_run: Callable[[FusedRun], None] = lambda _: None,
 ) -> FusionReport:
     """Fuse run folders under every policy that has what it needs; ``on_run`` sees each filtered run whole.
 
     Runs of one name are told apart by numbers: ``run``, ``run-2``.
     """
-    tell = tell or (lambda _: None)
     known = (*POLICIES, IMPORTED)
     unknown = [p for p in settings.policies if p not in known]
     if unknown:

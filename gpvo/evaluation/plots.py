@@ -130,12 +130,10 @@ def require_picture(path: Path) -> None:
         raise GpvoError("does not have the suffix of an image", where=path, cure=f"choose from {', '.join(known)}")
 
 
-def plot_fusion(traces: Sequence[Trace], path: str | Path) -> None:
+def plot_fusion(traces: Sequence[Trace], path: Path) -> None:
     """Draw the first run's path and errors and all runs' innovations to an image file."""
-    target = Path(path)
-    require_picture(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    save(figure_of(traces), target, dpi=120, bbox_inches="tight")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(figure_of(traces), path, dpi=120, bbox_inches="tight")
 
 
 def save(figure: Figure, path: Path, **options: Any) -> None:

@@ -23,6 +23,7 @@ from gpvo.types import IMPORTED_POSE, Array, VoLog
 
 SHORT_M, LONG_M = (10.0, 20.0, 50.0, 100.0), tuple(100.0 * k for k in range(1, 9))
 _LONG_PATH_M = 800.0
+_EVERY = 10  # frames between the starts of segments, as in the benchmark
 _ALIGNING = 20  # iterations at most
 
 
@@ -117,11 +118,7 @@ def pairs_ahead(
 
 
 def segments(
-    T_est: Array,
-    T_true: Array,
-    lengths_m: Sequence[float],
-    every: int = 10,
-    frame: NDArray[np.int64] | None = None,
+    T_est: Array, T_true: Array, lengths_m: Sequence[float], frame: NDArray[np.int64] | None = None
 ) -> tuple[Segment, ...]:
     """KITTI's segment errors for given lengths of the true path, a start at every tenth frame.
 
@@ -129,7 +126,7 @@ def segments(
     """
     arc, out = se3.path_length_m(T_true[:, :3, 3]), []
     for length in lengths_m:
-        error = rpe(T_est, T_true, *pairs_ahead(arc, length, every, frame))
+        error = rpe(T_est, T_true, *pairs_ahead(arc, length, _EVERY, frame))
         translation, rotation = error.translation_m, float(np.degrees(error.rotation_rad.mean))
         out.append(Segment(length, 100 * translation.mean / length, rotation / length, translation.count))
     return tuple(out)

@@ -29,7 +29,7 @@ from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import Stage, Taken, lost
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
-from gpvo.publish.odometry import Odometry, OdometryBuilder, about_zero, lift
+from gpvo.publish.odometry import LEAST_VARIANCE, Odometry, OdometryBuilder, about_zero, lift
 from gpvo.types import VEHICLES, Array, Prediction, Status, Vehicle, VoRecord
 from gpvo.vo.quality import lost_covariance
 
@@ -40,7 +40,6 @@ _RECENT = 100
 _FAR_SCALE = 5.0  # no model that fits its odometry is so far off, either way
 _FROM_OUTSIDE = (GpvoError, OSError, ValueError, ArithmeticError, LookupError, AttributeError, TypeError, struct.error)
 """What a message or a link can raise; neither must end the process."""
-_LEAST_VAR = 1e-9  # of an increment: robot_localization takes less for an error
 _POSITION_SIGMA_M, _ATTITUDE_SIGMA_RAD = 1.0, 0.1  # a source that starts again need not start where it stopped
 
 
@@ -241,7 +240,7 @@ class Engine:
             return message
         A = se3.adjoint(self.stage.T_body_cam)
         in_odom = rotate_covariance(message.T_odom_body[:3, :3], A @ C @ A.T)
-        return replace(message, pose_covariance=lift(in_odom, _LEAST_VAR, _LEAST_VAR))
+        return replace(message, pose_covariance=lift(in_odom, LEAST_VARIANCE))
 
     def _watch(self) -> None:
         """Warnings and diagnostics that are due."""

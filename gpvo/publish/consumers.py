@@ -23,38 +23,14 @@ from gpvo.types import Array
 
 CONSUMERS = ("px4", "ardupilot", "robot_localization", "fusioncore")
 
-
-@dataclass(frozen=True)
-class Px4Parameters:
-    """PX4's parameters of external vision, at their defaults; ``*_minimum`` is the least each may be set to."""
-
-    EKF2_EV_NOISE_MD: int = 0
-    EKF2_EVP_NOISE: float = 0.1
-    EKF2_EVV_NOISE: float = 0.1
-    EKF2_EVA_NOISE: float = 0.1
-
-    @staticmethod
-    def minimum(name: str) -> float:
-        """Smallest value that the parameter accepts."""
-        return {"EKF2_EVP_NOISE": 0.01, "EKF2_EVV_NOISE": 0.01, "EKF2_EVA_NOISE": 0.05}[name]
-
-
-@dataclass(frozen=True)
-class ArduPilotParameters:
-    """ArduPilot's parameters of visual odometry, at their defaults; ``minimum`` is the least sigma EKF3 works with,
-    whatever they are set to."""
-
-    VISO_POS_M_NSE: float = 0.2
-    VISO_YAW_M_NSE: float = 0.2
-    VISO_VEL_M_NSE: float = 0.1
-    VISO_QUAL_MIN: int = 0
-
-    @staticmethod
-    def minimum(name: str) -> float:
-        """Smallest value that makes a difference."""
-        return {"VISO_POS_M_NSE": 0.01, "VISO_YAW_M_NSE": float(np.deg2rad(5.0)), "VISO_VEL_M_NSE": 0.05}[name]
-
-
+PX4 = {"EKF2_EVP_NOISE": (0.1, 0.01), "EKF2_EVV_NOISE": (0.1, 0.01), "EKF2_EVA_NOISE": (0.1, 0.05)}
+"""Of external vision: the default of each parameter, and the least that it may be set to."""
+ARDUPILOT = {
+    "VISO_POS_M_NSE": (0.2, 0.01),
+    "VISO_YAW_M_NSE": (0.2, float(np.deg2rad(5.0))),
+    "VISO_VEL_M_NSE": (0.1, 0.05),
+}
+"""Of visual odometry: the default of each parameter, and the least sigma EKF3 works with, whatever it is set to."""
 FUSIONCORE_FALLBACK = (0.1, 0.02)
 """Standard deviations [m, rad] that FusionCore takes for a position or an attitude of which a variance is zero."""
 FUSIONCORE_LEAST = (0.01, 0.001)
@@ -109,16 +85,16 @@ def _check_robot_localization(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_px4(pose: Array, twist: Array) -> list[Verdict]:
-    p, pose, twist = Px4Parameters(), np.sqrt(variances(pose)), np.sqrt(variances(twist))
+    pose, twist = np.sqrt(variances(pose)), np.sqrt(variances(twist))
     out = []
     for quantity, name, sigma, unit in (
         ("velocity", "EKF2_EVV_NOISE", twist[:, :3], "m/s"),
         ("position", "EKF2_EVP_NOISE", pose[:, :3], "m"),
         ("yaw", "EKF2_EVA_NOISE", pose[:, 5:6], "rad"),
     ):
-        value = getattr(p, name)
+        value, minimum = PX4[name]
         typical = 0.05 if quantity == "velocity" else 0.5
-        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=p.minimum(name), typical=typical))
+        out.append(_verdict(quantity, name, value, sigma.min(axis=1), unit, minimum=minimum, typical=typical))
     return out
 
 
@@ -144,26 +120,27 @@ def _check_fusioncore(pose: Array, twist: Array) -> list[Verdict]:
 
 
 def _check_ardupilot(pose: Array, twist: Array) -> list[Verdict]:
-    p, pose, twist = ArduPilotParameters(), variances(pose), variances(twist)
+    pose, twist = variances(pose), variances(twist)
     out = []
     for quantity, name, old, new, unit in (
         ("position", "VISO_POS_M_NSE", np.cbrt((pose[:, :3] ** 2).sum(1)), np.sqrt(pose[:, :3].sum(1)), "m"),
         ("angle", "VISO_YAW_M_NSE", np.cbrt((pose[:, 3:] ** 2).sum(1)), np.sqrt(pose[:, 3:].sum(1)), "rad"),
     ):
-        value, minimum = getattr(p, name), p.minimum(name)
+        value, minimum = ARDUPILOT[name]
         out.append(_verdict(quantity, name, value, new, unit, minimum=minimum))
         out.append(_verdict(f"{quantity}, releases to early 2026", name, value, old, unit, minimum=minimum))
-    name, least = "VISO_VEL_M_NSE", p.minimum("VISO_VEL_M_NSE")
+    name = "VISO_VEL_M_NSE"
+    value, least = ARDUPILOT[name]
     predicted, speed = _percentiles(np.sqrt(twist[:, :3]).max(axis=1)), np.sqrt(twist[:, :3].sum(1))
     read = "velocity of VISION_SPEED_ESTIMATE since pull request 32478"
-    out.append(_verdict(read, name, p.VISO_VEL_M_NSE, speed, "m/s", minimum=least, typical=0.05))
+    out.append(_verdict(read, name, value, speed, "m/s", minimum=least, typical=0.05))
     advice = (
         "ODOMETRY's velocity covariance is never read, VISION_SPEED_ESTIMATE's not in older releases: set "
         f"{name} to {max(predicted[1], least):.2g}; EKF3 takes no sigma below {least:g}. From 1 on, VISO_QUAL_MIN lets "
         "ODOMETRY's quality decide frame by frame, but drops every VISION_SPEED_ESTIMATE, which has none; below 0 it "
         "would accept frames far outside the model's domain"
     )
-    return [*out, Verdict("velocity otherwise", name, p.VISO_VEL_M_NSE, 100.0, predicted, "m/s", advice)]
+    return [*out, Verdict("velocity otherwise", name, value, 100.0, predicted, "m/s", advice)]
 
 
 def _percentiles(sigma: Array) -> tuple[float, float, float]:

@@ -5,7 +5,6 @@ constants, then plain C99 that needs ``math.h`` alone.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -40,9 +39,9 @@ _KEYWORDS = (
 _NOT_IN_COMMENTS = re.compile(r"[^A-Za-z0-9_./^,;:=() -]")
 
 
-def format_of(to: str | None, path: str | os.PathLike[str] | None) -> str:
+def format_of(to: str | None, path: Path | None) -> str:
     """The format ``to``, else that which the name ``path`` tells; GpvoError where there is none or they contradict."""
-    told = next((f for f in FORMATS if path is not None and Path(path).suffix.lower() == SUFFIXES[f]), None)
+    told = next((f for f in FORMATS if path is not None and path.suffix.lower() == SUFFIXES[f]), None)
     chosen = to or told
     if chosen is None:
         raise GpvoError("the format is not given", cure=f"--to with one of: {', '.join(FORMATS)}")
@@ -53,13 +52,7 @@ def format_of(to: str | None, path: str | os.PathLike[str] | None) -> str:
     return chosen
 
 
-def export_model(
-    model: str | os.PathLike[str],
-    path: str | os.PathLike[str],
-    to: str,
-    *,
-    prefix: str = PREFIX,
-) -> None:
+def export_model(model: Path, path: Path, to: str, *, prefix: str = PREFIX) -> None:
     """Write the model file ``model`` as ``to`` ("onnx" or "c").
 
     ``prefix``: of every symbol in C, so that one program can hold several models. GpvoError for other formats or names,
@@ -80,14 +73,7 @@ def export_model(
         to_onnx(predictor.model, path, metadata=metadata)
 
 
-def to_c(
-    model: ErrorModel,
-    path: str | os.PathLike[str],
-    *,
-    name: str = PREFIX,
-    units: tuple[str, ...] = (),
-    note: str = "",
-) -> None:
+def to_c(model: ErrorModel, path: Path, *, name: str = PREFIX, units: tuple[str, ...] = (), note: str = "") -> None:
     """Write the header. ``name`` prefixes every symbol, so that one program can hold several models.
 
     ``units``: of the features, for the comment at the top; ``note``: one more line there. The numbers equal those of
@@ -101,7 +87,7 @@ def to_c(
     code = re.sub("gpvo_|GPVO_", lambda m: f"{name if m[0].islower() else name.upper()}_", code)
     # Another model under the same prefix must collide, not be skipped as if it were this one included again.
     guard = hashlib.sha256(code.encode()).hexdigest()[:16].upper()
-    write_text(Path(path), code.replace(f"{name.upper()}_MODEL_H", f"{name.upper()}_{guard}_H"))
+    write_text(path, code.replace(f"{name.upper()}_MODEL_H", f"{name.upper()}_{guard}_H"))
 
 
 def _preamble(model: ErrorModel, units: tuple[str, ...], note: str) -> list[str]:

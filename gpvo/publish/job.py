@@ -56,7 +56,6 @@ class Published:
 
     def document(self) -> dict[str, Any]:
         """Machine-readable form."""
-        keys = ("run", "to", "out", "messages", "lost", "outside", "source", "consumer")
         verdicts = [
             {
                 "quantity": v.quantity,
@@ -69,7 +68,7 @@ class Published:
             }
             for v in self.verdicts
         ]
-        return {"schema": 1, **{k: getattr(self, k) for k in keys}, "checks": verdicts}
+        return {"schema": 1, **{k: v for k, v in vars(self).items() if k != "verdicts"}, "checks": verdicts}
 
     def __str__(self) -> str:
         written = f"{self.out}: {self.messages} messages" if self.out else f"{self.run}: nothing written"

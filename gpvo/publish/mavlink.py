@@ -10,7 +10,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from types import ModuleType
@@ -171,9 +171,8 @@ class Sender:
         return packed
 
 
-def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
+def write_tlog(path: Path, odometry: Iterable[Odometry], *, system: int = 1) -> int:
     """Write a telemetry log: every message after its time, 8 bytes big-endian microseconds. Returns frames."""
-    path = Path(path)
     if path.is_dir():
         raise GpvoError("is a folder, and a telemetry log is a file", where=path, cure="choose another -o")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -186,21 +185,17 @@ def write_tlog(path: str | Path, odometry: Iterable[Odometry], *, system: int = 
     return count
 
 
-@dataclass
 class Link:
     """A live connection: ``udp:HOST:PORT`` or ``serial:DEVICE:BAUD`` (pyserial)."""
 
-    address: str
-    system: int = 1
-
-    def __post_init__(self) -> None:
-        self.sender = Sender(self.system)
-        kind, _, rest = self.address.partition(":")
+    def __init__(self, address: str, system: int = 1) -> None:
+        self.address, self.sender = address, Sender(system)
+        kind, _, rest = address.partition(":")
         place, _, number = rest.rpartition(":")
         if kind not in ("udp", "serial") or not place or not number.isdecimal():
-            raise GpvoError(f"'{self.address}' is not an address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
+            raise GpvoError(f"'{address}' is not an address", cure="give udp:HOST:PORT or serial:DEVICE:BAUD")
         if kind == "udp" and not 1 <= int(number) <= 65535:
-            raise GpvoError(f"'{self.address}' has no valid UDP port", cure="give one of 1 to 65535")
+            raise GpvoError(f"'{address}' has no valid UDP port", cure="give one of 1 to 65535")
         self._send = _udp(place, int(number)) if kind == "udp" else _serial(place, int(number))
 
     def send(self, odometry: Odometry) -> None:

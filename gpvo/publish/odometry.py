@@ -39,27 +39,18 @@ class Odometry:
     child_frame_id: str = "base_link"
 
 
-@dataclass(frozen=True)
-class Floors:
-    """Smallest variances ever published: robot_localization takes less for an error, and nothing replaces zeros well.
-
-    Larger floors would hide predictions: a second between two frames leaves 1e-4 rad/s of sigma.
-    """
-
-    translation_m2: float = 1e-9
-    rotation_rad2: float = 1e-9
-    velocity_m2ps2: float = 1e-9
-    rate_rad2ps2: float = 1e-9
+LEAST_VARIANCE = 1e-9
+"""Smallest ever published, of any axis: robot_localization takes less for an error, and nothing replaces zeros well. A
+larger one would hide predictions: a second between two frames leaves 1e-4 rad/s of sigma."""
 
 
-def lift(covariance: Array, first: float, second: float) -> Array:
-    """Raise variances (6, 6) to at least ``first`` (translation) and ``second`` (rotation), on the diagonal only.
+def lift(covariance: Array, least: Array | float) -> Array:
+    """Raise variances (6, 6) to at least ``least``, one for all or (6,), on the diagonal only.
 
     Adding to a diagonal keeps a matrix positive definite; clipping it would not keep its correlations valid.
     """
     out = symmetrise(covariance)
-    missing = np.maximum(np.repeat([first, second], 3) - np.diagonal(out), 0.0)
-    return out + np.diag(missing)
+    return out + np.diag(np.maximum(least - np.diagonal(out), 0.0))
 
 
 def about_zero(covariance: Array, mean: Array) -> Array:
@@ -89,13 +80,14 @@ class OdometryBuilder:
     T_body_cam : (4, 4) mounting of the camera; None takes a forward-looking camera at the body's origin.
     T_odom_body : (4, 4) body pose of the first frame in ``odom``.
     method : geometric covariance used where there is no prediction.
+    floor : smallest variance of any axis.
     resets : how often the pose was reset before.
     """
 
     T_body_cam: Array | None = None
     T_odom_body: Array = field(default_factory=lambda: np.eye(4))
     method: str | None = None
-    floors: Floors = field(default_factory=Floors)
+    floor: float = LEAST_VARIANCE
     resets: int = 0
 
     def __post_init__(self) -> None:
@@ -166,7 +158,7 @@ class OdometryBuilder:
         twist = self._Ad @ xi / dt
         J = self._Ad @ se3.right_jacobian_inverse(xi)
         moved = J @ covariance @ J.T / dt**2
-        return twist, lift(moved, self.floors.velocity_m2ps2, self.floors.rate_rad2ps2)
+        return twist, lift(moved, self.floor)
 
     def _lost(self, record: VoRecord, prediction: Prediction | None, base: _Chain, is_break: bool) -> Odometry:
         """A frame without a motion to be believed: what VO says stands in, as uncertain as what may have happened."""
@@ -199,7 +191,7 @@ class OdometryBuilder:
         return Odometry(
             t_ns=record.t_ns,
             T_odom_body=T,
-            pose_covariance=lift(in_odom, self.floors.translation_m2, self.floors.rotation_rad2),
+            pose_covariance=lift(in_odom, self.floor),
             twist_body=twist,
             twist_covariance=twist_covariance,
             status=status,

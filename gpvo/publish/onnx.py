@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ _INT64 = 7  # TensorProto.INT64
 _USUAL_DURATIONS = tuple(zip(("GreaterOrEqual", "LessOrEqual"), DURATIONS_S, strict=True))
 
 
-def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[str, str] | None = None) -> None:
+def to_onnx(model: ErrorModel, path: Path, *, metadata: dict[str, str] | None = None) -> None:
     """Write the graph.
 
     Inputs, all double: ``features`` (N, d), NaN where missing; ``geometry`` (N, 6, 6), NaN where unknown; ``dt_s``
@@ -45,7 +44,7 @@ def to_onnx(model: ErrorModel, path: str | os.PathLike[str], *, metadata: dict[s
     outputs: dict[str, list[Any]] = {"mean": ["N", 6], **square, "epistemic": ["N", 6], **scalar}
     names = {"features": ",".join(model.columns), **(metadata or {})}
     blob = graph.serialise(shapes, outputs, names)
-    with replacing(Path(path)) as temporary:
+    with replacing(path) as temporary:
         temporary.write_bytes(blob)
 
 

@@ -83,7 +83,7 @@ def check_topic(topic: str) -> str:
 
 
 def write_bag(
-    path: str | Path, odometry: Iterable[Odometry], topic: str = TOPIC, kind: str | None = None, seq: int = 0
+    path: Path, odometry: Iterable[Odometry], topic: str = TOPIC, kind: str | None = None, seq: int = 0
 ) -> int:
     """Write every frame that has a motion, in place of a bag of ``topic`` alone; returns the number of messages.
 
@@ -92,16 +92,16 @@ def write_bag(
     written.
     """
     kind = kind or _kind(path)
-    return _write(Path(path), _serialised(odometry, kind, seq), topic, kind)
+    return _write(path, _serialised(odometry, kind, seq), topic, kind)
 
 
-def join_bags(path: str | Path, parts: Iterable[Path], topic: str = TOPIC) -> int:
+def join_bags(path: Path, parts: Iterable[Path], topic: str = TOPIC) -> int:
     """The same of the messages of other bags that :func:`write_bag` wrote, of the kind that the suffix says."""
-    return _write(Path(path), _raw(parts), topic, _kind(path))
+    return _write(path, _raw(parts), topic, _kind(path))
 
 
-def _kind(path: str | Path) -> str:
-    return {".bag": "ros1", ".mcap": "mcap"}.get(Path(path).suffix.lower(), "sqlite3")
+def _kind(path: Path) -> str:
+    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix.lower(), "sqlite3")
 
 
 def _write(path: Path, messages: Iterable[tuple[int, bytes]], topic: str, kind: str) -> int:

@@ -74,7 +74,7 @@ class LikelihoodJob:
         found = []
         for s in sets_of(self.runs, self.model.lacking):
             stated = model.estimate(s.select(model.columns), s.covariances.get(model.base.method or ""), s.dt_s)
-            found.append(float(nll_per_dim(s.Y - stated.mean, stated.covariance).mean()))
+            found.append(float(nll_per_dim(s.Y, stated.covariance).mean()))
         write_arrays(path, {"nll_per_dim": np.array(found)})
 
     def load(self, store: Store) -> Array:

@@ -10,11 +10,11 @@ import numpy as np
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.sim import paths, recorded
+from gpvo.sim.events import CAMERA_HEIGHT_M
 from gpvo.sim.paths import Path3
 from gpvo.types import Array
 
 PATHS = ("along", "wander", "straight", "hover", "waypoints")
-_CAMERA_HEIGHT_M = 1.6  # over the road
 _STEP_M = 0.5  # between the points of a centre line
 _BEYOND_M = 80.0
 
@@ -49,7 +49,7 @@ def make(
     elif path == "wander" or (path == "along" and world == "room"):
         flown = paths.wandering(low, high, duration_s, speed_mps, rng, rest_s)
     elif path == "along" and world == "street":
-        flown = paths.driving(centre + [0, 0, _CAMERA_HEIGHT_M], duration_s, speed_mps, rng, rest_s)
+        flown = paths.driving(centre + [0, 0, CAMERA_HEIGHT_M], duration_s, speed_mps, rng, rest_s)
     elif path == "along":
         line = centre * [1, 1, 0] + [0, 0, 1.5] if world == "lunar" else centre
         flown = paths.along_curve(line, duration_s, speed_mps, rng, sway_m=0.35, rest_s=rest_s)
@@ -69,7 +69,7 @@ def _street_along(
 ) -> tuple[Path3, Array]:
     """The recording as it is, and a street below it that goes on straight beyond both of its ends."""
     path = recording.placed(np.zeros(3), 0.0, 1.0, 0.0, duration_s, rest_s)
-    at = path.position(np.arange(0.0, duration_s, 0.05)) - [0, 0, _CAMERA_HEIGHT_M]
+    at = path.position(np.arange(0.0, duration_s, 0.05)) - [0, 0, CAMERA_HEIGHT_M]
     steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
     at = at[np.concatenate([[True], steps > 1e-3])]
     ahead = path.attitude(np.array([0.0, duration_s]))[:, :, 0] * [1, 1, 0]

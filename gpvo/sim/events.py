@@ -19,7 +19,7 @@ from gpvo.types import Array
 
 LANE_M = 3.5
 _CAR, _LORRY = np.array([4.2, 1.8, 1.5]), np.array([11.0, 2.5, 3.5])
-_CAMERA_HEIGHT_M = 1.6
+CAMERA_HEIGHT_M = 1.6  # over the road
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def _car(way: _Way, rng: np.random.Generator) -> Body:
     position, heading = way.beside(arc, left_m)
     size = _LORRY if rng.random() < 0.4 else _CAR
     heading = heading + np.pi * (kind == "oncoming")
-    points = _box(size, int(10 ** rng.uniform(1.8, 3.3)), rng) - [0.0, 0.0, _CAMERA_HEIGHT_M]
+    points = _box(size, int(10 ** rng.uniform(1.8, 3.3)), rng) - [0.0, 0.0, CAMERA_HEIGHT_M]
     return Body(points, way.poses(position, heading, begin_s, begin_s + duration_s), solid=True)
 
 

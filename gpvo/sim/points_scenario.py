@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gpvo.cameras.rig import Tolerance
+from gpvo.cameras.rig import TOLERANCES, Tolerance
 from gpvo.errors import GpvoError
 from gpvo.sim import imu
 from gpvo.sim.events import CAUSES
@@ -69,7 +69,7 @@ SCENARIOS: dict[str, PointsScenario] = {
         camera=StereoCamera(300.0, 300.0, 319.5, 239.5, 0.064, 640, 480),
         imu="t265",
         sigma_px=0.25,
-        tolerance=Tolerance(baseline=0.01, focal=0.003, rotation_rad=5e-4),
+        tolerance=TOLERANCES["t265"],
     ),
     "street": PointsScenario(
         world="street",

@@ -261,7 +261,7 @@ def fly_one(scenario: Scenario, seed: int, out: Path, points: bool = False) -> F
 
 def fly(
     scenario: Scenario, seed: int, out: Path, points: bool = False, threads: int = 1,
-    on_frame: Callable[[], None] | None = None,
+    on_frame: Callable[[], None] = lambda: None,
 ) -> Flight:  # fmt: skip
     """One flight with images, a folder that stays if it is this very flight, or without, an ``.npz``, always written
     anew. Raises GpvoError where it goes wrong."""

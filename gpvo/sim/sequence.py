@@ -55,7 +55,7 @@ _TRUTH_HEAD = (
 
 
 def simulate(
-    scenario: Scenario, seed: int, out: str | Path, *, threads: int = 2, on_frame: Callable[[], None] | None = None
+    scenario: Scenario, seed: int, target: Path, *, threads: int = 2, on_frame: Callable[[], None] = lambda: None
 ) -> Flight:
     """Write a sequence folder; a finished one with the same scenario and seed is left as it is.
 
@@ -64,7 +64,6 @@ def simulate(
     or the folder holds something else. Raises MissingExtraError without the extra ``sim``.
     """
     require_pictures(scenario)
-    target = Path(out)
     resolved = to_toml({"seed": seed, **scenario.model_dump(), **_digests(scenario)})
     with _only_writer(target):
         if _is_finished(target, resolved):
@@ -76,7 +75,7 @@ def simulate(
         shutil.rmtree(part, ignore_errors=True)
         try:
             part.mkdir(parents=True)
-            frames, distance, drawn = _write(scenario, seed, part, threads, on_frame or (lambda: None))
+            frames, distance, drawn = _write(scenario, seed, part, threads, on_frame)
             (part / "scenario.toml").write_text(resolved + "\n" + to_toml({"drawn": drawn}), encoding="utf-8")
             if target.is_dir():
                 target.rmdir()
@@ -300,22 +299,19 @@ def _csv(path: Path, head: str, t_ns: NDArray[np.int64], rows: Array) -> None:
             file.write(f"{t}," + ",".join(f"{v:.12g}" for v in row) + "\n")
 
 
-def contact_sheet(sequence: str | Path, out: str | Path, rows: int = 3, columns: int = 2) -> Path:
-    """Write ``rows * columns`` pairs, left and right side by side and spread evenly over the sequence, as a PNG."""
-    mav = Path(sequence) / "mav0"
-    files = [sorted((mav / camera / "data").glob("*.png")) for camera in ("cam0", "cam1")]
+def contact_sheet(sequence: Path, out: Path) -> None:
+    """Write three rows of two pairs, left and right side by side and spread evenly over the sequence, as a PNG."""
+    files = [sorted((sequence / "mav0" / camera / "data").glob("*.png")) for camera in ("cam0", "cam1")]
     if not files[0]:
         raise GpvoError("holds no images", where=sequence)
     tiles = []
-    for k in np.linspace(0, len(files[0]) - 1, rows * columns).astype(int):
+    for k in np.linspace(0, len(files[0]) - 1, 6).astype(int):
         small = []
         for file in (side[k] for side in files):
             if (image := read_grey8(file)) is None:
                 raise GpvoError("is not an image", where=file)
             small.append(cv2.resize(image, (_WIDTH_PX, round(image.shape[0] * _WIDTH_PX / image.shape[1]))))
         tiles.append(np.pad(np.hstack(small), 2, constant_values=255))
-    sheet = np.vstack([np.hstack(tiles[r * columns : (r + 1) * columns]) for r in range(rows)])
-    target = Path(out)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
-    return target
+    sheet = np.vstack([np.hstack(tiles[k : k + 2]) for k in (0, 2, 4)])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())

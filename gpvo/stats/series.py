@@ -20,6 +20,7 @@ from gpvo.stats import student_t
 from gpvo.types import Array
 
 T = TypeVar("T")
+_LEVEL = 0.95  # of every interval
 
 
 def moving_sums(values: Array, m: int) -> Array:
@@ -89,7 +90,7 @@ class Doubt(Generic[T]):
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its two-sided bootstrap percentile interval."""
+    """A mean with its two-sided 95 % bootstrap percentile interval."""
 
     mean: float
     low: float
@@ -103,14 +104,8 @@ class Interval:
         low, high = (x if np.isfinite(x) else None for x in (self.low, self.high))
         return {"mean": self.mean, "low": low, "high": high}
 
-    def contains(self, value: float) -> bool:
-        """Whether ``value`` lies inside, ends included."""
-        return self.low <= value <= self.high
 
-
-def block_bootstrap(
-    values: Array, block: int | None = None, *, level: float = 0.95, draws: int = 2000, seed: int = 0
-) -> Interval:
+def block_bootstrap(values: Array, block: int | None = None, *, draws: int = 2000, seed: int = 0) -> Interval:
     """Interval for the mean of one autocorrelated series (n,), by circular blocks.
 
     ``block`` defaults to ``ceil(2 n^(1/3))``, at least 10 frames and three times as long as the series remembers, at
@@ -128,14 +123,14 @@ def block_bootstrap(
     # Sum of each circular block from a running sum, so that a draw costs n / block look-ups.
     block_mean = moving_sums(np.concatenate([values, values[:block]]), block)[:n] / block
     means = block_mean[rng.integers(0, n, (draws, per_draw))].mean(axis=1)
-    return _expanded(float(values.mean()), means, level, max(n // block, 4))
+    return _expanded(float(values.mean()), means, max(n // block, 4))
 
 
-def _expanded(mean: float, means: Array, level: float, k: int) -> Interval:
+def _expanded(mean: float, means: Array, k: int) -> Interval:
     """Interval from the ``means`` of draws of k blocks or sequences: as their spread is itself an estimate, percentiles
     are expanded by Student's t with k - 1 degrees of freedom (T. Hesterberg, "What teachers should know about the
     bootstrap", 2015, section 4.3)."""
-    outside = NormalDist().cdf(-student_t.quantile(level, k - 1) * math.sqrt(k / (k - 1)))
+    outside = NormalDist().cdf(-student_t.quantile(_LEVEL, k - 1) * math.sqrt(k / (k - 1)))
     low, high = np.quantile(means, [outside, 1 - outside])
     return Interval(mean, float(low), float(high))
 
@@ -162,17 +157,17 @@ _REACHED_BY = 5
 """Sequences whose draws reach the expanded percentiles."""
 
 
-def sequence_bootstrap(values: Array, *, level: float = 0.95, draws: int = 10000, seed: int = 0) -> Interval:
+def sequence_bootstrap(values: Array, *, draws: int = 10000, seed: int = 0) -> Interval:
     """Interval for the mean over sequences (n,): whole sequences are drawn with replacement.
 
     For a paired comparison pass the differences. Fewer than three sequences show no spread: (-inf, inf).
     """
     values = np.asarray(values, dtype=np.float64)
-    return bootstrap_over(len(values), lambda pick: values[pick].mean(axis=1), level=level, draws=draws, seed=seed)
+    return bootstrap_over(len(values), lambda pick: values[pick].mean(axis=1), draws=draws, seed=seed)
 
 
 def bootstrap_over(
-    n: int, statistic: Callable[[NDArray[np.int64]], Array], *, level: float = 0.95, draws: int = 10000, seed: int = 0
+    n: int, statistic: Callable[[NDArray[np.int64]], Array], *, draws: int = 10000, seed: int = 0
 ) -> Interval:
     """The same for any ``statistic`` (draws,) of n sequences, given the indices (draws, n) of those that were drawn.
 
@@ -184,6 +179,6 @@ def bootstrap_over(
         return Interval(value, -np.inf, np.inf)
     drawn = statistic(np.random.default_rng(seed).integers(0, n, (draws, n)))
     if n >= _REACHED_BY:
-        return _expanded(value, drawn, level, n)
-    half = student_t.quantile(level, n - 1) * math.sqrt(n / (n - 1)) * float(drawn.std())
+        return _expanded(value, drawn, n)
+    half = student_t.quantile(_LEVEL, n - 1) * math.sqrt(n / (n - 1)) * float(drawn.std())
     return Interval(value, value - half, value + half)

@@ -96,12 +96,6 @@ def test_chain_with_another_meaning_is_caught(write):
         read_camchain(write(camchain(chain=se3.inverse(T_RIGHT_LEFT))))
 
 
-def test_cameras_in_the_other_order(write):
-    text = camchain(chain=se3.inverse(T_RIGHT_LEFT))
-    rig = read_camchain(write(text), left="cam1", right="cam0")
-    np.testing.assert_allclose(rig.T_right_left, T_RIGHT_LEFT, atol=1e-12)
-
-
 @pytest.mark.parametrize("head", ["%YAML:1.0\n", "%YAML:1.0\n---\n", "%YAML 1.2\n---\n", "\ufeff", "# hello\n"])
 def test_headers_that_yaml_refuses(write, head):
     assert read_camchain(write(head + camchain())).baseline_m == pytest.approx(np.linalg.norm(T_RIGHT_LEFT[:3, 3]))

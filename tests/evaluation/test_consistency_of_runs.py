@@ -35,7 +35,7 @@ def test_an_honest_covariance_scores_one(honest):
         interval = c.nees_dof[block]
         assert interval is not None
         assert 0.9 < interval.mean < 1.1
-        assert interval.contains(1.0)
+        assert interval.low <= 1.0 <= interval.high
         assert interval.high - interval.low < 0.2
         # The truth of a simulation has no noise of its own.
         assert c.nees_dof_truth_noise[block] == pytest.approx(interval.mean)

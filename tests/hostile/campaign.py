@@ -148,7 +148,7 @@ def read_options(path: Path) -> None:
 
     for name, needed in NEEDED.items():
         command = commands()[name]
-        command.make_context(name, [*options_of_file(path, name, command), *needed])
+        command.make_context(name, [*options_of_file(path, name, commands()), *needed])
 
 
 @cache

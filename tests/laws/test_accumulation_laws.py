@@ -15,7 +15,7 @@ from gpvo.filters.measurement import Gate
 from gpvo.filters.propagation import CORE, Nominal
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import change_body
-from gpvo.publish.odometry import Floors, OdometryBuilder
+from gpvo.publish.odometry import OdometryBuilder
 from gpvo.types import MotionError, Prediction, Status, VoRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -99,7 +99,7 @@ def _assert_same(C: np.ndarray, expected: np.ndarray) -> None:
 def test_messages_state_what_adds_up(seed: int) -> None:
     made = _flight(seed)
     _, stated = along(made.T_prev_cur, made.errors, made.parent)
-    builder = OdometryBuilder(np.eye(4), floors=Floors(0.0, 0.0, 0.0, 0.0))
+    builder = OdometryBuilder(np.eye(4), floor=0.0)
     builder.step(made.records[0])
     for k, (record, error) in enumerate(zip(made.records[1:], made.errors[1:]), start=1):
         out = builder.step(record, error)
@@ -205,7 +205,7 @@ def test_the_published_sigma_never_falls_by_a_lost_frame() -> None:
     C = np.diag([4e-5, 4e-5, 4e-5, 1e-7, 1e-7, 1e-7])
     parts = {"mean": np.zeros(6), "persistent_root": np.zeros((6, 12)), "persistent_tau_s": np.ones(12), "dt_s": 0.1}
     sure = {"epistemic": np.zeros(6), "confidence": 1.0, "in_domain": 1.0}
-    builder, sigma, reference = OdometryBuilder(np.eye(4), floors=Floors(0.0, 0.0, 0.0, 0.0)), [], 0
+    builder, sigma, reference = OdometryBuilder(np.eye(4), floor=0.0), [], 0
     for k in range(1, 160):
         lost, t_ns = k == 150, k * 10**8
         status = Status.LOST if lost else Status.OK

@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from gpvo.publish.consumers import ArduPilotParameters, Px4Parameters
 from gpvo.publish.odometry import Odometry
 from gpvo.types import Array
+
+
+@dataclass(frozen=True)
+class Px4Parameters:
+    """PX4's parameters of external vision, at their defaults."""
+
+    EKF2_EV_NOISE_MD: int = 0
+    EKF2_EVP_NOISE: float = 0.1
+    EKF2_EVV_NOISE: float = 0.1
+    EKF2_EVA_NOISE: float = 0.1
+
+
+VISO_POS_M_NSE, VISO_YAW_M_NSE = 0.2, 0.2  # ArduPilot's defaults
 
 
 def px4_sigmas(odometry: Odometry, parameters: Px4Parameters | None = None) -> dict[str, Array]:
@@ -24,23 +38,20 @@ def px4_sigmas(odometry: Odometry, parameters: Px4Parameters | None = None) -> d
     return {k: np.maximum(v, floor[k]) for k, v in sent.items()}
 
 
-def ardupilot_errors(
-    pose_covariance: Array, parameters: ArduPilotParameters | None = None, *, before_2026: bool = False
-) -> tuple[float, float]:
+def ardupilot_errors(pose_covariance: Array, *, before_2026: bool = False) -> tuple[float, float]:
     """Position [m] and angle [rad] error that EKF3 takes from a pose covariance (6, 6), after its clamps.
 
     ``before_2026``: the cube root of the sum of squared variances, which is no standard deviation; since then the root
     of their sum. NaN in element 0 means unknown: the parameters are used.
     """
-    p = parameters or ArduPilotParameters()
     c = np.diagonal(pose_covariance)
     if np.isnan(c[0]):
-        return p.VISO_POS_M_NSE, p.VISO_YAW_M_NSE
+        return VISO_POS_M_NSE, VISO_YAW_M_NSE
     if before_2026:
         position, angle = np.cbrt((c[:3] ** 2).sum()), np.cbrt((c[3:] ** 2).sum())
     else:
         position, angle = np.sqrt(c[:3].sum()), np.sqrt(c[3:].sum())
-    return float(np.clip(position, p.VISO_POS_M_NSE, 100.0)), float(np.clip(angle, p.VISO_YAW_M_NSE, 1.5))
+    return float(np.clip(position, VISO_POS_M_NSE, 100.0)), float(np.clip(angle, VISO_YAW_M_NSE, 1.5))
 
 
 def robot_localization_covariance(covariance: Array) -> Array:

@@ -16,7 +16,7 @@ from gpvo.errors import GpvoError
 from gpvo.publish import consumers
 from gpvo.publish.mavlink import upper_triangle
 from gpvo.publish.odometry import Odometry, OdometryBuilder, lift, messages
-from receivers import ardupilot_errors, px4_sigmas, robot_localization_covariance
+from receivers import Px4Parameters, ardupilot_errors, px4_sigmas, robot_localization_covariance
 from synthetic_flights import ErrorLaw, synthetic_flight
 
 
@@ -41,7 +41,7 @@ def test_px4_reads_diagonals_and_floors_them(odometry: list[Odometry]) -> None:
 
 
 def test_px4_mode_one_ignores_the_message(odometry: list[Odometry]) -> None:
-    sigmas = px4_sigmas(odometry[0], consumers.Px4Parameters(EKF2_EV_NOISE_MD=1, EKF2_EVV_NOISE=0.3))
+    sigmas = px4_sigmas(odometry[0], Px4Parameters(EKF2_EV_NOISE_MD=1, EKF2_EVV_NOISE=0.3))
     np.testing.assert_array_equal(sigmas["velocity"], [0.3] * 3)
 
 
@@ -107,7 +107,7 @@ def test_check_of_the_others(odometry: list[Odometry]) -> None:
     loud = [replace(o, twist_covariance=np.eye(6) * 0.06**2) for o in odometry]
     assert consumers.check(loud, "ardupilot")[4].hidden_percent == 0.0
     assert all(v.hidden_percent == 0 for v in consumers.check(odometry, "robot_localization"))
-    lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9, 1e-9)) for o in odometry]
+    lifted = [replace(o, twist_covariance=lift(np.eye(6) * 1e-12, 1e-9)) for o in odometry]
     assert [v.hidden_percent for v in consumers.check(lifted, "robot_localization")] == [100.0, 0.0]
     with pytest.raises(GpvoError, match="unknown consumer"):
         consumers.check(odometry, "betaflight")

@@ -9,14 +9,14 @@ import pytest
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.geometry.se3 import R_FLU_OPTICAL
-from gpvo.publish.odometry import Floors, OdometryBuilder, lift, messages
+from gpvo.publish.odometry import LEAST_VARIANCE, OdometryBuilder, lift, messages
 from gpvo.types import Prediction, Status, VoRecord
 from synthetic_flights import ErrorLaw, Events, synthetic_flight
 
 from motion_errors import prediction
 
 MOUNT = se3.from_rt(R_FLU_OPTICAL @ se3.so3_exp(np.array([0.1, 0.2, 0.05])), np.array([0.4, 0.1, -0.2]))
-TINY = Floors(0.0, 0.0, 0.0, 0.0)
+TINY = 0.0
 
 
 def _prediction(t_ns: int, jitter: np.ndarray, white: np.ndarray, bias: np.ndarray, tau: float = 5.0) -> Prediction:
@@ -34,7 +34,7 @@ def test_twist_of_a_spinning_body_has_the_lever_arm_taken_out() -> None:
     T_cam = se3.inverse(MOUNT) @ T_body @ MOUNT
     record = VoRecord(10**8, 0, Status.OK, T_cam)
     C = _spd(np.random.default_rng(0), 1e-3)
-    out = OdometryBuilder(MOUNT, floors=TINY).step(record, _prediction(10**8, 0 * C, C, 0 * C))
+    out = OdometryBuilder(MOUNT, floor=TINY).step(record, _prediction(10**8, 0 * C, C, 0 * C))
     assert out.twist_body is not None
     np.testing.assert_allclose(out.twist_body, [1, 0, 0, *rate], atol=1e-9)
     A = se3.adjoint(MOUNT) @ se3.right_jacobian_inverse(se3.log(T_cam))
@@ -48,7 +48,7 @@ def test_accumulated_pose_covariance_against_monte_carlo(parts: tuple[float, flo
     n, frames, tau, dt = 4000, 15, 0.5, 0.1
     J, W, B = (s**2 * _spd(rng, 2e-3) for s in parts)
     motions = [se3.exp(np.array([0.02, 0.05, 0.3, 0.02, 0.1, -0.03]) * rng.uniform(0.5, 1.5)) for _ in range(frames)]
-    builder = OdometryBuilder(MOUNT, floors=TINY)
+    builder = OdometryBuilder(MOUNT, floor=TINY)
     truth = np.eye(4)
 
     def draw(C: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_accumulated_pose_covariance_against_monte_carlo(parts: tuple[float, flo
 
 def test_lost_frames_hold_the_pose_and_widen_it() -> None:
     flight = synthetic_flight(0, duration_s=6, events=Events(dark=(2.0, 4.0)))
-    out = list(messages(flight.records, flight.predictions, OdometryBuilder(floors=TINY)))
+    out = list(messages(flight.records, flight.predictions, OdometryBuilder(floor=TINY)))
     lost = [o for o in out if o.status is Status.LOST]
     assert len(lost) == 40
     assert all(o.twist_body is None and not o.tracked for o in lost)
@@ -94,7 +94,7 @@ def test_lost_frames_hold_the_pose_and_widen_it() -> None:
 def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
     C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
     guess = se3.exp(np.array([0.3, 0, 1.5, 0, 0, 0]))
-    builder = OdometryBuilder(floors=TINY)
+    builder = OdometryBuilder(floor=TINY)
     builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
     builder.step(VoRecord(10**8, 0, Status.OK, step), _prediction(10**8, 0 * C, C, 0 * C))
     # Lost for a second; the new beginning is placed by a guess that is half a metre off.
@@ -112,7 +112,7 @@ def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
 
 
 def test_a_restart_of_the_source_is_one_reset() -> None:
-    C, builder = 1e-6 * np.eye(6), OdometryBuilder(floors=TINY)
+    C, builder = 1e-6 * np.eye(6), OdometryBuilder(floor=TINY)
     builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
     # Nothing is known of what led from the last frame to a reference that follows none.
     unknown = VoRecord(10**9, 9 * 10**8, Status.LOST, np.eye(4), covariances={"triangulation": C})
@@ -124,7 +124,7 @@ def test_the_twist_of_a_large_turn_is_as_wrong_as_it_says() -> None:
     C, squares = np.diag([1e-4, 1e-4, 25e-4, 1e-6, 25e-6, 1e-6]), []
     for _ in range(400):
         record = VoRecord(10**9, 0, Status.OK, T @ se3.exp(np.linalg.cholesky(C) @ rng.standard_normal(6)))
-        out = OdometryBuilder(MOUNT, floors=TINY).step(record, _prediction(10**9, 0 * C, C, 0 * C))
+        out = OdometryBuilder(MOUNT, floor=TINY).step(record, _prediction(10**9, 0 * C, C, 0 * C))
         error = out.twist_body - se3.adjoint(MOUNT) @ se3.log(T)
         squares.append(error @ np.linalg.solve(out.twist_covariance, error) / 6)
     assert np.mean(squares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 6 / 400))
@@ -132,7 +132,7 @@ def test_the_twist_of_a_large_turn_is_as_wrong_as_it_says() -> None:
 
 def test_a_slip_that_only_the_model_sees_is_a_lost_frame() -> None:
     C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
-    builder = OdometryBuilder(floors=TINY)
+    builder = OdometryBuilder(floor=TINY)
     builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
     slip = replace(_prediction(10**8, 0 * C, np.eye(6), 0 * C), status=Status.LOST)
     out = builder.step(VoRecord(10**8, 0, Status.OK, se3.exp(np.array([0, 0, 2.0, 0, 0, 0]))), slip)
@@ -146,7 +146,7 @@ def test_a_slip_that_only_the_model_sees_is_a_lost_frame() -> None:
 
 def test_a_vehicle_at_rest_against_one_reference_does_not_drift() -> None:
     C = 1e-6 * np.eye(6)
-    builder = OdometryBuilder(floors=TINY)
+    builder = OdometryBuilder(floor=TINY)
     builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
     first = last = None
     for k in range(1, 200):
@@ -165,7 +165,7 @@ def test_a_mean_is_part_of_the_error_and_moves_nothing() -> None:
     C, mean = 1e-6 * np.eye(6), np.array([0, 0, 0.01, 0, 0, 0])
     record = VoRecord(10**8, 0, Status.OK, se3.exp(np.array([0, 0, 0.1, 0, 0, 0])))
     said = _prediction(record.t_ns, 0 * C, C, 0 * C)
-    plain, leaning = (OdometryBuilder(floors=TINY).step(record, p) for p in (said, replace(said, mean=mean)))
+    plain, leaning = (OdometryBuilder(floor=TINY).step(record, p) for p in (said, replace(said, mean=mean)))
     np.testing.assert_array_equal(leaning.twist_body, plain.twist_body)
     assert plain.twist_covariance is not None
     assert leaning.twist_covariance is not None
@@ -176,7 +176,7 @@ def test_a_mean_is_part_of_the_error_and_moves_nothing() -> None:
 def test_a_mean_adds_up_along_the_path() -> None:
     """The error of the pose over that of one motion is the mean's number of motions, as the mean is the same in all."""
     zero, step, mean = np.zeros((6, 6)), se3.exp(np.array([0, 0, 0.1, 0, 0.02, 0])), np.array([0, 0, 1e-3, 0, 2e-5, 0])
-    C, builder, estimate = 1e-12 * np.eye(6), OdometryBuilder(np.eye(4), floors=TINY), np.eye(4)
+    C, builder, estimate = 1e-12 * np.eye(6), OdometryBuilder(np.eye(4), floor=TINY), np.eye(4)
     for k in range(1, 101):
         estimate = estimate @ step @ se3.exp(mean)
         stated = replace(_prediction(k * 10**8, zero, C, zero), mean=mean)
@@ -190,7 +190,7 @@ def test_a_mean_adds_up_along_the_path() -> None:
 
 def test_at_rest_against_one_reference_a_mean_cancels() -> None:
     zero, C, mean = np.zeros((6, 6)), 1e-6 * np.eye(6), np.array([0.01, 0, 0, 0, 0, 0])
-    builder = OdometryBuilder(np.eye(4), floors=TINY)
+    builder = OdometryBuilder(np.eye(4), floor=TINY)
     builder.step(VoRecord(0, 0, Status.START, np.eye(4)))
     for k in range(1, 4):
         stated = replace(_prediction(k * 10**8, zero, C, zero), mean=mean)
@@ -201,17 +201,17 @@ def test_at_rest_against_one_reference_a_mean_cancels() -> None:
 
 def test_floors_lift_variances_and_keep_it_positive_definite() -> None:
     C = _spd(np.random.default_rng(1), 1e-6)
-    out = lift(C, 1e-6, 1e-4)
+    out = lift(C, np.repeat([1e-6, 1e-4], 3))
     assert (np.diagonal(out) >= [1e-6] * 3 + [1e-4] * 3).all()
     np.linalg.cholesky(out)
-    np.testing.assert_allclose(lift(np.eye(6), 1e-6, 1e-6), np.eye(6))
+    np.testing.assert_allclose(lift(np.eye(6), 1e-6), np.eye(6))
 
 
 def test_floors_hide_no_prediction_of_a_slow_or_tiny_rig() -> None:
     """A frame a second turns by 6e-5 rad/s of error, a baseline of a millimetre errs by micrometres."""
     C, record = np.diag([6e-5**2] * 6), VoRecord(10**9, 0, Status.OK, np.eye(4))
     plain, floored = (
-        OdometryBuilder(floors=f).step(record, _prediction(10**9, 0 * C, C, 0 * C)) for f in (TINY, Floors())
+        OdometryBuilder(floor=f).step(record, _prediction(10**9, 0 * C, C, 0 * C)) for f in (TINY, LEAST_VARIANCE)
     )
     np.testing.assert_allclose(floored.twist_covariance, plain.twist_covariance)
     np.testing.assert_allclose(floored.pose_covariance, plain.pose_covariance)
@@ -236,7 +236,7 @@ def test_every_covariance_of_a_bursty_flight_is_positive_definite() -> None:
 def test_the_pose_of_a_wrong_calibration_is_right_again_at_home() -> None:
     rng = np.random.default_rng(4)
     L, C, zero = rng.standard_normal((6, 6)) * 1e-2, _spd(rng, 1e-3), np.zeros((6, 6))
-    builder = OdometryBuilder(np.eye(4), floors=TINY)
+    builder = OdometryBuilder(np.eye(4), floor=TINY)
     for k in range(1, 9):
         stated = prediction(k * 10**8, zero, C, zero, 5.0, L if k % 2 else -L, np.inf)
         out = builder.step(VoRecord(k * 10**8, (k - 1) * 10**8, Status.OK, np.eye(4)), stated)

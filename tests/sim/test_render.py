@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -95,10 +96,8 @@ def test_motion_is_the_mean_over_the_exposure() -> None:
 
 def test_the_head_lamp_lights_what_is_ahead_and_near() -> None:
     def lamp_light(distance: float) -> np.ndarray:
-        dark, lit = (
-            StereoRenderer(wall(distance), PINHOLE, PINHOLE, T_RIGHT_LEFT, threads=1, head_lamp=power)
-            for power in (0.0, 3.0)
-        )
+        worlds = (replace(wall(distance), lighting=Lighting(0.5, power)) for power in (0.0, 3.0))
+        dark, lit = (StereoRenderer(world, PINHOLE, PINHOLE, T_RIGHT_LEFT, threads=1) for world in worlds)
         return lit.render(np.eye(4))[0] - dark.render(np.eye(4))[0]
 
     near, far = lamp_light(4.0), lamp_light(8.0)

@@ -25,9 +25,7 @@ class StereoRenderer:
     left, right : lens models of the two cameras; they may differ.
     T_right_left : (4, 4) maps points of the left camera to the right one (x translation is minus the baseline).
     threads : how many; the images are the same to the bit for any number.
-    head_lamp : radiant intensity of a lamp at each camera; by default that of the world.
     max_angle_rad : half the field of view; pixels beyond it are black, as behind the rim of a fisheye.
-    far_m : nothing beyond this distance is drawn.
 
     Raises MissingExtraError where numba is not installed.
     """
@@ -40,19 +38,16 @@ class StereoRenderer:
         T_right_left: Array,
         *,
         threads: int = 2,
-        head_lamp: float | None = None,
         max_angle_rad: float = np.deg2rad(82.0),
-        far_m: float = 500.0,
     ) -> None:
         require("numba")
         from gpvo.sim.render.draw import Drawer
 
         scene = Scene.of(world)
-        lamp = world.lighting.head_lamp if head_lamp is None else head_lamp
-        self._lights = np.array([world.lighting.ambient, lamp])
+        self._lights = np.array([world.lighting.ambient, world.lighting.head_lamp])
         tables = [RayTable.of(model, max_angle_rad) for model in (left, right)]
         bands = max(1, (threads + 1) // 2)
-        self._left, self._right = (Drawer(scene, table, far_m, bands) for table in tables)
+        self._left, self._right = (Drawer(scene, table, bands) for table in tables)
         self._T_left_right = np.linalg.inv(np.asarray(T_right_left, dtype=np.float64))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self.mask_left, self.mask_right = (table.valid for table in tables)

@@ -12,6 +12,7 @@ from gpvo.sim.render.scene import RayTable, Scene
 from gpvo.types import Array
 
 _MOST_TAPS = 3
+_FAR_M = 500.0  # nothing beyond is drawn
 
 
 class Drawer:
@@ -20,8 +21,8 @@ class Drawer:
     ``radiance`` and ``depth`` (H, W) float32 hold the last image.
     """
 
-    def __init__(self, scene: Scene, table: RayTable, far_m: float, bands: int) -> None:
-        self._scene, self._table, self._far = scene, table, float(far_m)
+    def __init__(self, scene: Scene, table: RayTable, bands: int) -> None:
+        self._scene, self._table = scene, table
         H, W = table.valid.shape
         edges = np.linspace(0, H, bands + 1).astype(int)
         self.bands = list(pairwise(edges.tolist()))
@@ -40,7 +41,7 @@ class Drawer:
         self._P = np.ascontiguousarray(T_world_cam[:3, 3])
         s, t = self._scene, self._table
         n = raster.cull(
-            s.sphere, s.cone, self._R, self._P, t.reach, t.max_angle_rad, self._far, self._index, self._distance
+            s.sphere, s.cone, self._R, self._P, t.reach, t.max_angle_rad, _FAR_M, self._index, self._distance
         )
         order = np.argsort(self._distance[:n], kind="stable")
         self._order, self._near = self._index[order], self._distance[order]
