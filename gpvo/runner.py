@@ -120,7 +120,7 @@ def run(
         if frames == 0:
             raise SourceError("no readable stereo pair", where=source.path, cure="look at the images of both cameras")
         state = odometry.rig_error.state
-        write_json(writer.path / STATE_FILE, document(state, source.camera))
+        write_json(writer.path / STATE_FILE, document(state, source.camera, calibration_state))
         wrong = findings(state, source.camera)
         summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report), wrong)
         writer.note(source_report=source.report.as_dict(), summary=asdict(summary))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, cell, new_table, numbers, print_json, say, show
+from gpvo.cli.output import Json, cell, new_table, numbers, print_json, progress, say, show
 from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
 from gpvo.files import in_metres
@@ -179,14 +179,16 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
     """``unjudged``: runs without truth are shown instead of refused."""
     from gpvo.evaluation.evaluate import evaluate_run, unjudged_run
 
-    options = judge.options()
-    loaded, predictor = _loaded(runs, judge)
-    for run in loaded:
-        _warn_of_misfits(judge.model, predictor, run)
-    return [
-        unjudged_run(run, predictor) if unjudged and run.truth is None else evaluate_run(run, predictor, options)
-        for run in loaded
-    ]
+    options, found = judge.options(), []
+    with progress("runs", len(runs)) as advance:
+        loaded, predictor = _loaded(runs, judge)
+        for run in loaded:
+            _warn_of_misfits(judge.model, predictor, run)
+        for run in loaded:
+            alone = unjudged and run.truth is None
+            found.append(unjudged_run(run, predictor) if alone else evaluate_run(run, predictor, options))
+            advance()
+    return found
 
 
 def _warn_of_misfits(model: Path | None, predictor: Predictor | None, run: Run) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, one_of, print_json, say
+from gpvo.cli.output import Json, one_of, print_json, progress, say
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
 
 
@@ -135,7 +135,8 @@ def publish(
     """
     from gpvo.publish.job import PublishSettings, publish_run
 
-    result = publish_run(run, PublishSettings(**vars(options)))
+    with progress("runs", 1):
+        result = publish_run(run, PublishSettings(**vars(options)))
     if json_:
         print_json(result.document())
     else:

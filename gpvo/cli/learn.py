@@ -13,7 +13,7 @@ import typer
 from gpvo.cli.common import is_given, refuse_twice
 from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
-from gpvo.dataset.errors import outweighed_by_truth
+from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
 from gpvo.files import read_json
 from gpvo.io.run import Run, read_run
@@ -144,6 +144,11 @@ def _each_once(paths: list[Path], config: TrainConfig, noisy: list[str]) -> Iter
                 note(
                     f"gpvo: odometry and truth of {path} contradict each other, and a model learns that as the"
                     f" odometry's error; 'gpvo evaluate {path}' says in what"
+                )
+            if made_from_odometry(motion_errors(run.log, truth), run.log):
+                note(
+                    f"gpvo: the truth of {path} seems to be made from odometry, as by closing loops: the model learns"
+                    " hardly any noise from it"
                 )
         yield run
         if config.target == "frame" and run.truth is not None and outweighed_by_truth(run.log, run.truth):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from gpvo.cli.output import Json, new_table, print_json, say, show
+from gpvo.cli.output import Json, new_table, print_json, progress, say, show
 from gpvo.errors import GpvoError
 from gpvo.files import make_folder, replacing, write_csv
 from gpvo.io.parquet import write_table
@@ -47,14 +47,16 @@ def predict(
     if len(runs) > 1 and out.is_file():
         raise GpvoError("is a file", where=out, cure="give a folder for the predictions of several runs")
     predictor, documents = Predictor.load(model), []
-    for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
-        predictions = list(predictor.replay(read_run(path).log).values())
-        target = out if len(runs) == 1 else out / f"{name}.parquet"
-        if target.exists() and target.name in FILES and target.name != "predictions.parquet":
-            raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
-        make_folder(target.parent)
-        write_predictions(target, predictions)
-        documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
+    with progress("runs", len(runs)) as advance:
+        for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
+            predictions = list(predictor.replay(read_run(path).log).values())
+            target = out if len(runs) == 1 else out / f"{name}.parquet"
+            if target.exists() and target.name in FILES and target.name != "predictions.parquet":
+                raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")
+            make_folder(target.parent)
+            write_predictions(target, predictions)
+            documents.append({"run": str(path), "file": str(target), **_summary(predictions)})
+            advance()
     if json_:
         print_json({"schema": 1, **({"runs": documents} if len(runs) > 1 else documents[0])})
         return
@@ -85,7 +87,8 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
     """
     from gpvo.dataset.check import check as check_model
 
-    found = check_model(Predictor.load(model), read_run(run))
+    with progress("runs", 1):
+        found = check_model(Predictor.load(model), read_run(run))
     if json_:
         print_json({"schema": 1, "fits": found.fits, **asdict(found)})
     else:

@@ -29,6 +29,9 @@ _MAX_LAG1 = -0.4
 """White noise has a correlation of -0.75 there; what an odometry smooths away of a real motion has less."""
 _EVEN_DT = 0.2
 _OUTLIER = 6.0
+_SAME = 3e-4
+"""Of the motion: what odometry and truth differ by from one motion to the next if one was made from the other. Graphs
+that close loops leave 1e-5 (on the road, with four decimals, 1e-4); cameras and truths of their own over 5e-3."""
 _MIN_WINDOWS = 10
 _NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's extent, what it has across
 
@@ -254,6 +257,19 @@ def estimate_truth_noise(errors: MotionErrors, log: VoLog) -> Array:
         if variance.low > 0 and power > _MIN_SHARE * np.mean(u[good] ** 2) and neighbours < _MAX_LAG1 * power:
             sigma[axis] = np.sqrt(variance.mean)
     return sigma
+
+
+def made_from_odometry(errors: MotionErrors, log: VoLog) -> bool:
+    """Whether the truth seems to be the odometry's own path, as closing loops bends it.
+
+    That spreads a drift evenly over the motions, so that the errors show it, but none of the odometry's noise: from one
+    motion to the next, the two agree better than any two measurements do.
+    """
+    lacks = _high_passed(errors, log)[1][:, :3]
+    if len(lacks) < _MIN_ROWS:
+        return False
+    differ = np.median(np.linalg.norm(lacks, axis=1)) / np.sqrt(comb(2 * (_ORDER - 1), _ORDER - 1))
+    return bool(differ < _SAME * np.median(np.linalg.norm(errors.T_true[:, :3, 3], axis=1)))
 
 
 def _high_passed(errors: MotionErrors, log: VoLog) -> tuple[Array, Array, NDArray[np.int64]]:

@@ -36,6 +36,8 @@ UNITS = {"translation_m": "translation", "rotation_rad": "rotation"}
 _SCORED = ("nees_dof_median", "coverage", "nll_per_dim", "nll_stated_per_dim", "nees_dof_median_stated", "crps")
 
 HORIZONS_M = (1.0, 10.0, 100.0)
+TOO_FAR = 2.5
+"""Times a span: where frames are sparser than it, or missing, what lies between two of them is not called by it."""
 _MAX_WINDOWS = 60
 # Times that are sums of a frame period must not miss the round number.
 _HAIR = 1 - 1e-9
@@ -223,7 +225,7 @@ def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float)
             continue
         chain, last = _window(start, parent, usable, leads_on, progress, span)
         stops = start if chain else last
-        if chain and known[chain[-1]]:
+        if chain and known[chain[-1]] and progress[chain[-1]] - progress[start] < TOO_FAR * span:
             t_next = float(progress[start]) + stride
             yield chain
 

@@ -53,8 +53,8 @@ def document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     * ``unlike`` {``scale``, ``motion``, ``turn``, ``path``}: how little odometry and truth resemble each other
       (:class:`gpvo.dataset.misread.Resemblance`), None where they do.
     * ``rpe`` {``frame``, ``1s``, ``10m``}: relative pose error over one frame, a second and ten metres of path, each
-      {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs of a
-      frame or a second do not reach across a gap in the truth.
+      {``translation_m``, ``rotation_rad``} with rmse, mean, median, std, min, max and the count of pairs. Pairs do not
+      reach across a gap in the truth, nor over more than 2.5 times the span.
 
     For each method, besides NEES, coverage, NLL and CRPS:
 

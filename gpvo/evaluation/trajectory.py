@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.evaluation.consistency import Consistency
+from gpvo.evaluation.consistency import TOO_FAR, Consistency
 from gpvo.filters.metrics import ate_rmse, umeyama
 from gpvo.geometry import se3
 from gpvo.stats.consistency import marginal, nees_by_block, seen_axes
@@ -107,12 +107,15 @@ def pairs_ahead(
     progress: NDArray[Any], step: float, every: int = 1, frame: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of poses ``step`` apart in a growing quantity (N,): every n-th start, and the first pose at least that
-    far on. ``frame`` (N,): number of each pose in the run; pairs with a left-out pose between them are dropped."""
+    far on, if that is not :data:`TOO_FAR` times as far. ``frame`` (N,): number of each pose in the run; pairs with a
+    left-out pose between them are dropped."""
     start = np.arange(0, len(progress), every)
     # A hair of slack: times that are sums of a frame period must not miss the round number.
     end = np.searchsorted(progress, progress[start] + step * (1 - 1e-9), side="left")
     inside = end < len(progress)
     start, end = start[inside], end[inside]
+    near = progress[end] - progress[start] < TOO_FAR * step
+    start, end = start[near], end[near]
     whole = slice(None) if frame is None else frame[end] - frame[start] == end - start
     return start[whole], end[whole]
 

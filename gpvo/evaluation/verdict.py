@@ -13,6 +13,7 @@ from gpvo.dataset.check import ENOUGH_INSIDE
 from gpvo.dataset.errors import (
     MAX_GAP_S,
     interpolated_between,
+    made_from_odometry,
     steps_of_slow_truth,
     turn_without_truth_deg,
     without_held,
@@ -67,6 +68,11 @@ def _why_blind(e: Evaluation) -> str:
         return (
             f"The truth holds no attitude (it never turns, but odometry does, by up to {turn_deg:.0f} deg):"
             " only the ATE is valid."
+        )
+    if made_from_odometry(e.errors, e.run.log):
+        return (
+            "From one motion to the next, odometry and truth agree as no two measurements do, so nothing can be judged:"
+            " was the truth made from odometry, as by closing loops?"
         )
     if len(e.errors.index) < 2 and e.run.log.methods and e.poses is None:
         return "Fewer than two motions have ground truth at both ends, so no covariance can be judged."

@@ -164,6 +164,9 @@ def guess(path: str | Path) -> str:
         raise SourceError(
             "is a run, not a sequence", where=p, cure="gpvo evaluate, train and fuse take runs as they are"
         )
+    if runs := sorted(inside.parent.name for inside in p.glob("*/run.json")):
+        more = f" and {len(runs) - 3} more" if len(runs) > 3 else ""
+        raise SourceError(f"holds runs, not a sequence: {', '.join(runs[:3])}{more}", where=p, cure="give one of them")
     raise SourceError(
         "not recognised as a stereo sequence",
         where=p,

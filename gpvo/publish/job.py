@@ -92,8 +92,7 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     odometry = odometry_of(run, predictions, settings)
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
     verdicts = consumers.check(odometry, consumer) if settings.check else []
-    only_check = settings.check and not (settings.to or settings.out or settings.link)
-    out, count = (None, 0) if only_check else _write(run, odometry, settings)
+    out, count = (None, 0) if settings.to is None else _write(run, odometry, settings)
     source = "the model" if settings.model or predictions else settings.method
     lost = sum(not o.tracked for o in odometry)
     outside = sum(mavlink.quality(o) < 0 for o in odometry) - lost
@@ -114,8 +113,8 @@ def odometry_of(run: Run, predictions: Mapping[int, Prediction], settings: Publi
 
 
 def _target(settings: PublishSettings) -> str | None:
-    """What to write: ``to``, else what the name of the output tells. GpvoError where they contradict each other, or its
-    suffix tells nothing."""
+    """What to write: ``to``, else what the name of the output tells, else a bag; None where nothing is written.
+    GpvoError where they contradict each other, or its suffix tells nothing."""
     told = None if settings.out is None else _SUFFIXES.get(settings.out.suffix.lower())
     if settings.to in TARGETS and told not in (None, settings.to):
         raise GpvoError(
@@ -124,7 +123,8 @@ def _target(settings: PublishSettings) -> str | None:
     if settings.out is not None and settings.out.suffix and not (settings.to or told):
         cure = f"end it in {', '.join(_SUFFIXES)}, or say with --to what to write"
         raise GpvoError("its suffix does not tell what to write", where=settings.out, cure=cure)
-    return settings.to or told
+    only_check = settings.check and not (settings.out or settings.link)
+    return settings.to or told or (None if only_check else "bag")
 
 
 def _require(settings: PublishSettings) -> None:
@@ -162,7 +162,7 @@ def _write(run: Run, odometry: Sequence[Odometry], settings: PublishSettings) ->
         return str(out), mavlink.write_tlog(out, odometry, system=settings.system)
     if all(o.twist_body is None for o in odometry):
         raise GpvoError("no frame has a motion: nothing to put into a bag", where=run.path)
-    kind = settings.to or "bag"
+    kind = settings.to
     out = settings.out or Path(f"{run.name}_{kind}")
     ros1 = kind == "bag" and out.suffix.lower() == ".bag"
     count = ros.write_bag(out, odometry, settings.topic, "mcap" if kind == "mcap" else "ros1" if ros1 else "sqlite3")

@@ -27,7 +27,7 @@ from gpvo.twin.noise import Neighbours, Structure, adjust, draw_signs, without_l
 from gpvo.types import Array, ImuLog, Mounting, StereoCamera, TrackFrame, TruthLog, VoRecord
 from gpvo.vo.config import VoConfig
 from gpvo.vo.rig_error import N_TERMS, RigError, RigState, principal_errors
-from gpvo.vo.rig_findings import STATE_FILE, read_state
+from gpvo.vo.rig_findings import STATE_FILE, read_start, read_state
 
 MIN_POINTS = 12
 """A run whose median motion has fewer inliers is refused: path, landmarks and noise cannot be told apart."""
@@ -38,7 +38,7 @@ class Original:
     """A run with its structure. ``noise_px`` (M, 3): residuals of the observations as large as the noise was;
     ``neighbours``: which tracks may err alike; ``common``: how all err alike; ``first`` (M,) the first observation of
     each track; ``repeats`` (F,) frames that repeat the one before. ``rig``: what odometry found of its calibration's
-    errors; measurements are ``seen`` without them."""
+    errors; measurements are ``seen`` without them. ``start``: what was known of these before, None if nothing."""
 
     run: Run
     config: VoConfig
@@ -50,6 +50,7 @@ class Original:
     common: CommonField
     first: NDArray[np.bool_]
     repeats: NDArray[np.bool_]
+    start: RigState | None = None
 
 
 def estimate(path: Path) -> Original:
@@ -80,7 +81,8 @@ def estimate(path: Path) -> Original:
     neighbours = Neighbours.of(seen, structure)
     noise = _noise(seen, structure)
     common = CommonField.of(seen, structure, noise, drawn_signs(len(structure.points_world), neighbours), t_ns)
-    return Original(run, config_of(path), rig, seen, structure, noise, neighbours, common, first, repeats)
+    start = read_start(path, camera)
+    return Original(run, config_of(path), rig, seen, structure, noise, neighbours, common, first, repeats, start)
 
 
 def _refuse_too_few(frame: NDArray[np.int64], path: Path) -> None:
@@ -243,7 +245,9 @@ def _make_twin(original: Original, settings: TwinSettings, replicate: int, out: 
         assert truth is not None
         return restated(conditions.amend(record), truth, factor)
 
-    run_odometry(source, out / source.name, original.config, amend=amend, meta={"twin": about})
+    run_odometry(
+        source, out / source.name, original.config, calibration_state=original.start, amend=amend, meta={"twin": about}
+    )
     return out / source.name
 
 

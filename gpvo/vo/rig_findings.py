@@ -79,8 +79,8 @@ def findings(state: RigState, camera: StereoCamera) -> list[str]:
     return lines
 
 
-def document(state: RigState, camera: StereoCamera) -> dict[str, Any]:
-    """The state in plain numbers, for the file beside a run."""
+def document(state: RigState, camera: StereoCamera, start: RigState | None = None) -> dict[str, Any]:
+    """The state in plain numbers, for the file beside a run, with that of an earlier run from which it started."""
     return {
         "schema": 1,
         "terms": _NAMES,
@@ -89,7 +89,7 @@ def document(state: RigState, camera: StereoCamera) -> dict[str, Any]:
         "probability": state.probability,
         "camera_px": _camera_px(camera),
         "findings": findings(state, camera),
-    }
+    } | ({} if start is None else {"start": document(start, camera)})
 
 
 def _camera_px(camera: StereoCamera) -> list[float]:
@@ -99,7 +99,17 @@ def _camera_px(camera: StereoCamera) -> list[float]:
 def read_state(path: Path, camera: StereoCamera) -> RigState:
     """The state of a file, or of a run folder. Raises SourceError where it is damaged, or of another camera."""
     path = path / STATE_FILE if path.is_dir() else path
-    read = read_json(path)
+    return _state_of(read_json(path), path, camera)
+
+
+def read_start(path: Path, camera: StereoCamera) -> RigState | None:
+    """The state that the run of a folder started from, None from nothing. Raises SourceError as :func:`read_state`."""
+    path = path / STATE_FILE
+    start = read_json(path).get("start") if path.is_file() else None
+    return None if start is None else _state_of(start, path, camera)
+
+
+def _state_of(read: dict[str, Any], path: Path, camera: StereoCamera) -> RigState:
     try:
         place = np.array([_NAMES.index(name) for name in read["terms"]])
         read_mean, read_covariance = np.array(read["mean"], np.float64), np.array(read["covariance"], np.float64)

@@ -174,6 +174,23 @@ def test_several_runs_are_predicted_and_judged_together(tmp_path: Path):
     assert "mean of the 2 runs: too few for an interval" in two
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("evaluate", UNSEEN, "--json"), ("predict", MODEL, UNSEEN, "-o", "out.parquet"), ("check", MODEL, UNSEEN),
+     ("publish", UNSEEN, "-o", "out", "--json")],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_what_takes_minutes_of_a_long_run_shows_on_a_terminal_that_it_works(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    assert "runs" not in call(*words, folder=tmp_path).stderr
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    done = call(*words, folder=tmp_path)
+    assert "runs" in done.stderr
+    assert "0/1" not in done.stdout
+
+
 def test_a_model_that_does_not_fit_is_named_at_once_and_at_the_end(tmp_path: Path):
     from dataclasses import replace
 

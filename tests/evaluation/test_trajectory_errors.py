@@ -124,3 +124,17 @@ def test_statistics():
     assert (s.mean, s.median, s.std, s.min, s.max, s.count) == (3.5, 3.5, 0.5, 3.0, 4.0, 2)
     assert s.rmse == pytest.approx(np.sqrt(12.5))
     assert np.isnan(Statistics.of(np.empty(0)).rmse)
+
+
+def test_over_a_gap_of_the_frames_nothing_is_called_a_second_or_ten_metres():
+    """Nor where all frames are sparser: the errors of what lies between would be those of something longer."""
+    T, t_ns = se3.exp(np.outer(np.arange(400), [0, 0, 0.3, 0, 0, 0])), np.arange(400) * 100_000_000
+    estimate = se3.exp(np.outer(np.arange(400), [0, 0, 0.303, 0, 0, 0]))
+    kept = np.r_[:150, 250:400]
+    found = trajectory_errors(t_ns[kept], estimate[kept], T[kept], (10.0,))
+    assert found.rpe_second.translation_m.max == pytest.approx(0.03)
+    assert found.rpe_10m.translation_m.max == pytest.approx(0.102)
+    assert found.segments[0].translation_percent == pytest.approx(1.02)
+    sparse = trajectory_errors(t_ns[::100], estimate[::100], T[::100], (10.0, 30.0))
+    assert sparse.rpe_second.translation_m.count == sparse.rpe_10m.translation_m.count == 0
+    assert [s.count for s in sparse.segments] == [0, 1]

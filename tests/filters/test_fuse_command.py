@@ -225,11 +225,9 @@ def test_publish_writes(runs: list[Path], tmp_path: Path, to: str, name: str) ->
 
 @pytest.mark.parametrize(
     "name, kind, ending",
-    [("x.bag", "bag", ".bag"), ("x.mcap", "mcap", ".mcap"), ("x.tlog", "mavlink", ".tlog"), ("x", None, ".db3")],
+    [("x.bag", "bag", ".bag"), ("x.mcap", "mcap", ".mcap"), ("x.tlog", "mavlink", ".tlog"), ("x", "bag", ".db3")],
 )
-def test_the_name_tells_what_to_publish(
-    runs: list[Path], tmp_path: Path, name: str, kind: str | None, ending: str
-) -> None:
+def test_the_name_tells_what_to_publish(runs: list[Path], tmp_path: Path, name: str, kind: str, ending: str) -> None:
     if kind == "mavlink":
         pytest.importorskip("pymavlink")
     out = json.loads(_run("publish", runs[0], "-o", tmp_path / name, "--json"))

@@ -406,6 +406,8 @@ def test_nothing_there_and_nothing_known(tmp_path):
     (tmp_path / "run" / "run.json").write_text("{}")
     with pytest.raises(SourceError, match="is a run, not a sequence .*gpvo evaluate"):
         open_source(tmp_path / "run")
+    with pytest.raises(SourceError, match="holds runs, not a sequence: run .give one of them"):
+        open_source(tmp_path)
     with pytest.raises(SourceError, match="unknown source 'x'"):
         open_source(tmp_path, kind="x")
     with pytest.raises(SourceError, match="no option 'colour'"):

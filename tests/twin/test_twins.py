@@ -19,6 +19,7 @@ from gpvo.twin.replicate import TwinSettings, estimate, make_twins, read_toleran
 from gpvo.types import StereoCamera
 from gpvo.vo.config import VoConfig
 from gpvo.vo.rig_error import N_TERMS, RigState
+from gpvo.vo.rig_findings import read_start, read_state
 from typer.testing import CliRunner
 
 
@@ -159,6 +160,18 @@ def test_a_run_without_self_calibration_has_twins_turned_by_the_tolerance(flown,
 
 
 @pytest.mark.slow
+def test_twins_know_of_their_rig_at_first_what_their_run_did(flown, tmp_path):
+    flight, camera = open_source(flown[0] / "flight.npz"), flown[1].log.camera
+    known = read_state(flown[0] / "run", camera)
+    run(flight, tmp_path / "run", keep_tracks=True, calibration_state=known)
+    [twin] = make_twins(tmp_path / "run", tmp_path / "twins", TwinSettings(replicates=1))
+    assert read_start(flown[0] / "run", camera) is None
+    for path in (tmp_path / "run", twin):
+        start = read_start(path, camera)
+        np.testing.assert_allclose(start.mean, known.mean)
+        np.testing.assert_allclose(start.covariance, known.covariance, atol=1e-12)
+
+
 def test_ratios_of_real_errors_to_those_that_twins_predict(flown, tmp_path):
     folder, real, _ = flown
     made = gpvo("twin", folder / "run", "--against", "--replicates", 3, "--json")
