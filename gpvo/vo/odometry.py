@@ -265,7 +265,8 @@ class StereoOdometry:
             otherwise = otherwise + lateness_covariance(self.pair.late, T_prev_cur)
         elif config.self_calibration:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
-            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px)
+            # Other doubts may come from the rig's own errors, which only learning ends.
+            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px, believed=motion.converged)
         return replace(
             record,
             T_prev_cur=T_prev_cur,

@@ -157,9 +157,11 @@ class RigError:
             rows = np.abs(row_error - row_expected) <= max_row_error_px + 3.0 * sigma
             return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
 
-    def update(self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float) -> Array:
+    def update(
+        self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float, *, believed: bool = True
+    ) -> Array:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
-        (M,).
+        (M,). One that is not ``believed`` teaches rows alone, which need no motion: what it teaches lasts.
 
         Returns
         -------
@@ -182,7 +184,7 @@ class RigError:
         if self._learn:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = np.tile(motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px, 3)
-            if near.sum() >= 3 * 8:
+            if believed and near.sum() >= 3 * 8:
                 self._learn_disparities(A[near], B[near])
             self._learn_rows(phi * self._camera.fy_px, row_error)
             self._conclude()
