@@ -98,6 +98,11 @@ def flicker(k: int, f: StereoFrame) -> StereoFrame:
     return _both(f, lambda i: _table(i, lambda g: 0.5 * g)) if k % 3 == 0 else f
 
 
+def right_blurred(k: int, f: StereoFrame) -> StereoFrame:
+    """The right image blurred over 21 columns."""
+    return replace(f, right=np.asarray(cv2.blur(f.right, (21, 1)), np.uint8))
+
+
 def _in_the_middle(k: int) -> bool:
     return k >= 4 and k % 12 in (4, 5)
 
@@ -239,4 +244,5 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "noise 10": _each(noise(10)),
     "noise 25": _each(noise(25)),
     "blur": _each(blur),
+    "right blurred": _each(right_blurred),
 }

@@ -60,10 +60,28 @@ def test_a_second_of_interlaced_pictures_is_forgotten() -> None:
     assert (outcome.error_m[25:] < 0.1 * outcome.moved_m[25:]).all()
 
 
+def test_blur_is_told_from_less_light() -> None:
+    rng = np.random.default_rng(0)
+    image = np.kron(rng.integers(0, 256, (40, 60)), np.ones((6, 6))).astype(np.uint8)
+    light = Light.of(halve(image))
+    others = {
+        "alike": image,
+        "darker": (0.4 * image).astype(np.uint8),
+        "brighter": np.clip(2.5 * image, 0, 255).astype(np.uint8),
+        "black": np.zeros_like(image),
+        "blurred": stress.right_blurred(0, StereoFrame(0, image, image)).right,
+    }
+    blur = {name: light.blur(Light.of(halve(other))) for name, other in others.items()}
+    assert all(0.8 < blur[name] < 1.25 for name in blur if name != "blurred"), blur
+    assert blur["blurred"] > 2.5
+    assert Light.of(halve(others["blurred"])).blur(light) == pytest.approx(1 / blur["blurred"])
+
+
 FATAL = {
     "half size": "principal point",
     "swapped": "found in the right image",
     "frozen right": "frozen right image",
+    "right blurred": "as blurred as",
 }
 
 
@@ -83,6 +101,7 @@ def test_the_cause_is_named_with_its_cure(footage: stress.Footage) -> None:
         "half size": "twice as large",
         "swapped": "right",
         "frozen right": "repeats itself",
+        "right blurred": "focus and clean",
     }
     for fault, words in named.items():
         changed = stress.FAULTS[fault](footage)
