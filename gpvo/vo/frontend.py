@@ -27,12 +27,14 @@ class Observation:
 
     ``repeated``, ``right_repeated``: the pair, or its right image alone, is identical to that of the previous frame.
     ``right_light``: by what factor the right image is brighter or has more contrast; 1 if they are alike.
+    ``right_blur``: by what factor it is more blurred.
     """
 
     stats: ImageStats | None
     repeated: bool
     right_repeated: bool = False
     right_light: float = 1.0
+    right_blur: float = 1.0
 
 
 @dataclass(frozen=True)

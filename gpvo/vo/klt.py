@@ -103,6 +103,7 @@ class KltFrontend:
             same_right and same_left,
             same_right and not same_left,
             light_left.ratio(light_right),
+            light_left.blur(light_right),
         )
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:

@@ -191,6 +191,18 @@ class Light:
         most = max(ratios, key=lambda x: abs(math.log(x)))
         return most if abs(math.log(most)) > math.log(_SAME_LIGHT) else 1.0
 
+    def blur(self, other: Light) -> float:
+        """How many times the other is more blurred along its rows, where disparity is; below 1 where it is sharper.
+
+        By the differences between columns, in grey values or in units of contrast, whichever differ less: the light of
+        two cameras may differ too. 1 where one holds no image.
+        """
+        if min(self.std, other.std) < _NO_PICTURE:
+            return 1.0
+        fine = [max(cv2.norm(cv2.Sobel(a.half[::4], cv2.CV_16S, 1, 0, ksize=1)), 1e-3) for a in (self, other)]
+        ratio = fine[0] / fine[1]
+        return float(min(ratio, ratio * other.std / self.std, key=lambda x: abs(math.log(x))))
+
 
 def in_light_of(image: NDArray[np.uint8], own: Light, other: Light) -> NDArray[np.uint8]:
     """The image with the other's distribution of grey values where their light differs, else the image itself.

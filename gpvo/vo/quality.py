@@ -25,6 +25,7 @@ _ENOUGH_FOR_SIGMAS = 8  # points
 _MEMORY = 0.8  # of the running sums: about five frames
 _NAMED_FROM = 0.05  # share of the frames
 _DARKER = 1.25
+_BLURRED = 2.0  # times; a pair in focus is within a tenth
 _LATE = 0.25  # frames between left and right
 _RIG_PX = 1.0  # by which a wrong rig displaces rows at most, a shift of all apart (a focal length that is 1 % off)
 
@@ -34,6 +35,7 @@ _CURES = {
     "swapped": "most points lie behind the cameras; exchange left and right",
     "rows": "most points are in a different row on the right; calibrate the pair again",
     "few": "most points are not found in the right image; look at its exposure, focus and lens",
+    "blur": "one image is much more blurred than the other; focus and clean both lenses, and shorten their exposure",
     "light": "left and right differ in brightness; give both cameras the same exposure and gain",
     "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
@@ -150,6 +152,8 @@ class PairWatch:
     """Watches the pairs of a run: :meth:`step` says what is doubtful in one, :meth:`findings` what is in the run.
 
     ``late``: by how many frames the right image is older than the left one, 0 where nothing speaks for it.
+    ``blurred``: whether one image of the last pair was far more blurred than the other; then the search on the right
+    stops near where it began, and disparities say what was expected of them.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
@@ -158,6 +162,7 @@ class PairWatch:
         self._half_size = bool((np.abs(doubled - 2.0) < 0.4).all())
         self._rows = np.zeros(4)
         self.late = 0.0
+        self.blurred = False
         self._frames = 0
         self._seen: Counter[str] = Counter()
 
@@ -166,7 +171,12 @@ class PairWatch:
         self._frames += 1
         self._seen["frozen"] += seen.right_repeated
         self._seen["light"] += not 1 / _DARKER < seen.right_light < _DARKER
+        self.blurred = not 1 / _BLURRED < seen.right_blur < _BLURRED
+        self._seen["blur"] += self.blurred
         doubts = []
+        if self.blurred:
+            side, times = ("right", seen.right_blur) if seen.right_blur > 1.0 else ("left", 1.0 / seen.right_blur)
+            doubts.append(f"the {side} image is {times:.1f} times as blurred as the other")
         if self._half_size:
             self._seen["size"] += 1
             doubts.append("the principal point lies in the corner of the image")

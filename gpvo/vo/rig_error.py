@@ -160,9 +160,11 @@ class RigError:
             rows = np.abs(row_error - row_expected) <= max_row_error_px + 3.0 * sigma
             return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
 
-    def update(self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float) -> Array:
+    def update(
+        self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float, *, believed: bool = True
+    ) -> Array:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
-        (M,).
+        (M,). One that is not ``believed`` teaches rows alone, which need no motion: what it teaches lasts.
 
         Returns
         -------
@@ -188,7 +190,7 @@ class RigError:
         if self._learn:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
-            if near.sum() >= 8:
+            if believed and near.sum() >= 8:
                 rows = np.tile(near, 3)
                 self._learn_disparities(A[rows], B[rows], dilution[:, near].sum(axis=1))
             self._learn_rows(phi * self._camera.fy_px, row_error)

@@ -98,6 +98,11 @@ def flicker(k: int, f: StereoFrame) -> StereoFrame:
     return _both(f, lambda i: _table(i, lambda g: 0.5 * g)) if k % 3 == 0 else f
 
 
+def right_blurred(k: int, f: StereoFrame) -> StereoFrame:
+    """The right image blurred over 21 columns."""
+    return replace(f, right=np.asarray(cv2.blur(f.right, (21, 1)), np.uint8))
+
+
 def _in_the_middle(k: int) -> bool:
     return k >= 4 and k % 12 in (4, 5)
 
@@ -167,6 +172,19 @@ def frozen_right(footage: Footage) -> Footage:
     return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
 
 
+def interlaced(footage: Footage) -> Footage:
+    """Every second row is that of the frame before."""
+
+    def weave(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        out = now.copy()
+        out[1::2] = before[1::2]
+        return out
+
+    pairs = pairwise(footage.frames)
+    frames = [replace(b, left=weave(a.left, b.left), right=weave(a.right, b.right)) for a, b in pairs]
+    return replace(footage, frames=[footage.frames[0], *frames])
+
+
 def half_size(footage: Footage) -> Footage:
     """Images of half the size with the calibration of the full one."""
     c = footage.camera
@@ -226,4 +244,5 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "noise 10": _each(noise(10)),
     "noise 25": _each(noise(25)),
     "blur": _each(blur),
+    "right blurred": _each(right_blurred),
 }
