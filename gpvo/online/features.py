@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import entry_points
+from operator import attrgetter
 
 import numpy as np
 
@@ -36,9 +37,9 @@ class Feature:
 class FeatureGroup:
     """Columns computed together. ``start(camera)`` gives a step function with its own, empty memory.
 
-    The step function is called once per record, in time order, and returns one number per column; where it has a
-    memory, it is an object, so that a predictor can be copied and pickled. Several groups may
-    share a ``name``, by which they are selected: each is computed only if one of its own columns is wanted.
+    The step function is called once per record, in time order, and returns one number per column; one with a memory
+    is an object, so that a predictor can be copied and pickled. Several groups may share a ``name``, by which they are
+    selected: each is computed only if one of its own columns is wanted.
     """
 
     name: str
@@ -51,12 +52,8 @@ def _stateless(values: Callable[[float, VoRecord], Sequence[float]]) -> Callable
     return lambda camera: partial(values, math.nan if camera is None else camera.fx_px)
 
 
-def _velocity(_: float, r: VoRecord) -> Sequence[float]:
-    return twist(r).tolist()[:3]
-
-
-def _rotation(_: float, r: VoRecord) -> Sequence[float]:
-    return twist(r).tolist()[3:]
+def _twist(first: int, _: float, r: VoRecord) -> Sequence[float]:
+    return twist(r).tolist()[first : first + 3]
 
 
 def _counts(_: float, r: VoRecord) -> Sequence[float]:
@@ -69,22 +66,16 @@ def _seen(focal: float, r: VoRecord) -> Sequence[float]:
     return [*disparities, r.spread_u, r.spread_v, log_of(r.reproj_rms_px / focal), r.log10_condition]
 
 
-def _image(_: float, r: VoRecord) -> Sequence[float]:
-    return r.brightness, r.contrast, r.sharpness, r.noise_level
-
-
 def _residual(_: float, r: VoRecord) -> Sequence[float]:
     return (log_of(r.reproj_rms_px),)
 
 
 def _variances(method: str, _: float, r: VoRecord) -> Sequence[float]:
-    C = _finite(r, method)
-    return (math.nan,) * 6 if C is None else [log_of(c) for c in C.diagonal().tolist()]
+    return [log_of(c) for c in _stated_covariance(r, method).diagonal().tolist()]
 
 
 def _determinant(method: str, _: float, r: VoRecord) -> Sequence[float]:
-    C = _finite(r, method)
-    sign, log_det = (0.0, 0.0) if C is None else np.linalg.slogdet(C)
+    sign, log_det = np.linalg.slogdet(_stated_covariance(r, method))
     return (float(log_det) if sign > 0 else math.nan,)
 
 
@@ -97,9 +88,9 @@ def _stated(name: str, method: str) -> tuple[FeatureGroup, FeatureGroup]:
     )
 
 
-def _finite(r: VoRecord, method: str) -> Array | None:
+def _stated_covariance(r: VoRecord, method: str) -> Array:
     C = r.covariances.get(method)
-    return C if C is not None and np.isfinite(C).all() else None
+    return C if C is not None and np.isfinite(C).all() else np.zeros((6, 6))
 
 
 def _imu(_: float, r: VoRecord) -> Sequence[float]:
@@ -123,8 +114,8 @@ def _of_axes(name: str, unit: str) -> str:
 
 
 BUILT_IN = (
-    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), _stateless(_velocity)),
-    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), _stateless(_rotation)),
+    FeatureGroup("velocity", _columns(_of_axes("v_*_mps", "m/s")), _stateless(partial(_twist, 0))),
+    FeatureGroup("rotation", _columns(_of_axes("w_*_radps", "rad/s")), _stateless(partial(_twist, 3))),
     FeatureGroup(
         "counts",
         _columns("n_detected [1], n_stereo [1], n_tracked [1], n_inliers [1], inlier_ratio [1]"),
@@ -143,7 +134,7 @@ BUILT_IN = (
     FeatureGroup(
         "image",
         _columns("brightness [0..1], contrast [0..1], sharpness [log10], noise_level [0..1]"),
-        _stateless(_image),
+        lambda c: attrgetter("brightness", "contrast", "sharpness", "noise_level"),
     ),
     FeatureGroup(
         "trend",
@@ -207,18 +198,15 @@ def resolve(selection: str | Sequence[str]) -> tuple[str, ...]:
     wanted = [w for w in groups() if w not in ("imu_axes", "residual")] if selection == "full" else selection
     if isinstance(wanted, str):
         wanted = [w.strip() for w in wanted.split(",") if w.strip()]
-    columns = known_columns()
     out: dict[str, None] = {}
     for name in wanted:
         if name in groups():
             out.update(dict.fromkeys(c.name for group in groups()[name] for c in group.columns))
-        elif name in columns:
+        elif name in known_columns():
             out[name] = None
         else:
-            raise GpvoError(
-                f"unknown feature '{name}'",
-                cure=f"thesis, full, or any of: {', '.join(groups())}, or a column of them",
-            )
+            cure = f"thesis, full, or any of: {', '.join(groups())}, or a column of them"
+            raise GpvoError(f"unknown feature '{name}'", cure=cure)
     if not out:
         raise GpvoError("the selection of features is empty", cure="thesis, full, or a comma-separated list")
     return tuple(out)
@@ -245,8 +233,7 @@ class FeatureStream:
             picked = [(place[c.name], j) for j, c in enumerate(group.columns) if c.name in place]
             if picked:
                 self._pick.append((group.start(camera), picked))
-        unknown = set(self.names) - known_columns().keys()
-        if unknown:
+        if unknown := set(self.names) - known_columns().keys():
             raise GpvoError(
                 f"features that are needed are not installed: {', '.join(sorted(unknown))}",
                 cure="install the package that defines them, or update gpvo",

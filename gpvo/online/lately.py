@@ -16,7 +16,6 @@ TREND_S = 1.0
 AGILITY_S = 0.5
 """Time constant of the running mean of the squared jerk [s]."""
 _STILL = 1e-3
-_UNKNOWN = math.nan
 
 
 def twist(record: VoRecord) -> Array:
@@ -43,8 +42,7 @@ def log_of(value: float) -> float:
 
 def lengths(rate: Sequence[float]) -> tuple[float, float]:
     """Of the translation's and the rotation's half of a twist or its derivative."""
-    x, y, z, rx, ry, rz = rate
-    return math.hypot(x, y, z), math.hypot(rx, ry, rz)
+    return math.hypot(*rate[:3]), math.hypot(*rate[3:])
 
 
 class Trend:
@@ -59,10 +57,10 @@ class Trend:
     def __call__(self, r: VoRecord) -> Sequence[float]:
         """The five of the next record."""
         if not r.usable:
-            return (_UNKNOWN,) * 5
+            return (math.nan,) * 5
         now = twist(r).tolist()
         level = [log_of(r.n_inliers), log_of(r.reproj_rms_px), float(r.brightness)]
-        out = [_UNKNOWN] * 5
+        out = [math.nan] * 5
         if self._twist is not None:
             # A clock may be set back: a trend then begins anew.
             step_s = max((r.t_ns - self._t_ns) * 1e-9, 1e-6)
@@ -82,14 +80,14 @@ class Agility:
 
     def __init__(self) -> None:
         self._before: list[list[float]] = []
-        self._square = [_UNKNOWN, _UNKNOWN]
+        self._square = [math.nan, math.nan]
 
     def __call__(self, r: VoRecord) -> Sequence[float]:
         """The six of the next record: speed, turn rate, both jerks, both lately."""
         if not r.usable or r.dt_s <= 0:
             self._before = []
-            return (_UNKNOWN,) * 6
-        now, jerk = twist(r).tolist(), (_UNKNOWN, _UNKNOWN)
+            return (math.nan,) * 6
+        now, jerk = twist(r).tolist(), (math.nan, math.nan)
         if len(self._before) == 2:
             square_s = r.dt_s * r.dt_s
             jerk = lengths([(c - 2.0 * b + a) / square_s for a, b, c in zip(*self._before, now)])

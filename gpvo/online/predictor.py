@@ -176,14 +176,11 @@ class Predictor:
     def observe(self, xi_true: ArrayLike, t_ns: int | None = None) -> None:
         """Late truth: the error (6,) that the motion ending at ``t_ns`` (default: the last) turned out to have.
 
-        Adapts the scale of later predictions; NaN axes are left unchanged, and so are lost motions. Raises GpvoError
-        for another shape.
+        Adapts the scale of later predictions, but for NaN axes and lost motions. Raises GpvoError for another shape.
         """
         xi = np.asarray(xi_true, dtype=np.float64)
         if xi.shape != (6,):
-            raise GpvoError(
-                f"an error of shape {xi.shape} is not that of a motion", cure="give (6,) [m, m, m, rad, rad, rad]"
-            )
+            raise GpvoError(f"an error of shape {xi.shape} is not that of a motion", cure="give (6,) [m, rad]")
         stated = self._stated.get(next(reversed(self._stated), -1) if t_ns is None else t_ns)
         if stated is not None:
             self._adaptive.observe(xi - stated[0], stated[1], self.model.degrees_of_freedom)
