@@ -64,10 +64,10 @@ def _scores(ate: float) -> Scores:
 
 def test_tables_hold_every_run_and_every_comparison(tmp_path: Path) -> None:
     study = Study(
-        ("a", "b", "c"),
+        ("a", "b", "c", "d", "e"),
         {
-            "constant_best": tuple(map(_scores, (0.04, 0.05, 0.06))),
-            "learned": tuple(map(_scores, (0.02, 0.03, 0.01))),
+            "constant_best": tuple(map(_scores, (0.04, 0.05, 0.06, 0.04, 0.06))),
+            "learned": tuple(map(_scores, (0.02, 0.03, 0.01, 0.02, 0.02))),
         },
     )
     outcome = Outcome("flights", FusionReport(study, (), ()), Rise(0.2, np.full(6, 10.0), np.full(6, 9.0)))

@@ -180,7 +180,7 @@ def test_a_forecast_states_what_adds_up(seed: int) -> None:
         epistemic=np.zeros((len(rows), 6)), confidence=np.ones(len(rows)), in_domain=np.ones(len(rows)),
     )  # fmt: skip
     plan = SimpleNamespace(T_world_cam=made.poses)
-    covariance, _, _ = _sum_up(np.array(made.parent), said, plan)
+    covariance, _ = _sum_up(np.array(made.parent), said, plan)
     _, stated = along(made.T_prev_cur, made.errors, made.parent)
     for C, expected in zip(covariance[1:], stated[1:]):
         _assert_same(C, expected)
