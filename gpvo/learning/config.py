@@ -33,7 +33,7 @@ first."""
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """``features``: ``auto`` (chosen by cross-validation over the sequences), ``thesis``, ``full``, or names with commas.
+    """``features``: ``auto`` (by cross-validation over the sequences), ``thesis``, ``full`` or names with commas.
 
     ``target``: ``frame``, ``window:1s``, ``length:1m`` or ``position``. ``regressor``, ``inducing``: of positions, the
     latter the points of its GP. ``align``: ``rotation`` or ``transform`` first fits that between each log and its

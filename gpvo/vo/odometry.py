@@ -270,8 +270,8 @@ class StereoOdometry:
         elif config.self_calibration:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
             # Other doubts may come from the rig's own errors, which only learning ends.
-            believed = motion.converged and not self.pair.blurred
-            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px, believed=believed)
+            sharp = not self.pair.blurred
+            otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px, sharp=sharp)
         return replace(
             record,
             T_prev_cur=T_prev_cur,

@@ -161,10 +161,10 @@ class RigError:
             return (d >= min_disparity_px) & (d <= max_disparity_px) & rows
 
     def update(
-        self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float, *, believed: bool = True
+        self, motion: Motion, white: Whitened, row_error: Array, min_disparity_px: float, *, sharp: bool = True
     ) -> Array:
         """Learn from a motion over corrected measurements and its whitened residuals; its inliers have these row errors
-        (M,). One that is not ``believed`` teaches rows alone, which need no motion: what it teaches lasts.
+        (M,). Where the images are not equally ``sharp``, it teaches rows alone: what disparities teach lasts.
 
         Returns
         -------
@@ -190,7 +190,7 @@ class RigError:
         if self._learn:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
-            if believed and near.sum() >= 8:
+            if sharp and near.sum() >= 8:
                 rows = np.tile(near, 3)
                 self._learn_disparities(A[rows], B[rows], dilution[:, near].sum(axis=1))
             self._learn_rows(phi * self._camera.fy_px, row_error)

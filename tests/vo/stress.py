@@ -172,19 +172,6 @@ def frozen_right(footage: Footage) -> Footage:
     return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
 
 
-def interlaced(footage: Footage) -> Footage:
-    """Every second row is that of the frame before."""
-
-    def weave(before: np.ndarray, now: np.ndarray) -> np.ndarray:
-        out = now.copy()
-        out[1::2] = before[1::2]
-        return out
-
-    pairs = pairwise(footage.frames)
-    frames = [replace(b, left=weave(a.left, b.left), right=weave(a.right, b.right)) for a, b in pairs]
-    return replace(footage, frames=[footage.frames[0], *frames])
-
-
 def half_size(footage: Footage) -> Footage:
     """Images of half the size with the calibration of the full one."""
     c = footage.camera

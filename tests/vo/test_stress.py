@@ -50,16 +50,6 @@ def test_a_table_undoes_gain_and_gamma_and_leaves_like_pictures_alone(footage: s
     assert in_light_of(black, Light.of(halve(black)), Light.of(halve(image))) is black
 
 
-def test_a_second_of_interlaced_pictures_is_forgotten() -> None:
-    """Estimates that did not converge taught the rig errors that made every later motion twice as long."""
-    clip = render_clip(pinhole(480, 360), wander(36, speed_mps=1.6, seed=5))
-    whole = stress.Footage(clip.camera, clip.frames, clip.T_world_cam)
-    woven = stress.interlaced(whole)
-    frames = [*whole.frames[:4], *woven.frames[4:24], *whole.frames[24:]]
-    outcome = stress.run(stress.Footage(clip.camera, frames, clip.T_world_cam))
-    assert (outcome.error_m[25:] < 0.1 * outcome.moved_m[25:]).all()
-
-
 def test_blur_is_told_from_less_light() -> None:
     rng = np.random.default_rng(0)
     image = np.kron(rng.integers(0, 256, (40, 60)), np.ones((6, 6))).astype(np.uint8)
