@@ -12,8 +12,8 @@ from bench.gain_experiment import SETS, Place, judge, markdown
 def test_poses_alone_show_how_good_they_are_by_their_jerk(tmp_path: Path) -> None:
     """Nothing but poses is known of flights with bursts of noise: the base variance, which sees how fast the vehicle
     is, cannot tell a burst; the process tells it by the jerk."""
-    row = judge("bursts-poses", Place(tmp_path, tmp_path, 3, 20.0))
-    assert (row["sequences"], row["inputs"]) == (3, "agility")
+    row = judge("bursts-poses", Place(tmp_path, tmp_path, 5, 20.0))
+    assert (row["sequences"], row["inputs"]) == (5, "agility")
     assert row["high"] < -0.2
     assert row["set"] in markdown([row])
 
