@@ -55,8 +55,6 @@ from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuNoise, MotionError
 _POSE = np.array([0, 1, 2, 6, 7, 8])  # position and attitude inside the core
 _STATE = CLONE.stop  # core and clone; what follows is VO's
 _MOST_SPEED_VAR, _MOST_ANGLE_VAR = 100.0, 0.1  # (10 m/s)^2, (18 deg)^2: no state is doubted beyond
-
-
 _UNSEEN_TURN_RAD, _UNSEEN_TILT_RAD = 1.0, 0.2  # about and from the vertical, while nothing is heard
 
 

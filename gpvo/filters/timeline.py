@@ -255,7 +255,7 @@ class Timeline:
                 t, i = heard_ns, bisect.bisect_right(self._imu_t, heard_ns)
                 sample = self._at(t, i)
                 continue
-            t1 = min(end_ns, t + _GUESS_NS, *self._imu_t[i : i + 1])
+            t1 = min(heard_ns, t + _GUESS_NS)
             arrived = self._imu_t[i : i + 1] == [t1]
             after = self._imu[i] if arrived else self._at(t1, i)
             dt, ends = (t1 - t) * 1e-9, np.array([sample, after])

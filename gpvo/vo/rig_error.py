@@ -179,11 +179,8 @@ class RigError:
         M[2] -= fx * phi
         B = apply_whitener(white.W, M)
         root = np.sqrt(np.minimum(1.0, 3.2 / np.sqrt((z**2).sum(0) + 1e-9)))
-        A, B = white.A * (root / scale_px), B * (root / scale_px)
-        # The derivatives by the translation are in proportion to the disparity, and so to its error.
-        g = apply_whitener(white.W, persistent_direction(moved.G)) * (root / scale_px)
-        dilution = (A[:, :3] * g[:, None]).sum(0) * motion.noise.persistent * motion.scale_px**2 / motion.uvd_prev[:, 2]
-        A = A.transpose(0, 2, 1).reshape(-1, 6)
+        by_motion, B = white.A * (root / scale_px), B * (root / scale_px)
+        A = by_motion.transpose(0, 2, 1).reshape(-1, 6)
         B = np.column_stack([B.transpose(0, 2, 1).reshape(-1, N_TERMS), (z * root).reshape(-1)])
         K = np.linalg.solve(A.T @ A, A.T @ B[:, :-1])
         added: Array = K @ self.state.covariance[_DX, _DX] @ K.T
@@ -191,6 +188,10 @@ class RigError:
             sigma_px = motion.scale_px * np.sqrt(1.0 + motion.noise.persistent)
             near = motion.uvd_prev[:, 2] > min_disparity_px + _NEAR * sigma_px
             if sharp and near.sum() >= 8:
+                # The derivatives by the translation are in proportion to the disparity, and so to its error.
+                g = apply_whitener(white.W, persistent_direction(moved.G)) * (root / scale_px)
+                along = (by_motion[:, :3] * g[:, None]).sum(0)
+                dilution = along * motion.noise.persistent * motion.scale_px**2 / motion.uvd_prev[:, 2]
                 rows = np.tile(near, 3)
                 self._learn_disparities(A[rows], B[rows], dilution[:, near].sum(axis=1))
             self._learn_rows(phi * self._camera.fy_px, row_error)
@@ -299,6 +300,8 @@ class _Blocks:
 
     def believed(self) -> tuple[Array, Array]:
         """Information and score, of which the excess and a share of the dilution may be no signal."""
+        if not self._dilution.any():
+            return self.information / self.excess, self.score / self.excess
         dilution = _DILUTION * self._dilution
         diluted = np.linalg.solve(self.information + self._floor, dilution)
         part = dilution / (self.excess + dilution @ diluted)
