@@ -251,13 +251,7 @@ def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path, mor
         )
 
 
-def read_imu_csv(
-    path: Path,
-    *,
-    shift_s: float = 0.0,
-    noise: ImuNoise | None = None,
-    remark: Callable[[str], None] | None = None,
-) -> ImuLog:
+def read_imu_csv(path: Path, *, shift_s: float, noise: ImuNoise | None, remark: Callable[[str], None]) -> ImuLog:
     """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order.
 
     ``shift_s``: ``t_imu = t_cam + shift``, taken off so that the stamps are of the camera's clock. Lines that repeat
@@ -280,16 +274,11 @@ def read_imu_csv(
 
 
 def make_imu(
-    t_ns: np.ndarray,
-    gyro_acc: np.ndarray,
-    *,
-    shift_s: float = 0.0,
-    noise: ImuNoise | None = None,
-    remark: Callable[[str], None] | None = None,
+    t_ns: Stamps, gyro_acc: Array, *, shift_s: float, remark: Callable[[str], None], noise: ImuNoise | None = None
 ) -> ImuLog:
     """An :class:`ImuLog` of samples (N, 6), gyro first; those that repeat or go back in time are dropped."""
     keep = growing(t_ns)
-    if remark is not None and not keep.all():
+    if not keep.all():
         remark(f"{int((~keep).sum())} of {len(t_ns)} IMU samples repeat or go back in time: dropped")
     t = t_ns[keep] - round(shift_s * 1e9)
     return ImuLog(t_ns=t, gyro_radps=gyro_acc[keep, :3], acc_mps2=gyro_acc[keep, 3:], noise=noise)
