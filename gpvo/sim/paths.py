@@ -43,13 +43,13 @@ class Path3:
 RAMP_S = 2.0
 
 
-def smooth_start(t_s: Array, rest_s: float, ramp_s: float = RAMP_S) -> Array:
-    """Time that stands still for ``rest_s`` and then takes ``ramp_s`` to run at full pace (C3)."""
-    x = np.clip((np.asarray(t_s) - rest_s) / ramp_s, 0.0, None)
+def smooth_start(t_s: Array, rest_s: float) -> Array:
+    """Time that stands still for ``rest_s`` and then takes :data:`RAMP_S` to run at full pace (C3)."""
+    x = np.clip((np.asarray(t_s) - rest_s) / RAMP_S, 0.0, None)
     y = np.minimum(x, 1.0)
     # Integral of the smoothstep 35 y^4 - 84 y^5 + 70 y^6 - 20 y^7.
     begun = 7 * y**5 - 14 * y**6 + 10 * y**7 - 2.5 * y**8
-    return ramp_s * (begun + np.maximum(x - 1.0, 0.0))
+    return RAMP_S * (begun + np.maximum(x - 1.0, 0.0))
 
 
 def along_curve(
