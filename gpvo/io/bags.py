@@ -31,7 +31,7 @@ from gpvo.io.bag_reader import (
 from gpvo.io.images import Image8, ImageSource, check_size
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
-from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
+from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, carry, check_overlap
 from gpvo.types import TruthLog
 
 # How drivers name the two cameras of one head.
@@ -80,7 +80,6 @@ class BagSource(ImageSource):
         imu_topic: str | None = None,
         truth_topic: str | None = None,
         truth_frame: str | None = None,
-        truth_noise: TruthNoise | None = None,
         tolerance_s: float = PAIR_TOLERANCE_S,
         calibration: str | Path | None = None,
         **options: Any,
@@ -102,7 +101,7 @@ class BagSource(ImageSource):
         if self.imu is not None and (self.imu.t_ns[0] > span[1] or self.imu.t_ns[-1] < span[0]):
             self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
         if self._topics.truth is not None:
-            self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
+            self.truth = self._read_truth(self._topics.truth, truth_frame)
         if self._topics.doubtful is not None:
             whose = "whose they are is unknown; give --truth-topic and --truth-frame"
             self.remark(f"poses on '{self._topics.doubtful}' not used as truth: {whose}")
@@ -130,7 +129,7 @@ class BagSource(ImageSource):
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
-    def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
+    def _read_truth(self, topic: str, frame: str | None) -> TruthLog:
         try:
             t, T, _ = read_poses(self.path, topic, self.remark, complete=True)
         except SourceError as error:
@@ -142,8 +141,7 @@ class BagSource(ImageSource):
         place = self.rectifier.T_left_cam if whose == "cam" else self.mounting.T_imu_cam
         assert place is not None
         self.remark(f"truth on '{topic}' taken as poses of the {whose} frame")
-        usual = MOTION_CAPTURE if _is_capture(topic) else UNKNOWN
-        truth = carry(Trajectory(t, T), place, noise or usual)
+        truth = carry(Trajectory(t, T), place, MOTION_CAPTURE if _is_capture(topic) else UNKNOWN)
         check_overlap(truth, self.span_ns, self.path)
         return truth
 

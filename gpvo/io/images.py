@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -222,19 +223,13 @@ class FileSource(ImageSource):
             yield pair.t_ns, read_grey8(pair.left, self.depth), read_grey8(pair.right, self.depth)
 
 
-def _size_of(path: Path) -> tuple[int, int] | None:
-    """(width, height) by the file's header, nothing decoded; None where it is missing or no image."""
-    try:
-        with path.open("rb") as file:
-            return image_size(file.read(_MAX_HEAD_BYTES))
-    except OSError:
-        return None
-
-
 def first_size(pairs: Sequence[PairFiles], side: str) -> tuple[Path, tuple[int, int]] | None:
-    """File and (width, height) of the first readable image of a camera, ``left`` or ``right``."""
-    sizes = ((path, _size_of(path)) for path in (getattr(pair, side) for pair in pairs))
-    return next(((path, size) for path, size in sizes if size is not None), None)
+    """File and (width, height) of the first readable image of a camera, ``left`` or ``right``, by its header."""
+    for path in (getattr(pair, side) for pair in pairs):
+        with suppress(OSError), path.open("rb") as file:
+            if (size := image_size(file.read(_MAX_HEAD_BYTES))) is not None:
+                return path, size
+    return None
 
 
 def check_size(images: str, size: tuple[int, int], lens: CameraModel, where: object, source: str = "") -> None:
