@@ -162,17 +162,19 @@ def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float 
     way = curve(fine)
     steps = np.diff(way, axis=0)
     if (back := (steps[1:] * steps[:-1]).sum(axis=1) <= 0).any():
-        x, y, z = way[1 + int(back.argmax())]
-        cure = "put another place beside the turn"
-        raise GpvoError(
-            f"the way through the waypoints turns back on the spot at ({x:.1f}, {y:.1f}, {z:.1f}) m", cure=cure
-        )
+        text = f"the way through the waypoints turns back on the spot at {place(way[1 + int(back.argmax())])}"
+        raise GpvoError(text, cure="put another place beside the turn")
     along = path_length_m(way)
     at_arc = CubicSpline(along, fine)
     t = knots(duration_s)
     u = at_arc(soft_end(speed_mps * smooth_start(t, rest_s), along[-1], 0.5 * speed_mps))
     # A step straight up has no heading of its own: it keeps a trace of the first one.
     return _flat(t, curve(u), _heading(curve.derivative(1)(u) + 1e-3 * (corners[-1] - corners[0])), duration_s)
+
+
+def place(p: Array) -> str:
+    """A place in words."""
+    return f"({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) m"
 
 
 def soft_end(distance: Array, limit: float, width: float) -> Array:
