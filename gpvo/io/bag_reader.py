@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gpvo.errors import GpvoError, SourceError
+from gpvo.files import TooLarge
 from gpvo.io.stamps import BACK_NS
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -128,7 +129,7 @@ def open_bag(path: Path) -> Iterator[Any]:
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
-    except ChunkTooLarge as error:
+    except TooLarge as error:
         raise SourceError(f"unreadable bag: {error}", where=path, cure="record or convert it again") from None
     # The readers below raise whatever their storage does: struct, sqlite3, zstd, Unicode, index, assertion and
     # memory errors, the last for a length that is no length.
@@ -186,10 +187,6 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-class ChunkTooLarge(Exception):
-    """A chunk of a bag unpacks to more than is made room for."""
-
-
 def bound_chunks() -> None:
     """Make the readers of ``rosbags`` stop unpacking a chunk at what it declares, and at 256 MB in any case."""
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -207,7 +204,7 @@ def bound_chunks() -> None:
 def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], Any]) -> bytes:
     """All that compressed bytes hold, by decompressors that ``new`` makes, one for each of the streams.
 
-    Raises ChunkTooLarge beyond ``declared`` bytes or the bound, EOFError where a stream is cut off.
+    Raises TooLarge beyond ``declared`` bytes or the bound, EOFError where a stream is cut off.
     """
     most, out = min(declared, MAX_CHUNK_BYTES), bytearray()
     while data:
@@ -219,7 +216,7 @@ def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], 
                 raise EOFError("a chunk is cut off")
             out += part
             if len(out) > most:
-                raise ChunkTooLarge(f"a chunk unpacks to more than {most} bytes")
+                raise TooLarge(f"a chunk unpacks to more than {most} bytes")
         data = one.unused_data or b""
     return bytes(out)
 
