@@ -30,7 +30,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 class TooLarge(Exception):
-    """A file is longer than anything that may stand in its place."""
+    """A file, or a part of one, is longer than anything that may stand in its place."""
 
 
 def read_bounded(path: Path, most: int) -> bytes:
@@ -104,7 +104,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 class FolderLock:
-    """Held from its making to :meth:`release`, or to the end of the process, however that comes.
+    """Held from its making to :meth:`release`, the end of its ``with`` block, or that of the process, however it comes.
 
     ``path``: the folder, or with ``create`` a file that stands for ``where``. Raises OutputError where another process,
     or another writer of this one, holds it, or it cannot be opened.
@@ -132,6 +132,12 @@ class FolderLock:
         if self._handle >= 0:
             os.close(self._handle)
         self._handle = -1
+
+    def __enter__(self) -> FolderLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
 
     def __del__(self) -> None:
         self.release()

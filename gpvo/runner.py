@@ -123,7 +123,7 @@ def run(
         write_json(writer.path / STATE_FILE, document(state, source.camera, calibration_state))
         wrong = findings(state, source.camera)
         summary = RunSummary(frames, dict(status), length_m, frames / max(busy_s, 1e-9), str(source.report), wrong)
-        writer.note(source_report=source.report.as_dict(), summary=asdict(summary))
+        writer.note(source_report=asdict(source.report), summary=asdict(summary))
     return summary
 
 

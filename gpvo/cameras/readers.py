@@ -233,7 +233,14 @@ def read_kitti_calib(path: Path, left: int, right: int, size: tuple[int, int]) -
     lens = PinholeRadtan(*_of_matrix(P_left), *size)
     if lens.fx_px <= 1:
         raise CalibrationError(f"P{left} has focal length {lens.fx_px:g} px", where=path)
-    _check_centre(lens, path)
+    # The file does not say its resolution; a principal point far from the middle tells that it is another.
+    if not (0.3 < lens.cx_px / lens.width < 0.7 and 0.3 < lens.cy_px / lens.height < 0.7):
+        raise CalibrationError(
+            f"its principal point ({lens.cx_px:.1f}, {lens.cy_px:.1f}) is far from the middle of the"
+            f" {lens.width}x{lens.height} images",
+            where=path,
+            cure="is it the calibration of another resolution? Scale its first two rows like the images",
+        )
     # Both matrices place their camera relative to camera 0; K^-1 p is the translation from it.
     try:
         t_right_left = np.linalg.solve(P_left[:, :3], P_right[:, 3] - P_left[:, 3])
@@ -244,17 +251,6 @@ def read_kitti_calib(path: Path, left: int, right: int, size: tuple[int, int]) -
         raise CalibrationError(f"P{left} and P{right} do not sit side by side", where=path)
     T_right_left = se3.from_rt(np.eye(3), np.array([t_right_left[0], 0.0, 0.0]))
     return StereoRig(left=lens, right=lens, T_right_left=T_right_left, where=str(path))
-
-
-def _check_centre(lens: CameraModel, path: Path) -> None:
-    """The file does not say its resolution; a principal point far from the middle tells that it is another."""
-    if not (0.3 < lens.cx_px / lens.width < 0.7 and 0.3 < lens.cy_px / lens.height < 0.7):
-        raise CalibrationError(
-            f"its principal point ({lens.cx_px:.1f}, {lens.cy_px:.1f}) is far from the middle of the"
-            f" {lens.width}x{lens.height} images",
-            where=path,
-            cure="is it the calibration of another resolution? Scale its first two rows like the images",
-        )
 
 
 def left_camera_offset(path: Path, left: int) -> Array:

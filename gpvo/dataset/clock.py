@@ -30,12 +30,8 @@ _ROUNDS, _ORDINARY = 8, 3.0  # the latter: median misfits, beyond which a sample
 def estimate_time_offset(log: VoLog, truth: TruthLog) -> float:
     """Seconds to add to the log's stamps so that they are of the truth's clock.
 
-    Clocks whose times do not overlap at all are searched over their whole length.
-
-    Raises
-    ------
-    GpvoError
-        Where either is too short, or the motions do not resemble one another at any offset.
+    Clocks whose times do not overlap at all are searched over their whole length. Raises GpvoError where either is too
+    short, or the motions do not resemble one another at any offset.
     """
     if len(log) < 10 or len(truth.t_ns) < 10:
         raise GpvoError("too few poses to estimate a time offset", cure="give --time-offset in seconds")

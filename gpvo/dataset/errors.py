@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.stats.series import block_bootstrap, moving_sums
+from gpvo.stats.series import block_bootstrap, integral, interpolated, moving_sums
 from gpvo.types import Array, TruthLog, VoLog, VoRecord
 
 MAX_GAP_S = 0.5
@@ -324,10 +324,8 @@ def velocity_path(truth: TruthLog, t_ns: NDArray[np.int64]) -> Array | None:
     if truth.v_world_mps is None:
         return None
     t_s = (truth.t_ns - truth.t_ns[0]) * 1e-9
-    steps = 0.5 * (truth.v_world_mps[1:] + truth.v_world_mps[:-1]) * np.diff(t_s)[:, None]
-    path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     at_s = (np.asarray(t_ns) - truth.t_ns[0]) * 1e-9
-    return np.stack([np.interp(at_s, t_s, along) for along in path.T], axis=1)
+    return interpolated(at_s, t_s, integral(truth.v_world_mps, t_s))
 
 
 def drift_variance(contradiction: Array, error: Array) -> Array:

@@ -99,17 +99,10 @@ def fit_fixed_transform(
 ) -> FixedTransform:
     """``X`` with ``A X ~ X B``, robust against slips of the log.
 
-    Parameters
-    ----------
-    A, B : (M, 4, 4) motions of the log and of the truth over the same times.
-    attitudes : (M, 3, 3) of the truth at their ends, to fit the rotation between the worlds of its attitudes and of its
-        positions as well.
-    lever_arm : estimate the translation as well; else both origins are taken as one.
-
-    Raises
-    ------
-    GpvoError
-        For fewer than ten motions, or motions that do not determine the rotation.
+    ``A``, ``B`` (M, 4, 4): motions of the log and of the truth over the same times. ``attitudes`` (M, 3, 3) of the
+    truth at their ends: fit the rotation between the worlds of its attitudes and of its positions as well.
+    ``lever_arm``: estimate the translation as well; else both origins are taken as one. Raises GpvoError for fewer than
+    ten motions, or motions that do not determine the rotation.
     """
     if len(A) < MIN_MOTIONS:
         raise GpvoError(

@@ -131,26 +131,21 @@ def require_picture(path: Path) -> None:
 
 
 def plot_fusion(traces: Sequence[Trace], path: Path) -> None:
-    """Draw the first run's path and errors and all runs' innovations to an image file."""
+    """Draw the first run's path and errors and all runs' innovations to an image file, one colour per policy."""
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    above, middle, below = figure.subplots(3, 1)
+    first = [t for t in traces if t.run == traces[0].run]
+    _fused_paths(above, first)
+    _fused_errors(middle, first)
+    _innovations(below, traces)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save(figure_of(traces), path, dpi=120, bbox_inches="tight")
+    save(figure, path, dpi=120, bbox_inches="tight")
 
 
 def save(figure: Figure, path: Path, **options: Any) -> None:
     """Write to an image file, whole or not at all; ``options``: of matplotlib's ``savefig``."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower(), **options)
-
-
-def figure_of(traces: Sequence[Trace]) -> Figure:
-    """The figure, one colour per policy."""
-    figure = Figure(figsize=(11, 9), layout="constrained")
-    above, middle, below = figure.subplots(3, 1)
-    first = [t for t in traces if t.run == traces[0].run] if traces else []
-    _fused_paths(above, first)
-    _fused_errors(middle, first)
-    _innovations(below, traces)
-    return figure
 
 
 def _fused_paths(axes: Axes, traces: Sequence[Trace]) -> None:

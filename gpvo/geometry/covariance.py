@@ -104,8 +104,7 @@ def correlation(C: Array) -> Array:
 
 def compound(T_b_c: Array, cov_a_b: Array, cov_b_c: Array) -> Array:
     """Covariance of ``T_a_b T_b_c`` for independent errors: ``Ad(T_b_c)^-1 S_ab Ad(T_b_c)^-T + S_bc``."""
-    A = se3.adjoint(se3.inverse(T_b_c))
-    return A @ cov_a_b @ np.swapaxes(A, -1, -2) + cov_b_c
+    return change_body(se3.inverse(T_b_c), cov_a_b) + cov_b_c
 
 
 def change_body(T_new_old: Array, covariance: Array) -> Array:

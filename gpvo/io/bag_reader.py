@@ -1,7 +1,6 @@
-"""ROS 1 bags, ROS 2 bags (sqlite3) and MCAP through one reader, with their failures as one line; their poses and IMU.
+"""ROS 1 bags, ROS 2 bags (sqlite3) and MCAP through one reader, with their failures as one line.
 
 Bags that would fill the memory or never end are refused: chunks unpack to a bound, and databases hold tables alone.
-An IMU is one topic, or two where a driver publishes gyroscope and accelerometer apart.
 """
 
 from __future__ import annotations
@@ -9,23 +8,15 @@ from __future__ import annotations
 import bz2
 import re
 import sqlite3
-from array import array
-from collections import Counter
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gpvo.errors import GpvoError, SourceError
-from gpvo.geometry import se3
-from gpvo.io.stamps import BACK_NS, Stamps, astray
-from gpvo.io.trajectory import make_imu
-from gpvo.types import Array, ImuLog
+from gpvo.files import TooLarge
+from gpvo.io.stamps import BACK_NS
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -38,7 +29,6 @@ _NOT_YET = (".bag.active", ".db3.zstd", ".mcap.zstd")
 _PACKED = re.compile(r"compression_mode[\"']?:\s*[\"']?file\b", re.IGNORECASE)
 _PAUSE_S = 10.0  # between the bags of one recording
 _MAX_METADATA_BYTES = 500_000  # a topic takes some 600, a file of a split bag 230; a megabyte is read in ten seconds
-_LEAST_LEFT = 0.9  # of the messages, without those that repeat a stamp
 MAX_CHUNK_BYTES = 1 << 28
 """No recorder makes chunks of more than a few megabytes, or of one message where that is larger."""
 _STEP_BYTES = 1 << 22
@@ -139,7 +129,7 @@ def open_bag(path: Path) -> Iterator[Any]:
             yield reader
     except (GpvoError, GeneratorExit, KeyboardInterrupt):
         raise
-    except ChunkTooLarge as error:
+    except TooLarge as error:
         raise SourceError(f"unreadable bag: {error}", where=path, cure="record or convert it again") from None
     # The readers below raise whatever their storage does: struct, sqlite3, zstd, Unicode, index, assertion and
     # memory errors, the last for a length that is no length.
@@ -197,175 +187,6 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def pose_of(message: Any) -> Array:
-    """(7,) position and quaternion x y z w of an Odometry, PoseStamped, PoseWithCovarianceStamped or
-    TransformStamped."""
-    if hasattr(message, "transform"):
-        p, q = message.transform.translation, message.transform.rotation
-    else:
-        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-        p, q = pose.position, pose.orientation
-    return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], dtype=np.float64)
-
-
-def read_poses(
-    path: Path, topic: str, remark: Callable[[str], None] | None = None, *, complete: bool = False
-) -> tuple[np.ndarray, Array, list[Any]]:
-    """Stamps (N,) [ns], poses (N, 4, 4) and the messages of one topic, in order of time, repeated stamps dropped.
-
-    ``remark`` is told how many were dropped, or out of order. Messages that hold no pose, as some odometries send when
-    they are lost, are dropped, or refused where the poses must be ``complete``; those without a stamp, or with a wrong
-    one, and a few between other frames than most, are dropped. Raises SourceError where the topic has no poses or mixes
-    frames, and where its clock goes back by more than a second or gives many messages one stamp.
-    """
-    with open_bag(path) as reader:
-        available = topics_of(reader, POSE_TYPES)
-        if topic not in available:
-            found = ", ".join(available) or "none"
-            raise SourceError(f"has no poses on '{topic}' (topics with poses: {found})", where=path)
-        kept = [message for _, message in messages(reader, [topic])]
-    kept = _of_one_odometry(kept, topic, path, remark)
-    t = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
-    wrong = astray(t)
-    if remark is not None and wrong.any():
-        remark(f"{int(wrong.sum())} of {len(t)} messages on '{topic}' are stamped seconds off and were left out")
-    t, kept = t[~wrong], list(compress(kept, ~wrong))
-    data = np.array([pose_of(m) for m in kept])
-    order = _in_time(t, data, topic, path, remark)
-    good = np.isfinite(data[order]).all(axis=1) & (np.abs(np.linalg.norm(data[order, 3:], axis=1) - 1) < 0.1)
-    if bad := int((~good).sum()):
-        if complete or bad == len(order):
-            raise SourceError(f"message {order[~good][0] + 1} on '{topic}' holds no valid pose", where=path)
-        if remark is not None:
-            remark(f"{bad} of {len(t)} messages on '{topic}' hold no valid pose and were left out")
-    order = order[good]
-    t, data = t[order], data[order]
-    return t, se3.from_quaternion(data[:, :3], data[:, 3:]), [kept[i] for i in order]
-
-
-def _of_one_odometry(messages: list[Any], topic: str, path: Path, remark: Callable[[str], None] | None) -> list[Any]:
-    """Those with a stamp, if any has one, and of the frames that most are between."""
-    kept = [m for m in messages if stamp_ns(m)]
-    if not kept or min(map(stamp_ns, kept)) < BACK_NS:  # on a clock that starts there, zero is a stamp
-        kept = messages
-    if remark is not None and (unset := len(messages) - len(kept)):
-        remark(f"{unset} of {len(messages)} messages on '{topic}' carry no stamp and were left out")
-    frames = [(str(m.header.frame_id), str(getattr(m, "child_frame_id", ""))) for m in kept]
-    (most, count), *others = Counter(frames).most_common()
-    if count < _LEAST_LEFT * len(kept):
-        a, b = (" to ".join(filter(None, pair)) for pair in (most, others[0][0]))
-        cure = "one topic must be one odometry's: record its publishers apart, or split the bag where the frames change"
-        raise SourceError(f"poses of different frames are mixed on '{topic}': {a}, and {b}", where=path, cure=cure)
-    if remark is not None and others:
-        remark(f"{len(kept) - count} of {len(kept)} messages on '{topic}' are of other frames and were left out")
-    return [m for m, pair in zip(kept, frames) if pair == most]
-
-
-def _in_time(
-    t_ns: Stamps, poses: Array, topic: str, path: Path, remark: Callable[[str], None] | None
-) -> NDArray[np.intp]:
-    """Indices of the messages at (N,) stamps, of (N, 7) poses, in order of time, the first of those that share one."""
-    where, steps = f"on '{topic}'", np.diff(t_ns)
-    if len(steps) and -steps.min() > BACK_NS:
-        text = f"the stamps {where} go back by {-steps.min() * 1e-9:.3f} s at message {int(steps.argmin()) + 2}"
-        raise SourceError(text, where=path, cure="the clock was set or restarted: split the bag there")
-    order = np.argsort(t_ns, kind="stable")
-    again = np.concatenate([[False], np.diff(t_ns[order]) == 0])
-    # A driver may publish each pose twice; other poses at one time are no poses.
-    other = int((again[1:] & (np.diff(poses[order], axis=0) != 0).any(axis=1)).sum())
-    order, repeated, late = order[~again], int(again.sum()), int((steps < 0).sum())
-    if other > (1 - _LEAST_LEFT) * len(t_ns):
-        text = f"{other} of {len(t_ns)} messages {where} repeat a stamp with another pose"
-        cure = "header.stamp must be the time of each measurement; after the clock restarts, use a new bag"
-        raise SourceError(text, where=path, cure=cure)
-    if remark is not None and repeated:
-        remark(f"{repeated} of {len(t_ns)} messages {where} repeat a stamp and were left out")
-    if remark is not None and late:
-        remark(f"{late} of {len(t_ns)} messages {where} came out of order and were sorted by their stamps")
-    return order
-
-
-def imu_topics(topics: list[str]) -> list[tuple[str, ...]]:
-    """What can serve as IMU, the best first: whole topics, then gyroscopes with the accelerometer beside them."""
-    pairs = [(t, acc) for t in topics if (acc := accelerometer_beside(t)) in topics and acc is not None]
-    halves = {topic for pair in pairs for topic in pair}
-    return [*((t,) for t in topics if t not in halves), *pairs]
-
-
-def accelerometer_beside(gyroscope: str) -> str | None:
-    """The topic of the accelerometer of a driver that publishes gyroscope and accelerometer apart, None by other names.
-
-    realsense-ros has ``/camera/gyro/sample`` and ``/camera/accel/sample``, each with the other's fields zero.
-    """
-    names = (("gyro", "accel"), ("Gyro", "Accel"))
-    return next((gyroscope.replace(gyro, acc) for gyro, acc in names if gyro in gyroscope), None)
-
-
-def read_imu(
-    path: Path, candidates: list[tuple[str, ...]], shift_s: float, remark: Callable[[str], None]
-) -> ImuLog | None:
-    """The first of the candidates that measures rates, in the camera's time by ``t_imu = t_cam + shift_s``.
-
-    An accelerometer of its own is interpolated onto the gyroscope's stamps, inside the time that both cover.
-    ``acc_mps2`` is NaN throughout where nothing measured it.
-    """
-    for topics in candidates:
-        t_ns, data = _samples(path, topics[0])
-        if len(topics) == 2:
-            t_ns, data = with_accelerometer(t_ns, data, *_samples(path, topics[1]))
-        no_acc = bool(np.isnan(data[:, 3:]).all())
-        good = np.isfinite(data[:, :3]).all(axis=1) & (no_acc | np.isfinite(data[:, 3:]).all(axis=1))
-        if not good.any():
-            when = f" while '{topics[1]}' runs" if len(topics) == 2 else ""
-            remark(f"'{topics[0]}' not used as IMU: it measures no rates{when}")
-            continue
-        if no_acc:
-            remark(f"'{topics[0]}' is a gyroscope only: it measures no acceleration")
-        elif len(topics) == 2:
-            remark(f"IMU of '{topics[0]}', with '{topics[1]}' interpolated onto its stamps")
-        return make_imu(t_ns[good], data[good], shift_s=shift_s, remark=remark)
-    return None
-
-
-def _samples(path: Path, topic: str) -> tuple[Stamps, Array]:
-    """Stamps (N,) and samples (N, 6), gyro first; NaN where the topic does not measure.
-
-    That is where a covariance begins with -1, as ROS has it, or nothing but exact zeros came.
-    """
-    stamps, rows = array("q"), array("d")  # of hours: lists of numbers take several times as much
-    with open_bag(path) as reader:
-        for _, m in messages(reader, [topic]):
-            stamps.append(stamp_ns(m))
-            measured = (m.angular_velocity, m.linear_acceleration)
-            covariances = (m.angular_velocity_covariance, m.linear_acceleration_covariance)
-            for v, C in zip(measured, covariances):
-                rows.extend((v.x, v.y, v.z, C[0]))
-    data = np.array(rows, dtype=np.float64).reshape(-1, 2, 4)
-    for values in (data[:, 0], data[:, 1]):
-        if (values[:, 3] == -1).all() or not values[:, :3].any():
-            values[:] = np.nan
-    return np.array(stamps, dtype=np.int64), data[:, :, :3].reshape(-1, 6)
-
-
-def with_accelerometer(t_ns: Stamps, data: Array, t_acc_ns: Stamps, acc_data: Array) -> tuple[Stamps, Array]:
-    """Stamps and samples (N, 6) of a gyroscope with accelerations (M, 6) interpolated onto them, where both cover; as
-    they were where nothing measures any."""
-    good = np.isfinite(acc_data[:, 3:]).all(axis=1)
-    t_acc, first = np.unique(t_acc_ns[good], return_index=True)
-    if len(t_acc) == 0:
-        return t_ns, data
-    acc = acc_data[good, 3:][first]
-    inside = (t_ns >= t_acc[0]) & (t_ns <= t_acc[-1])
-    t, out = t_ns[inside], data[inside].copy()
-    # From the first stamp on: nanoseconds of an epoch are finer than a float.
-    out[:, 3:] = np.stack([np.interp(t - t_acc[0], t_acc - t_acc[0], acc[:, i]) for i in range(3)], axis=1)
-    return t, out
-
-
-class ChunkTooLarge(Exception):
-    """A chunk of a bag unpacks to more than is made room for."""
-
-
 def bound_chunks() -> None:
     """Make the readers of ``rosbags`` stop unpacking a chunk at what it declares, and at 256 MB in any case."""
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -383,7 +204,7 @@ def bound_chunks() -> None:
 def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], Any]) -> bytes:
     """All that compressed bytes hold, by decompressors that ``new`` makes, one for each of the streams.
 
-    Raises ChunkTooLarge beyond ``declared`` bytes or the bound, EOFError where a stream is cut off.
+    Raises TooLarge beyond ``declared`` bytes or the bound, EOFError where a stream is cut off.
     """
     most, out = min(declared, MAX_CHUNK_BYTES), bytearray()
     while data:
@@ -395,7 +216,7 @@ def unpacked(data: bytes, declared: int = MAX_CHUNK_BYTES, *, new: Callable[[], 
                 raise EOFError("a chunk is cut off")
             out += part
             if len(out) > most:
-                raise ChunkTooLarge(f"a chunk unpacks to more than {most} bytes")
+                raise TooLarge(f"a chunk unpacks to more than {most} bytes")
         data = one.unused_data or b""
     return bytes(out)
 

@@ -15,26 +15,23 @@ from gpvo.cameras.kalibr import camchain_topics
 from gpvo.cameras.readers import CameraInfo, find_calibration, read_stereo_yaml, rig_from_camera_info
 from gpvo.cameras.rig import StereoRig
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.io.bag_images import decode_message, encoding_of, pair_streams
+from gpvo.io.bag_messages import decode_message, encoding_of, imu_topics, pair_streams, read_imu, read_poses
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
     ODOMETRY_TYPE,
     POSE_TYPES,
-    imu_topics,
     is_bag,
     messages,
     open_bag,
-    read_imu,
-    read_poses,
     stamp_ns,
     topics_of,
 )
 from gpvo.io.images import Image8, ImageSource, check_size
 from gpvo.io.source import SourceReport
-from gpvo.io.stamps import PAIR_TOLERANCE_S, Stamps, tolerance_ns, usual_interval
-from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, TruthNoise, carry, check_overlap
+from gpvo.io.stamps import PAIR_TOLERANCE_S, tolerance_ns, usual_interval
+from gpvo.io.trajectory import MOTION_CAPTURE, UNKNOWN, Trajectory, carry, check_overlap
 from gpvo.types import TruthLog
 
 # How drivers name the two cameras of one head.
@@ -83,7 +80,6 @@ class BagSource(ImageSource):
         imu_topic: str | None = None,
         truth_topic: str | None = None,
         truth_frame: str | None = None,
-        truth_noise: TruthNoise | None = None,
         tolerance_s: float = PAIR_TOLERANCE_S,
         calibration: str | Path | None = None,
         **options: Any,
@@ -102,10 +98,10 @@ class BagSource(ImageSource):
         self.span_ns = span = _span(first, self._topics.count)
         self._tolerance_ns = tolerance_ns(tolerance_s)
         self.imu = read_imu(path, self._topics.imu, rig.timeshift_cam_imu_s, self.remark)
-        if self.imu is not None and not _overlap(self.imu.t_ns, span):
+        if self.imu is not None and (self.imu.t_ns[0] > span[1] or self.imu.t_ns[-1] < span[0]):
             self.remark("the IMU does not overlap the images in time, so it says nothing of them: two clocks?")
         if self._topics.truth is not None:
-            self.truth = self._read_truth(self._topics.truth, truth_frame, truth_noise)
+            self.truth = self._read_truth(self._topics.truth, truth_frame)
         if self._topics.doubtful is not None:
             whose = "whose they are is unknown; give --truth-topic and --truth-frame"
             self.remark(f"poses on '{self._topics.doubtful}' not used as truth: {whose}")
@@ -133,7 +129,7 @@ class BagSource(ImageSource):
             for t_ns, left, right in pair_streams(stream, topics.left, self._tolerance_ns, report, self.path):
                 yield t_ns, decode_message(left, self.depth), decode_message(right, self.depth)
 
-    def _read_truth(self, topic: str, frame: str | None, noise: TruthNoise | None) -> TruthLog:
+    def _read_truth(self, topic: str, frame: str | None) -> TruthLog:
         try:
             t, T, _ = read_poses(self.path, topic, self.remark, complete=True)
         except SourceError as error:
@@ -145,14 +141,9 @@ class BagSource(ImageSource):
         place = self.rectifier.T_left_cam if whose == "cam" else self.mounting.T_imu_cam
         assert place is not None
         self.remark(f"truth on '{topic}' taken as poses of the {whose} frame")
-        usual = MOTION_CAPTURE if _is_capture(topic) else UNKNOWN
-        truth = carry(Trajectory(t, T), place, noise or usual)
+        truth = carry(Trajectory(t, T), place, MOTION_CAPTURE if _is_capture(topic) else UNKNOWN)
         check_overlap(truth, self.span_ns, self.path)
         return truth
-
-
-def _overlap(t_ns: Stamps, span_ns: tuple[int, int]) -> bool:
-    return bool(t_ns[0] <= span_ns[1] and t_ns[-1] >= span_ns[0])
 
 
 def _calibration_beside(path: Path) -> Path | None:
@@ -292,12 +283,5 @@ def camera_info_of(message: Any, where: object, topic: str) -> CameraInfo:
     if not all(np.isfinite(m).all() for m in (D, K, R, P)):
         raise CalibrationError(f"CameraInfo on '{topic}' holds NaN or infinity", where=where)
     R = R.reshape(3, 3) if np.any(R) else np.eye(3)
-    return CameraInfo(
-        width=int(message.width),
-        height=int(message.height),
-        distortion_model=str(message.distortion_model),
-        D=D,
-        K=K.reshape(3, 3),
-        R=R,
-        P=P.reshape(3, 4),
-    )
+    size = int(message.width), int(message.height)
+    return CameraInfo(*size, str(message.distortion_model), D=D, K=K.reshape(3, 3), R=R, P=P.reshape(3, 4))

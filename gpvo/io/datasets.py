@@ -56,7 +56,6 @@ class EurocSource(FileSource):
         *,
         calibration: str | Path | None = None,
         tolerance_s: float = PAIR_TOLERANCE_S,
-        truth_noise: TruthNoise | None = None,
         **options: Any,
     ) -> None:
         mav = _mav_folder(path)
@@ -64,7 +63,7 @@ class EurocSource(FileSource):
         known = SourceReport()
         super().__init__(path, path.resolve().name, rig, _euroc_pairs(mav, tolerance_s, known), known, **options)
         self.imu = self._read_imu(mav)
-        self.truth = self._read_truth(mav, truth_noise)
+        self.truth = self._read_truth(mav)
         if self.truth is None and (mav / "leica0").is_dir():
             self.remark("leica0 gives positions only: not used as truth of motions")
 
@@ -80,7 +79,7 @@ class EurocSource(FileSource):
         noise = _imu_noise(self.path, mav)
         return read_imu_csv(file, shift_s=self.rig.timeshift_cam_imu_s, noise=noise, remark=self.remark)
 
-    def _read_truth(self, mav: Path, noise: TruthNoise | None) -> TruthLog | None:
+    def _read_truth(self, mav: Path) -> TruthLog | None:
         for folder, usual in _EUROC_TRUTH:
             file = mav / folder / "data.csv"
             if not file.is_file():
@@ -88,9 +87,8 @@ class EurocSource(FileSource):
             if self.mounting.T_imu_cam is None:
                 self.remark("ground truth not used: the calibration does not say where the IMU sits")
                 return None
-            stated = _stated_noise(mav / folder / "sensor.yaml")
-            T_marker_imu = _marker_to_imu(mav, folder)
-            truth = carry(read_euroc_csv(file), T_marker_imu @ self.mounting.T_imu_cam, noise or stated or usual)
+            noise = _stated_noise(mav / folder / "sensor.yaml") or usual
+            truth = carry(read_euroc_csv(file), _marker_to_imu(mav, folder) @ self.mounting.T_imu_cam, noise)
             check_overlap(truth, self.span_ns, file)
             return truth
         return None
@@ -108,19 +106,15 @@ def _mav_folder(path: Path) -> Path:
 def _euroc_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
     sensors = [mav / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     if given is None and all(s.is_file() for s in sensors):
-        imu = mav / "imu0" / "sensor.yaml"
-        return read_sensor_pair(*sensors, imu=imu if imu.is_file() else None, body_is_flu=_body_is_flu(mav))
+        imu, body = mav / "imu0" / "sensor.yaml", mav / "body.yaml"
+        is_flu = body.is_file() and str(read_yaml(body).get("axes", "")).upper() == "FLU"
+        return read_sensor_pair(*sensors, imu=imu if imu.is_file() else None, body_is_flu=is_flu)
     chain = given or next((c for c in map(find_calibration, (path, mav, path / "dso", mav.parent)) if c), None)
     if chain is None:
         text = "no calibration: neither cam0/sensor.yaml and cam1/sensor.yaml nor dso/camchain.yaml"
         cure = "put Kalibr's camchain.yaml into the folder or name one with --calibration"
         raise CalibrationError(text, where=mav, cure=cure)
     return read_stereo_yaml(chain)
-
-
-def _body_is_flu(mav: Path) -> bool:
-    body = mav / "body.yaml"
-    return body.is_file() and str(read_yaml(body).get("axes", "")).upper() == "FLU"
 
 
 def _euroc_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
@@ -180,33 +174,24 @@ def _stated_noise(sensor: Path) -> TruthNoise | None:
     document = read_yaml(sensor) if sensor.is_file() else {}
     stated = [document.get(k) for k in ("sigma_translation_m", "sigma_rotation_rad")]
     values = [float(v) for v in stated if isinstance(v, (int, float)) and 0 <= v < 10]
-    return TruthNoise(*values) if len(values) == 2 else None
+    return (values[0], values[1]) if len(values) == 2 else None
 
 
 class KittiSource(FileSource):
     """A sequence folder with ``image_0 image_1`` (or ``image_2 image_3``), ``calib.txt`` and ``times.txt``.
 
-    Poses are read from ``poses.txt`` in the folder or ``../../poses/NN.txt``. ``colour`` chooses the colour pair;
-    by default the grey one where it is there. ``calibration``: another ``calib.txt``, or a stereo YAML.
-    ``truth_noise`` replaces the default of GPS/INS.
+    The grey pair is taken where it is there. Poses are read from ``poses.txt`` in the folder or
+    ``../../poses/NN.txt``. ``calibration``: another ``calib.txt``, or a stereo YAML.
     """
 
     format = "kitti"
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        colour: bool | None = None,
-        calibration: str | Path | None = None,
-        truth_noise: TruthNoise = GPS_INS,
-        **options: Any,
-    ) -> None:
+    def __init__(self, path: Path, *, calibration: str | Path | None = None, **options: Any) -> None:
         own = path / "calib.txt"
         calib = own if calibration is None else Path(calibration)
         if not calib.is_file():
             raise CalibrationError("no calibration", where=calib, cure="copy the sequence's calib.txt there")
-        left, right = self._cameras(path, colour)
+        left, right = self._cameras(path)
         if not (path / "times.txt").is_file():
             raise SourceError("no time stamps", where=path / "times.txt", cure="one line of seconds per frame")
         stamps, known = read_times(path / "times.txt"), SourceReport()
@@ -219,7 +204,7 @@ class KittiSource(FileSource):
         super().__init__(path, path.resolve().name, rig, pairs, known, **options)
         # Poses are of camera 0, whose place only KITTI's own file tells.
         T_cam0_left = left_camera_offset(own if own.is_file() else calib, left)
-        self.truth = self._read_truth(path, stamps, T_cam0_left @ self.rectifier.T_left_cam, truth_noise)
+        self.truth = self._read_truth(path, stamps, T_cam0_left @ self.rectifier.T_left_cam)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -231,10 +216,8 @@ class KittiSource(FileSource):
         )
 
     @staticmethod
-    def _cameras(path: Path, colour: bool | None) -> tuple[int, int]:
+    def _cameras(path: Path) -> tuple[int, int]:
         for left, right in ((0, 1), (2, 3)):
-            if colour is not None and colour != (left == 2):
-                continue
             if (path / f"image_{left}").is_dir() and (path / f"image_{right}").is_dir():
                 return left, right
         cure = "image_0 and image_1 (grey) or image_2 and image_3"
@@ -261,7 +244,7 @@ class KittiSource(FileSource):
         ]
 
     @staticmethod
-    def _read_truth(path: Path, stamps: Stamps, T_cam0_cam: Array, noise: TruthNoise) -> TruthLog | None:
+    def _read_truth(path: Path, stamps: Stamps, T_cam0_cam: Array) -> TruthLog | None:
         candidates = (path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt")
         file = next((c for c in candidates if c.is_file()), None)
         if file is None:
@@ -272,4 +255,4 @@ class KittiSource(FileSource):
             cure = "KITTI poses have no stamps: both files must have one line per frame"
             raise SourceError(text, where=file, cure=cure)
         grows = growing(stamps)
-        return carry(Trajectory(stamps[grows], T_world_cam0[grows]), T_cam0_cam, noise)
+        return carry(Trajectory(stamps[grows], T_world_cam0[grows]), T_cam0_cam, GPS_INS)

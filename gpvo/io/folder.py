@@ -12,7 +12,7 @@ from gpvo.errors import CalibrationError, SourceError
 from gpvo.io.images import IMAGE_SUFFIXES, FileSource, PairFiles, first_size
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import PAIR_TOLERANCE_S, integer_ns, match_nearest, seconds_text_to_ns, tolerance_ns
-from gpvo.io.trajectory import UNKNOWN, TruthNoise, carry, check_overlap, read_imu_csv, read_times, read_tum
+from gpvo.io.trajectory import UNKNOWN, carry, check_overlap, read_imu_csv, read_times, read_tum
 
 _FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("left/data", "right/data"))
 _SIDE = re.compile(r"(?P<stem>.*?)[_-]?(?P<side>left|right|cam0|cam1|l|r)$", re.IGNORECASE)
@@ -41,7 +41,6 @@ class FolderSource(FileSource):
         calibration: str | Path | None = None,
         rate_hz: float | None = None,
         tolerance_s: float = PAIR_TOLERANCE_S,
-        truth_noise: TruthNoise = UNKNOWN,
         **options: Any,
     ) -> None:
         chain = Path(calibration) if calibration is not None else find_calibration(path)
@@ -62,7 +61,7 @@ class FolderSource(FileSource):
                 remark=self.remark,
             )
         if (path / "truth.tum").is_file():
-            self.truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, truth_noise)
+            self.truth = carry(read_tum(path / "truth.tum"), self.rectifier.T_left_cam, UNKNOWN)
             check_overlap(self.truth, self.span_ns, path / "truth.tum")
 
     @classmethod

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -69,11 +70,6 @@ def read_grey8(path: Path, depth: Depth | None = None) -> Image8 | None:
         raw = np.fromfile(path, dtype=np.uint8)
     except OSError:
         return None
-    return decode_grey8(raw, depth)
-
-
-def decode_grey8(raw: NDArray[np.uint8], depth: Depth | None = None) -> Image8 | None:
-    """Encoded bytes (PNG, JPEG, ...) as (H, W) uint8: :func:`to_grey8` of :func:`decode_stored`."""
     image = decode_stored(raw)
     return None if image is None else to_grey8(image, depth=depth)
 
@@ -157,15 +153,8 @@ class ImageSource(ABC):
 
     def __iter__(self) -> Iterator[StereoFrame]:
         self.report = report = self._fresh_report()
-        frames = self._not_swapped(self._frames(report))
+        frames = self._frames(report)
         return prefetched(frames) if self._prefetch else frames
-
-    def _not_swapped(self, frames: Iterable[StereoFrame]) -> Iterator[StereoFrame]:
-        order = OrderCheck()
-        for frame in frames:
-            if order.is_swapped(frame):
-                raise SourceError(SWAPPED, where=self.path, cure="exchange the two image folders or topics")
-            yield frame
 
     def remark(self, text: str) -> None:
         """Add a remark to this and every later report."""
@@ -177,9 +166,13 @@ class ImageSource(ABC):
         return replace(self.known, notes=list(self.known.notes))
 
     def _frames(self, report: SourceReport) -> Iterator[StereoFrame]:
+        order = OrderCheck()
         for raw in in_order(self._readable(report), report, self.usual_interval_ns):
             report.frames += 1
-            yield StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
+            frame = StereoFrame(raw.t_ns, *self.rectifier.apply(raw.left, raw.right))
+            if order.is_swapped(frame):
+                raise SourceError(SWAPPED, where=self.path, cure="exchange the two image folders or topics")
+            yield frame
         if doubt := self.depth.doubt():
             report.note(doubt)
 
@@ -213,7 +206,9 @@ class FileSource(ImageSource):
         self._pairs = pairs
         self.span_ns = (min(p.t_ns for p in pairs), max(p.t_ns for p in pairs))
         self.usual_interval_ns = usual_interval(p.t_ns for p in pairs)
-        _check_sizes(pairs, rig)
+        for side, lens in (("left", rig.left), ("right", rig.right)):
+            if (first := first_size(pairs, side)) is not None:
+                check_size("the image is", first[1], lens, first[0], f" ({rig.where})" if rig.where else "")
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -228,26 +223,13 @@ class FileSource(ImageSource):
             yield pair.t_ns, read_grey8(pair.left, self.depth), read_grey8(pair.right, self.depth)
 
 
-def _size_of(path: Path) -> tuple[int, int] | None:
-    """(width, height) by the file's header, nothing decoded; None where it is missing or no image."""
-    try:
-        with path.open("rb") as file:
-            return image_size(file.read(_MAX_HEAD_BYTES))
-    except OSError:
-        return None
-
-
 def first_size(pairs: Sequence[PairFiles], side: str) -> tuple[Path, tuple[int, int]] | None:
-    """File and (width, height) of the first readable image of a camera, ``left`` or ``right``."""
-    sizes = ((path, _size_of(path)) for path in (getattr(pair, side) for pair in pairs))
-    return next(((path, size) for path, size in sizes if size is not None), None)
-
-
-def _check_sizes(pairs: Sequence[PairFiles], rig: StereoRig) -> None:
-    """:func:`check_size` of the first readable image of each camera."""
-    for side, lens in (("left", rig.left), ("right", rig.right)):
-        if (first := first_size(pairs, side)) is not None:
-            check_size("the image is", first[1], lens, first[0], f" ({rig.where})" if rig.where else "")
+    """File and (width, height) of the first readable image of a camera, ``left`` or ``right``, by its header."""
+    for path in (getattr(pair, side) for pair in pairs):
+        with suppress(OSError), path.open("rb") as file:
+            if (size := image_size(file.read(_MAX_HEAD_BYTES))) is not None:
+                return path, size
+    return None
 
 
 def check_size(images: str, size: tuple[int, int], lens: CameraModel, where: object, source: str = "") -> None:

@@ -250,14 +250,9 @@ def _columns(table: pa.Table) -> dict[str, NDArray[Any]]:
 
 
 def placed_columns(path: Path) -> RowGroup:
-    """Where the columns of a written table lie. SourceError where it cannot be read."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        group = pq.read_metadata(path).row_group(0)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise SourceError(f"is damaged: {str(error).splitlines()[0]}", where=path) from None
+    """Where the columns of a written table lie. Raises SourceError as :func:`read_columns`."""
+    with _opened(path) as file:
+        group = file.metadata.row_group(0)
     columns = [group.column(i) for i in range(group.num_columns)]
     place = [(c.data_page_offset, c.total_compressed_size, c.total_uncompressed_size) for c in columns]
     names = tuple(c.path_in_schema for c in columns)

@@ -8,7 +8,7 @@ class method ``recognises(path) -> bool``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -48,10 +48,6 @@ class SourceReport:
         """Count ``n`` more of ``what``, the name of a count, with a remark."""
         setattr(self, what, getattr(self, what) + n)
         self.note(text)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for ``run.json``."""
-        return asdict(self)
 
     def __str__(self) -> str:
         names = ("missing", "unreadable", "duplicate", "out_of_order", "gaps")

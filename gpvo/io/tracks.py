@@ -29,7 +29,7 @@ from gpvo.errors import SourceError
 from gpvo.geometry import se3
 from gpvo.io.source import SourceReport
 from gpvo.io.stamps import UNITS_NS, check_interval, growing, in_order, likely_unit
-from gpvo.io.trajectory import GPS_INS, TruthNoise
+from gpvo.io.trajectory import GPS_INS
 from gpvo.types import Array, ImuLog, ImuNoise, Mounting, StereoCamera, TrackFrame, TruthLog
 
 _REQUIRED = ("t_s", "frame", "track", "uv_left", "uv_right", "fx", "fy", "cx", "cy", "baseline_m")
@@ -54,7 +54,7 @@ class TracksSource:
     kind: Literal["images", "tracks"] = "tracks"
     format = "tracks"
 
-    def __init__(self, path: Path, *, truth_noise: TruthNoise | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
         self._data, self.report = load_arrays(path, _REQUIRED, _OPTIONAL), SourceReport()
         self._t_ns = self._stamps()
@@ -64,7 +64,7 @@ class TracksSource:
         T_body_cam = self._body_cam()
         self.mounting = Mounting(T_body_cam=T_body_cam, T_imu_cam=T_body_cam)
         self.imu = self._make_imu()
-        self.truth = self._make_truth(truth_noise)
+        self.truth = self._make_truth()
         self.calibration: dict[str, Any] | None = None
         self.span_ns = (int(self._t_ns.min()), int(self._t_ns.max()))
 
@@ -161,7 +161,7 @@ class TracksSource:
         keep = growing(t_ns)
         return ImuLog(t_ns[keep].astype(np.int64), gyro[keep], acc[keep], noise)
 
-    def _make_truth(self, noise: TruthNoise | None) -> TruthLog | None:
+    def _make_truth(self) -> TruthLog | None:
         if "T_world_cam" not in self._data:
             return None
         T = self._array("T_world_cam", len(self._t_ns), 4, 4, finite=False)
@@ -169,12 +169,10 @@ class TracksSource:
         if not keep.any():
             raise SourceError("'T_world_cam' is NaN throughout", where=self.path, cure="without truth, leave it out")
         poses = [check_pose(T[k], f"'T_world_cam' row {k}", self.path) for k in np.flatnonzero(keep)]
-        stated = ("sigma_translation_m", "sigma_rotation_rad")
-        if noise is None and all(k in self._data for k in stated):
-            noise = TruthNoise(*(abs(float(self._array(k, most=1e3))) for k in stated))
-        noise = noise or GPS_INS
-        v_world = self._velocity(np.stack(poses), keep)
-        return TruthLog(self._t_ns[keep], np.stack(poses), noise.translation_m, noise.rotation_rad, v_world)
+        stated, (sigma_t, sigma_r) = ("sigma_translation_m", "sigma_rotation_rad"), GPS_INS
+        if all(k in self._data for k in stated):
+            sigma_t, sigma_r = (abs(float(self._array(k, most=1e3))) for k in stated)
+        return TruthLog(self._t_ns[keep], np.stack(poses), sigma_t, sigma_r, self._velocity(np.stack(poses), keep))
 
     def _velocity(self, T_world_cam: Array, keep: NDArray[np.bool_]) -> Array | None:
         """(K, 3) velocity of the camera, from the body's and its turning; None where the file does not have all."""

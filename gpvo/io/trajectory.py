@@ -204,23 +204,17 @@ def check_unit(path: Path, q_xyzw: Array, lines: list[int]) -> None:
         raise SourceError(text, where=path, cure="check the order of the columns")
 
 
-@dataclass(frozen=True)
-class TruthNoise:
-    """White noise of a truth, per pose and axis: ``translation_m``, ``rotation_rad``."""
-
-    translation_m: float
-    rotation_rad: float
-
-
-# Per pose and axis. GPS/INS: a motion between two poses carries sqrt(2) times as much, about 4 mm; measured as the
+TruthNoise = tuple[float, float]
+"""White noise of a truth, per pose and axis: translation [m], rotation [rad]."""
+# GPS/INS: a motion between two poses carries sqrt(2) times as much, about 4 mm; measured as the
 # fourth difference of vertical and lateral position over seven KITTI drives (1 to 6 mm per motion).
-GPS_INS = TruthNoise(3e-3, 2e-4)
+GPS_INS: TruthNoise = (3e-3, 2e-4)
 # Optical motion capture at 120 Hz, unfiltered (fourth difference of TUM-VI room 1: 0.09 mm and 0.8 mrad).
-MOTION_CAPTURE = TruthNoise(1e-4, 8e-4)
+MOTION_CAPTURE: TruthNoise = (1e-4, 8e-4)
 # Smoothed by a batch estimator with an IMU (EuRoC: below 0.01 mm and 0.1 mrad): its white part is nothing, what
 # remains is slow.
-BATCH_ESTIMATE = TruthNoise(0.0, 0.0)
-UNKNOWN = TruthNoise(0.0, 0.0)
+BATCH_ESTIMATE: TruthNoise = (0.0, 0.0)
+UNKNOWN: TruthNoise = (0.0, 0.0)
 
 
 def carry(trajectory: Trajectory, T_body_cam: Array, noise: TruthNoise) -> TruthLog:
@@ -229,12 +223,7 @@ def carry(trajectory: Trajectory, T_body_cam: Array, noise: TruthNoise) -> Truth
     The rotation noise acts at the lever arm too; at the decimetres of a head that is far below the translation noise
     and is left out.
     """
-    return TruthLog(
-        t_ns=trajectory.t_ns,
-        T_world_cam=trajectory.T_world_body @ T_body_cam,
-        sigma_translation_m=noise.translation_m,
-        sigma_rotation_rad=noise.rotation_rad,
-    )
+    return TruthLog(trajectory.t_ns, trajectory.T_world_body @ T_body_cam, *noise)
 
 
 def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path, more: str = "") -> None:
@@ -251,13 +240,7 @@ def check_overlap(truth: TruthLog, t_ns: Sequence[int] | Stamps, path: Path, mor
         )
 
 
-def read_imu_csv(
-    path: Path,
-    *,
-    shift_s: float = 0.0,
-    noise: ImuNoise | None = None,
-    remark: Callable[[str], None] | None = None,
-) -> ImuLog:
+def read_imu_csv(path: Path, *, shift_s: float, noise: ImuNoise | None, remark: Callable[[str], None]) -> ImuLog:
     """EuRoC's ``data.csv``: stamp [ns], gyro xyz [rad/s], accelerometer xyz [m/s^2], in that order.
 
     ``shift_s``: ``t_imu = t_cam + shift``, taken off so that the stamps are of the camera's clock. Lines that repeat
@@ -280,16 +263,11 @@ def read_imu_csv(
 
 
 def make_imu(
-    t_ns: np.ndarray,
-    gyro_acc: np.ndarray,
-    *,
-    shift_s: float = 0.0,
-    noise: ImuNoise | None = None,
-    remark: Callable[[str], None] | None = None,
+    t_ns: Stamps, gyro_acc: Array, *, shift_s: float, remark: Callable[[str], None], noise: ImuNoise | None = None
 ) -> ImuLog:
     """An :class:`ImuLog` of samples (N, 6), gyro first; those that repeat or go back in time are dropped."""
     keep = growing(t_ns)
-    if remark is not None and not keep.all():
+    if not keep.all():
         remark(f"{int((~keep).sum())} of {len(t_ns)} IMU samples repeat or go back in time: dropped")
     t = t_ns[keep] - round(shift_s * 1e9)
     return ImuLog(t_ns=t, gyro_radps=gyro_acc[keep, :3], acc_mps2=gyro_acc[keep, 3:], noise=noise)

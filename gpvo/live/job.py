@@ -13,13 +13,13 @@ from typing import Any
 
 from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.errors import GpvoError
+from gpvo.io.bag_messages import accelerometer_beside
 from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
     ODOMETRY_TYPE,
     POSE_TYPE,
-    accelerometer_beside,
     open_bag,
 )
 from gpvo.io.bags import has_word, info_topic

@@ -23,7 +23,8 @@ from gpvo.geometry.covariance import (
     symmetrise,
 )
 from gpvo.geometry.se3 import rotate_covariance
-from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.bag_messages import pose_of
+from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.foreign import T_FLU_OPTICAL, definite_in_plane, is_optical, moving_frame
 from gpvo.io.stated import is_turn_unknown
 from gpvo.io.trajectory import FARTHEST_M

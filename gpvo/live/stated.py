@@ -11,7 +11,8 @@ import numpy as np
 from gpvo.errors import GpvoError, printable
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import LARGEST
-from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.bag_messages import pose_of
+from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.types import Array
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -81,18 +81,10 @@ class Workers:
         self.map(what, keep, dict.fromkeys(stages), store)
 
 
-@contextmanager
-def only_user(root: Path) -> Iterator[None]:
-    """Hold the folder, so that two reproductions never fill one; the hold falls when the process dies.
-
-    Raises GpvoError where another process has it.
-    """
+def only_user(root: Path) -> FolderLock:
+    """Hold the folder, so that two reproductions never fill one. Raises GpvoError where another process has it."""
     folder = Store(root).folder(".")
     try:
-        lock = FolderLock(folder)
+        return FolderLock(folder)
     except OutputError:
         raise GpvoError("another reproduction is running here", where=root, cure="give another --out") from None
-    try:
-        yield
-    finally:
-        lock.release()

@@ -12,6 +12,7 @@ from gpvo.geometry import se3
 from gpvo.sim import paths, recorded
 from gpvo.sim.events import CAMERA_HEIGHT_M
 from gpvo.sim.paths import Path3
+from gpvo.stats.series import interpolated
 from gpvo.types import Array
 
 PATHS = ("along", "wander", "straight", "hover", "waypoints")
@@ -76,7 +77,7 @@ def _street_along(
     at = np.concatenate([at[:1] - _BEYOND_M * ahead[0], at, at[-1:] + _BEYOND_M * ahead[1]])
     arc = se3.path_length_m(at)
     even = np.arange(0.0, arc[-1], _STEP_M)
-    return path, _street(np.stack([np.interp(even, arc, at[:, i]) for i in range(3)], axis=1), rng)
+    return path, _street(interpolated(even, arc, at), rng)
 
 
 def _tunnel_line(length_m: float, rng: np.random.Generator, bend: float, scale: float = 1.0) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.geometry import se3
 from gpvo.sim.paths import level_axes
+from gpvo.stats.series import interpolated
 from gpvo.types import Array
 
 LANE_M = 3.5
@@ -132,10 +133,9 @@ class _Way:
         moving = np.concatenate([[True], np.diff(self.arc_m) > 1e-9])
         arc, place, turn = self.arc_m[moving], self.position[moving], self.heading[moving]
         heading = np.interp(arc_m, arc, turn)
-        at = np.stack([np.interp(arc_m, arc, place[:, i]) for i in range(3)], 1)
         ahead, left = level_axes(heading)
         over = np.maximum(arc_m - arc[-1], 0.0) + np.minimum(arc_m - arc[0], 0.0)
-        return at + over[:, None] * ahead + left_m * left, heading
+        return interpolated(arc_m, arc, place) + over[:, None] * ahead + left_m * left, heading
 
     def poses(self, position: Array, heading: Array, begin_s: float, end_s: float) -> Array:
         """Upright poses (K, 4, 4), NaN outside of begin and end."""

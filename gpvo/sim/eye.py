@@ -163,16 +163,16 @@ class SensorModel:
         right_linear: Image,
         frame_index: int,
         *,
-        depth: Image | Sequence[Image] | None = None,
+        depth: Sequence[Image] | None = None,
         darkness: float = 1.0,
         dust: float = 0.0,
         noise_sigma: float = 0.0,
     ) -> tuple[Grey, Grey]:
         """Two (H, W) uint8 images from linear radiance.
 
-        ``darkness``: factor on all light, 1 is as drawn. ``dust``: extinction of the air [1/m], which needs ``depth``:
-        that of the left camera, or of both. ``noise_sigma``: additional white noise on the 0..1 scale of the grey
-        values. Raises GpvoError for dust without depth, or a negative amount of anything.
+        ``darkness``: factor on all light, 1 is as drawn. ``dust``: extinction of the air [1/m], which needs the
+        ``depth`` of both. ``noise_sigma``: additional white noise on the 0..1 scale of the grey values. Raises
+        GpvoError for dust without depth, or a negative amount of anything.
         """
         if min(darkness, dust, noise_sigma) < 0:
             raise GpvoError("darkness, dust and noise_sigma cannot be negative")
@@ -182,8 +182,7 @@ class SensorModel:
         if dust > 0:
             if depth is None:
                 raise GpvoError("dust needs the depth of the image", cure="pass depth=")
-            both = [depth, depth] if isinstance(depth, np.ndarray) else list(depth)
-            images = [through_dust(image, d, dust) for image, d in zip(images, both, strict=True)]
+            images = [through_dust(image, d, dust) for image, d in zip(images, depth, strict=True)]
         self._adjust(images[0])
         jobs = [(image, side, frame_index, noise_sigma) for side, image in enumerate(images)]
         run = map if self._pool is None else self._pool.map

@@ -43,13 +43,13 @@ class Path3:
 RAMP_S = 2.0
 
 
-def smooth_start(t_s: Array, rest_s: float, ramp_s: float = RAMP_S) -> Array:
-    """Time that stands still for ``rest_s`` and then takes ``ramp_s`` to run at full pace (C3)."""
-    x = np.clip((np.asarray(t_s) - rest_s) / ramp_s, 0.0, None)
+def smooth_start(t_s: Array, rest_s: float) -> Array:
+    """Time that stands still for ``rest_s`` and then takes :data:`RAMP_S` to run at full pace (C3)."""
+    x = np.clip((np.asarray(t_s) - rest_s) / RAMP_S, 0.0, None)
     y = np.minimum(x, 1.0)
     # Integral of the smoothstep 35 y^4 - 84 y^5 + 70 y^6 - 20 y^7.
     begun = 7 * y**5 - 14 * y**6 + 10 * y**7 - 2.5 * y**8
-    return ramp_s * (begun + np.maximum(x - 1.0, 0.0))
+    return RAMP_S * (begun + np.maximum(x - 1.0, 0.0))
 
 
 def along_curve(
@@ -162,17 +162,19 @@ def waypoints(points: Array, duration_s: float, speed_mps: float, rest_s: float 
     way = curve(fine)
     steps = np.diff(way, axis=0)
     if (back := (steps[1:] * steps[:-1]).sum(axis=1) <= 0).any():
-        x, y, z = way[1 + int(back.argmax())]
-        cure = "put another place beside the turn"
-        raise GpvoError(
-            f"the way through the waypoints turns back on the spot at ({x:.1f}, {y:.1f}, {z:.1f}) m", cure=cure
-        )
+        text = f"the way through the waypoints turns back on the spot at {place(way[1 + int(back.argmax())])}"
+        raise GpvoError(text, cure="put another place beside the turn")
     along = path_length_m(way)
     at_arc = CubicSpline(along, fine)
     t = knots(duration_s)
     u = at_arc(soft_end(speed_mps * smooth_start(t, rest_s), along[-1], 0.5 * speed_mps))
     # A step straight up has no heading of its own: it keeps a trace of the first one.
     return _flat(t, curve(u), _heading(curve.derivative(1)(u) + 1e-3 * (corners[-1] - corners[0])), duration_s)
+
+
+def place(p: Array) -> str:
+    """A place in words."""
+    return f"({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) m"
 
 
 def soft_end(distance: Array, limit: float, width: float) -> Array:

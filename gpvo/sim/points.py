@@ -7,7 +7,7 @@ frame, so the two motions that share a frame share its noise, as in reality.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +62,7 @@ class PointsFlight:
             "gyro_body_radps": self.imu.gyro_radps[:: self.scenario.imu_samples_per_frame],
             "vel_body_mps": np.einsum("nji,nj->ni", at_frames.R_world_body, at_frames.velocity_mps),
             "imu_t_ns": self.imu.t_ns, "imu_gyro_radps": self.imu.gyro_radps, "imu_acc_mps2": self.imu.acc_mps2,
-            "imu_noise": np.array([noise.gyro_density_radps_sqrthz, noise.acc_density_mps2_sqrthz,
-                                   noise.gyro_walk_radps2_sqrthz, noise.acc_walk_mps3_sqrthz]),
+            "imu_noise": np.array(astuple(noise)),
             "episodes_s": np.array([[e.begin_s, e.end_s] for e in self.episodes]).reshape(-1, 2),
         }  # fmt: skip
         write_arrays(target, arrays)

@@ -106,12 +106,11 @@ def _only_writer(target: Path) -> Iterator[None]:
     """Hold a lock beside the folder, so that two processes never fill one; it falls when the process dies."""
     file = target.with_name(target.name + ".lock")
     make_folder(target.parent)
-    lock = FolderLock(file, create=True, where=target)
-    try:
-        yield
-    finally:
-        file.unlink(missing_ok=True)
-        lock.release()
+    with FolderLock(file, create=True, where=target):
+        try:
+            yield
+        finally:
+            file.unlink(missing_ok=True)
 
 
 def _is_finished(target: Path, resolved: str) -> bool:

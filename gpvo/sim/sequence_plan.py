@@ -13,7 +13,7 @@ from gpvo.geometry import se3
 from gpvo.sim import paths, vehicles
 from gpvo.sim.events import Episode, draw_episodes
 from gpvo.sim.imu import Motion
-from gpvo.sim.paths import Path3
+from gpvo.sim.paths import Path3, place
 from gpvo.sim.recorded import Recording, read_recording
 from gpvo.sim.scenario import Scenario
 from gpvo.sim.worlds import World
@@ -86,11 +86,6 @@ def refuse_outside(world: World, position_m: Array, t_s: Array, flat: bool = Fal
             f"the path leaves the world at t = {t_s[k]:.1f} s, place {place(position_m[k])}",
             cure="a shorter duration, a lower speed, or a larger world",
         )
-
-
-def place(p: Array) -> str:
-    """A place in words."""
-    return f"({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) m"
 
 
 def _times(scenario: Scenario) -> Array:

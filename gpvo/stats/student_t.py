@@ -42,20 +42,11 @@ def log_fisher(nu: ArrayLike) -> Array:
     return np.where(np.isinf(nu), 0.5, 0.5 / (1.0 + 3.0 / nu))
 
 
-def row_weight(ratio: Array, nu: ArrayLike) -> Array:
-    """``(nu + 1) / (nu + ratio)``, weight of a row of squared standardised residual ``ratio``; 1 for a Gaussian."""
-    inverse = 1.0 / np.asarray(nu, dtype=np.float64)
-    return (1.0 + inverse) / (1.0 + ratio * inverse)
-
-
 def log_scale_score(ratio: Array, nu: ArrayLike) -> Array:
-    """Derivative of the log density by the log of the squared scale: ``(weight * ratio - 1) / 2``."""
-    return 0.5 * (row_weight(ratio, nu) * ratio - 1.0)
-
-
-def log_second_moment(nu: ArrayLike) -> Array:
-    """``log(nu / (nu - 2))``: from squared scale to variance."""
-    return -np.log1p(-2.0 / np.asarray(nu, dtype=np.float64))
+    """Derivative of the log density by the log of the squared scale, at squared standardised residuals ``ratio``:
+    ``(weight * ratio - 1) / 2`` with the weight ``(nu + 1) / (nu + ratio)``, 1 for a Gaussian."""
+    inverse = 1.0 / np.asarray(nu, dtype=np.float64)
+    return 0.5 * ((1.0 + inverse) / (1.0 + ratio * inverse) * ratio - 1.0)
 
 
 def fit(ratio: Array) -> tuple[Array, Array]:
@@ -119,7 +110,7 @@ def second_moment(square: Array) -> Array:
     """Second moment (D,) of each column of residuals, given their squares (n, D), by the best t: a few gross errors
     hardly move it."""
     nu, log_scale = fit(np.maximum(square, 1e-300))
-    return np.exp(log_scale + log_second_moment(nu))
+    return np.exp(log_scale - np.log1p(-2.0 / nu))  # from squared scale to variance: nu / (nu - 2)
 
 
 def scatter(z: Array, nu: float = NU) -> Array:

@@ -48,16 +48,10 @@ def point_jacobian(uvd: Array, camera: StereoCamera) -> Array:
     return J
 
 
-def triangulation_pixel_covariance(sigma_px: float = 1.0, pixel_covariance: Array | None = None) -> Array:
-    """Covariance (3, 3) of (u, v, d) from the four image coordinates [px^2].
-
-    With equal independent noise it is ``s^2 [[1, 0, 1], [0, 1/2, 0], [1, 0, 2]]``: never diagonal, as u takes part in
-    d. ``pixel_covariance`` (4, 4) of (uL, vL, uR, vR) stands in for the square of ``sigma_px`` times the identity.
-    """
-    S = np.eye(4) * sigma_px**2 if pixel_covariance is None else np.asarray(pixel_covariance, dtype=np.float64)
-    if S.shape != (4, 4):
-        raise ValueError(f"pixel_covariance must be (4, 4) for (uL, vL, uR, vR), got {S.shape}")
-    return _PIXELS_TO_UVD @ S @ _PIXELS_TO_UVD.T
+def triangulation_pixel_covariance(sigma_px: float = 1.0) -> Array:
+    """Covariance (3, 3) of (u, v, d) from four image coordinates of equal, independent noise [px^2]:
+    ``s^2 [[1, 0, 1], [0, 1/2, 0], [1, 0, 2]]``, never diagonal, as u takes part in d."""
+    return _PIXELS_TO_UVD @ (np.eye(4) * sigma_px**2) @ _PIXELS_TO_UVD.T
 
 
 @dataclass(frozen=True)

@@ -105,13 +105,14 @@ def read_image(path: Path) -> None:
 
 
 def read_bag(path: Path) -> None:
-    from gpvo.io.bag_reader import POSE_TYPES, open_bag, read_poses, topics_of
+    from gpvo.io.bag_messages import read_poses
+    from gpvo.io.bag_reader import POSE_TYPES, open_bag, topics_of
     from gpvo.live.doctor import examine_bag
 
     with open_bag(path) as reader:
         topics = list(topics_of(reader, POSE_TYPES))
     for topic in topics:
-        if len(read_poses(path, topic)[0]) >= 10:
+        if len(read_poses(path, topic, lambda _: None)[0]) >= 10:
             examine_bag(path, topic)
 
 

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from bag_maker import stereo_bag
 from gpvo.errors import SourceError
+from gpvo.files import TooLarge
 from gpvo.io import bag_reader, open_source
-from gpvo.io.bag_reader import ChunkTooLarge, open_bag, unpacked
+from gpvo.io.bag_reader import open_bag, unpacked
 from lz4.frame import LZ4FrameDecompressor
 from lz4.frame import compress as lz4_compress
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -34,7 +35,7 @@ def test_a_chunk_unpacks_to_what_it_declares_and_no_further(new: Callable[[], An
         unpacked(pack(some)[:-20], new=new)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for declared, most in ((1000, 1000), (1 << 62, 1 << 28)):
-        with pytest.raises(ChunkTooLarge, match=f"more than {most} bytes"):
+        with pytest.raises(TooLarge, match=f"more than {most} bytes"):
             unpacked(large, declared, new=new)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 700_000
 

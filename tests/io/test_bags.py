@@ -14,8 +14,8 @@ from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import CalibrationError, SourceError
 from gpvo.geometry import se3
 from gpvo.io import guess, open_source
-from gpvo.io.bag_images import decode_message, pair_streams
-from gpvo.io.bag_reader import pose_of, stamp_ns
+from gpvo.io.bag_messages import decode_message, pair_streams, pose_of
+from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.bags import has_word
 from gpvo.io.foreign import read_foreign
 from gpvo.io.source import SourceReport

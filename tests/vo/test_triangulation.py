@@ -47,10 +47,6 @@ def test_pixel_covariance_of_four_measurements() -> None:
     uL, vL, uR, vR = 0.5 * rng.standard_normal((4, 400_000))
     sample = np.cov(np.stack([uL, (vL + vR) / 2, uL - uR]))
     np.testing.assert_allclose(S, sample, atol=0.005)
-    given = triangulation_pixel_covariance(pixel_covariance=np.diag([1.0, 2, 3, 4]))
-    np.testing.assert_allclose(np.diag(given), [1, 1.5, 4])
-    with pytest.raises(ValueError, match=r"\(4, 4\)"):
-        triangulation_pixel_covariance(pixel_covariance=np.eye(3))
 
 
 def test_pointing_matching_holds_squares() -> None:
