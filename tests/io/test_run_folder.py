@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tracemalloc
 from dataclasses import fields, replace
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from gpvo.errors import SourceError
 from gpvo.geometry import se3
-from gpvo.io.run import RunWriter, read_predictions, read_run, write_predictions, write_run
+from gpvo.io.run import RunWriter, digest_of_file, read_predictions, read_run, write_predictions, write_run
 from gpvo.io.run_read import is_run
 from gpvo.types import (
     ImuLog,
@@ -134,6 +135,17 @@ def test_a_log_takes_a_kilobyte_a_motion(tmp_path):
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert held < 1024 * len(run.log)
+
+
+def test_digests_are_of_files_that_do_not_fit_into_memory(tmp_path):
+    """The tracks of a run of hours."""
+    (tmp_path / "tracks.parquet").write_bytes(bytes(20_000_000))
+    tracemalloc.start()
+    found = digest_of_file(tmp_path / "tracks.parquet")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found == hashlib.sha256(bytes(20_000_000)).hexdigest()
+    assert peak < 5_000_000
 
 
 def test_parts_that_know_different_methods_make_one_log(tmp_path):
