@@ -216,10 +216,13 @@ def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float)
     parent, usable = log.parent, log.usable
     leads_on = np.append(parent[1:] == np.arange(len(parent) - 1), False)  # whether the next motion starts there
     # A run would cost the square of its frames without these cuts: a window ends where odometry measures first beyond
-    # its length, and what stops one start stops all between.
+    # its length or further on, and what stops one start stops all between.
     measured = np.flatnonzero(usable)
     end = np.searchsorted(measured, np.searchsorted(progress, progress + span * _HAIR))
-    starts, stops = np.flatnonzero(leads_on & known & np.append(known[measured], False)[end]), 0
+    beyond = np.append(measured, 0)[end]
+    may_begin = leads_on & known & (end < len(measured)) & known[beyond]
+    may_begin &= progress[beyond] - progress < TOO_FAR * span
+    starts, stops = np.flatnonzero(may_begin), 0
     for start in starts.tolist():
         if start < stops or progress[start] < t_next:
             continue
