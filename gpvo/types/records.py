@@ -235,10 +235,18 @@ class VoLog:
     @property
     def methods(self) -> tuple[str, ...]:
         """Names of the geometric covariance methods present, in first-seen order."""
+        return self._names("covariances")
+
+    @property
+    def v_t_methods(self) -> tuple[str, ...]:
+        """The same of ``V_T``."""
+        return self._names("v_t")
+
+    def _names(self, of: str) -> tuple[str, ...]:
         if isinstance(self.records, StoredRecords):
-            known = {m: ~np.isnan(C).all(axis=1) for m, C in self.records.covariances.items()}
+            known = {m: ~np.isnan(C).all(axis=1) for m, C in getattr(self.records, of).items()}
             return tuple(sorted((m for m in known if known[m].any()), key=lambda m: int(known[m].argmax())))
-        return tuple(dict.fromkeys(method for record in self.records for method in record.covariances))
+        return tuple(dict.fromkeys(method for record in self.records for method in getattr(record, of)))
 
     def covariance(self, method: str) -> Array:
         """(N, 6, 6) of one method; NaN where a record has none."""
@@ -248,6 +256,13 @@ class VoLog:
             return np.asarray(elements[:, _PLACE_6])
         return np.array([r.covariances.get(method, missing) for r in self.records]).reshape(-1, 6, 6)
 
+    def v_t(self, method: str) -> Array:
+        """(N, 3, 3) ``V_T`` by one method [m^2], in axes of the reference camera; NaN where a record has none."""
+        missing = np.full((3, 3), np.nan)
+        if isinstance(self.records, StoredRecords):
+            return np.asarray(self.records.v_t.get(method, np.full((len(self), 6), np.nan))[:, _PLACE_3])
+        return np.array([r.v_t.get(method, missing) for r in self.records]).reshape(-1, 3, 3)
+
     def judged_as(self, records: Iterable[VoRecord]) -> VoLog:
         """The log with the statuses and reasons of ``records``, which are otherwise its own, in their order."""
         if not isinstance(self.records, StoredRecords):
@@ -255,6 +270,13 @@ class VoLog:
         said = np.array([(r.status, r.reason) for r in records], dtype=object).reshape(-1, 2)
         columns = {**self.records.columns, "status": said[:, 0], "reason": said[:, 1]}
         return replace(self, records=replace(self.records, columns=columns))
+
+    def rows(self, keep: NDArray[np.bool_]) -> VoLog:
+        """A part (N,) of the records."""
+        if not isinstance(self.records, StoredRecords):
+            return replace(self, records=[r for r, k in zip(self.records, keep, strict=True) if k])
+        maps = (getattr(self.records, f.name) for f in fields(StoredRecords))
+        return replace(self, records=StoredRecords(*({name: c[keep] for name, c in m.items()} for m in maps)))
 
     def trajectory(self) -> Array:
         """(N, 4, 4) ``T_first_cam``: the motions compounded, never corrected by a model."""
