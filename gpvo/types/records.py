@@ -385,6 +385,36 @@ class Prediction(MotionError):
         return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
 
 
+@dataclass(frozen=True, eq=False)
+class StoredPredictions(Sequence[Prediction]):
+    """N predictions as columns, a third of what they take as objects; each is made when it is asked for.
+
+    ``columns``: the fields of a prediction by name, (N, ...).
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def join(cls, parts: Sequence[StoredPredictions]) -> StoredPredictions:
+        """One after the other."""
+        return cls({name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns})
+
+    def __len__(self) -> int:
+        return len(self.columns["t_ns"])
+
+    @overload
+    def __getitem__(self, k: int) -> Prediction: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> list[Prediction]: ...
+
+    def __getitem__(self, k: int | slice) -> Prediction | list[Prediction]:
+        if isinstance(k, slice):
+            return [self[i] for i in range(*k.indices(len(self)))]
+        of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
+        return Prediction(**of_one)
+
+
 _FIELDS = frozenset(f.name for f in fields(VoRecord))
 COUNT_FIELDS = tuple(f.name for f in fields(VoRecord) if f.default == -1)
 FLOAT_FIELDS = tuple(f.name for f in fields(VoRecord) if f.type == "float")
