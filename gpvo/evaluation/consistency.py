@@ -9,7 +9,7 @@ from functools import partial, reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpvo.accumulation import PoseError, over_windows
+from gpvo.accumulation import PoseError, carry, over_windows
 from gpvo.dataset.errors import MotionErrors, drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
@@ -165,9 +165,11 @@ def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) ->
     covered = np.flatnonzero(known)
     chain = _ancestors(int(covered[-1]), int(covered[0]), log.parent)
     pose, independent = PoseError(), np.zeros((6, 6))
-    for k, T in zip(chain, log.T_prev_cur[chain]):
-        pose = pose.after(T, statement.errors[k])
-        independent = compound(T, independent, statement.errors[k].covariance)
+    T = log.T_prev_cur[chain]
+    for k, T_prev_cur, A in zip(chain, T, carry(T)):
+        error = statement.errors[k]
+        pose = pose.after(T_prev_cur, error)
+        independent = A @ independent @ A.T + error.covariance
     a, b = (float(np.sqrt(np.trace(C[:3, :3]))) for C in (pose.covariance, independent))
     return a, b
 
