@@ -225,6 +225,12 @@ def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
             yield _columns(block if isinstance(block, pa.Table) else pa.Table.from_batches([block]))
 
 
+def count_rows(path: Path) -> int:
+    """Rows of a table, of which none is read. SourceError as :func:`read_columns`."""
+    with _opened(path) as file:
+        return int(file.metadata.num_rows)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     """The file, its sizes checked; what goes wrong with it, in one line."""
