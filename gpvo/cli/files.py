@@ -209,7 +209,7 @@ def import_(
     one_of("--frame", frame, ("auto", "cam", "body"))
     one_of("--align", align, ("none", "rotation", "transform"))
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])
-    stated = {"covariance_of": covariance_of, "covariance_axes": covariance_axes}
+    stated: dict[str, Any] = {"covariance_of": covariance_of, "covariance_axes": covariance_axes}
     of_truth: dict[str, Any] = {"mapping": truth_mapping, "topic": truth_topic, "complete": True}
     read = partial(read_foreign, times=times, rate_hz=rate_hz)
     with progress("logs", 1):

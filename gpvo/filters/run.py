@@ -259,8 +259,8 @@ def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
     est, imu = run.T_world_cam[valid], run.T_world_imu[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
     path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
-    counted = run.t_ns[valid] > run.t_ns[0]
-    finite = np.isfinite(run.covariance).all(axis=(1, 2))[valid] & np.isfinite(imu).all(axis=(1, 2)) & counted
+    finite = np.asarray(np.isfinite(run.covariance).all(axis=(1, 2)) & (run.t_ns > run.t_ns[0]))[valid]
+    finite &= np.isfinite(imu).all(axis=(1, 2))
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
     lever, R = se3.skew(imu[finite, :3, 3] - run.T_world_imu[0, :3, 3]), imu[finite, :3, :3]
     own[0] = own[0] + lever @ world_tilt @ np.swapaxes(lever, 1, 2)
