@@ -175,6 +175,12 @@ def test_parts_that_know_different_methods_make_one_log(tmp_path):
             assert_same(a, b)
         assert log.methods == VoLog(records).methods
         np.testing.assert_array_equal(log.covariance("triangulation"), VoLog(records).covariance("triangulation"))
+        assert log.v_t_methods == VoLog(records).v_t_methods
+        np.testing.assert_array_equal(log.v_t("triangulation"), VoLog(records).v_t("triangulation"))
+        some = np.arange(90) % 4 == 1
+        assert log.rows(some & (log.t_ns < log.t_ns[30])).methods == ()
+        for a, b in zip(log.rows(some), VoLog(records).rows(some), strict=True):
+            assert_same(a, b)
         assert_same(log.records[-1], records[-1])
         assert [r.t_ns for r in log.records[3:50:7]] == [r.t_ns for r in records[3:50:7]]
         with pytest.raises(IndexError):
