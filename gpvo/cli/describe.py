@@ -11,7 +11,8 @@ from gpvo.errors import GpvoError, ModelError, SourceError, printable
 from gpvo.geometry.se3 import path_length_m
 from gpvo.io.bag_reader import IMAGE_TYPES, is_bag, open_bag, topics_of
 from gpvo.io.foreign import guess_format, read_foreign
-from gpvo.io.run import read_run, read_tracks
+from gpvo.io.parquet import count_rows
+from gpvo.io.run import read_run
 from gpvo.io.run_read import is_run
 from gpvo.io.source import guess, open_source
 from gpvo.io.trajectory import read_kitti_poses
@@ -83,7 +84,7 @@ def _poses(t_ns: Any, T: Any) -> dict[str, Any]:
 def _run(path: Path) -> dict[str, Any]:
     run = read_run(path)
     log = run.log
-    kept = (path / "tracks.parquet").is_file()
+    tracks = path / "tracks.parquet"
     return {
         "what": "run",
         "name": run.name,
@@ -97,7 +98,7 @@ def _run(path: Path) -> dict[str, Any]:
         "truth": None if run.truth is None else _poses(run.truth.t_ns, run.truth.T_world_cam),
         "imu": None if run.imu is None else _imu(run.imu),
         "predictions": len(run.predictions),
-        "tracks": {"observations": len(read_tracks(path))} if kept else None,
+        "tracks": {"observations": count_rows(tracks)} if tracks.is_file() else None,
     }
 
 

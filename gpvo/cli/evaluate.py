@@ -97,8 +97,11 @@ def evaluate(
     else:
         found = _evaluate(runs, judge)
         documents = document(found)["runs"]
-    for evaluation, name in zip(found, distinct([e.run.name for e in found]), strict=True):
-        _write_files(evaluation, name, stated=stated, tables=tables, plots=plots)
+    if stated or tables or plots:
+        with progress("files", len(found)) as advance:
+            for evaluation, name in zip(found, distinct([e.run.name for e in found]), strict=True):
+                _write_files(evaluation, name, stated=stated, tables=tables, plots=plots)
+                advance()
     if json_:
         print_json({"schema": 1, "runs": documents})
     else:
@@ -146,7 +149,8 @@ def report(
         raise GpvoError("--sequence has no effect without --frames", cure="add --frames, such as 5,80")
     found = _evaluate(runs, judge, unjudged=True)
     pictures = [] if frames is None else _pictures(runs, frames, sequence)
-    write_report(found, out, pictures, judge.model.name if judge.model else "")
+    with progress("pages", 1):
+        write_report(found, out, pictures, judge.model.name if judge.model else "")
     print(out)
     _tell_misfits(judge.model, found)
 

@@ -12,7 +12,7 @@ import typer
 
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
-from gpvo.cli.output import Json, note, numbers, one_of, print_json
+from gpvo.cli.output import Json, note, numbers, one_of, print_json, progress
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
@@ -141,7 +141,8 @@ def info(
 
     Example: gpvo info MH_01_easy/
     """
-    document = plain(describe(path, kind, reading.given()))
+    with progress("files", 1):
+        document = plain(describe(path, kind, reading.given()))
     if json_:
         print_json({"schema": 1, "path": str(path), **document})
     else:
@@ -208,18 +209,21 @@ def import_(
     one_of("--frame", frame, ("auto", "cam", "body"))
     one_of("--align", align, ("none", "rotation", "transform"))
     mapping, truth_mapping = _mapping("--map", map_ or []), _mapping("--truth-map", truth_map or [])
+    stated: dict[str, Any] = {"covariance_of": covariance_of, "covariance_axes": covariance_axes}
+    of_truth: dict[str, Any] = {"mapping": truth_mapping, "topic": truth_topic, "complete": True}
     read = partial(read_foreign, times=times, rate_hz=rate_hz)
-    summary = import_log(
-        read(log, format_, mapping=mapping, topic=topic, covariance_of=covariance_of, covariance_axes=covariance_axes),
-        None if truth is None else read(truth, truth_format, mapping=truth_mapping, topic=truth_topic, complete=True),
-        out,
-        frame=frame,
-        align=align,
-        time_offset_s=offset,
-        truth_sigma=sigma,
-        vehicle=vehicle.bounds(),
-        overwrite=overwrite,
-    )
+    with progress("logs", 1):
+        summary = import_log(
+            read(log, format_, mapping=mapping, topic=topic, **stated),
+            None if truth is None else read(truth, truth_format, **of_truth),
+            out,
+            frame=frame,
+            align=align,
+            time_offset_s=offset,
+            truth_sigma=sigma,
+            vehicle=vehicle.bounds(),
+            overwrite=overwrite,
+        )
     if json_:
         print_json({"schema": 1, "run": str(out), **summary.__dict__})
     else:

@@ -9,7 +9,7 @@ import typer
 
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
-from gpvo.cli.output import Json, cell, new_table, print_json, say, show
+from gpvo.cli.output import Json, cell, new_table, print_json, progress, say, show
 from gpvo.errors import GpvoError
 
 
@@ -42,7 +42,8 @@ def score(
     truth = truth or []
     options = JudgeOptions(truth_sigma=truth_sigma).options()
     if len(stated) == 1 and stated[0].is_dir() and not truth:
-        methods = score_folder(stated[0], options)
+        with progress("folders", 1):
+            methods = score_folder(stated[0], options)
         if out is not None:
             write_board(methods, out)
         if json_:
@@ -54,7 +55,8 @@ def score(
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
-    found = score_files(list(zip(stated, truth)), options)
+    with progress("files", 1):
+        found = score_files(list(zip(stated, truth)), options)
     if json_:
         print_json(found)
     else:

@@ -155,7 +155,7 @@ def build(
             where=where or name,
             cure="check that log and truth share one clock",
         )
-    kept = [r for r, k in zip(records, known) if k]
+    kept = seen.rows(known)
     n_lost, slips, jumps = lost_of(log)
     as_if, has = motion_targets([replace(r, status=Status.OK) for r in slips], truth)
     return TrainingSet(
@@ -163,10 +163,10 @@ def build(
         columns=names,
         X=X[known],
         Y=Y[known],
-        t_ns=np.array([r.t_ns for r in kept], dtype=np.int64),
-        dt_s=np.array([r.dt_s for r in kept]),
-        covariances={m: VoLog(kept).covariance(m) for m in VoLog(kept).methods},
-        v_t=_v_t(kept),
+        t_ns=kept.t_ns,
+        dt_s=kept.column("dt_s"),
+        covariances={m: kept.covariance(m) for m in kept.methods},
+        v_t={m: kept.v_t(m) for m in kept.v_t_methods},
         counts={
             "frames": len(log),
             "lost": n_lost,
@@ -251,12 +251,6 @@ def aligned_truth(log: VoLog, truth: TruthLog, align: str) -> TruthLog:
     if align == "none":
         return truth
     return replace(truth, T_world_cam=align_frames(flag_slips(log), truth, align).in_log_frame(truth.T_world_cam))
-
-
-def _v_t(records: Sequence[VoRecord]) -> dict[str, Array]:
-    names = dict.fromkeys(m for r in records for m in r.v_t)
-    missing = np.full((3, 3), np.nan)
-    return {m: np.array([r.v_t.get(m, missing) for r in records]).reshape(-1, 3, 3) for m in names}
 
 
 def predictions_of(run: Run, predictor: Predictor | None) -> dict[int, Prediction]:

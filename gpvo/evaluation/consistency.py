@@ -9,7 +9,7 @@ from functools import partial, reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpvo.accumulation import PoseError, over_windows
+from gpvo.accumulation import PoseError, carry, over_windows
 from gpvo.dataset.errors import MotionErrors, drift_variance
 from gpvo.evaluation.statements import Statement
 from gpvo.geometry import se3
@@ -165,9 +165,11 @@ def _final_errors(statement: Statement, log: VoLog, known: NDArray[np.bool_]) ->
     covered = np.flatnonzero(known)
     chain = _ancestors(int(covered[-1]), int(covered[0]), log.parent)
     pose, independent = PoseError(), np.zeros((6, 6))
-    for k, T in zip(chain, log.T_prev_cur[chain]):
-        pose = pose.after(T, statement.errors[k])
-        independent = compound(T, independent, statement.errors[k].covariance)
+    T = log.T_prev_cur[chain]
+    for k, T_prev_cur, A in zip(chain, T, carry(T)):
+        error = statement.errors[k]
+        pose = pose.after(T_prev_cur, error)
+        independent = A @ independent @ A.T + error.covariance
     a, b = (float(np.sqrt(np.trace(C[:3, :3]))) for C in (pose.covariance, independent))
     return a, b
 
@@ -216,10 +218,13 @@ def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float)
     parent, usable = log.parent, log.usable
     leads_on = np.append(parent[1:] == np.arange(len(parent) - 1), False)  # whether the next motion starts there
     # A run would cost the square of its frames without these cuts: a window ends where odometry measures first beyond
-    # its length, and what stops one start stops all between.
+    # its length or further on, and what stops one start stops all between.
     measured = np.flatnonzero(usable)
     end = np.searchsorted(measured, np.searchsorted(progress, progress + span * _HAIR))
-    starts, stops = np.flatnonzero(leads_on & known & np.append(known[measured], False)[end]), 0
+    beyond = np.append(measured, 0)[end]
+    may_begin = leads_on & known & (end < len(measured)) & known[beyond]
+    may_begin &= progress[beyond] - progress < TOO_FAR * span
+    starts, stops = np.flatnonzero(may_begin), 0
     for start in starts.tolist():
         if start < stops or progress[start] < t_next:
             continue

@@ -117,10 +117,9 @@ class _Rows(Sequence[MotionError]):
 
 def _translation_alone(log: VoLog, method: str) -> Array:
     """(N, 3, 3) covariance of the translation."""
-    missing = np.full((3, 3), np.nan)
     # V_T is in the axes of the reference camera, the error in those of the current one.
-    turned = [r.T_prev_cur[:3, :3].T @ r.v_t.get(method, missing) @ r.T_prev_cur[:3, :3] for r in log]
-    return where_stated(np.array(turned).reshape(-1, 3, 3))
+    R = log.T_prev_cur[:, :3, :3]
+    return where_stated(np.swapaxes(R, 1, 2) @ log.v_t(method) @ R)
 
 
 def predicted_statement(method: str, log: VoLog, predictions: Mapping[int, Prediction]) -> Statement:

@@ -19,7 +19,7 @@ from gpvo.filters.propagation import DEFAULT_IMU_NOISE, TH, constant_velocity_no
 from gpvo.filters.start import Start, StartSigmas, from_rest, from_truth, tilt_of, vertical_in_world
 from gpvo.filters.timeline import Step, Timeline
 from gpvo.geometry import se3
-from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoRecord
+from gpvo.types import STANDARD_GRAVITY_MPS2, Array, ImuLog, Prediction, VoLog, VoRecord
 
 T = TypeVar("T")
 
@@ -57,7 +57,7 @@ class Flight:
     @property
     def covered(self) -> NDArray[np.bool_]:
         """(N,) which records the IMU reaches; all without one. Beyond its ends nothing is known to fuse with."""
-        t_ns = np.array([r.t_ns for r in self.records], dtype=np.int64)
+        t_ns = VoLog(self.records).t_ns
         if self.imu is None or not len(self.imu.t_ns):
             return np.ones(len(t_ns), bool)
         known = self.imu.t_ns[usable(self.imu)]
@@ -120,7 +120,7 @@ def begin(flight: Flight, options: FuseOptions) -> tuple[Start, Array | None]:
     Where truth's z is not up, gravity is measured in truth's world.
     """
     sigmas, valid = options.sigmas, np.flatnonzero(flight.known)
-    t_ns = np.array([flight.records[i].t_ns for i in valid.tolist()], dtype=np.int64)
+    t_ns = VoLog(flight.records).t_ns[valid]
     if options.init == "static":
         if flight.imu is None:
             cure = "use --init truth" if flight.has_truth else "use --twins"
@@ -205,12 +205,12 @@ def _fly(
 ) -> tuple[Timeline, Start, dict[int, T]]:
     """The filter at the end, its start, and what is kept of the step of each record, by stamp."""
     start, gravity = begin(flight, options)
-    first = flight.first
-    records = [flight.records[int(i)] for i in np.flatnonzero(flight.covered) if i >= first]
+    rows = np.flatnonzero(flight.covered)
+    rows = rows[rows >= flight.first]
     filter = make_filter(flight, start, gravity, batch, options)
     timeline = Timeline(
         filter,
-        records[0].t_ns,
+        flight.records[int(rows[0])].t_ns,
         policy,
         gate=options.gate,
         with_imu=flight.imu is not None,
@@ -219,7 +219,7 @@ def _fly(
     steps: dict[int, T] = {}
     imu = flight.imu
     samples = iter(()) if imu is None else zip(imu.t_ns.tolist(), imu.gyro_radps, imu.acc_mps2)
-    for record in records:
+    for record in map(flight.records.__getitem__, rows.tolist()):
         while not timeline.reaches(record.t_ns) and (sample := next(samples, None)):
             timeline.add_imu(*sample)
         for step in timeline.add_vo(record, flight.predictions.get(record.t_ns)):
@@ -256,17 +256,18 @@ def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
     rows, valid = _rows_with_truth(flight, run.t_ns.tolist())
     assert flight.T_world_cam is not None
     truth_cam, truth_imu = flight.T_world_cam[rows][valid], flight.T_world_imu[rows][valid]
-    est, imu, C = run.T_world_cam[valid], run.T_world_imu[valid], run.covariance[valid]
+    est, imu = run.T_world_cam[valid], run.T_world_imu[valid]
     error = np.linalg.norm(est[:, :3, 3] - truth_cam[:, :3, 3], axis=1)
     path = float(se3.path_length_m(truth_cam[:, :3, 3])[-1])
-    counted = run.t_ns[valid] > run.t_ns[0]
-    finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(imu).all(axis=(1, 2)) & counted
+    finite = np.asarray(np.isfinite(run.covariance).all(axis=(1, 2)) & (run.t_ns > run.t_ns[0]))[valid]
+    finite &= np.isfinite(imu).all(axis=(1, 2))
     own = [np.eye(3) * sigma**2 for sigma in flight.truth_sigma]
     lever, R = se3.skew(imu[finite, :3, 3] - run.T_world_imu[0, :3, 3]), imu[finite, :3, :3]
     own[0] = own[0] + lever @ world_tilt @ np.swapaxes(lever, 1, 2)
     own[1] = own[1] + np.swapaxes(R, 1, 2) @ world_tilt @ R
-    position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], C[finite, :3, :3] + own[0])
-    attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], C[finite, 6:9, 6:9] + own[1])
+    of_position, of_attitude = (run.covariance[valid, block, block][finite] for block in (slice(0, 3), TH))
+    position = metrics.position_nees(imu[finite, :3, 3], truth_imu[finite, :3, 3], of_position + own[0])
+    attitude = metrics.attitude_nees(imu[finite, :3, :3], truth_imu[finite, :3, :3], of_attitude + own[1])
     return replace(
         run.scores,
         ate_rmse_m=metrics.ate_rmse(est[:, :3, 3], truth_cam[:, :3, 3]),
@@ -281,6 +282,6 @@ def _score(flight: Flight, run: FusedRun, world_tilt: Array) -> metrics.Scores:
 
 def _rows_with_truth(flight: Flight, t_ns: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The flight's records of these stamps (n,), and which of them have truth (n,)."""
-    index = {r.t_ns: i for i, r in enumerate(flight.records)}
+    index = {t: i for i, t in enumerate(VoLog(flight.records).t_ns.tolist())}
     rows = np.array([index[t] for t in t_ns])
     return rows, np.ones(len(rows), bool) if flight.truth_valid is None else np.asarray(flight.truth_valid)[rows]

@@ -27,7 +27,7 @@ from gpvo.filters.policies import (
 )
 from gpvo.filters.run import Flight, FusedRun, FuseOptions, ate_of_members, fuse_flight
 from gpvo.stats.series import Interval, sequence_bootstrap
-from gpvo.types import Array, MotionError, Prediction, VoRecord
+from gpvo.types import Array, MotionError, Prediction, VoLog, VoRecord
 
 Progress = Callable[[str], None]
 
@@ -219,13 +219,14 @@ def _cell(value: float, digits: int, width: int) -> str:
 
 @dataclass(frozen=True)
 class _SideBySide:
-    """The noises of several policies, one member each, by the records' stamps."""
+    """The noises of several policies, one member each, by the records' stamps, which are the same."""
 
-    noises: Mapping[int, MotionError]
+    noises: Sequence[Mapping[int, MotionError]]
     name: str = "side by side"
 
     def noise(self, record: VoRecord, prediction: Prediction | None) -> MotionError | None:
-        return self.noises.get(record.t_ns)
+        found = [of_one[record.t_ns].row(0) for of_one in self.noises if record.t_ns in of_one]
+        return stacked(found) if found else None
 
 
 def fuse_side_by_side(
@@ -237,14 +238,13 @@ def fuse_side_by_side(
     Members see the same clock and the same records. A policy that has nothing to say about some records, or whose bias
     has other time constants, is filtered by itself.
     """
-    usable = sum(r.usable for r in flight.records)
+    usable = int(VoLog(flight.records).usable.sum())
     found = {name: _noises(flight, policy) for name, policy in policies.items()}
     stated = {name: noises for name, noises in found.items() if usable and 2 * len(noises) >= usable}
     together = _alike(stated)
     out: dict[str, FusedRun] = {}
     if len(together) > 1:
-        noises = {t: stacked([stated[name][t].row(0) for name in together]) for t in stated[together[0]]}
-        fused = fuse_flight(flight, _SideBySide(noises), options, batch=len(together))
+        fused = fuse_flight(flight, _SideBySide([stated[name] for name in together]), options, batch=len(together))
         out = {name: replace(run, policy=name) for name, run in zip(together, fused, strict=True)}
     for name in stated:
         if name not in out:

@@ -9,6 +9,7 @@ from gpvo.geometry import se3
 from gpvo.types import Array
 
 LARGEST = 1e100  # No element of a covariance is larger, no variance as small as its inverse: squares stay finite.
+_SKEW, _SKEW_OF_SUM = 1e-8, 1e-12
 
 
 def symmetrise(C: Array) -> Array:
@@ -24,7 +25,7 @@ def variances(C: Array) -> Array:
 def is_symmetric(C: Array) -> bool:
     """Whether one (n, n) matrix is symmetric to rounding: of an element, or of those that were summed up to it."""
     size = np.abs(C)
-    return bool((np.abs(C - C.T) <= 1e-8 * size + 1e-12 * size.max()).all())
+    return bool((np.abs(C - C.T) <= _SKEW * size + _SKEW_OF_SUM * size.max()).all())
 
 
 def is_positive_definite(C: Array) -> bool:
@@ -38,6 +39,29 @@ def is_positive_definite(C: Array) -> bool:
     except np.linalg.LinAlgError:
         return False
     return True
+
+
+def are_covariances(C: Array) -> NDArray[np.bool_]:
+    """(N,) which of (N, n, n) matrices :func:`is_positive_definite` is true of."""
+    C = np.asarray(C, dtype=np.float64)
+    size = np.abs(C)
+    largest = size.max(axis=(1, 2), initial=0.0)
+    with np.errstate(invalid="ignore"):
+        symmetric = np.abs(C - np.swapaxes(C, 1, 2)) <= _SKEW * size + _SKEW_OF_SUM * largest[:, None, None]
+        # Comparisons with NaN are false.
+        good = (largest < LARGEST) & (variances(C) > 1 / LARGEST).all(axis=1) & symmetric.all(axis=(1, 2))
+    good[good] = _have_roots(C[good])
+    return np.asarray(good)
+
+
+def _have_roots(C: Array) -> NDArray[np.bool_]:
+    """(N,) which of (N, n, n) have a Cholesky factor: tried together, in halves where one of them has none."""
+    try:
+        np.linalg.cholesky(C)
+    except np.linalg.LinAlgError:
+        halves = np.array_split(C, 2)
+        return np.zeros(1, bool) if len(C) == 1 else np.concatenate([_have_roots(half) for half in halves])
+    return np.ones(len(C), bool)
 
 
 def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
@@ -58,8 +82,7 @@ def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
 def where_stated(C: Array) -> Array:
     """(N, n, n) with NaN in place of what is no covariance: zeros, say, with which other software marks what it does
     not know, or one that says that some error is impossible."""
-    stated = np.array([is_positive_definite(one) for one in C], dtype=bool)
-    return np.where(stated[:, None, None], C, np.nan)
+    return np.where(are_covariances(C)[:, None, None], C, np.nan)
 
 
 def upper(C: Array) -> Array:

@@ -2,7 +2,7 @@
 so that odometry can record without a Parquet library.
 
 Format: Apache Parquet 2.10, its footer and page headers in Thrift's compact protocol (the ids of fields are those of
-``parquet.thrift``). Every column is optional, plainly encoded, in one gzip page with its CRC-32 per group of rows.
+``parquet.thrift``). Every column is optional, plainly encoded, in gzip pages with a CRC-32 each, one per joined table.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _BLOCK_ROWS = 50_000
+_MOST_GROUPS = 1000  # of rows: what a file says of each column of each takes 1 kB to write and to read
 _PLAIN_BYTES, _MAX_RATIO = 200_000_000, 200
 _LARGEST = np.float64(1e100)  # No number of a run is larger: products of two or three stay finite.
 
@@ -74,23 +75,29 @@ def write_table(path: Path, columns: Mapping[str, Any], metadata: Mapping[str, s
 
 
 def join_tables(parts: Sequence[RowGroup], target: Path, metadata: Mapping[str, str] | None = None) -> None:
-    """Join tables of a growing set of columns into one file, a part at a time in memory."""
+    """Join tables of a growing set of columns into one file, a few parts at a time in memory."""
     names = tuple(dict.fromkeys(name for part in parts for name in part.names))
-    joined, end = [], len(_MAGIC)
+    joined, end, at_once = [], len(_MAGIC), -(-len(parts) // _MOST_GROUPS)
     with replacing(target) as temporary, temporary.open("wb") as file:
         file.write(_MAGIC)
-        for part in parts:
-            stored, place, rows = part.path.read_bytes(), dict(zip(part.names, part.place)), []
+        for k in range(0, len(parts), at_once or 1):
+            some, rows = [(part, part.path.read_bytes()) for part in parts[k : k + at_once]], []
             for name in names:
-                if name in place:
-                    offset, size, plain = place[name].tolist()
-                    page = stored[offset : offset + size]
-                else:
-                    page, plain = _page([None] * part.rows, KIND_OF.get(name, "float64"))
-                rows.append((end, len(page), plain))
-                end += file.write(page)
-            joined.append(RowGroup(target, part.rows, names, np.array(rows, dtype=np.int64)))
+                pages = [_stored_page(part, stored, name) for part, stored in some]
+                size = file.write(b"".join(page for page, _ in pages))
+                rows.append((end, size, sum(plain for _, plain in pages)))
+                end += size
+            count = sum(part.rows for part, _ in some)
+            joined.append(RowGroup(target, count, names, np.array(rows, dtype=np.int64)))
         file.write(_footer(joined, metadata))
+
+
+def _stored_page(part: RowGroup, stored: bytes, name: str) -> tuple[bytes, int]:
+    """A column's page in a stored table, of nulls where it has none, and its size before compression."""
+    if name not in part.names:
+        return _page([None] * part.rows, KIND_OF.get(name, "float64"))
+    offset, size, plain = part.place[part.names.index(name)].tolist()
+    return stored[offset : offset + size], plain
 
 
 def _page(values: Any, kind: str) -> tuple[bytes, int]:
@@ -216,6 +223,12 @@ def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
         blocks = file.iter_batches(_BLOCK_ROWS) if file.metadata.num_rows else [file.read()]
         for block in blocks:
             yield _columns(block if isinstance(block, pa.Table) else pa.Table.from_batches([block]))
+
+
+def count_rows(path: Path) -> int:
+    """Rows of a table, of which none is read. SourceError as :func:`read_columns`."""
+    with _opened(path) as file:
+        return int(file.metadata.num_rows)
 
 
 @contextmanager

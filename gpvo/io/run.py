@@ -205,7 +205,7 @@ class RunWriter:
     def _digests(self) -> dict[str, str]:
         """SHA-256 of each table of the folder."""
         files = ((name, self.path / name) for name in run_folder.FILES)
-        return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in files if f.is_file()}
+        return {name: digest_of_file(file) for name, file in files if file.is_file()}
 
     def _write_meta(self, *, complete: bool) -> None:
         state = self._state
@@ -226,6 +226,15 @@ class RunWriter:
                 "versions": {"gpvo": __version__, "python": platform.python_version(), "numpy": np.__version__},
             },
         )
+
+
+def digest_of_file(path: Path) -> str:
+    """SHA-256 of a file, which may not fit into memory: the tracks of a long run."""
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            sha.update(block)
+    return sha.hexdigest()
 
 
 @dataclass

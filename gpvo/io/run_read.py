@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from gpvo.types import (
     Prediction,
     StereoCamera,
     StereoTracks,
+    StoredPredictions,
     StoredRecords,
     TruthLog,
     Vehicle,
@@ -51,7 +52,7 @@ class Run:
     truth: TruthLog | None
     imu: ImuLog | None
     mounting: Mounting
-    predictions: list[Prediction]
+    predictions: Sequence[Prediction]
     meta: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -92,6 +93,7 @@ def read_run(path: str | Path) -> Run:
         raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=p / "run.json", cure="upgrade")
     camera, mounting = _read_rig(p / "rig.json")
     log = _read_log(p, camera, _vehicle_of(meta, p / "run.json"))
+    stated = [read_predictions(part) for part in _parts(p, "predictions")]
     return Run(
         path=p,
         name=printable(meta.get("name") or p.resolve().name),
@@ -99,29 +101,30 @@ def read_run(path: str | Path) -> Run:
         truth=_read_truth(p / "truth.parquet"),
         imu=_read_imu(p / "imu.parquet"),
         mounting=mounting,
-        predictions=[q for part in _parts(p, "predictions") for q in read_predictions(part)],
+        predictions=StoredPredictions.join(stated) if stated else [],
         meta=meta,
         settings=read_toml(p / "config.toml") if (p / "config.toml").is_file() else {},
     )
 
 
-def read_predictions(path: str | Path) -> list[Prediction]:
+def read_predictions(path: str | Path) -> StoredPredictions:
     """Predictions of a Parquet file. Raises SourceError where it is damaged or holds something else."""
     p = Path(path)
-    predictions = [q for piece in _read_table(p, run_table.predictions_from) for q in piece]
+    predictions = StoredPredictions.join(_read_table(p, run_table.predictions_from))
     if not predictions:
-        return []
-    numbers = np.array([[*q.mean, q.dt_s, q.confidence, q.in_domain] for q in predictions], dtype=np.float64)
+        return predictions
+    of = predictions.columns
+    numbers = np.column_stack([of[name] for name in ("mean", "dt_s", "confidence", "in_domain")])
     if not np.isfinite(numbers).all():
         raise SourceError("holds a prediction that is not finite", where=p)
-    covariance = np.array([q.covariance for q in predictions])
+    covariance = of["jitter"] + of["white"] + of["persistent_root"] @ np.swapaxes(of["persistent_root"], 1, 2)
     if max(np.abs(numbers).max(), variances(covariance).max()) > _LARGEST:
         raise SourceError(f"holds a prediction beyond {_LARGEST:g}", where=p, cure="make it again with 'gpvo predict'")
-    if not all(q.nu > 2.0 for q in predictions):
+    if not (of["nu"] > 2.0).all():
         raise SourceError("holds a prediction without a second moment: its 'nu' is not above 2", where=p)
     _check_covariances(covariance, "predicted covariance", p)
     for part in ("jitter", "white"):
-        _check_covariances(np.array([getattr(q, part) for q in predictions]), f"covariance '{part}'", p, semi=True)
+        _check_covariances(of[part], f"covariance '{part}'", p, semi=True)
     return predictions
 
 

@@ -27,6 +27,7 @@ from gpvo.types import (
     Prediction,
     Status,
     StereoTracks,
+    StoredPredictions,
     StoredRecords,
     TruthLog,
     VoLog,
@@ -165,7 +166,7 @@ def prediction_columns(predictions: Sequence[Prediction]) -> Columns:
     return out
 
 
-def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
+def predictions_from(columns: Mapping[str, NDArray[Any]]) -> StoredPredictions:
     """Predictions of :func:`prediction_columns`.
 
     A bias without a time constant counts as white. The root of what persists is that of its covariance, to rounding.
@@ -188,23 +189,20 @@ def predictions_from(columns: Mapping[str, NDArray[Any]]) -> list[Prediction]:
     root[~usable], tau[~usable] = 0.0, 1.0
     persistent = np.where(usable[:, None, None], bias, 0.0) - root @ np.swapaxes(root, -1, -2)
     root[:, :, :6] = scaled_root(persistent)
-    return [
-        Prediction(
-            mean=mean[k],
-            jitter=jitter[k],
-            white=white[k],
-            persistent_root=root[k],
-            persistent_tau_s=tau[k],
-            dt_s=float(columns["dt_s"][k]),
-            status=Status(columns["status"][k]),
-            t_ns=int(columns["t_ns"][k]),
-            epistemic=epistemic[k],
-            confidence=float(columns["confidence"][k]),
-            in_domain=float(columns["in_domain"][k]),
-            nu=float(columns["nu"][k]) if "nu" in columns else math.inf,
-        )
-        for k in range(n)
-    ]
+    return StoredPredictions(
+        {
+            "mean": mean,
+            "jitter": jitter,
+            "white": white,
+            "persistent_root": root,
+            "persistent_tau_s": tau,
+            "status": _objects(map(Status, columns["status"].tolist()), n),
+            "t_ns": np.array([int(t) for t in columns["t_ns"].tolist()], dtype=np.int64),
+            "epistemic": epistemic,
+            **{name: np.asarray(columns[name], dtype=np.float64) for name in ("dt_s", "confidence", "in_domain")},
+            "nu": np.asarray(columns.get("nu", np.full(n, np.inf)), dtype=np.float64),
+        }
+    )
 
 
 def _wide(persistent: Array, fill: float) -> Array:

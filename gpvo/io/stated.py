@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from gpvo.errors import SourceError
 from gpvo.files import write_text
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import are_positive_definite, from_upper, is_positive_definite, symmetrise, upper
+from gpvo.geometry.covariance import (
+    are_covariances,
+    are_positive_definite,
+    from_upper,
+    is_positive_definite,
+    symmetrise,
+    upper,
+)
 from gpvo.io.foreign import NONE_STATED, ForeignLog, definite_in_plane, still_axes
 from gpvo.io.stamps import ns_to_seconds_text, seconds_text_to_ns, text_lines
 from gpvo.io.trajectory import Trajectory, read_tum_with, tum_line
@@ -162,7 +169,7 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
     growth[1:] = symmetrise(C[1:] - A @ C[:-1] @ np.swapaxes(A, -1, -2))
     still = still_axes(log.trajectory.T_world_body)
     growth = definite_in_plane(growth, still, np.diagonal(C, axis1=1, axis2=2))
-    share = float(np.mean([is_positive_definite(g) for g in growth[1:]])) if len(motions) else 0.0
+    share = float(are_covariances(growth[1:]).mean()) if len(motions) else 0.0
     if share >= 0.95:
         return IMPORTED, growth, []
     other = "" if log.topic else " (if they are of single motions, --covariance-of motion)"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite, variances
+from gpvo.geometry.covariance import are_covariances, variances
 from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
 from gpvo.live.intake import Mailbox, arrivals
 from gpvo.live.job import WIRES, open_wire
@@ -127,7 +127,7 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
         if bad.any():
             yield Finding(f"{name}-{code}", what.format(name), text, float(bad.mean()))
     if (D > 0).all() and symmetric.all():
-        bad = np.array([not is_positive_definite(c) for c in C])
+        bad = ~are_covariances(C)
         if bad.any():
             text = "its correlations are impossible: robot_localization's gain goes wrong, Cholesky factorisation fails"
             what = f"the {name}'s covariance is not positive definite"

@@ -29,6 +29,8 @@ _LONGEST_STEP_NS = round(LONGEST_STEP_S * 1e9)
 _FARTHEST_M = 1e5  # No motion between two frames is longer.
 _EYE = np.eye(4)
 _EYE.setflags(write=False)
+MOST_MOTIONS = 1000
+"""In a window: to join them anew with each frame takes 40 us a motion."""
 _PATTERN = re.compile(r"(window|length):([0-9]*\.?[0-9]+)(s|m)")
 
 
@@ -102,12 +104,13 @@ def follows(before_ns: int, t_ns: int) -> bool:
 class Window:
     """Joins the latest motions into one that spans ``size`` seconds or metres, frame by frame and causally.
 
-    ``kind`` is "window" (seconds) or "length" (metres of path).
+    ``kind`` is "window" (seconds) or "length" (metres of path). A window holds at most ``MOST_MOTIONS``: a vehicle
+    that stands would need ever more for a metre.
     """
 
     def __init__(self, kind: str, size: float) -> None:
         self.kind, self.size = kind, size
-        self._motions: deque[VoRecord] = deque()
+        self._motions: deque[VoRecord] = deque(maxlen=MOST_MOTIONS)
 
     @classmethod
     def of(cls, target: str) -> Window | None:

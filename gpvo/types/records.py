@@ -235,10 +235,18 @@ class VoLog:
     @property
     def methods(self) -> tuple[str, ...]:
         """Names of the geometric covariance methods present, in first-seen order."""
+        return self._names("covariances")
+
+    @property
+    def v_t_methods(self) -> tuple[str, ...]:
+        """The same of ``V_T``."""
+        return self._names("v_t")
+
+    def _names(self, of: str) -> tuple[str, ...]:
         if isinstance(self.records, StoredRecords):
-            known = {m: ~np.isnan(C).all(axis=1) for m, C in self.records.covariances.items()}
+            known = {m: ~np.isnan(C).all(axis=1) for m, C in getattr(self.records, of).items()}
             return tuple(sorted((m for m in known if known[m].any()), key=lambda m: int(known[m].argmax())))
-        return tuple(dict.fromkeys(method for record in self.records for method in record.covariances))
+        return tuple(dict.fromkeys(method for record in self.records for method in getattr(record, of)))
 
     def covariance(self, method: str) -> Array:
         """(N, 6, 6) of one method; NaN where a record has none."""
@@ -248,6 +256,13 @@ class VoLog:
             return np.asarray(elements[:, _PLACE_6])
         return np.array([r.covariances.get(method, missing) for r in self.records]).reshape(-1, 6, 6)
 
+    def v_t(self, method: str) -> Array:
+        """(N, 3, 3) ``V_T`` by one method [m^2], in axes of the reference camera; NaN where a record has none."""
+        missing = np.full((3, 3), np.nan)
+        if isinstance(self.records, StoredRecords):
+            return np.asarray(self.records.v_t.get(method, np.full((len(self), 6), np.nan))[:, _PLACE_3])
+        return np.array([r.v_t.get(method, missing) for r in self.records]).reshape(-1, 3, 3)
+
     def judged_as(self, records: Iterable[VoRecord]) -> VoLog:
         """The log with the statuses and reasons of ``records``, which are otherwise its own, in their order."""
         if not isinstance(self.records, StoredRecords):
@@ -255,6 +270,13 @@ class VoLog:
         said = np.array([(r.status, r.reason) for r in records], dtype=object).reshape(-1, 2)
         columns = {**self.records.columns, "status": said[:, 0], "reason": said[:, 1]}
         return replace(self, records=replace(self.records, columns=columns))
+
+    def rows(self, keep: NDArray[np.bool_]) -> VoLog:
+        """A part (N,) of the records."""
+        if not isinstance(self.records, StoredRecords):
+            return replace(self, records=[r for r, k in zip(self.records, keep, strict=True) if k])
+        maps = (getattr(self.records, f.name) for f in fields(StoredRecords))
+        return replace(self, records=StoredRecords(*({name: c[keep] for name, c in m.items()} for m in maps)))
 
     def trajectory(self) -> Array:
         """(N, 4, 4) ``T_first_cam``: the motions compounded, never corrected by a model."""
@@ -361,6 +383,36 @@ class Prediction(MotionError):
     def is_of(self, record: VoRecord) -> bool:
         """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
         return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPredictions(Sequence[Prediction]):
+    """N predictions as columns, a third of what they take as objects; each is made when it is asked for.
+
+    ``columns``: the fields of a prediction by name, (N, ...).
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def join(cls, parts: Sequence[StoredPredictions]) -> StoredPredictions:
+        """One after the other."""
+        return cls({name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns})
+
+    def __len__(self) -> int:
+        return len(self.columns["t_ns"])
+
+    @overload
+    def __getitem__(self, k: int) -> Prediction: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> list[Prediction]: ...
+
+    def __getitem__(self, k: int | slice) -> Prediction | list[Prediction]:
+        if isinstance(k, slice):
+            return [self[i] for i in range(*k.indices(len(self)))]
+        of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
+        return Prediction(**of_one)
 
 
 _FIELDS = frozenset(f.name for f in fields(VoRecord))

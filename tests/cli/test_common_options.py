@@ -210,3 +210,27 @@ def test_a_model_that_does_not_fit_is_named_at_once_and_at_the_end(tmp_path: Pat
         assert "do not fly it there" in lines[-1]
     fused = call("fuse", str(tmp_path / "other"), "--model", MODEL, "--policies", "triangulation,learned")
     assert "the model does not fit: baseline is 0.6" in fused.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a terminal")
+@pytest.mark.parametrize(
+    ("bar", "words"),
+    [
+        ("logs", ["import", f"{UNSEEN}/trajectory.tum", "-o", "run"]),
+        ("files", ["info", UNSEEN]),
+        ("pages", ["report", UNSEEN, "-o", "report.html"]),
+    ],
+)
+def test_a_long_log_is_not_worked_on_in_silence(tmp_path: Path, bar: str, words: list[str]):
+    """A million poses take minutes: on a terminal, a bar shows that something happens."""
+    reader, writer = os.openpty()
+    line = [sys.executable, "-m", "gpvo", *words]
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=writer, cwd=tmp_path) as process:
+        os.close(writer)
+        shown = b""
+        with suppress(OSError):  # what Linux says at the end
+            while part := os.read(reader, 4096):
+                shown += part
+    os.close(reader)
+    assert process.returncode == 0, shown
+    assert f"{bar} ".encode() in shown

@@ -164,18 +164,20 @@ def test_final_error_is_stated_between_the_first_and_the_last_frame_with_truth()
     assert part < 0.8 * whole
 
 
-@pytest.mark.parametrize("what", ["lost frames", "gaps of the truth"])
+@pytest.mark.parametrize("what", ["lost frames", "gaps of the truth", "a leap after hours at rest"])
 def test_windows_that_cannot_be_are_not_looked_through_from_every_frame(monkeypatch, what):
-    """Of 50 s in a log that is lost every 20 s, and in one whose truth comes and goes."""
+    """Of 50 s in a log that is lost every 20 s, and in one whose truth comes and goes; of 50 m where frames are missing
+    over three times as far, once the vehicle has stood."""
     n, starts = 4000, []
     usable, known = np.arange(n) > 0, np.ones(n, bool)
     if what == "lost frames":
         usable[400::400] = False
-    else:
+    elif what == "gaps of the truth":
         known = np.arange(n) // 700 % 2 == 0
     log, looked = SimpleNamespace(parent=np.arange(n) - 1, usable=usable), module._window
     monkeypatch.setattr(module, "_window", lambda start, *known: starts.append(start) or looked(start, *known))
-    windows = list(module._windows(log, known, np.arange(n) / 20, 50.0))
+    progress = np.repeat([0.0, 150.0], n // 2) if "rest" in what else np.arange(n) / 20
+    windows = list(module._windows(log, known, progress, 50.0))
     assert bool(windows) == (what == "gaps of the truth")
     assert all(known[w[0] - 1] and known[w[-1]] and len(w) == 1000 for w in windows)
     assert len(starts) < 20

@@ -79,6 +79,9 @@ def test_accumulate_is_repeated_compounding_and_follows_parents():
 )
 def test_is_positive_definite(C, expected):
     assert cov.is_positive_definite(C) is expected
+    many = np.array([np.eye(len(C)), C, 2.0 * np.eye(len(C))])
+    assert cov.are_covariances(many).tolist() == [True, expected, True]
+    assert cov.are_covariances(many[:0]).tolist() == []
 
 
 def test_the_scaled_root_follows_the_units():

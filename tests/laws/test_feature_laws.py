@@ -8,7 +8,8 @@ import numpy as np
 from gpvo.dataset.build import observe
 from gpvo.geometry import se3
 from gpvo.online.features import FeatureStream, resolve
-from gpvo.types import Status, VoLog
+from gpvo.online.observer import MOST_MOTIONS, Window
+from gpvo.types import Status, VoLog, VoRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_runs import CAMERA, make_run
@@ -59,3 +60,16 @@ def test_image_lengths_scale_with_the_focal_length(zoom, seed):
     names = resolve("geometry")
     a, b = FeatureStream(names, CAMERA).step(record), FeatureStream(names, zoomed).step(closer)
     np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_a_vehicle_that_stands_does_not_make_a_window_grow():
+    """Each motion of imported odometry starts from the frame before, at rest too: after an hour, a metre held 100,000
+    motions, all joined anew with each frame."""
+    window, speeds = Window.of("length:1m"), [*5 * [0.1], *2 * MOST_MOTIONS * [0.0], *12 * [0.1]]
+    out = []
+    for k, dx in enumerate(speeds, start=1):
+        T = se3.exp(np.array([dx, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        out.append(window.step(VoRecord(k * 10**8, (k - 1) * 10**8, Status.OK, T)))
+    full = [k for k, joint in enumerate(out) if joint is not None]
+    assert full == [len(speeds) - 3, len(speeds) - 2, len(speeds) - 1]
+    assert out[-1].dt_s == 1.0
