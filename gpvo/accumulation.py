@@ -13,7 +13,7 @@ motion brings in the noise of the frame where it starts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -143,7 +143,9 @@ class PoseError:
         return error.persistent_root, persistence(elapsed_s, error.persistent_tau_s)
 
 
-def over_windows(T_prev_cur: Array, errors: Sequence[MotionError], windows: Sequence[Sequence[int]]) -> Array:
+def over_windows(
+    T_prev_cur: Array, errors: Sequence[MotionError] | Mapping[int, MotionError], windows: Sequence[Sequence[int]]
+) -> Array:
     """Covariance (W, 6, 6) of the motion over each of several windows of a log, all of them step by step together.
 
     ``T_prev_cur`` (N, 4, 4) motions with their ``errors``, of one model; ``windows``: the motions in each, none lost.

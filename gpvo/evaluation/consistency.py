@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 
 import numpy as np
@@ -26,7 +26,7 @@ from gpvo.stats.consistency import (
     seen_axes,
 )
 from gpvo.stats.series import Interval, block_bootstrap
-from gpvo.types import Array, VoLog
+from gpvo.types import Array, MotionError, VoLog
 
 BY_MODEL = "prediction"
 """The last reason of a motion whose status is the model's and not the odometry's."""
@@ -51,6 +51,7 @@ class Horizon:
     ``span``: metres of path, or seconds. ``nees_dof_truth_noise``: with the truth's own noise added to what is stated;
     ``z2_truth_noise`` (6,): likewise, the mean squared error of each axis over its variance. ``truth_drift_m`` (3,):
     standard deviation of the truth's displacement over such a stretch that its own velocities contradict, added too.
+    ``independent``: as many windows with independent errors would tell as much, if what is stated of them is right.
     """
 
     span: float
@@ -59,6 +60,7 @@ class Horizon:
     z2_truth_noise: tuple[float, ...]
     truth_drift_m: tuple[float, ...]
     count: int
+    independent: float
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ def horizon(
     assert statement.errors is not None
     chains = list(_windows(log, known, progress, span))
     if not chains:
-        return Horizon(span, np.nan, np.nan, (np.nan,) * 6, (0.0,) * 3, 0)
+        return Horizon(span, np.nan, np.nan, (np.nan,) * 6, (0.0,) * 3, 0, 0.0)
     starts, ends = log.parent[[chain[0] for chain in chains]], np.array([chain[-1] for chain in chains])
     T = se3.inverse(T_true[starts]) @ T_true[ends]
     # The mean is taken off each motion, as a filter would.
@@ -209,7 +211,31 @@ def horizon(
         noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
     z2 = (e**2 / variances(C + noise)).mean(axis=0)
     plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + noise))
-    return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(chains))
+    worth = _independent(statement.errors, log, chains, C + noise, np.asarray(axes))
+    return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(chains), worth)
+
+
+def _independent(
+    errors: Sequence[MotionError], log: VoLog, chains: list[list[int]], C: Array, axes: NDArray[np.intp]
+) -> float:
+    """How many windows with independent errors the mean NEES of these is worth, of stated covariances ``C`` (W, 6, 6).
+
+    Of Gaussian errors whitened over d axes, with correlations R_ij between windows, the mean of NEES/dof has the
+    variance ``2 / (W d)^2 sum_ij |R_ij|^2``. Windows overlap by half, which alone costs at most half of them; and
+    errors that persist, as of a wrong calibration, are the same in many.
+    """
+    half = 0.5 * len(chains)
+    tau_s = max(float(errors[chain[0]].persistent_tau_s.max(initial=0.0)) for chain in chains)
+    if tau_s == 0.0:
+        return half
+    used = {k: errors[k] for chain in chains for k in chain}
+    passing = {k: replace(e, persistent_root=np.zeros_like(e.persistent_root)) for k, e in used.items()}
+    lasting = over_windows(log.T_prev_cur, used, chains) - over_windows(log.T_prev_cur, passing, chains)
+    share = np.linalg.solve(marginal(C, axes), marginal(lasting, axes))
+    t_s = 1e-9 * (log.t_ns[[c[-1] for c in chains]] - log.t_ns[0])
+    both = np.einsum("iab,jba->ij", share, share) * np.exp(-2.0 * np.abs(t_s[:, None] - t_s) / tau_s)
+    np.fill_diagonal(both, 0.0)
+    return half / (1.0 + both.sum() / (2.0 * len(chains) * len(axes)))
 
 
 def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float) -> Iterator[list[int]]:

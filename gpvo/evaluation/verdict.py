@@ -174,8 +174,8 @@ class _Judgement:
         """Over what the statement is wrong, beyond chance, and how."""
         out = {"one motion": _per_motion(self.c)} if self.of_motions else {}
         for name, h in self.spans:
-            # Windows overlap by half, so half of them are independent: the mean of n chi-squared of so many dof.
-            out[name] = _word(h.nees_dof_truth_noise, chance=math.sqrt(2 / (len(self.c.axes) * h.count / 2)))
+            # The mean of n chi-squared of so many dof.
+            out[name] = _word(h.nees_dof_truth_noise, chance=math.sqrt(2 / (len(self.c.axes) * h.independent)))
         return {name: word for name, word in out.items() if word != "honest"}
 
     def words(self) -> str:

@@ -152,6 +152,13 @@ class ErrorStateFilter:
         G = self._F[:, : BA.start, BA.start :] * np.roll(sigma, 3)
         self.P[:, : BA.start, : BA.start] += G @ kernels.transpose(G)
 
+    def doubt_passage(self, before: Nominal) -> None:
+        """Widen by all that has changed since ``before``: maybe a clock was set, and no time has passed."""
+        moved = np.zeros((self.batch, CORE, 1))
+        moved[:, P, 0], moved[:, V, 0] = self.x.position - before.position, self.x.velocity - before.velocity
+        moved[:, TH, 0] = kernels.log(kernels.transpose(before.R_world_imu) @ self.x.R_world_imu)
+        self.P[:, :CORE, :CORE] += moved @ kernels.transpose(moved)
+
     def lose_track(self, dt: float) -> None:
         """Widen by what may have happened in ``dt`` seconds of which nothing is known, if they have passed at all and
         no clock was set: the vehicle has gone on as fast as before, or at a metre per second, in any direction, or

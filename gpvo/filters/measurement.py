@@ -105,6 +105,11 @@ class Innovation:
     used: NDArray[np.bool_]
     own_fault: NDArray[np.bool_]
 
+    @property
+    def surprise(self) -> Array:
+        """(B,) minus twice the log of its likelihood, but for a constant."""
+        return np.asarray(self.nis + np.linalg.slogdet(self.S)[1])
+
     def of_member(self, b: int) -> Innovation:
         """The same of one member."""
         return each(self, lambda values: values[b : b + 1])

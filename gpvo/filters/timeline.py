@@ -28,6 +28,7 @@ _GAP_FACTOR, _GAP_S = 5.0, 0.05
 _NEARBY = 1000  # samples that tell how far a guess over a gap may be off
 _GUESS_NS = 250_000_000  # longest step of a guess
 _SILENCE_NS, _LONGEST_SILENCE_S = 4_000_000_000, 1e3  # without sample and record: no guess holds so long
+_CLOCK_NS, _RARELY_SET = 150_000_000, 14.0  # shorter gaps no clock made; minus twice the log of one in a thousand
 _SLOWEST_NS = 20_000_000_000  # records are no further apart, where nothing else is heard
 _LONGEST_STEP_NS, _LONGEST_GAP_NS = round(LONGEST_STEP_S * 1e9), round(LONGEST_GAP_S * 1e9)
 
@@ -102,6 +103,7 @@ class Timeline:
         self._guard = ImuGuard()
         self._doubt: Doubt[int] = Doubt()
         self._is_set_back = False
+        self._heard_ns = self.t_ns  # stamp of the sample that came last
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
 
@@ -113,13 +115,26 @@ class Timeline:
         if problem := self._guard.judge(int(t_ns), sample):
             self.counts[problem] += 1
             return
-        if self._imu_t and t_ns <= self._imu_t[-1]:
+        i = bisect.bisect_left(self._imu_t, t_ns)
+        if i < len(self._imu_t) and t_ns <= self._heard_ns and not self._is_missing(i):
             # The clock was set back, and no record can be put among what came before.
-            if self._imu_t[-1] - t_ns > _LONGEST_GAP_NS:
-                self._go_on_from(int(t_ns))
+            self._go_on_from(int(t_ns))
             del self._imu_t[:], self._imu[:]
-        self._imu_t.append(int(t_ns))
-        self._imu.append(sample)
+            i = 0
+        if self._imu_t[i : i + 1] == [t_ns]:
+            self.counts["imu_repeated"] += 1
+            return
+        self._imu_t.insert(i, int(t_ns))
+        self._imu.insert(i, sample)
+        self._heard_ns = int(t_ns)
+
+    def _is_missing(self, i: int) -> bool:
+        """Whether there is a gap before sample i, which samples that come late may fill."""
+        return i > 0 and self._imu_t[i] - self._imu_t[i - 1] > 2.5e9 * self._usual_step_s(i)  # two came to show it
+
+    def _usual_step_s(self, i: int) -> float:
+        steps = np.diff(self._imu_t[max(0, i - 100) : i + 100])
+        return 1e-9 * float(np.median(steps)) if len(steps) else 0.0
 
     def _go_on_from(self, t_ns: int) -> None:
         """What the filter is at the newest sample holds, by another clock, two samples before ``t_ns``: of these the
@@ -180,13 +195,15 @@ class Timeline:
 
     def _step(self, record: VoRecord, noise: MotionError | None) -> Step:
         self._remember(record, noise)
-        self._propagate(self.filter, self.t_ns, record.t_ns, self.counts)
+        unmoved = self._propagate(self.filter, self.t_ns, record.t_ns, self.counts)
         self.t_ns = self._newest_ns = record.t_ns
         if noise is not None and len(noise.persistent_tau_s):
             # Since it last did, not since the last record: VO's bias goes on changing while frames are lost.
             self.filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.persistent_tau_s)
             self._bias_ns = record.t_ns
-        outcome, judged = self._measure(record, noise)
+        outcome, judged = self._measure(record, noise, unmoved)
+        if judged is None and unmoved is not None:
+            self.filter.doubt_passage(unmoved.x)
         passed, own_fault = (True, False) if judged is None else (judged.passed, judged.own_fault)
         self._wait = self._wait.after(record.t_ns, passed, own_fault)
         self.counts[outcome] += 1
@@ -197,7 +214,11 @@ class Timeline:
             self.filter.forget_current()
         return Step(record.t_ns, outcome, judged, self.filter.x.copy(), self.filter.covariance.copy())
 
-    def _measure(self, record: VoRecord, noise: MotionError | None) -> tuple[str, Innovation | None]:
+    def _measure(
+        self, record: VoRecord, noise: MotionError | None, unmoved: ErrorStateFilter | None
+    ) -> tuple[str, Innovation | None]:
+        """``unmoved``: the filter if no time has passed; a motion that is by far likelier of that one is of a clock
+        that was set."""
         if record.status in (Status.START, Status.LOST):
             return record.status.value, None
         if record.t_prev_ns != self._reference_ns:
@@ -208,6 +229,11 @@ class Timeline:
             return "no_covariance", None
         recover = self._wait.over(record.t_ns, self.gate)
         innovation = self.filter.update_motion(record.T_prev_cur, noise, self.gate, recover)
+        if unmoved is not None:
+            other = unmoved.update_motion(record.T_prev_cur, noise, self.gate)
+            if other.passed.all() and (other.surprise + _RARELY_SET < innovation.surprise).all():
+                self.filter, innovation = unmoved, other
+                self.counts["clock_set_ahead"] += 1
         self.counts["recovered"] += int((recover & ~innovation.passed).any())
         return _outcome(innovation), innovation
 
@@ -235,19 +261,23 @@ class Timeline:
 
     # -- time ---------------------------------------------------------------------------------------------------
 
-    def _propagate(self, filter: ErrorStateFilter, start_ns: int, end_ns: int, counts: Counter[str]) -> None:
+    def _propagate(
+        self, filter: ErrorStateFilter, start_ns: int, end_ns: int, counts: Counter[str]
+    ) -> ErrorStateFilter | None:
+        """Move the filter; where nothing was heard for a while, returns what it is if that was a clock set ahead."""
         if end_ns <= start_ns:
-            return
+            return None
         if not self._with_imu:
             if end_ns - start_ns > _SLOWEST_NS:
                 self._over_silence(filter, end_ns - start_ns, counts)
             else:
                 filter.propagate_constant_velocity((end_ns - start_ns) * 1e-9)
-            return
+            return None
         if not self._imu_t:
             raise ValueError("no IMU sample has arrived; give the timeline with_imu=False to do without")
         i = bisect.bisect_right(self._imu_t, start_ns)
         t, sample = start_ns, self._at(start_ns, i)
+        unmoved, resumed_ns = None, start_ns
         while t < end_ns:
             heard_ns = min([end_ns, *self._imu_t[i : i + 1]])
             if heard_ns - t > _SILENCE_NS:
@@ -261,11 +291,20 @@ class Timeline:
             dt, ends = (t1 - t) * 1e-9, np.array([sample, after])
             over = self._over_gap(i, t, t1, ends)
             ends = ends if over is None else over[0]
+            if over is not None and t >= resumed_ns and heard_ns - t > _CLOCK_NS:
+                unmoved, resumed_ns = filter.copy(), heard_ns
             filter.propagate_imu(dt, ends[:1, :3], ends[:1, 3:], ends[1:, :3], ends[1:, 3:])
             if over is not None:
                 filter.doubt_readings(over[1])
                 counts["imu_gaps"] += 1
             t, sample, i = t1, after, i + arrived
+        if unmoved is not None:
+            # Between two samples some time has passed even so: about one usual step.
+            before, step_ns = unmoved.x.copy(), round(1e9 * self._usual_step_s(i))
+            self._propagate(unmoved, resumed_ns - step_ns, resumed_ns, Counter())
+            unmoved.doubt_passage(before)
+            self._propagate(unmoved, resumed_ns, end_ns, Counter())
+        return unmoved
 
     @staticmethod
     def _over_silence(filter: ErrorStateFilter, ns: int, counts: Counter[str]) -> None:
@@ -295,8 +334,7 @@ class Timeline:
         age = [(t_ns - last_ns) * 1e-9 for t_ns in (start_ns, end_ns)]
         if age[1] < _GAP_S:
             return None
-        steps = np.diff(self._imu_t[max(0, i - 100) : i + 100])
-        shortest = max(_GAP_S, _GAP_FACTOR * 1e-9 * float(np.median(steps)) if len(steps) else 0.0)
+        shortest = max(_GAP_S, _GAP_FACTOR * self._usual_step_s(i))
         if age[1] < shortest:
             return None
         begun = age[0] if age[0] >= shortest else 0.0

@@ -140,3 +140,13 @@ def position_in_world(T_world_cur: Array, covariance: Array) -> Array:
     """(..., 3, 3) covariance of the position in world axes, from the right-perturbation (..., 6, 6)."""
     R = T_world_cur[..., :3, :3]
     return R @ covariance[..., :3, :3] @ np.swapaxes(R, -1, -2)
+
+
+def lost_covariance(dt_s: float, twist: Array) -> Array:
+    """(6, 6) covariance of a motion that was not measured but extrapolated over ``dt_s``.
+
+    A vehicle may have stopped, or doubled its speed, or started from rest at one m/s and half a radian per second.
+    """
+    speed, rate = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
+    sigma_m, sigma_rad = dt_s * max(speed, 1.0), dt_s * max(rate, 0.5)
+    return np.diag([max(sigma_m, 1e-3) ** 2] * 3 + [max(sigma_rad, 1e-3) ** 2] * 3)

@@ -21,7 +21,7 @@ from gpvo.dataset.check import odometry_problems, rate_problems
 from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import are_positive_definite, symmetrise
+from gpvo.geometry.covariance import are_positive_definite, lost_covariance, symmetrise
 from gpvo.geometry.se3 import is_rigid, rotate_covariance
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import Arrival
@@ -31,7 +31,6 @@ from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
 from gpvo.publish.odometry import LEAST_VARIANCE, Odometry, OdometryBuilder, about_zero, lift
 from gpvo.types import VEHICLES, Array, Prediction, Status, Vehicle, VoRecord
-from gpvo.vo.quality import lost_covariance
 
 REPEAT_S = 10.0
 """How often a warning that still holds is repeated."""
@@ -104,7 +103,6 @@ class Engine:
         self.counts: Counter[str] = Counter()
         self.sources: list[Mapping[str, int]] = [stage.counts, self.counts]
         self.last: Odometry | None = None
-        self._twist = np.zeros(6)  # of the body, as last measured
         self.tell = tell
         self._truth, self._unheard = truth, list(topics)
         self._told_s: dict[str, float] = {}
@@ -119,6 +117,10 @@ class Engine:
         self._saved_s = -np.inf
         self._resume = load_state(self.settings.state)
         self._scale = np.ones(6) if self._resume is None else self._resume.scale
+        # Of the body, as last measured; before that, one as fast as vehicles were in training.
+        self._twist = np.sqrt(predictor.model.velocities.usual_rate_var)
+        if self._resume is not None:
+            self._twist = self._resume.twist
         if self._resume is not None and self._resume.model not in ("", predictor.digest):
             tell("the state is another model's: its pose is used, the scale learned from late truth is not")
             self._scale = np.ones(6)

@@ -206,13 +206,11 @@ class Predictor:
 
     def _publish(self, record: VoRecord, prediction: Prediction) -> Prediction:
         """The prediction for a record in flight: the adapted scale, the record's status, and what is lost."""
-        t_ns, status, confidence, scale = record.t_ns, record.status, float(prediction.confidence), self._adaptive.scale
+        t_ns, status, scale = record.t_ns, record.status, self._adaptive.scale
         if status is Status.LOST:
             return self._publish_lost(record, prediction)
         if prediction.in_domain < DEGRADED_BELOW and status is Status.OK:
             status = Status.DEGRADED
-        if status is Status.DEGRADED:
-            confidence *= 0.5
         squared = scale[:, None] * scale
         variance = np.diagonal(prediction.covariance) * scale**2
         if record.dt_s > 0:
@@ -227,7 +225,7 @@ class Predictor:
             status=status,
             t_ns=t_ns,
             epistemic=np.minimum(prediction.epistemic * scale**2, variance),
-            confidence=confidence,
+            confidence=float(prediction.confidence),
             in_domain=float(prediction.in_domain),
         )
 

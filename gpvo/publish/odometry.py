@@ -10,7 +10,7 @@ import numpy as np
 from gpvo.accumulation import PoseError, frame_jitter
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import is_positive_definite, symmetrise
+from gpvo.geometry.covariance import is_positive_definite, lost_covariance, symmetrise
 from gpvo.geometry.se3 import R_FLU_OPTICAL, rotate_covariance
 from gpvo.types import Array, MotionError, Prediction, Status, VoRecord
 
@@ -165,7 +165,7 @@ class OdometryBuilder:
         stated = prediction.covariance if prediction is not None else record.covariances.get(self.method or "")
         if stated is None or not is_positive_definite(stated):
             dt = (record.t_ns - base.t_ns) * 1e-9
-            stated = np.diag((np.abs(self._speed) * dt) ** 2)
+            stated = lost_covariance(dt, self._speed)
         chain = base.extended(record, MotionError.independent(stated, dt_s=record.dt_s, status=Status.LOST))
         self._remember(record, chain)
         if is_break:

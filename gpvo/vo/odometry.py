@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
+from gpvo.geometry.covariance import lost_covariance
 from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
@@ -24,7 +25,6 @@ from gpvo.vo.quality import (
     agrees,
     judge,
     lateness_covariance,
-    lost_covariance,
     median_parallax_px,
     motion_fields,
     stats_fields,

@@ -130,16 +130,6 @@ def _log10_condition(information: Array, depth_m: float) -> float:
     return float(np.log10(values[-1] / values[0])) if values[0] > 0 else 16.0
 
 
-def lost_covariance(dt_s: float, twist: Array) -> Array:
-    """(6, 6) covariance of a motion that was not measured but extrapolated over ``dt_s``.
-
-    A vehicle may have stopped, or doubled its speed, or started from rest at one m/s and half a radian per second.
-    """
-    speed, rate = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
-    sigma_m, sigma_rad = dt_s * max(speed, 1.0), dt_s * max(rate, 0.5)
-    return np.diag([max(sigma_m, 1e-3) ** 2] * 3 + [max(sigma_rad, 1e-3) ** 2] * 3)
-
-
 def median_parallax_px(matches: Matches, inliers: NDArray[np.bool_]) -> float:
     """Median image motion of the inliers [px], far ones apart if there are others: they stand still while one moves."""
     near = inliers & (matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX)

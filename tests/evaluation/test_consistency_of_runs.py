@@ -10,10 +10,11 @@ import pytest
 from evaluation_runs import make_run, stated_covariance
 from gpvo.dataset.errors import interpolate_truth, motion_errors
 from gpvo.evaluation import consistency as module
-from gpvo.evaluation.consistency import Consistency, consistency, truth_noise
-from gpvo.evaluation.statements import statements
+from gpvo.evaluation.consistency import Consistency, consistency, horizon, truth_noise
+from gpvo.evaluation.statements import predicted_statement, statements
 from gpvo.geometry import se3
 from gpvo.types import TruthLog, VoLog
+from synthetic_flights import ErrorLaw, synthetic_flight
 
 
 def _scores(log: VoLog, truth: TruthLog, sigma: tuple[float, float] = (0.0, 0.0)) -> dict[str, Consistency]:
@@ -181,3 +182,20 @@ def test_windows_that_cannot_be_are_not_looked_through_from_every_frame(monkeypa
     assert bool(windows) == (what == "gaps of the truth")
     assert all(known[w[0] - 1] and known[w[-1]] and len(w) == 1000 for w in windows)
     assert len(starts) < 20
+
+
+@pytest.mark.parametrize("tau_s", [5.0, 300.0])
+def test_the_mean_over_windows_scatters_as_that_of_so_many_independent_ones(tau_s: float) -> None:
+    """90 flights whose errors persist, honestly stated: a wrong calibration is one draw, in whatever many windows."""
+    one = np.array([4e-3, 4e-3, 8e-3, 8e-4, 8e-4, 8e-4])
+    law, nees, stated = ErrorLaw(0.5 * one, 0.3 * one, one, tau_s), [], []
+    for seed in range(90):
+        flight = synthetic_flight(seed, duration_s=12, rate_hz=5, imu_hz=20, law=law)
+        log = VoLog(list(flight.records))
+        at_s, known = (log.t_ns - log.t_ns[0]) * 1e-9, np.ones(len(log), bool)
+        statement = predicted_statement("learned", log, flight.predictions)
+        h = horizon(statement, log, flight.T_world_cam, known, at_s, 1.0, np.zeros(6), None, range(6))
+        nees.append(h.nees_dof)
+        stated.append(np.sqrt(2 / (6 * h.independent)))
+        assert h.independent < 0.5 * h.count
+    assert 0.7 < np.std(nees) / np.mean(stated) < 1.4

@@ -185,7 +185,7 @@ def test_a_silence_of_camera_and_imu_is_as_uncertain_as_it_is(silence_s: float, 
     assert np.median(later, axis=0).max() < 3 * most
 
 
-@pytest.mark.parametrize("back_s", [1.2, 3.0, 3600.0, -5.0, -30.0, -3600.0])
+@pytest.mark.parametrize("back_s", [0.1, 0.6, 1.2, 3.0, 3600.0, -0.5, -2.0, -3.9, -5.0, -30.0, -3600.0])
 @pytest.mark.parametrize("late", [0, 2])
 def test_the_filter_goes_on_when_the_clock_is_set_back_or_ahead(flight: Flight, back_s: float, late: int) -> None:
     """``late``: records that are on their way then."""
@@ -204,11 +204,57 @@ def test_the_filter_goes_on_when_the_clock_is_set_back_or_ahead(flight: Flight, 
             again = replace(r, t_ns=told(r.t_ns), t_prev_ns=told(r.t_prev_ns))
             timeline.add_vo(again, flight.predictions.get(r.t_ns))
     assert timeline.t_ns == told(flight.records[99].t_ns)
-    assert timeline.counts["clock_set_back" if back_s > 0 else "silences"] == 1
+    assert timeline.counts["clock_set_back" if back_s > 0 else "clock_set_ahead" if back_s > -4.0 else "silences"] == 1
     assert timeline.counts["used"] >= 96 - late
     error = timeline.filter.x.position[0] - flight.T_world_imu[99, :3, 3]
     C = timeline.filter.covariance[0, P, P]
     assert error @ np.linalg.solve(C, error) / 3 < 3.0
+
+
+@pytest.mark.parametrize("ahead_s", [0.5, 2.0])
+def test_where_no_motion_tells_whether_time_has_passed_the_filter_doubts_it(ahead_s: float) -> None:
+    nees = []
+    for seed in range(6):
+        flight = synthetic_flight(seed, duration_s=4)
+        imu, ahead_ns = flight.imu, round(ahead_s * 1e9)
+        assert imu is not None
+        told = imu.t_ns + ahead_ns * (imu.t_ns >= flight.records[60].t_ns)
+        timeline = _timeline(flight)
+        _feed_imu(timeline, replace(flight, imu=replace(imu, t_ns=told)))
+        _feed(timeline, flight, list(range(60)))
+        r = flight.records[60]
+        timeline.add_vo(replace(r, t_ns=r.t_ns + ahead_ns, status=Status.LOST))
+        error = timeline.filter.x.position[0] - flight.T_world_imu[60, :3, 3]
+        nees.append(error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3)
+    assert 0.1 < np.mean(nees) < 2.0
+
+
+@pytest.mark.parametrize("n", [3, 10])
+def test_samples_that_come_late_fill_their_gap(flight: Flight, n: int) -> None:
+    """Two datagrams of n samples change places: no clock was set."""
+    imu = flight.imu
+    assert imu is not None
+    order = np.arange(len(imu.t_ns))
+    order[500 : 500 + 2 * n] = np.roll(order[500 : 500 + 2 * n], n)
+    usual, swapped = _timeline(flight), _timeline(flight)
+    _feed_imu(usual, flight)
+    columns = (values[order] for values in (imu.t_ns, imu.gyro_radps, imu.acc_mps2))
+    _feed_imu(swapped, replace(flight, imu=ImuLog(*columns, imu.noise)))
+    for timeline in (usual, swapped):
+        _feed(timeline, flight, list(range(120)))
+    assert swapped.counts["imu_out_of_order"] == 1
+    assert swapped.counts["clock_set_back"] == swapped.counts["imu_gaps"] == 0
+    off_m = np.linalg.norm(usual.filter.x.position - swapped.filter.x.position)
+    assert off_m < 0.2 * np.sqrt(np.trace(usual.filter.covariance[0, P, P]))
+
+
+def test_one_sample_of_an_imu_is_enough_to_go_on(flight: Flight) -> None:
+    imu = flight.imu
+    assert imu is not None
+    timeline = _timeline(flight)
+    timeline.add_imu(int(imu.t_ns[0]), imu.gyro_radps[0], imu.acc_mps2[0])
+    _feed(timeline, flight, [0, 10])
+    assert np.isfinite(timeline.filter.covariance).all()
 
 
 def test_after_a_long_silence_the_filter_is_as_unsure_as_it_is_wrong() -> None:

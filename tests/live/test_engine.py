@@ -270,6 +270,20 @@ def test_a_state_taken_up_under_way_is_as_unsure_as_what_was_missed_is_long(tmp_
     assert missed_m / 3 < np.sqrt(kept.frames[0].pose_covariance[0, 0]) < 3 * missed_m
 
 
+def test_what_was_missed_before_any_motion_was_seen_is_as_long_as_usual_ones() -> None:
+    arrivals = _gone(150.0)
+    live, kept, _ = engine()
+    usual = np.full(6, 100.0)
+    live.predictor.model = replace(
+        live.predictor.model, velocities=replace(live.predictor.model.velocities, usual_rate_var=usual)
+    )
+    live = Engine(live.stage, live.predictor, [kept])
+    live.take(arrivals[0])
+    live.stage.reset()
+    live.take(arrivals[100])
+    assert np.sqrt(kept.frames[-1].pose_covariance[0, 0]) > 150.0 * 100 / 299
+
+
 def test_a_silence_after_a_lost_frame_is_at_the_speed_of_before() -> None:
     arrivals = _gone(150.0)
     live, kept, _ = engine()

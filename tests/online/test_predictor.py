@@ -46,6 +46,15 @@ def test_step_is_what_training_would_have_seen(predictor, flight):
     np.testing.assert_allclose(one.covariance, many.covariance[7], rtol=1e-9)
 
 
+def test_confidence_is_the_same_in_flight_and_for_rows_of_features(predictor, flight):
+    """Exports, which know no status, are compared with the latter."""
+    predictor.reset()
+    for record in flight[0].records[:60]:
+        said = predictor.step(record if record.dt_s == 0 else replace(record, status=Status.DEGRADED))
+    alone = predictor.predict(predictor._last[1], record.covariances["pointing_matching"], said.dt_s)
+    assert said.confidence == pytest.approx(alone.confidence, rel=1e-9)
+
+
 def test_parts_sum_to_the_covariance(predictor, flight):
     for record in flight[0]:
         p = predictor.step(record)

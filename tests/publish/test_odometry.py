@@ -91,6 +91,11 @@ def test_lost_frames_hold_the_pose_and_widen_it() -> None:
     assert np.trace(after.pose_covariance[:3, :3]) < np.trace(lost[-1].pose_covariance[:3, :3])
 
 
+def test_a_lost_frame_before_any_motion_of_which_nothing_is_stated_is_no_exact_one() -> None:
+    out = OdometryBuilder(floor=TINY).step(VoRecord(5 * 10**8, 0, Status.LOST, np.eye(4)))
+    assert (np.sqrt(np.diagonal(out.pose_covariance)) > np.repeat([0.4, 0.2], 3)).all()
+
+
 def test_after_a_break_the_twist_is_that_of_the_motion_alone() -> None:
     C, step = 1e-6 * np.eye(6), se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
     guess = se3.exp(np.array([0.3, 0, 1.5, 0, 0, 0]))
