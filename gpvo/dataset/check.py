@@ -36,6 +36,11 @@ class Check:
         """Whether nothing was found."""
         return not self.problems
 
+    @property
+    def misfits(self) -> tuple[str, ...]:
+        """The problems besides unknown conditions, of which ``in_domain`` speaks."""
+        return self.problems[:-1] if self.in_domain < ENOUGH_INSIDE else self.problems
+
 
 def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
@@ -79,9 +84,11 @@ def _mean(rows: NDArray[Any]) -> Array:
 
 
 def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list[str]:
-    """Whether gpvo's own odometry runs with the ``settings`` that a model was trained with; a line if not."""
+    """Whether gpvo's own odometry, with these ``settings``, is what a model was trained on; a line if not."""
     trained = predictor.header.get("odometry") or {}
     here = that_matter(settings)
+    if here and predictor.camera is None:
+        return ["the model was trained on another odometry's poses, not on images"]
     other = [f"{k} is {v}, not {trained[k]}" for k, v in here.items() if k in trained and trained[k] != v]
     return [f"the model was trained on odometry with other settings: {'; '.join(other)}"] if other else []
 
