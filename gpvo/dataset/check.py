@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,6 +66,12 @@ def check(predictor: Predictor, run: Run) -> Check:
     if inside < ENOUGH_INSIDE:
         problems.append(f"only {100 * inside:.0f} % of the frames lie inside the training domain")
     return Check(len(run.log), len(X), inside, farthest, tuple(problems))
+
+
+def warn_of_misfits(model: Path, predictor: Predictor, run: Run) -> None:
+    """Warn of each problem that :func:`check` finds; ``model``: the file, to name it."""
+    for problem in check(predictor, run).problems:
+        warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
 
 
 def _learned_from(predictor: Predictor, X: Array) -> bool:
