@@ -181,26 +181,20 @@ def _loaded(runs: list[Path], judge: JudgeOptions) -> tuple[list[Run], Predictor
 
 def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> list[Evaluation]:
     """``unjudged``: runs without truth are shown instead of refused."""
+    from gpvo.dataset.check import warn_of_misfits
     from gpvo.evaluation.evaluate import evaluate_run, unjudged_run
 
     options, found = judge.options(), []
     with progress("runs", len(runs)) as advance:
         loaded, predictor = _loaded(runs, judge)
         for run in loaded:
-            _warn_of_misfits(judge.model, predictor, run)
+            if judge.model is not None and predictor is not None:
+                warn_of_misfits(judge.model, predictor, run)
         for run in loaded:
             alone = unjudged and run.truth is None
             found.append(unjudged_run(run, predictor) if alone else evaluate_run(run, predictor, options))
             advance()
     return found
-
-
-def _warn_of_misfits(model: Path | None, predictor: Predictor | None, run: Run) -> None:
-    from gpvo.dataset.check import check
-
-    if model is not None and predictor is not None:
-        for problem in check(predictor, run).problems:
-            warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
 
 
 def _tell_misfits(model: Path | None, found: list[Evaluation]) -> None:
@@ -217,13 +211,15 @@ def _with_twins(
     runs: list[Run], predictor: Predictor | None, model: Path | None, options: EvaluateOptions, settings: TwinSettings
 ) -> tuple[list[dict[str, Any]], list[Evaluation]]:
     """Documents of the runs, and the evaluations behind them: a run's own if it has truth, else those of its twins."""
+    from gpvo.dataset.check import warn_of_misfits
     from gpvo.evaluation.by_twins import by_twins
 
     documents, found = [], []
     for run in runs:
         with TemporaryDirectory(prefix="gpvo-twins-") as folder:
             twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
-        _warn_of_misfits(model, predictor, run if run.truth is not None else twins[0])
+        if model is not None and predictor is not None:
+            warn_of_misfits(model, predictor, run if run.truth is not None else twins[0])
         about, own = by_twins(run, twins, predictor, options)
         documents.append(about)
         found += own

@@ -38,6 +38,7 @@ def predict(
 
     Example: gpvo predict errors.gpvo runs/flight -o predictions.parquet
     """
+    from gpvo.dataset.check import warn_of_misfits
     from gpvo.evaluation.evaluate import distinct
 
     if len(runs) == 1 and out.is_dir():
@@ -49,7 +50,9 @@ def predict(
     predictor, documents = Predictor.load(model), []
     with progress("runs", len(runs)) as advance:
         for path, name in zip(runs, distinct([r.resolve().name for r in runs]), strict=True):
-            predictions = list(predictor.replay(read_run(path).log).values())
+            run = read_run(path)
+            warn_of_misfits(model, predictor, run)
+            predictions = list(predictor.replay(run.log).values())
             target = out if len(runs) == 1 else out / f"{name}.parquet"
             if target.exists() and target.name in FILES and target.name != "predictions.parquet":
                 raise GpvoError("is part of a run, not a file of predictions", where=target, cure="choose another -o")

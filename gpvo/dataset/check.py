@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +38,11 @@ class Check:
         """Whether nothing was found."""
         return not self.problems
 
+    @property
+    def misfits(self) -> tuple[str, ...]:
+        """The problems besides unknown conditions, of which ``in_domain`` speaks."""
+        return self.problems[:-1] if self.in_domain < ENOUGH_INSIDE else self.problems
+
 
 def check(predictor: Predictor, run: Run) -> Check:
     """Compare a run (a few seconds of the vehicle's own) with what a model was trained on."""
@@ -61,6 +68,12 @@ def check(predictor: Predictor, run: Run) -> Check:
     return Check(len(run.log), len(X), inside, farthest, tuple(problems))
 
 
+def warn_of_misfits(model: Path, predictor: Predictor, run: Run) -> None:
+    """Warn of each problem that :func:`check` finds; ``model``: the file, to name it."""
+    for problem in check(predictor, run).problems:
+        warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
+
+
 def _learned_from(predictor: Predictor, X: Array) -> bool:
     """Whether most rows that the model file keeps of one of its training sequences are among these features (N, d)."""
     kept, sequence = predictor.arrays.get("sample.X"), predictor.arrays.get("sample.sequence")
@@ -79,9 +92,11 @@ def _mean(rows: NDArray[Any]) -> Array:
 
 
 def odometry_problems(predictor: Predictor, settings: Mapping[str, Any]) -> list[str]:
-    """Whether gpvo's own odometry runs with the ``settings`` that a model was trained with; a line if not."""
+    """Whether gpvo's own odometry, with these ``settings``, is what a model was trained on; a line if not."""
     trained = predictor.header.get("odometry") or {}
     here = that_matter(settings)
+    if here and predictor.camera is None:
+        return ["the model was trained on another odometry's poses, not on images"]
     other = [f"{k} is {v}, not {trained[k]}" for k, v in here.items() if k in trained and trained[k] != v]
     return [f"the model was trained on odometry with other settings: {'; '.join(other)}"] if other else []
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gpvo.accumulation import along
 from gpvo.dataset.build import aligned_truth, predictions_of
+from gpvo.dataset.check import check
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
@@ -61,7 +62,8 @@ class Evaluation:
     clocks, where it matters and none was given; ``turned``: a fixed rotation between truth and odometry, likewise;
     ``inverse``: poses of one of the two seem to be inverse; ``unlike``: how little the two resemble each other, where
     they do not. ``in_domain``: share of the predicted frames that lie in the model's training domain, None without a
-    model. ``poses``: scores of the covariances of poses that a log states.
+    model. ``misfits``: why else the model does not fit the run, or cannot be judged by it. ``poses``: scores of the
+    covariances of poses that a log states.
     """
 
     run: Run
@@ -83,6 +85,7 @@ class Evaluation:
     unscored: int = 0
     odd: Sequence[Stretch] = ()
     in_domain: float | None = None
+    misfits: tuple[str, ...] = ()
     poses: PoseConsistency | None = None
 
     @property
@@ -132,7 +135,7 @@ def evaluate_run(
     """
     options = options or EvaluateOptions()
     truth, offset_s = _truth(run, options)
-    predictions = predictions_of(run, predictor)
+    predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor)
     run = replace(run, log=judged(run.log, predictions))
     log = run.log
     T_true, known = interpolate_truth(truth, log.t_ns)
@@ -181,6 +184,7 @@ def evaluate_run(
         odd=[] if blind else [*leaps, *odd_stretches(scored, truth)],
         poses=pose_consistency(log, T_est, T_true, known),
         in_domain=_in_domain(predictions),
+        misfits=misfits,
     )
 
 
@@ -210,7 +214,7 @@ def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
 
     Raises ModelError if the model predicts something else than the error of a motion.
     """
-    predictions = predictions_of(run, predictor)
+    predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor)
     run = replace(run, log=judged(run.log, predictions))
     T_est, noiseless = run.log.trajectory(), np.zeros(6)
     none = np.zeros((0, 4, 4))
@@ -228,7 +232,12 @@ def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
         truth_sigma_stated=noiseless,
         time_offset_s=0.0,
         in_domain=_in_domain(predictions),
+        misfits=misfits,
     )
+
+
+def _misfits(run: Run, predictor: Predictor | None) -> tuple[str, ...]:
+    return () if predictor is None else check(predictor, run).misfits
 
 
 def _in_domain(predictions: Mapping[int, Prediction]) -> float | None:

@@ -104,15 +104,23 @@ def _of_motions(e: Evaluation, judged: Mapping[str, Consistency]) -> Verdict:
         return Verdict("amber", headline, tuple(_conditions(e)), judged=False)
     wrong = told.wrong()
     outside = e.in_domain is not None and e.in_domain < ENOUGH_INSIDE
+    misfit = bool(e.misfits) and told.c.method == "learned"
     shown = dict.fromkeys((told.c.method, best, *(m for m in judged if m in _ALWAYS)))
     lines = [*_conditions(e), *(found[m].line() for m in shown)]
     if not wrong and not outside:
         where = "per motion; over a second or a distance, nothing can be judged"
         if told.spans:
             where = "per motion and " * told.of_motions + f"over {_listed([n for n, _ in told.spans])}"
-        return Verdict("green", f"The {told.c.method} covariance is honest here, {where}.", tuple(lines))
-    if told.c.method != best and not found[best].wrong():
-        lines.append(f"Use {best} here: it is honest{', and has the best likelihood of all' * told.of_motions}.")
+        headline = f"The {told.c.method} covariance is honest here, {where}"
+        if misfit:
+            return Verdict("amber", f"{headline}; but the model does not fit this run.", tuple(lines))
+        return Verdict("green", f"{headline}.", tuple(lines))
+    # Of the others, gpvo publish sends those alone that the odometry states itself.
+    stated = [m for m in found if m in e.run.log.methods and m != told.c.method and not found[m].wrong()]
+    if stated:
+        use = min(stated, key=lambda m: found[m].loss())
+        likeliest = ", and has the best likelihood of all" * (told.of_motions and use == best)
+        lines.append(f"Use {use} here (gpvo publish --method {use}): it is honest{likeliest}.")
     if outside:
         lines.append("Train on runs with this camera in these conditions, with ground truth or with twins.")
     headline = f"The {told.c.method} covariance is {told.words()}"
@@ -213,6 +221,8 @@ def _conditions(e: Evaluation) -> Iterator[str]:
     """What was seen of the run, of its truth, and of the model's domain."""
     if e.in_domain is not None:
         yield f"{100 * e.in_domain:.0f} % of the frames lie in the model's training domain."
+    for problem in e.misfits:
+        yield f"The model does not fit: {problem}."
     reasons = [r.reason for r in e.run.log if r.status is Status.LOST]
     by_model = sum(reason.endswith(BY_MODEL) for reason in reasons)
     if lost := len(reasons) - by_model:

@@ -25,7 +25,10 @@ _STAMP_NAMES = {
     *("t", "time", "timestamp", "stamp", "sec", "secs"),
     *(f"{name}_{unit}" for name in ("time", "timestamp", "stamp") for unit in (*UNITS_NS, "sec", "secs")),
 }
+# Its own files number the axes, and put the covariance of the rotation (Pr) before that of the translation (Pt).
 _OPENVINS = {
+    **{f"pt{i + 1}{j + 1}": f"cov_{i}{j}" for i in range(3) for j in range(i, 3)},
+    **{f"pr{i + 1}{j + 1}": f"cov_{i + 3}{j + 3}" for i in range(3) for j in range(i, 3)},
     **{f"p{a}{b}": f"cov_{i}{j}" for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j},
     **{f"q{a}{b}": f"cov_{i + 3}{j + 3}" for i, a in enumerate("rpy") for j, b in enumerate("rpy") if i <= j},
 }

@@ -50,6 +50,8 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
             for number, line in enumerate(iter(partial(file.readline, _MAX_CHARACTERS + 1), ""), 1):
                 if len(line) > _MAX_CHARACTERS:
                     raise SourceError(f"line {number} is longer than a million characters", where=path)
+                if "\0" in line:
+                    raise SourceError("is no text file, or one in UTF-16", where=path, cure="give it as UTF-8 text")
                 if text := line.strip().removeprefix("\ufeff"):
                     yield number, text
     except OSError as error:

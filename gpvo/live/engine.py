@@ -272,10 +272,7 @@ class Engine:
 
     def _misfits(self) -> list[str]:
         """What does not fit between source and model, looked at once a second."""
-        out = []
-        if self.stage.camera is not None and self.predictor.camera is None:
-            out.append("the model was trained on another odometry's poses, not on images")
-        out += camera_problems(self.predictor.camera, self.stage.camera)
+        out = camera_problems(self.predictor.camera, self.stage.camera)
         out += odometry_problems(self.predictor, self.stage.odometry)
         if np.abs(np.log(self._scale)).max() > np.log(_FAR_SCALE):
             factors = f"{self._scale.min():.2g} to {self._scale.max():.2g}"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpvo.dataset.build import predictions_of
+from gpvo.dataset.check import warn_of_misfits
 from gpvo.errors import GpvoError
 from gpvo.files import write_text
 from gpvo.io.run import Run, read_run
@@ -88,7 +89,10 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     _require(settings)
     run = read_run(path)
     model = settings.model
-    predictions = predictions_of(run, None if model is None else Predictor.load(model).require_motions(model))
+    predictor = None if model is None else Predictor.load(model).require_motions(model)
+    if model is not None and predictor is not None:
+        warn_of_misfits(model, predictor, run)
+    predictions = predictions_of(run, predictor)
     odometry = odometry_of(run, predictions, settings)
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")
     verdicts = consumers.check(odometry, consumer) if settings.check else []

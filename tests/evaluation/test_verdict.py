@@ -117,6 +117,27 @@ def test_outside_the_domain_is_never_green() -> None:
     assert any(line.startswith("10 % of the frames") for line in found.lines)
 
 
+def test_a_model_that_does_not_fit_is_never_green() -> None:
+    """Judged by its own training run, or made for another odometry: a good score says nothing of the next flight."""
+    evaluation = evaluated({"learned": 1.0, "triangulation": 1.0})
+    assert verdict(evaluation).colour == "green"
+    found = verdict(replace(evaluation, misfits=("it learned from this very run",)))
+    assert found.colour == "amber"
+    assert "the model does not fit this run" in found.headline
+    assert any("it learned from this very run" in line for line in found.lines)
+
+
+def test_only_what_can_be_published_is_advised() -> None:
+    evaluation = evaluated({"learned": 0.05, "base": 1.0, "triangulation": 1.1})
+    records = [replace(r, covariances={k: v for k, v in r.covariances.items() if k == "triangulation"})
+               for r in evaluation.run.log]  # fmt: skip
+    log = VoLog(records, evaluation.run.log.camera)
+    lines = verdict(replace(evaluation, run=replace(evaluation.run, log=log))).lines
+    assert any(line.startswith("base: honest") for line in lines)
+    (advice,) = (line for line in lines if line.startswith("Use "))
+    assert advice == "Use triangulation here (gpvo publish --method triangulation): it is honest."
+
+
 @pytest.mark.parametrize(("angle_deg", "asks"), [(2.0, False), (89.0, False), (120.0, True), (179.5, True)])
 def test_a_rotation_that_no_mounting_has_is_asked_about(angle_deg: float, asks: bool) -> None:
     found = verdict(replace(evaluated({"triangulation": 1.0}), turned=FixedRotation(angle_deg, (0.0, 0.0, 0.0), -0.5)))

@@ -59,6 +59,26 @@ def test_columns_by_name(tmp_path, header, separator):
     assert log.covariance is None
 
 
+def test_covariances_of_openvins_own_files_are_read(tmp_path):
+    """As its recorder writes them: the rotation's block, then the translation's, upper triangles."""
+    numbers = [f"{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3) if i <= j]
+    names = [f"{block}{n}" for block in ("Pr", "Pt") for n in numbers]
+    values = [3e-4, 1e-5, 2e-5, 4e-4, 3e-5, 5e-4, 3e-2, 1e-3, 2e-3, 4e-2, 3e-3, 5e-2]
+    header = "# timestamp(s) tx ty tz qx qy qz qw " + " ".join(names)
+    path = _csv(tmp_path / "state_estimate.txt", header, [[v] * N for v in values], " ")
+    path.write_text(re.sub(r"(?m)^(\d{10})(\d{9})", r"\1.\2", path.read_text()))
+    log = read_foreign(path, covariance_axes="body")
+    np.testing.assert_allclose(log.covariance[0][np.triu_indices(6)].reshape(-1)[[0, 1, 2, 6, 7, 11]], values[6:])
+    np.testing.assert_allclose(log.covariance[0][3:, 3:][np.triu_indices(3)], values[:6])
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_what_is_no_text_is_said_to_be_none(tmp_path, encoding):
+    (tmp_path / "log.csv").write_bytes("t,x,y\0\n1,2,3\n".encode(encoding))
+    with pytest.raises(SourceError, match=r"no text file, or one in UTF-16 \(give it as UTF-8"):
+        read_foreign(tmp_path / "log.csv")
+
+
 @pytest.mark.parametrize(
     ("step", "doubt"), [("20", "20 s apart .*milliseconds"), ("1", "numbers of frames"), ("0.5", "")]
 )

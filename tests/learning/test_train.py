@@ -16,6 +16,7 @@ from gpvo.dataset.build import TrainingSet, build, build_run
 from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
+from gpvo.evaluation.evaluate import evaluate_run
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_positive_definite
 from gpvo.io import open_source
@@ -611,8 +612,13 @@ def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> No
     assert [s.odometry for s in read_sets(rows_path(path))] == [s.odometry for s in sets[:2]]
     mixed = train_sets(sets, QUICK, judge=False).predictor()
     assert not any("settings" in problem for problem in check(mixed, runs[2]).problems)
-    # Another's odometry has no settings of ours.
+    # Another's odometry has no settings of ours, and a model of its poses no camera.
     assert not odometry_problems(predictor, {"import": {"frame": "body"}})
+    poses_alone = Predictor(predictor.arrays, {**predictor.header, "camera": None, "odometry": {}})
+    assert any("another odometry's poses" in p for p in check(poses_alone, runs[0]).problems)
+    # What the check finds, besides the domain, stands in the evaluation.
+    assert any("learned from this very run" in p for p in evaluate_run(runs[0], predictor).misfits)
+    assert not any("inside" in p for p in evaluate_run(runs[2], predictor).misfits)
 
 
 def test_the_folder_of_a_model_is_made_and_one_that_cannot_be_is_named(tmp_path: Path) -> None:

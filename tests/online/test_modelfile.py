@@ -95,7 +95,7 @@ def test_trailing_bytes_other_files_and_no_file_are_refused(model: Path, tmp_pat
         modelfile.load(other)
     with pytest.raises(ModelError, match="No such file"):
         modelfile.load(tmp_path / "nowhere")
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match=r"is a folder, not a model file \(give one of gpvo train, before the run\)"):
         modelfile.load(tmp_path)
 
 

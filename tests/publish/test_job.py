@@ -140,6 +140,19 @@ def test_a_model_of_windows_is_refused_by_name(predicted: Path, tmp_path: Path) 
         Predictor.load(model).require_motions(model)
 
 
+def test_a_model_that_does_not_fit_is_named(predicted: Path, tmp_path: Path) -> None:
+    """What is written goes to a filter: it is told as evaluate tells it."""
+    model = tmp_path / "other.gpvo"
+    modelfile.save(model, small_model().arrays, {**small_model().header, "camera": None, "rate_hz": 99.0})
+    log, truth = make_run(61, n=40, rate_hz=7.0)
+    write_run(tmp_path / "slow", log, truth=truth, meta={"source": "made"})
+    with pytest.warns(match=r"other\.gpvo does not fit slow: the rate is 7 Hz"):
+        publish_run(tmp_path / "slow", replace(GEOMETRY, model=model, check=True))
+    words = ["predict", str(model), str(tmp_path / "slow"), "-o", str(tmp_path / "p.parquet")]
+    with pytest.warns(match=r"other\.gpvo does not fit slow: the rate is 7 Hz"):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+
+
 def test_a_run_of_poses_alone_needs_a_model(predicted: Path, tmp_path: Path) -> None:
     bare = [replace(r, covariances={}) for r in read_run(predicted).log]
     write_run(tmp_path / "bare", VoLog(bare), meta={"source": "made"})
