@@ -26,7 +26,7 @@ from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
-from gpvo.io.parquet import read_columns
+from gpvo.io.parquet import read_blocks, read_columns
 from gpvo.io.run_read import _read_imu
 from gpvo.io.tracks import TracksSource
 
@@ -221,6 +221,14 @@ def test_text_in_the_place_of_numbers_is_refused(tmp_path: Path) -> None:
     pq.write_table(pa.table({"t_ns": [1, 2], **columns}), tmp_path / "imu.parquet")
     with pytest.raises(SourceError, match=r"imu\.parquet.*holds string"):
         _read_imu(tmp_path / "imu.parquet")
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "truth.parquet"
+    pq.write_table(pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], names=["p_x_m", "p_x_m"]), path)
+    for read in (read_columns, lambda p: list(read_blocks(p))):
+        with pytest.raises(SourceError, match=r"truth\.parquet: .*two columns have the same name"):
+            read(path)
 
 
 def test_a_line_without_end_is_not_read_whole(tmp_path: Path) -> None:
