@@ -1,7 +1,8 @@
-"""The same jobs on this machine's cores or on a Dask cluster; items made ahead in a thread."""
+"""The same jobs on this machine's cores or on a Dask cluster; items made ahead in a thread; what ends a process."""
 
 from __future__ import annotations
 
+import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -15,6 +16,14 @@ from gpvo.errors import GpvoError, require
 
 T = TypeVar("T")
 _KILLED = "a worker process was killed, as when memory runs out"
+
+
+def ending_signals() -> list[int]:
+    """Signals that end a process as Ctrl-C does: SIGTERM, and SIGHUP, of a terminal or a connection to it that is lost,
+    unless it is to be ignored, as under ``nohup``."""
+    lost = getattr(signal, "SIGHUP", None)  # not on Windows
+    is_heeded = lost is not None and signal.getsignal(lost) is not signal.SIG_IGN
+    return [signal.SIGTERM, lost] if is_heeded else [signal.SIGTERM]
 
 
 def map_jobs(
