@@ -20,6 +20,7 @@ from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.kalibr import calibration_text
 from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.cli.describe import describe
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.files import read_json, read_toml
 from gpvo.io import open_source
@@ -306,3 +307,11 @@ def test_a_file_without_an_end_is_left_at_its_bound() -> None:
         read_toml(Path("/dev/zero"))
     with pytest.raises(CalibrationError, match="too large for a calibration"):
         calibration_text(Path("/dev/zero"))
+
+
+def test_a_disk_that_fails_while_a_file_is_read_is_told_with_its_name(tmp_path: Path) -> None:
+    if not Path("/proc/self/mem").exists():
+        pytest.skip("no file here that opens and cannot be read")
+    (tmp_path / "image.tif").symlink_to("/proc/self/mem")
+    with pytest.raises(SourceError, match=r"image\.tif: cannot be read: Input/output error"):
+        describe(tmp_path / "image.tif")
