@@ -139,6 +139,11 @@ _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "calibration": ("an object whose 'interval_sigmas' hold a positive number per level for six axes", _is_calibration),
     "config": _OBJECT,
     "versions": _OBJECT,
+    "constant_best": (
+        "two positive numbers",
+        lambda v: isinstance(v, list) and [_is_number(x) and x > 0 for x in v] == [True] * 2,
+    ),
+    "simulated_truth": ("a list of objects", lambda v: _are(dict, v)),
     "sequences": (
         "a list of named sequences",
         lambda v: _are(dict, v) and _are(str, [s.get("name") for s in v]),

@@ -55,6 +55,24 @@ def _change(path: Path, column: str, value: float) -> None:
     pq.write_table(table.set_column(at, column, pa.array(values, pa.float64())), path)
 
 
+TWIN = {"of": "a", "seed": 0, "replicate": 0, "tolerance_name": "none", "tolerance": {"focal": 0.0}, "gap": None}
+
+
+@pytest.mark.parametrize("changed", [
+    {"vehicle": [1.0]}, {"vehicle": {"max_turn_radps2": "fast"}}, {"twin": [1]}, {"twin": "x"}, {"twin": {"of": "a"}},
+    {"twin": TWIN | {"seed": -1}}, {"twin": TWIN | {"seed": "0"}}, {"twin": TWIN | {"replicate": None}},
+    {"twin": TWIN | {"tolerance": 0.1}}, {"twin": TWIN | {"tolerance": {"focal": "0"}}}, {"twin": TWIN | {"gap": 2.0}},
+    {"twin": TWIN | {"gap": {"ratio": [1.0], "spread": ["x"]}}}, {"options": ["bits"]}, {"frames": "many"},
+], ids=str)  # fmt: skip
+def test_what_a_run_says_of_itself_is_held_against_its_kind(changed: dict, run: Path) -> None:
+    write_json(run / "run.json", read_json(run / "run.json") | {"twin": TWIN})
+    assert read_run(run).meta["twin"] == TWIN
+    write_json(run / "run.json", read_json(run / "run.json") | changed)
+    with pytest.raises(SourceError, match=r"run\.json: is (damaged|malformed)") as refusal:
+        read_run(run)
+    assert "\n" not in str(refusal.value)
+
+
 @pytest.mark.parametrize(("column", "value"), [
     ("cov_pointing_matching_01", 1.0), ("cov_pointing_matching_00", np.nan), ("cov_pointing_matching_11", 0.0),
     ("cov_pointing_matching_11", -1.0), ("cov_pointing_matching_12", np.nan), ("cov_pointing_matching_33", np.inf),
