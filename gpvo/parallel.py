@@ -7,7 +7,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from itertools import starmap
 from typing import Any, TypeVar
@@ -51,6 +50,8 @@ def map_jobs(
         raise GpvoError(f"unknown backend '{backend}'", cure="local or dask")
     if jobs == 1 or len(jobs_arguments) < 2:
         return _told(starmap(function, jobs_arguments), on_done)
+    from concurrent.futures.process import BrokenProcessPool
+
     from joblib import Parallel, delayed
 
     calls = (delayed(function)(*arguments) for arguments in jobs_arguments)

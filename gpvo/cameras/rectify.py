@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.imagesize import is_decodable
+from gpvo.cameras.imagesize import decoded
 from gpvo.cameras.models import CameraModel, KannalaBrandt
 from gpvo.cameras.rig import StereoRig, mean_view
 from gpvo.errors import CalibrationError
@@ -174,7 +174,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     if not path.is_file():
         raise CalibrationError("no such mask image", where=path)
     raw = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if is_decodable(raw.data) else None
+    image = decoded(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise CalibrationError("not readable as an image", where=path, cure="give the mask as PNG")
     white = image > 127

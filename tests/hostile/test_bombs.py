@@ -20,6 +20,7 @@ from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.kalibr import calibration_text
 from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.cameras.rectify import read_mask
 from gpvo.cli.describe import describe
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.files import read_json, read_toml
@@ -315,3 +316,12 @@ def test_a_disk_that_fails_while_a_file_is_read_is_told_with_its_name(tmp_path: 
     (tmp_path / "image.tif").symlink_to("/proc/self/mem")
     with pytest.raises(SourceError, match=r"image\.tif: cannot be read: Input/output error"):
         describe(tmp_path / "image.tif")
+
+
+def test_a_damaged_mask_is_refused_and_nothing_else_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mask.pgm"
+    cv2.imwrite(str(path), np.full((48, 64), 255, np.uint8))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CalibrationError, match=r"mask\.pgm: not readable as an image"):
+        read_mask(path)
+    assert capfd.readouterr() == ("", "")
