@@ -8,7 +8,6 @@ import sys
 from typing import NoReturn
 
 from gpvo.cameras.imagesize import MAX_PIXELS
-from gpvo.parallel import ending_signals
 
 
 def _terminate(number: int, _frame: object) -> NoReturn:
@@ -24,9 +23,11 @@ def main() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # whoever started this has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-    for number in ending_signals():
-        signal.signal(number, _terminate)
     try:
+        from gpvo.parallel import ending_signals
+
+        for number in ending_signals():
+            signal.signal(number, _terminate)
         try:
             from gpvo.cli import main as run
         except ModuleNotFoundError as error:
