@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -91,7 +92,7 @@ def read_run(path: str | Path) -> Run:
     log = _read_log(p, camera, _vehicle_of(meta, p / "run.json"))
     return Run(
         path=p,
-        name=printable(meta.get("name") or p.resolve().name),
+        name=_file_name(meta.get("name")) or _file_name(p.resolve().name),
         log=log,
         truth=_read_truth(p / "truth.parquet"),
         imu=_read_imu(p / "imu.parquet"),
@@ -114,6 +115,12 @@ def read_meta(path: Path) -> dict[str, Any]:
         if wrong:
             raise SourceError(f"is damaged: its '{wrong[0]}' cannot be", where=file)
     return meta
+
+
+def _file_name(name: object) -> str:
+    """A run's name, of which files beside other runs' are named: never a path that leads elsewhere."""
+    text = re.sub(r"[/\\]", "_", printable(name or ""))
+    return "" if text in (".", "..") else text
 
 
 def _is_count(value: Any) -> bool:

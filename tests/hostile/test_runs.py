@@ -55,6 +55,18 @@ def _change(path: Path, column: str, value: float) -> None:
     pq.write_table(table.set_column(at, column, pa.array(values, pa.float64())), path)
 
 
+@pytest.mark.parametrize("name", ["../../escaped", "/tmp/escaped", "..", ".", "a/b", "a\\..\\b", "", "\x1b[2Ja"])
+def test_the_name_of_a_run_leads_to_no_other_folder(name: str, run: Path, tmp_path: Path) -> None:
+    """Folders of plots, tables and stated covariances hold files of that name."""
+    write_json(run / "run.json", read_json(run / "run.json") | {"name": name, "source": f"{ESC}x"})
+    found = read_run(run)
+    place = tmp_path / "out" / f"{found.name}.txt"
+    assert place.resolve().parent == tmp_path / "out"
+    assert found.name
+    assert (tmp_path / found.name).resolve().parent == tmp_path
+    assert found.meta["source"].isprintable()
+
+
 TWIN = {"of": "a", "seed": 0, "replicate": 0, "tolerance_name": "none", "tolerance": {"focal": 0.0}, "gap": None}
 
 
