@@ -19,11 +19,14 @@ import pytest
 from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.kalibr import calibration_text
+from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.readers import read_stereo_yaml
-from gpvo.cameras.rectify import read_mask
+from gpvo.cameras.rectify import Rectifier, read_mask
+from gpvo.cameras.rig import StereoRig
 from gpvo.cli.describe import describe
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.files import read_json, read_toml
+from gpvo.geometry.se3 import from_rt
 from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
@@ -325,3 +328,15 @@ def test_a_damaged_mask_is_refused_and_nothing_else_is_said(tmp_path: Path, capf
     with pytest.raises(CalibrationError, match=r"mask\.pgm: not readable as an image"):
         read_mask(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_large_rectified_image_is_mapped_in_little_memory_and_a_larger_one_refused() -> None:
+    lens = PinholeRadtan(300.0, 300.0, 319.5, 239.5, 640, 480, (0.1, 0.0, 0.0, 0.0, 0.0))
+    rig = StereoRig(lens, lens, from_rt(np.eye(3), np.array([-0.1, 0.0, 0.0])))
+    tracemalloc.start()
+    assert Rectifier(rig, size=(3000, 3000), hfov_deg=60.0).camera.width == 3000
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 500_000_000
+    with pytest.raises(CalibrationError, match="rectified size 16384x16384 is not possible"):
+        Rectifier(rig, size=(16384, 16384))
