@@ -20,9 +20,8 @@ _KILLED = "a worker process was killed, as when memory runs out"
 def ending_signals() -> list[int]:
     """Signals that end a process as Ctrl-C does: SIGTERM, and SIGHUP, of a terminal or a connection to it that is lost,
     unless it is to be ignored, as under ``nohup``."""
-    lost = getattr(signal, "SIGHUP", None)  # not on Windows
-    is_heeded = lost is not None and signal.getsignal(lost) is not signal.SIG_IGN
-    return [signal.SIGTERM, lost] if is_heeded else [signal.SIGTERM]
+    lost: list[int] = [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []  # not on Windows
+    return [signal.SIGTERM, *(number for number in lost if signal.getsignal(number) is not signal.SIG_IGN)]
 
 
 def map_jobs(
