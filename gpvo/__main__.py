@@ -9,13 +9,11 @@ from typing import NoReturn
 
 from gpvo.cameras.imagesize import MAX_PIXELS
 
-_SIGTERM = 128 + signal.SIGTERM  # the exit code that shells know it by
-
 
 def _terminate(number: int, _frame: object) -> NoReturn:
     """End as by Ctrl-C: worker processes and temporary folders go too. A second signal ends the process at once."""
     signal.signal(number, signal.SIG_DFL)
-    sys.exit(_SIGTERM)
+    sys.exit(128 + number)  # the exit code that shells know it by
 
 
 def main() -> None:
@@ -25,8 +23,11 @@ def main() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # whoever started this has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-    signal.signal(signal.SIGTERM, _terminate)
     try:
+        from gpvo.parallel import ending_signals
+
+        for number in ending_signals():
+            signal.signal(number, _terminate)
         try:
             from gpvo.cli import main as run
         except ModuleNotFoundError as error:

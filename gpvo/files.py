@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gpvo.errors import GpvoError, OutputError, SourceError
+from gpvo.errors import GpvoError, OutputError, SourceError, printable
 
 try:
     import fcntl
@@ -170,7 +170,8 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a document. Raises SourceError where the file is missing, too large, or not a JSON object."""
+    """Read a document, its texts without what a terminal would obey. Raises SourceError where the file is missing, too
+    large, or not a JSON object."""
     try:
         document = parse_json(read_bounded(path, _MAX_BYTES).decode("utf-8"))
     except TooLarge:
@@ -181,7 +182,16 @@ def read_json(path: Path) -> dict[str, Any]:
         raise SourceError(f"is damaged: {str(error).splitlines()[0]}", where=path) from None
     if not isinstance(document, dict):
         raise SourceError("is damaged: no JSON object", where=path)
-    return document
+    return {printable(k): printable_document(v) for k, v in document.items()}
+
+
+def printable_document(value: Any) -> Any:
+    """The same document, without text that a terminal would obey."""
+    if isinstance(value, dict):
+        return {printable(k): printable_document(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [printable_document(v) for v in value]
+    return printable(value) if isinstance(value, str) else value
 
 
 def parse_json(text: str) -> Any:

@@ -1,12 +1,12 @@
-"""The same jobs on this machine's cores or on a Dask cluster; items made ahead in a thread."""
+"""The same jobs on this machine's cores or on a Dask cluster; items made ahead in a thread; what ends a process."""
 
 from __future__ import annotations
 
+import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from itertools import starmap
 from typing import Any, TypeVar
@@ -15,6 +15,13 @@ from gpvo.errors import GpvoError, require
 
 T = TypeVar("T")
 _KILLED = "a worker process was killed, as when memory runs out"
+
+
+def ending_signals() -> list[int]:
+    """Signals that end a process as Ctrl-C does: SIGTERM, and SIGHUP, of a terminal or a connection to it that is lost,
+    unless it is to be ignored, as under ``nohup``."""
+    lost: list[int] = [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []  # not on Windows
+    return [signal.SIGTERM, *(number for number in lost if signal.getsignal(number) is not signal.SIG_IGN)]
 
 
 def map_jobs(
@@ -42,6 +49,8 @@ def map_jobs(
         raise GpvoError(f"unknown backend '{backend}'", cure="local or dask")
     if jobs == 1 or len(jobs_arguments) < 2:
         return _told(starmap(function, jobs_arguments), on_done)
+    from concurrent.futures.process import BrokenProcessPool
+
     from joblib import Parallel, delayed
 
     calls = (delayed(function)(*arguments) for arguments in jobs_arguments)

@@ -180,12 +180,13 @@ def steps(
 
 
 def _content(source: Source) -> list[object]:
-    """What a source is known by: its files by name, size and time, its IMU and its truth."""
+    """What a source is known by: its files by name, size and time, its IMU, its truth, and its calibration, which may
+    lie elsewhere and not show in the rectified camera."""
     path = Path(source.path)
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     stats = ((p, p.stat()) for p in files)
     known = [(str(p.relative_to(path.parent)), s.st_size, s.st_mtime_ns) for p, s in stats]
-    return [source.format, known, source.imu, source.truth]
+    return [source.format, known, source.imu, source.truth, source.calibration]
 
 
 def imu_between(imu: ImuLog | None, t_from_ns: int, t_to_ns: int) -> ImuLog | None:

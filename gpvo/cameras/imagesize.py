@@ -1,10 +1,15 @@
-"""The size that an image file declares, read from its header, so that nothing too large is ever decoded."""
+"""The size that an image file declares, read from its header, so that nothing too large is ever decoded; decoding."""
 
 from __future__ import annotations
 
 import re
 import struct
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 MAX_PIXELS = 1 << 25
 """33 megapixels: more than any stereo camera has."""
@@ -35,6 +40,24 @@ def is_plausible(size: Size | None) -> bool:
 def is_decodable(raw: bytes | memoryview) -> bool:
     """Whether encoded bytes are an image, of a size and of chunks that a decoder may be given."""
     return is_plausible(image_size(raw)) and is_whole(raw)
+
+
+def decoded(raw: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
+    """Encoded bytes as OpenCV decodes them with these ``flags``; None where they are no image, or claim to be larger
+    than any."""
+    if not is_decodable(raw.data):
+        return None
+    import cv2
+
+    # Whoever asked reports a damaged image; OpenCV need not warn as well.
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imdecode(raw, flags)
+    except cv2.error:
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def is_whole(raw: bytes | memoryview) -> bool:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.imagesize import is_decodable
+from gpvo.cameras.imagesize import decoded, is_plausible
 from gpvo.cameras.models import CameraModel, KannalaBrandt
 from gpvo.cameras.rig import StereoRig, mean_view
 from gpvo.errors import CalibrationError
@@ -19,6 +19,7 @@ from gpvo.types import Array, Mounting, StereoCamera
 MAX_DEFAULT_HALF_ANGLE_RAD = np.deg2rad(57.0)
 # Bilinear sampling needs a whole neighbour; the outermost pixel of a lens image is often blank.
 _BORDER_PX = 1.5
+_BLOCK_PX = 1 << 21  # Maps are made of so many pixels at once: the arithmetic takes a hundred bytes for each.
 
 _Map = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
@@ -83,7 +84,7 @@ class Rectifier:
         lenses = (self.rig.left, self.rig.right)
         f = float(np.mean([[c.fx_px, c.fy_px] for c in lenses]))
         width, height = size if size is not None else (self.rig.left.width, self.rig.left.height)
-        if not (16 <= width <= 16384 and 16 <= height <= 16384):
+        if min(width, height) < 16 or not is_plausible((width, height)):
             raise CalibrationError(f"rectified size {width}x{height} is not possible", where=self.rig.where)
         if hfov_deg is not None:
             if not 5.0 <= hfov_deg <= 160.0:
@@ -109,10 +110,10 @@ class Rectifier:
         cx, cy = centre - shift
         return float(cx), float(cy)
 
-    def _sample_points(self, lens: CameraModel, R_rect: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Where each virtual pixel lies in the raw image: (H, W, 2) px, and (H, W) whether the lens sees it."""
+    def _sample_points(self, lens: CameraModel, R_rect: Array, rows: slice) -> tuple[Array, NDArray[np.bool_]]:
+        """Where each virtual pixel of some rows lies in the raw image: (n, W, 2) px, and whether the lens sees it."""
         c = self.camera
-        u, v = np.meshgrid(np.arange(c.width), np.arange(c.height))
+        u, v = np.meshgrid(np.arange(c.width), np.arange(c.height)[rows])
         rays = np.stack([(u - c.cx_px) / c.fx_px, (v - c.cy_px) / c.fy_px, np.ones(u.shape)], axis=-1)
         uv, valid = lens.project(rays.reshape(-1, 3) @ R_rect)
         return uv.reshape(*u.shape, 2), valid.reshape(u.shape)
@@ -120,23 +121,33 @@ class Rectifier:
     def _make_maps(self) -> tuple[list[_Map], list[NDArray[np.bool_] | None]]:
         maps: list[_Map] = []
         seen: list[NDArray[np.bool_] | None] = []
+        step = max(_BLOCK_PX // self.camera.width, 1)
         for lens, R, mask in (
             (self.rig.left, self.R_rect_left, self.rig.mask_left),
             (self.rig.right, self.R_rect_right, self.rig.mask_right),
         ):
-            uv, valid = self._sample_points(lens, R)
-            uv = np.where(valid[..., None], uv, -10.0)
-            x, y = uv[..., 0], uv[..., 1]
-            inside = (x >= _BORDER_PX) & (x <= lens.width - 1 - _BORDER_PX)
-            inside &= (y >= _BORDER_PX) & (y <= lens.height - 1 - _BORDER_PX)
-            if mask is not None:
-                nearest = np.rint(np.where(inside[..., None], uv, 0.0)).astype(np.intp)
-                inside &= mask[nearest[..., 1], nearest[..., 0]]
-            seen.append(inside)
-            # 16-bit fixed point: 1/32 px steps, half the memory traffic of floats.
-            clipped = np.clip(uv, -100.0, 32000.0).astype(np.float32)
-            maps.append(cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2))
+            blocks = (slice(top, top + step) for top in range(0, self.camera.height, step))
+            xy, fraction, inside = zip(*(self._map_of(lens, R, mask, rows) for rows in blocks))
+            maps.append((np.concatenate(xy), np.concatenate(fraction)))
+            seen.append(np.concatenate(inside))
         return maps, seen
+
+    def _map_of(
+        self, lens: CameraModel, R: Array, mask: NDArray[np.bool_] | None, rows: slice
+    ) -> tuple[NDArray[np.int16], NDArray[np.uint16], NDArray[np.bool_]]:
+        """The map of some rows, and which of their pixels show anything."""
+        uv, valid = self._sample_points(lens, R, rows)
+        uv = np.where(valid[..., None], uv, -10.0)
+        x, y = uv[..., 0], uv[..., 1]
+        inside = (x >= _BORDER_PX) & (x <= lens.width - 1 - _BORDER_PX)
+        inside &= (y >= _BORDER_PX) & (y <= lens.height - 1 - _BORDER_PX)
+        if mask is not None:
+            nearest = np.rint(np.where(inside[..., None], uv, 0.0)).astype(np.intp)
+            inside &= mask[nearest[..., 1], nearest[..., 0]]
+        # 16-bit fixed point: 1/32 px steps, half the memory traffic of floats.
+        clipped = np.clip(uv, -100.0, 32000.0).astype(np.float32)
+        xy, fraction = cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2)
+        return np.asarray(xy, np.int16), np.asarray(fraction, np.uint16), inside
 
     def _mask_or_none(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
         if mask is not None and mask.mean() < 0.02:
@@ -174,7 +185,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     if not path.is_file():
         raise CalibrationError("no such mask image", where=path)
     raw = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if is_decodable(raw.data) else None
+    image = decoded(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise CalibrationError("not readable as an image", where=path, cure="give the mask as PNG")
     white = image > 127

@@ -167,8 +167,11 @@ def _of_header(header: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_safetensors(path: Path) -> bool:
-    with path.open("rb") as file:
-        head = file.read(9)
+    try:
+        with path.open("rb") as file:
+            head = file.read(9)
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
     return len(head) == 9 and head[8:] == b"{" and int.from_bytes(head[:8], "little") < 100_000_000
 
 

@@ -15,8 +15,8 @@ from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, s
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
-from gpvo.files import read_json
 from gpvo.io.run import Run, read_run
+from gpvo.io.run_read import read_meta
 
 if TYPE_CHECKING:
     from gpvo.learning.config import TrainConfig
@@ -177,7 +177,7 @@ def _with_origin(trained: TrainedModel, paths: list[Path], update: Path | None) 
     from gpvo.twin.gap import simulated_truth
 
     before = [] if update is None else modelfile.load(update)[1].get("simulated_truth") or []
-    origin = before + simulated_truth([read_json(p / "run.json") for p in paths if p.is_dir()])
+    origin = before + simulated_truth([read_meta(p) for p in paths if p.is_dir()])
     return replace(trained, header={**trained.header, "simulated_truth": origin}) if origin else trained
 
 
@@ -211,7 +211,7 @@ def _train(
 
 def _frames(paths: list[Path]) -> int:
     """How many frames the runs say they have."""
-    return sum(int(read_json(p / "run.json").get("frames") or 0) for p in paths if (p / "run.json").is_file())
+    return sum(int(read_meta(p).get("frames") or 0) for p in paths if (p / "run.json").is_file())
 
 
 def _train_streaming(runs: Iterator[Run], config: TrainConfig, on_fit: OnFit) -> TrainedModel:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import TrainingSet
-from gpvo.errors import SourceError
-from gpvo.files import replacing
-from gpvo.geometry.covariance import from_upper, upper
+from gpvo.errors import CalibrationError, SourceError
+from gpvo.files import parse_json, replacing
+from gpvo.geometry.covariance import LARGEST, from_upper, upper
 from gpvo.io.parquet import numbers_of
 from gpvo.types import Array, StereoCamera
 
@@ -82,6 +83,33 @@ def _elements(kind: str, method: str, d: int) -> list[str]:
     return [f"{kind}.{method}.{a}.{b}" for a, b in zip(*np.triu_indices(d), strict=True)]
 
 
+@contextmanager
+def _guarded(path: Path) -> Iterator[None]:
+    """What is wrong with a file, in one line."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, CalibrationError, LookupError, NotImplementedError, OSError,
+            RecursionError, TypeError, ValueError, pa.ArrowException) as problem:  # fmt: skip
+        cure = "give run folders, or the .rows.parquet beside a model"
+        raise SourceError(f"is not a training set: {problem}", where=path, cure=cure) from None
+
+
+def _require_sound(s: TrainingSet) -> None:
+    """Raise ValueError for what no run gives: names that are none, numbers that nothing can be learned from."""
+    if not all(isinstance(text, str) for text in (s.name, s.target, *s.columns)):
+        raise ValueError("a name in it is no text")
+    if not all(isinstance(n, int) for n in (s.counts["lost"], *s.counts.values())) or s.counts.keys() & {
+        "name",
+        "rows",
+    }:
+        raise ValueError(f"the counts of '{s.name}' are none")
+    if s.t_ns.dtype != np.int64 or (s.t_ns[1:] < s.t_ns[:-1]).any() or not (s.dt_s > 0).all():
+        raise ValueError(f"the stamps of '{s.name}' do not increase")
+    errors = (s.Y, s.lost_xi, s.lost_jump, s.dt_s)
+    if s.Y.shape[1] not in (3, 6) or not all((np.abs(e) < LARGEST).all() for e in errors) or np.isinf(s.X).any():
+        raise ValueError(f"'{s.name}' holds numbers that are no errors or features")
+
+
 def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
     """Rows of one sequence; ``entry``: what the file's metadata says of it."""
 
@@ -98,7 +126,7 @@ def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         }
 
     outputs = sum(name.startswith("y.") for name in table.column_names)
-    return TrainingSet(
+    made = TrainingSet(
         name=entry["name"],
         columns=tuple(entry["columns"]),
         X=np.stack([column(f"x.{c}").astype(np.float64) for c in entry["columns"]], axis=1),
@@ -111,9 +139,11 @@ def _set_of_table(entry: dict[str, Any], table: pa.Table) -> TrainingSet:
         camera=None if entry["camera"] is None else StereoCamera(**entry["camera"]),
         target=entry["target"],
         lost_xi=np.array(entry.get("lost_xi", []), dtype=np.float64).reshape(-1, 6),
-        odometry=entry.get("odometry", {}),
+        odometry=dict(entry.get("odometry", {})),
         lost_jump=np.array(entry.get("lost_jump", []), dtype=np.float64).reshape(-1, 6),
     )
+    _require_sound(made)
+    return made
 
 
 CHUNK_ROWS = 8192
@@ -131,18 +161,14 @@ class StoredSets:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        try:
-            with self._open() as file:
-                meta = json.loads((file.schema_arrow.metadata or {})[b"gpvo"])
-                self._about: list[dict[str, Any]] = meta["sequences"]
-                self.lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
-                if meta["schema"] > SCHEMA or len(self._about) != len(self.lengths):
-                    raise SourceError("was written by a newer gpvo", where=path, cure="update gpvo")
-        except (OSError, KeyError, ValueError, pa.ArrowException) as problem:
-            if isinstance(problem, SourceError):
-                raise
-            cure = "give run folders, or the .rows.parquet beside a model"
-            raise SourceError(f"is not a training set: {problem}", where=path, cure=cure) from None
+        with _guarded(self.path), self._open() as file:
+            meta = parse_json((file.schema_arrow.metadata or {})[b"gpvo"].decode())
+            self._about: list[dict[str, Any]] = meta["sequences"]
+            self.lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
+            if meta["schema"] > SCHEMA:
+                raise SourceError("was written by a newer gpvo", where=path, cure="update gpvo")
+            if len(self._about) != len(self.lengths) or 0 in self.lengths:
+                raise ValueError(f"{len(self._about)} sequences in groups of {self.lengths} rows")
 
     def __len__(self) -> int:
         return sum(self.lengths)
@@ -152,12 +178,12 @@ class StoredSets:
 
     def whole(self, i: int) -> TrainingSet:
         """Sequence i."""
-        with self._open() as file:
+        with _guarded(self.path), self._open() as file:
             return _set_of_table(self._about[i], file.read_row_group(i))
 
     def chunks(self, i: int, chunk_rows: int = CHUNK_ROWS) -> Iterator[TrainingSet]:
         """Sequence i in order, piece by piece."""
-        with self._open() as file:
+        with _guarded(self.path), self._open() as file:
             for batch in file.iter_batches(batch_size=chunk_rows, row_groups=[i], use_threads=False):
                 yield _set_of_table(self._about[i], pa.Table.from_batches([batch]))
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.cameras.imagesize import image_size, is_decodable
+from gpvo.cameras.imagesize import decoded, image_size
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
@@ -80,17 +80,7 @@ def decode_stored(raw: NDArray[np.uint8]) -> NDArray[Any] | None:
 
     As stored, not turned by an Exif orientation: that is what the calibration and the size in the header are of.
     """
-    if not is_decodable(raw.data):
-        return None
-    # A damaged image is counted and reported by us; OpenCV need not warn as well.
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        return cv2.imdecode(raw, _AS_STORED)
-    except cv2.error:
-        return None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    return decoded(raw, _AS_STORED)
 
 
 @dataclass(frozen=True)

@@ -246,6 +246,9 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
                 )
             if sum(shape.row_group(i).total_byte_size for i in range(shape.num_row_groups)) > MAX_BYTES:
                 raise SourceError("unpacks to more than 8 GB", where=path)
+            names = file.schema_arrow.names
+            if len(set(names)) < len(names):
+                raise ValueError("two columns have the same name")
             # What a page's run lengths stand for is in no size that the file states.
             cells, packed = shape.num_rows * shape.num_columns, path.stat().st_size
             if 8 * cells > _PLAIN_BYTES + _MAX_RATIO * packed:

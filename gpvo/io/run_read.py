@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -87,16 +88,13 @@ def read_run(path: str | Path) -> Run:
         raise SourceError(what, where=p, cure="make one with 'gpvo run SOURCE -o RUN'")
     if not (p / "run.json").is_file():
         raise SourceError("is not a run folder: it lacks run.json", where=p, cure="make one with 'gpvo run'")
-    meta = read_json(p / "run.json")
-    schema = meta.get("schema")
-    if not isinstance(schema, int) or schema > _MAX_SCHEMA:
-        raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=p / "run.json", cure="upgrade")
+    meta = read_meta(p)
     camera, mounting = _read_rig(p / "rig.json")
     log = _read_log(p, camera, _vehicle_of(meta, p / "run.json"))
     stated = [read_predictions(part) for part in _parts(p, "predictions")]
     return Run(
         path=p,
-        name=printable(meta.get("name") or p.resolve().name),
+        name=_file_name(meta.get("name")) or _file_name(p.resolve().name),
         log=log,
         truth=_read_truth(p / "truth.parquet"),
         imu=_read_imu(p / "imu.parquet"),
@@ -105,6 +103,55 @@ def read_run(path: str | Path) -> Run:
         meta=meta,
         settings=read_toml(p / "config.toml") if (p / "config.toml").is_file() else {},
     )
+
+
+def read_meta(path: Path) -> dict[str, Any]:
+    """``run.json`` of a run folder. Raises SourceError where it is newer than this version, or damaged."""
+    file = path / "run.json"
+    meta = read_json(file)
+    schema = meta.get("schema")
+    if not isinstance(schema, int) or schema > _MAX_SCHEMA:
+        raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=file, cure="upgrade")
+    for holder, kinds in ((meta, _META), (meta.get("twin") or None, _TWIN)):
+        wrong = [key for key, holds in kinds.items() if isinstance(holder, dict) and not holds(holder.get(key))]
+        if wrong:
+            raise SourceError(f"is damaged: its '{wrong[0]}' cannot be", where=file)
+    return meta
+
+
+def _file_name(name: object) -> str:
+    """A run's name, of which files beside other runs' are named: never a path that leads elsewhere."""
+    text = re.sub(r"[/\\]", "_", printable(name or ""))
+    return "" if text in (".", "..") else text
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and value >= 0
+
+
+def _are_numbers(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(v, int | float) for v in value.values())
+
+
+def _is_gap(value: Any) -> bool:
+    if not value:
+        return value is None
+    return isinstance(value, dict) and all(
+        isinstance(v := value.get(key), list) and _are_numbers(dict(enumerate(v))) for key in ("ratio", "spread")
+    )
+
+
+_META: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("twin", "options", "vehicle"), lambda v: v is None or isinstance(v, dict)),
+    "frames": lambda v: v is None or _is_count(v),
+}
+_TWIN: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("of", "tolerance_name"), lambda v: isinstance(v, str)),
+    **dict.fromkeys(("seed", "replicate"), _is_count),
+    "tolerance": _are_numbers,
+    "gap": _is_gap,
+}
+"""What is read of ``run.json``, and of what it says of a twin."""
 
 
 def read_predictions(path: str | Path) -> StoredPredictions:
@@ -159,7 +206,7 @@ def _guarded(path: Path) -> Iterator[None]:
         yield
     except KeyError as error:
         raise SourceError(f"lacks the column {error}", where=path, cure="was it made by gpvo?") from None
-    except (ValueError, TypeError, OverflowError) as error:
+    except (AttributeError, ValueError, TypeError, OverflowError) as error:
         raise SourceError(f"is malformed: {error}", where=path) from None
 
 

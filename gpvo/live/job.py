@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOu
 from gpvo.live.stages import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage, PoseStage, Stage
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.online.predictor import Predictor
+from gpvo.parallel import ending_signals
 from gpvo.publish.ros import check_topic
 
 WIRES = ("zenoh", "dds", "ros2", "ros1")
@@ -263,7 +264,7 @@ def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
 
 @contextmanager
 def ending_by_signal(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C and SIGTERM set ``stop`` inside the block; a second one ends the process at once."""
+    """Ctrl-C, SIGTERM and SIGHUP set ``stop`` inside the block; a second one ends the process at once."""
 
     def end(number: int, _frame: object) -> None:
         signal.signal(number, signal.SIG_DFL)
@@ -272,7 +273,7 @@ def ending_by_signal(stop: threading.Event) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, *ending_signals())}
     try:
         yield
     finally:
@@ -281,7 +282,8 @@ def ending_by_signal(stop: threading.Event) -> Iterator[None]:
 
 
 def _tell(text: str) -> None:
-    print(f"gpvo live: {text}", file=sys.stderr, flush=True)
+    with suppress(OSError):  # the terminal may be gone, and what is recorded is still to be written
+        print(f"gpvo live: {text}", file=sys.stderr, flush=True)
 
 
 POSE_TYPE_NAMES = {"odometry": ODOMETRY_TYPE, "pose": POSE_TYPE, "pose_stamped": "geometry_msgs/msg/PoseStamped"}

@@ -38,8 +38,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as _load_tensors
 from safetensors.numpy import save as _save_tensors
 
-from gpvo.errors import ModelError, printable
-from gpvo.files import TooLarge, parse_json, plain, read_bounded, replacing
+from gpvo.errors import ModelError
+from gpvo.files import TooLarge, parse_json, plain, printable_document, read_bounded, replacing
 
 SCHEMA = 1
 KIND = "gpvo-error-model"
@@ -87,7 +87,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
         raise ModelError("the content does not match its digest", where=path, cure="copy or train the model again")
     # Without escapes, all text of the header stands as it is in the text that it was read from.
     plain_text = text.isprintable() and "\\" not in text
-    return arrays, document["header"] if plain_text else _printable(document["header"])
+    return arrays, document["header"] if plain_text else printable_document(document["header"])
 
 
 def _check_document(document: Any, path: Path) -> None:
@@ -141,6 +141,11 @@ _HEADER: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "calibration": ("an object whose 'interval_sigmas' hold a positive number per level for six axes", _is_calibration),
     "config": _OBJECT,
     "versions": _OBJECT,
+    "constant_best": (
+        "two positive numbers",
+        lambda v: isinstance(v, list) and [_is_number(x) and x > 0 for x in v] == [True] * 2,
+    ),
+    "simulated_truth": ("a list of objects", lambda v: _are(dict, v)),
     "sequences": (
         "a list of named sequences",
         lambda v: _are(dict, v) and _are(str, [s.get("name") for s in v]),
@@ -158,15 +163,6 @@ def _check_header(header: Mapping[str, Any], path: Path) -> None:
     features, units = header.get("features"), header.get("units")
     if features and units and len(features) != len(units):
         raise ModelError(f"its header names {len(units)} units for {len(features)} features", where=path)
-
-
-def _printable(value: Any) -> Any:
-    """The same document, without text that a terminal would obey."""
-    if isinstance(value, dict):
-        return {printable(k): _printable(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_printable(v) for v in value]
-    return printable(value) if isinstance(value, str) else value
 
 
 def _storable(name: str, array: NDArray[Any]) -> NDArray[Any]:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -23,6 +23,7 @@ from gpvo.sim.rig import CAMERAS, camera_rig
 
 CalibrationKey = Literal["baseline", "focal", "rotation_rad", "distortion"]
 Cause = Literal["darkness", "dust", "motion_blur", "bare_wall", "image_noise"]
+Deviation = Annotated[float, Field(ge=-0.5, le=0.5)]  # beyond, not even the simulator's cameras would make a pair
 Share = Field(0.0, ge=0.0, le=0.5)
 _SHARED = (
     "world", "world_seed", "duration_s", "rest_s", "rate_hz", "speed_mps", "imu", "imu_rate_hz", "episodes_share",
@@ -91,8 +92,8 @@ class Scenario(BaseModel):
     imu_offset_s: float = Field(0.0, ge=-0.1, le=0.1)
     depth: bool = False
     flow: bool = False
-    calibration: dict[CalibrationKey, float] = {}
-    calibration_offset: dict[CalibrationKey, float] = {}
+    calibration: dict[CalibrationKey, Deviation] = {}
+    calibration_offset: dict[CalibrationKey, Deviation] = {}
     points: dict[str, Any] = {}
 
     @property

@@ -19,14 +19,19 @@ import pytest
 from bag_maker import stereo_bag
 from gpvo.cameras.imagesize import image_size
 from gpvo.cameras.kalibr import calibration_text
+from gpvo.cameras.models import PinholeRadtan
 from gpvo.cameras.readers import read_stereo_yaml
+from gpvo.cameras.rectify import Rectifier, read_mask
+from gpvo.cameras.rig import StereoRig
+from gpvo.cli.describe import describe
 from gpvo.errors import CalibrationError, GpvoError, SourceError
 from gpvo.files import read_json, read_toml
+from gpvo.geometry.se3 import from_rt
 from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
-from gpvo.io.parquet import read_columns
+from gpvo.io.parquet import read_blocks, read_columns
 from gpvo.io.run_read import _read_imu
 from gpvo.io.tracks import TracksSource
 
@@ -223,6 +228,14 @@ def test_text_in_the_place_of_numbers_is_refused(tmp_path: Path) -> None:
         _read_imu(tmp_path / "imu.parquet")
 
 
+def test_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "truth.parquet"
+    pq.write_table(pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], names=["p_x_m", "p_x_m"]), path)
+    for read in (read_columns, lambda p: list(read_blocks(p))):
+        with pytest.raises(SourceError, match=r"truth\.parquet: .*two columns have the same name"):
+            read(path)
+
+
 def test_a_line_without_end_is_not_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_text("1 " * 5_000_000)
@@ -298,3 +311,32 @@ def test_a_file_without_an_end_is_left_at_its_bound() -> None:
         read_toml(Path("/dev/zero"))
     with pytest.raises(CalibrationError, match="too large for a calibration"):
         calibration_text(Path("/dev/zero"))
+
+
+def test_a_disk_that_fails_while_a_file_is_read_is_told_with_its_name(tmp_path: Path) -> None:
+    if not Path("/proc/self/mem").exists():
+        pytest.skip("no file here that opens and cannot be read")
+    (tmp_path / "image.tif").symlink_to("/proc/self/mem")
+    with pytest.raises(SourceError, match=r"image\.tif: cannot be read: Input/output error"):
+        describe(tmp_path / "image.tif")
+
+
+def test_a_damaged_mask_is_refused_and_nothing_else_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mask.pgm"
+    cv2.imwrite(str(path), np.full((48, 64), 255, np.uint8))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CalibrationError, match=r"mask\.pgm: not readable as an image"):
+        read_mask(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_large_rectified_image_is_mapped_in_little_memory_and_a_larger_one_refused() -> None:
+    lens = PinholeRadtan(300.0, 300.0, 319.5, 239.5, 640, 480, (0.1, 0.0, 0.0, 0.0, 0.0))
+    rig = StereoRig(lens, lens, from_rt(np.eye(3), np.array([-0.1, 0.0, 0.0])))
+    tracemalloc.start()
+    assert Rectifier(rig, size=(3000, 3000), hfov_deg=60.0).camera.width == 3000
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 500_000_000
+    with pytest.raises(CalibrationError, match="rectified size 16384x16384 is not possible"):
+        Rectifier(rig, size=(16384, 16384))

@@ -166,6 +166,9 @@ HEADERS: dict[str, dict[str, Any]] = {
     "units of too few": {"units": ["m"]},
     "unknown target": {"target": "window:-3s"},
     "sequences without names": {"sequences": [{}]},
+    "twins that are a number": {"simulated_truth": 3},
+    "negative factors of the constant": {"constant_best": [-1.0, 1.0]},
+    "one factor of the constant": {"constant_best": [1.0]},
 }  # fmt: skip
 
 

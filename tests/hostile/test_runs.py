@@ -55,6 +55,36 @@ def _change(path: Path, column: str, value: float) -> None:
     pq.write_table(table.set_column(at, column, pa.array(values, pa.float64())), path)
 
 
+@pytest.mark.parametrize("name", ["../../escaped", "/tmp/escaped", "..", ".", "a/b", "a\\..\\b", "", "\x1b[2Ja"])
+def test_the_name_of_a_run_leads_to_no_other_folder(name: str, run: Path, tmp_path: Path) -> None:
+    """Folders of plots, tables and stated covariances hold files of that name."""
+    write_json(run / "run.json", read_json(run / "run.json") | {"name": name, "source": f"{ESC}x"})
+    found = read_run(run)
+    place = tmp_path / "out" / f"{found.name}.txt"
+    assert place.resolve().parent == tmp_path / "out"
+    assert found.name
+    assert (tmp_path / found.name).resolve().parent == tmp_path
+    assert found.meta["source"].isprintable()
+
+
+TWIN = {"of": "a", "seed": 0, "replicate": 0, "tolerance_name": "none", "tolerance": {"focal": 0.0}, "gap": None}
+
+
+@pytest.mark.parametrize("changed", [
+    {"vehicle": [1.0]}, {"vehicle": {"max_turn_radps2": "fast"}}, {"twin": [1]}, {"twin": "x"}, {"twin": {"of": "a"}},
+    {"twin": TWIN | {"seed": -1}}, {"twin": TWIN | {"seed": "0"}}, {"twin": TWIN | {"replicate": None}},
+    {"twin": TWIN | {"tolerance": 0.1}}, {"twin": TWIN | {"tolerance": {"focal": "0"}}}, {"twin": TWIN | {"gap": 2.0}},
+    {"twin": TWIN | {"gap": {"ratio": [1.0], "spread": ["x"]}}}, {"options": ["bits"]}, {"frames": "many"},
+], ids=str)  # fmt: skip
+def test_what_a_run_says_of_itself_is_held_against_its_kind(changed: dict, run: Path) -> None:
+    write_json(run / "run.json", read_json(run / "run.json") | {"twin": TWIN})
+    assert read_run(run).meta["twin"] == TWIN
+    write_json(run / "run.json", read_json(run / "run.json") | changed)
+    with pytest.raises(SourceError, match=r"run\.json: is (damaged|malformed)") as refusal:
+        read_run(run)
+    assert "\n" not in str(refusal.value)
+
+
 @pytest.mark.parametrize(("column", "value"), [
     ("cov_pointing_matching_01", 1.0), ("cov_pointing_matching_00", np.nan), ("cov_pointing_matching_11", 0.0),
     ("cov_pointing_matching_11", -1.0), ("cov_pointing_matching_12", np.nan), ("cov_pointing_matching_33", np.inf),

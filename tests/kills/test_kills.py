@@ -5,20 +5,24 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from gpvo.errors import GpvoError
+from gpvo.files import read_json
 from gpvo.io.run import is_finished, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.sim.points import simulate_points
@@ -122,6 +126,43 @@ def test_sigterm_ends_the_workers_too(tmp_path: Path) -> None:
         time.sleep(0.1)
     os.killpg(call.pid, signal.SIGKILL)
     pytest.fail("a worker lives on")
+
+
+@pytest.mark.parametrize("wrapper", [[], ["nohup"]], ids=["plain", "nohup"])
+def test_a_lost_terminal_costs_nothing_that_was_recorded(wrapper: list[str], tmp_path: Path) -> None:
+    """As a session on a robot ends with the connection to it; ``nohup`` keeps it going."""
+    from bag_maker import BagMaker
+
+    maker, covariance = BagMaker(ros1=True), np.eye(6)
+    for k in range(600):
+        T = np.eye(4)
+        T[0, 3] = 0.05 * k
+        maker.odometry("/odom", 10**18 + k * 10**8, T, 1e-4 * (k + 1) * covariance, 1e-4 * covariance)
+    bag, model = maker.write(tmp_path / "in.bag"), Path(__file__).parents[2] / "models" / "tunnel.gpvo"
+    out, state = tmp_path / "out.bag", tmp_path / "state.json"
+    command = [*wrapper, *GPVO, "live", "--replay", bag, "--model", model, "-o", out, "--state", state]
+    ours, theirs = os.openpty()
+
+    def take_terminal() -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        fcntl.ioctl(theirs, termios.TIOCSCTTY, 0)
+
+    call = subprocess.Popen(
+        list(map(str, command)), stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+        preexec_fn=take_terminal, cwd=tmp_path, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    os.close(theirs)
+    deadline = time.monotonic() + 120
+    while not (state.is_file() and read_json(state)["t_ns"] > 10**18) and time.monotonic() < deadline:
+        time.sleep(0.05)  # until it is written for the second time
+    os.close(ours)
+    if wrapper:
+        with pytest.raises(subprocess.TimeoutExpired):
+            call.wait(timeout=3)
+        call.terminate()
+    call.wait(timeout=60)
+    assert out.is_file()
+    assert not out.with_name("out.bag.parts").exists()
 
 
 @pytest.mark.slow

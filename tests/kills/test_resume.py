@@ -157,6 +157,39 @@ def test_another_source_setting_or_code_begins_anew(tmp_path: Path, monkeypatch:
     assert made == [13, 3, 13, 13, 13, 13]
 
 
+def test_an_edited_calibration_that_lies_elsewhere_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lens' distortion shows in no rectified camera, only in the images: half a run would be of either lens."""
+    monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=3))
+    picture = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+    for side in ("left", "right"):
+        (tmp_path / "source" / side).mkdir(parents=True)
+        for k in range(9):
+            cv2.imwrite(str(tmp_path / "source" / side / f"{10**18 + k * 10**8}.png"), picture)
+    calibration, went = tmp_path / "camchain.yaml", []
+    step = StereoOdometry.step
+    monkeypatch.setattr(StereoOdometry, "step", lambda *given: (went.append(True), step(*given))[1])
+
+    def broken(k1: float) -> tuple[Any, int]:
+        """The rectified camera, and how many frames odometry goes through until the run breaks off at the 7th."""
+        block = "  camera_model: pinhole\n  intrinsics: [60.0, 60.0, 31.5, 23.5]\n  distortion_model: radtan\n"
+        block += f"  distortion_coeffs: [{k1}, 0.0, 0.0, 0.0]\n  resolution: [64, 48]\n"
+        calibration.write_text(f"cam0:\n{block}cam1:\n{block}{POSE}")
+        source, left = open_source(tmp_path / "source", calibration=calibration, hfov_deg=30.0), iter(range(6))
+
+        def stop(*_: object) -> None:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+
+        went.clear()
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(source, tmp_path / "run", on_frame=stop, options={})
+        return source.camera, len(went)
+
+    (camera, begun), (_, resumed), (other, anew) = broken(0.001), broken(0.001), broken(0.05)
+    assert (camera, begun, resumed) == (other, 7, 1)
+    assert anew == 7
+
+
 def test_the_command_resumes_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "RunWriter", partial(RunWriter, chunk=5))
     monkeypatch.setattr("sys.argv", ["gpvo", "run", str(tracks(tmp_path)), "-o", str(tmp_path / "run")])

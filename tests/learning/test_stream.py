@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from gpvo.dataset.table import BLOCK_ROWS, StoredSets, kept_rows, read_sets, write_sets
 from gpvo.errors import GpvoError, SourceError
 from gpvo.learning.config import TrainConfig
 from gpvo.learning.store import save_model, train_stored
 from gpvo.learning.train import train_sets
+from gpvo.types import StereoCamera, field_names
 from small_model import training_sets
 
 QUICK = TrainConfig(features="velocity,n_inliers")
@@ -76,3 +80,56 @@ def test_what_is_no_training_set(tmp_path):
         StoredSets(tmp_path / "x.parquet")
     with pytest.raises(GpvoError):
         train_stored(tmp_path / "none.parquet", QUICK)
+
+
+def _column(name, value):
+    def change(meta, table):
+        at = table.column_names.index(name)
+        return meta, table.set_column(at, name, pa.array([value] * table.num_rows))
+
+    return change
+
+
+def _about(**changed):
+    def change(meta, table):
+        first = {k: v for k, v in (meta["sequences"][0] | changed).items() if v is not None}
+        return {**meta, "sequences": [first, *meta["sequences"][1:]]}, table
+
+    return change
+
+
+DAMAGED = {
+    "a list": lambda meta, table: ([meta], table),
+    "no sequence": lambda meta, table: ({**meta, "sequences": 3}, table),
+    "a feature without its column": _about(columns=["v_x_mps", "x"]),
+    "a feature that is a list": _about(columns=[["v_x_mps"]]),
+    "no name": _about(name=None),
+    "a name that is a number": _about(name=7),
+    "counts of text": _about(counts={"lost": "3"}),
+    "no counts": _about(counts={}),
+    "half a camera": _about(camera={"fx_px": 300.0}),
+    "an impossible camera": _about(camera=dict.fromkeys(field_names(StereoCamera), 1e100)),
+    "errors of five axes": _about(lost_xi=[1.0] * 5),
+    "an infinite error": _column("y.0", np.inf),
+    "an error beyond all squares": _column("y.1", 1e200),
+    "an unknown error": _column("y.2", np.nan),
+    "an infinite feature": _column("x.v_x_mps", -np.inf),
+    "a motion of no time": _column("dt_s", 0.0),
+    "one column less": lambda meta, table: (meta, table.drop_columns(["y.5"])),
+    "stamps that are text": _column("t_ns", "x"),
+    "stamps that are structures": _column("t_ns", {"a": 1.0}),
+    "no rows": lambda meta, table: (meta, table.slice(0, 0)),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_file_of_rows_that_cannot_be_is_refused_in_one_line(case, tmp_path):
+    path = tmp_path / "rows.parquet"
+    write_sets(path, training_sets(range(1), n=40))
+    table = pq.ParquetFile(path).read()
+    meta, table = DAMAGED[case](json.loads(table.schema.metadata[b"gpvo"]), table)
+    pq.write_table(table.replace_schema_metadata({"gpvo": json.dumps(meta)}), path)
+    for read in (read_sets, lambda p: StoredSets(p).thinned(1000)):
+        with pytest.raises(SourceError, match=r"rows\.parquet: is not a training set: ") as refusal:
+            read(path)
+        assert "\n" not in str(refusal.value)

@@ -154,3 +154,11 @@ def test_what_has_no_pictures_says_so(name):
     with pytest.raises(GpvoError, match="has no images"):
         sc.require_pictures(sc.load_scenario(name))
     sc.require_pictures(sc.load_scenario("tunnel"))
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e300, -0.6])
+@pytest.mark.parametrize("table", ["calibration", "calibration_offset"])
+def test_a_calibration_that_no_pair_has_is_refused(table, value):
+    """An infinite rotation gave tracks that are not numbers."""
+    with pytest.raises(GpvoError, match=rf"{table}\.rotation_rad = "):
+        sc.load_scenario("tunnel-bursts", {f"{table}.rotation_rad": value})
