@@ -37,6 +37,7 @@ _CURES = {
     "few": "most points are not found in the right image; look at its exposure, focus and lens",
     "blur": "one image is much more blurred than the other; focus and clean both lenses, and shorten their exposure",
     "light": "left and right differ in brightness; give both cameras the same exposure and gain",
+    "held": "points stay in place while the image moves; mask what is fixed to the camera, and clean both lenses",
     "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
 
@@ -193,6 +194,10 @@ class PairWatch:
             self._seen[cause] += lost > 0.4 * right.sought and not self.late  # which moves points out of their rows
             doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
         return doubts
+
+    def note(self, cause: str, seen: bool) -> None:
+        """Count a cause that others see in the last pair."""
+        self._seen[cause] += seen
 
     def findings(self) -> list[str]:
         """What was wrong in more than a twentieth of the pairs, with the remedy."""
