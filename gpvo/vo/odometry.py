@@ -272,7 +272,7 @@ class StereoOdometry:
         elif config.self_calibration:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
             # Other doubts may come from the rig's own errors, which only learning ends.
-            sharp = not self.pair.blurred
+            sharp = not self.pair.unsharp
             otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px, sharp=sharp)
         return replace(
             record,

@@ -172,6 +172,19 @@ def frozen_right(footage: Footage) -> Footage:
     return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
 
 
+def interlaced(footage: Footage) -> Footage:
+    """Every second row is that of the frame before."""
+
+    def weave(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        out = now.copy()
+        out[1::2] = before[1::2]
+        return out
+
+    f = footage.frames
+    frames = [replace(b, left=weave(a.left, b.left), right=weave(a.right, b.right)) for a, b in pairwise(f)]
+    return replace(footage, frames=[f[0], *frames])
+
+
 def half_size(footage: Footage) -> Footage:
     """Images of half the size with the calibration of the full one."""
     c = footage.camera
@@ -258,6 +271,7 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "right black": _each(right_black),
     "frozen right": frozen_right,
     "late right": late_right,
+    "interlaced": interlaced,
     "half size": half_size,
     "swapped": _each(swapped),
     "bonnet of 10 %": bonnet(0.1),
