@@ -27,7 +27,7 @@ class Observation:
 
     ``repeated``, ``right_repeated``: the pair, or its right image alone, is identical to that of the previous frame.
     ``right_light``: by what factor the right image is brighter or has more contrast; 1 if they are alike.
-    ``right_blur``: by what factor it is more blurred.
+    ``right_blur``: by what factor it is more blurred. ``woven``: every second row of one is of another moment.
     """
 
     stats: ImageStats | None
@@ -35,6 +35,7 @@ class Observation:
     right_repeated: bool = False
     right_light: float = 1.0
     right_blur: float = 1.0
+    woven: bool = False
 
 
 @dataclass(frozen=True)

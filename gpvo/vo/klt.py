@@ -104,6 +104,7 @@ class KltFrontend:
             same_right and not same_left,
             light_left.ratio(light_right),
             light_left.blur(light_right),
+            opencv.woven(frame.left) or opencv.woven(frame.right),
         )
 
     def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:

@@ -30,7 +30,7 @@ from gpvo.vo.quality import (
     stats_fields,
 )
 from gpvo.vo.rig_error import RigError, RigState
-from gpvo.vo.rivals import Choice, areas, choose, unexplained
+from gpvo.vo.rivals import Choice, areas, choose, unexplained, untangled
 from gpvo.vo.sigmas import NoiseEstimator, ResidualMoments, SigmaEstimator
 from gpvo.vo.state import State, Stopwatch, own_frame
 from gpvo.vo.window import Window
@@ -166,12 +166,14 @@ class StereoOdometry:
     def _choose(
         self, matches: Matches, motion: Motion | None, guess: Array, t_ns: int, doubts: list[str]
     ) -> tuple[Motion | None, Choice]:
-        """The motion, or its rival among the points that disagree: a second one is added to the doubts, and so is a
-        motion that the vehicle cannot make."""
+        """The motion freed from points that do not move with the scene, or its rival among the points that disagree: a
+        second one is added to the doubts, and so is a motion that the vehicle cannot make."""
         assert self._state is not None
         self._state.rival = None
         if motion is None:
             return None, Choice()
+        motion, held = untangled(motion, matches, self.camera, self._estimate)
+        self.pair.note("held", held)
         free = unexplained(motion, matches, self.camera, self.config)
         second = None if free is None else self._estimate(matches, free)
         covered = (1, 0) if second is None else areas(motion, second, matches, self.camera, self.config)
@@ -270,7 +272,7 @@ class StereoOdometry:
         elif config.self_calibration:
             row_error, least_px = matches.row_error[motion.inliers], max(config.min_disparity_px, KNOWN_DEPTH_PX)
             # Other doubts may come from the rig's own errors, which only learning ends.
-            sharp = not self.pair.blurred
+            sharp = not self.pair.unsharp
             otherwise = otherwise + self.rig_error.update(motion, white, row_error, least_px, sharp=sharp)
         return replace(
             record,

@@ -22,6 +22,7 @@ Points = NDArray[np.floating[Any]]
 _IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 # Lucas-Kanade compares grey values: it bears what two lenses differ by, not a tenth.
 _SAME_LIGHT = 1.06
+_WOVEN = 1.01  # times; 1 in nothing but noise
 _NO_PICTURE = 2.0  # grey values of contrast
 _ALIKE = 0.9  # difference of two patches of one thing over what varies within; those of noise have 1.1 to 1.4
 
@@ -202,6 +203,18 @@ class Light:
         fine = [max(cv2.norm(cv2.Sobel(a.half[::4], cv2.CV_16S, 1, 0, ksize=1)), 1e-3) for a in (self, other)]
         ratio = fine[0] / fine[1]
         return float(min(ratio, ratio * other.std / self.std, key=lambda x: abs(math.log(x))))
+
+
+def woven(image: NDArray[np.uint8]) -> bool:
+    """Whether every second row is of another moment, as in interlaced video of a moving camera: then rows differ more
+    from their neighbours than from the next but one, which neither texture nor noise does. Columns of a raw colour
+    mosaic do so too."""
+
+    def comb(a: NDArray[np.uint8]) -> float:
+        """One for noise, less for any texture."""
+        return cv2.norm(a[1:-1], a[:-2], cv2.NORM_L1) / max(cv2.norm(a[2:], a[:-2], cv2.NORM_L1), 1.0)
+
+    return comb(image) > _WOVEN and comb(np.ascontiguousarray(image[: len(image) // 8].T)) < 1.0
 
 
 def in_light_of(image: NDArray[np.uint8], own: Light, other: Light) -> NDArray[np.uint8]:

@@ -37,6 +37,8 @@ _CURES = {
     "few": "most points are not found in the right image; look at its exposure, focus and lens",
     "blur": "one image is much more blurred than the other; focus and clean both lenses, and shorten their exposure",
     "light": "left and right differ in brightness; give both cameras the same exposure and gain",
+    "woven": "every second row is of another moment; let the cameras scan progressively, or drop these rows",
+    "held": "points stay in place while the image moves; mask what is fixed to the camera, and clean both lenses",
     "size": "the calibration is of images twice as large; scale it, or use images of full size",
 }
 
@@ -142,8 +144,8 @@ class PairWatch:
     """Watches the pairs of a run: :meth:`step` says what is doubtful in one, :meth:`findings` what is in the run.
 
     ``late``: by how many frames the right image is older than the left one, 0 where nothing speaks for it.
-    ``blurred``: whether one image of the last pair was far more blurred than the other; then the search on the right
-    stops near where it began, and disparities say what was expected of them.
+    ``unsharp``: whether disparities of the last pair are not to be learned from: one image was far more blurred than
+    the other, so that the search on the right stops near where it began, or rows were of two moments.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
@@ -152,7 +154,7 @@ class PairWatch:
         self._half_size = bool((np.abs(doubled - 2.0) < 0.4).all())
         self._rows = np.zeros(4)
         self.late = 0.0
-        self.blurred = False
+        self.unsharp = self._woven = False
         self._frames = 0
         self._seen: Counter[str] = Counter()
 
@@ -161,10 +163,13 @@ class PairWatch:
         self._frames += 1
         self._seen["frozen"] += seen.right_repeated
         self._seen["light"] += not 1 / _DARKER < seen.right_light < _DARKER
-        self.blurred = not 1 / _BLURRED < seen.right_blur < _BLURRED
-        self._seen["blur"] += self.blurred
-        doubts = []
-        if self.blurred:
+        blurred = not 1 / _BLURRED < seen.right_blur < _BLURRED
+        self._seen["blur"] += blurred
+        self._seen["woven"] += seen.woven
+        woven, self._woven = seen.woven or self._woven, seen.woven
+        self.unsharp = blurred or woven
+        doubts = ["every second row is of another moment"] if woven else []
+        if blurred:
             side, times = ("right", seen.right_blur) if seen.right_blur > 1.0 else ("left", 1.0 / seen.right_blur)
             doubts.append(f"the {side} image is {times:.1f} times as blurred as the other")
         if self._half_size:
@@ -183,6 +188,10 @@ class PairWatch:
             self._seen[cause] += lost > 0.4 * right.sought and not self.late  # which moves points out of their rows
             doubts.append(f"only {right.found} of {right.sought} points are found in the right image")
         return doubts
+
+    def note(self, cause: str, seen: bool) -> None:
+        """Count a cause that others see in the last pair."""
+        self._seen[cause] += seen
 
     def findings(self) -> list[str]:
         """What was wrong in more than a twentieth of the pairs, with the remedy."""

@@ -8,7 +8,7 @@ the mixture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +25,7 @@ from gpvo.vo.quality import worst_translation_sigma_m
 _CELLS = 96  # of the whole image
 _EXPLAINED = 0.8  # share of the cells; below, a rival is looked for
 _LEAST = 8  # points: a motion through any three is found by chance, a tight one through eight is not
+_STILL_PX = 0.5  # change of a measurement by noise alone
 _SHARE = 1 / 8  # of the other's cells: a motion seen over less is that of an object
 _NOISE = 9.0  # standard deviations of odometry's own noise that are no change of velocity
 _AREA = 0.5  # power of the parts covered in the odds of being the scene, frame by frame: neighbours tell the same
@@ -145,6 +146,35 @@ def unexplained(motion: Motion, matches: Matches, camera: StereoCamera, config: 
     agree = np.isin(sought, cells(matches.uvd_prev[(off_px < config.ransac_threshold_px) & told], camera))
     free = told & (off_px > max(config.ransac_threshold_px, 6 * motion.scale_px))
     return free if free.sum() >= _LEAST and agree.sum() < _EXPLAINED * len(sought) else None
+
+
+def untangled(
+    motion: Motion,
+    matches: Matches,
+    camera: StereoCamera,
+    estimate: Callable[[Matches, NDArray[np.bool_]], Motion | None],
+) -> tuple[Motion, bool]:
+    """The motion, and whether that of the scene was told from points that something holds in place in the image.
+
+    A bonnet, dirt on a lens or lettering stay in place with their disparity while the scene moves by pixels, and as all
+    are within reach of a compromise, one through both would have small residuals. So the points that move have a motion
+    of their own; where it contradicts those that stay, that of the ones which cover more of the image is taken. Points
+    at infinity that stay do not count: they tell no translation, but may be dirt.
+    """
+    still = np.linalg.norm(matches.uvd_cur - matches.uvd_prev, axis=1) < _STILL_PX
+    if min(still.sum(), (~still).sum()) < _LEAST:
+        return motion, False
+    moving = estimate(matches, ~still)
+    if moving is None:
+        return motion, False
+    held = still & (_off_px(moving.T_prev_cur, matches, camera) > 2 * _STILL_PX)
+    if held.sum() < _LEAST:
+        return motion, False
+    told = matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX
+    n_held, n_moving = (len(np.unique(cells(matches.uvd_cur[of & told], camera))) for of in (held, moving.inliers))
+    scene_moves = n_held <= n_moving
+    pure = estimate(matches, ~held if scene_moves else still)
+    return (motion, False) if pure is None else (pure, scene_moves)
 
 
 def areas(first: Motion, second: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> tuple[int, int]:

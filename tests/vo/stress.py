@@ -172,6 +172,19 @@ def frozen_right(footage: Footage) -> Footage:
     return replace(footage, frames=[replace(f[k], right=f[k // 20 * 20 + min(k % 20, 9)].right) for k in range(len(f))])
 
 
+def interlaced(footage: Footage) -> Footage:
+    """Every second row is that of the frame before."""
+
+    def weave(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        out = now.copy()
+        out[1::2] = before[1::2]
+        return out
+
+    f = footage.frames
+    frames = [replace(b, left=weave(a.left, b.left), right=weave(a.right, b.right)) for a, b in pairwise(f)]
+    return replace(footage, frames=[f[0], *frames])
+
+
 def half_size(footage: Footage) -> Footage:
     """Images of half the size with the calibration of the full one."""
     c = footage.camera
@@ -210,6 +223,41 @@ def moving_patch(u_per_frame: float, disparity_px: float = 20.0, share: float = 
     return paint
 
 
+def bonnet(share: float) -> Callable[[Footage], Footage]:
+    """A texture over the lowest ``share`` of the image that moves with the camera, a twentieth of the image apart."""
+
+    def paint(footage: Footage) -> Footage:
+        c = footage.camera
+        h = round(share * c.height)
+        coarse = np.random.default_rng(1).integers(20, 235, (h // 6 + 2, c.width // 5)).astype(np.uint8)
+        texture = cv2.resize(coarse, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)[:h]
+
+        def one(image: np.ndarray, shift: int) -> np.ndarray:
+            return np.concatenate([image[:-h], texture[:, shift : shift + c.width]])
+
+        return _each(lambda k, f: replace(f, left=one(f.left, 0), right=one(f.right, c.width // 20)))(footage)
+
+    return paint
+
+
+def specks(count: int, radius_px: int = 5) -> Callable[[Footage], Footage]:
+    """So many dots at the same places of both images: dots of a projector far away, or lettering."""
+
+    def paint(footage: Footage) -> Footage:
+        c, rng = footage.camera, np.random.default_rng(1)
+        dots = rng.uniform([0, 0, 0.5, 20], [c.width, c.height, 1.0, 235], (count, 4))
+
+        def one(image: np.ndarray) -> np.ndarray:
+            out = image.copy()
+            for x, y, size, grey in dots:
+                cv2.circle(out, (int(x), int(y)), int(size * radius_px), grey, -1, cv2.LINE_AA)
+            return out
+
+        return _each(lambda k, f: _both(f, one))(footage)
+
+    return paint
+
+
 FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "clean": lambda footage: footage,
     "darker right": _each(darker_right),
@@ -223,8 +271,12 @@ FAULTS: dict[str, Callable[[Footage], Footage]] = {
     "right black": _each(right_black),
     "frozen right": frozen_right,
     "late right": late_right,
+    "interlaced": interlaced,
     "half size": half_size,
     "swapped": _each(swapped),
+    "bonnet of 10 %": bonnet(0.1),
+    "bonnet of 25 %": bonnet(0.25),
+    "400 specks": specks(400),
     "patch at rest": moving_patch(0.0),
     "patch that moves": moving_patch(7.0),
     "JPEG 30": _each(jpeg_30),
