@@ -102,7 +102,7 @@ class Timeline:
         self._newest_ns: int | None = None
         self._guard = ImuGuard()
         self._doubt: Doubt[int] = Doubt()
-        self._is_set_back = False
+        self._set_back_ns: int | None = None  # first stamp of a new clock, while records of the old one may come
         self._heard_ns = self.t_ns  # stamp of the sample that came last
         self._imu_t: list[int] = []
         self._imu: list[Array] = []
@@ -144,7 +144,7 @@ class Timeline:
         self._reference_ns = self._newest_ns = None
         self._wait = Wait.since(self.t_ns, self.filter.batch)
         self._history.clear()
-        self._is_set_back = True
+        self._set_back_ns = t_ns
         self.counts["clock_set_back"] += 1
 
     def reaches(self, t_ns: int) -> bool:
@@ -153,10 +153,11 @@ class Timeline:
 
     def add_vo(self, record: VoRecord, prediction: Prediction | None = None) -> list[Step]:
         """Take one VO record; returns the steps done, more than one where later records were used again."""
-        if self._is_set_back and record.t_ns - self._imu_t[-1] > _LONGEST_GAP_NS // 2:
-            self.counts["too_late"] += 1  # by the clock of before
+        is_new = self._set_back_ns is not None and self._heard_ns - self._set_back_ns < _LONGEST_GAP_NS
+        if is_new and record.t_ns - self._heard_ns > _LONGEST_GAP_NS // 2:
+            self.counts["too_late"] += 1  # by the clock of before, unless such records go on coming
             return []
-        self._is_set_back = False
+        self._set_back_ns = None
         if record.t_ns <= self.t_ns and self._already_seen(record.t_ns):
             self.counts["repeated"] += 1
             return []

@@ -211,6 +211,23 @@ def test_the_filter_goes_on_when_the_clock_is_set_back_or_ahead(flight: Flight, 
     assert error @ np.linalg.solve(C, error) / 3 < 3.0
 
 
+@pytest.mark.parametrize("back_s", [0.3, 0.9])
+def test_motions_go_on_where_the_clock_of_the_imu_alone_is_set_back(flight: Flight, back_s: float) -> None:
+    imu, n = flight.imu, 100
+    assert imu is not None
+    told = imu.t_ns - round(back_s * 1e9) * (imu.t_ns >= flight.records[40].t_ns)
+    timeline = _timeline(flight)
+    for k in range(n):
+        for i in range(max(0, 10 * k - 9), 10 * k + 1):
+            timeline.add_imu(told[i], imu.gyro_radps[i], imu.acc_mps2[i])
+        timeline.add_vo(flight.records[k], flight.predictions.get(flight.records[k].t_ns))
+    assert timeline.counts["clock_set_back"] == 1
+    assert timeline.t_ns == flight.records[n - 1].t_ns
+    assert timeline.counts["used"] >= 70
+    error = timeline.filter.x.position[0] - flight.T_world_imu[n - 1, :3, 3]
+    assert error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3 < 3.0
+
+
 @pytest.mark.parametrize("ahead_s", [0.5, 2.0])
 def test_where_no_motion_tells_whether_time_has_passed_the_filter_doubts_it(ahead_s: float) -> None:
     nees = []
