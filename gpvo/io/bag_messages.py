@@ -10,14 +10,12 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError, printable
 from gpvo.geometry import se3
 from gpvo.io.bag_reader import POSE_TYPES, messages, open_bag, stamp_ns, topics_of
-from gpvo.io.images import Image8, decode_stored, to_grey8
 from gpvo.io.source import Depth, SourceReport
 from gpvo.io.stamps import BACK_NS, PAIR_TOLERANCE_S, Stamps, astray, no_pair, reach_ns, steps_ns
 from gpvo.io.trajectory import make_imu
@@ -26,10 +24,10 @@ from gpvo.types import Array, ImuLog
 
 # OpenCV names the pattern by its second row and column.
 _BAYER = {
-    "bayer_rggb": cv2.COLOR_BayerBG2GRAY,
-    "bayer_bggr": cv2.COLOR_BayerRG2GRAY,
-    "bayer_gbrg": cv2.COLOR_BayerGR2GRAY,
-    "bayer_grbg": cv2.COLOR_BayerGB2GRAY,
+    "bayer_rggb": "BG",
+    "bayer_bggr": "RG",
+    "bayer_gbrg": "GR",
+    "bayer_grbg": "GB",
 }
 _CHANNELS = {"mono": (1, True), "rgb": (3, False), "bgr": (3, True), "rgba": (4, False), "bgra": (4, True)}
 _CHANNELS |= dict.fromkeys(_BAYER, (1, True))
@@ -50,8 +48,12 @@ _ENOUGH = 8  # intervals, of both cameras, that tell the usual one
 _LEAST_LEFT = 0.9  # of the messages of a topic of poses, without those that repeat a stamp
 
 
-def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
+def decode_message(message: Any, depth: Depth | None = None) -> NDArray[np.uint8] | None:
     """A sensor_msgs Image or CompressedImage as (H, W) uint8; None where it is damaged or of unknown encoding."""
+    import cv2
+
+    from gpvo.io.images import decode_stored, to_grey8
+
     if hasattr(message, "encoding"):
         name, (pixels, bgr) = str(message.encoding).lower(), _raw_pixels(message)
     else:
@@ -62,7 +64,7 @@ def decode_message(message: Any, depth: Depth | None = None) -> Image8 | None:
         return None
     pattern = _BAYER.get(name.rstrip("0123456789"))
     if pattern is not None and pixels[0, 0].size == 1:
-        pixels = np.asarray(cv2.cvtColor(pixels, pattern))
+        pixels = np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_Bayer{pattern}2GRAY")))
     return to_grey8(pixels, bgr=bgr, depth=depth)
 
 

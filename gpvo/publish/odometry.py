@@ -165,7 +165,7 @@ class OdometryBuilder:
         stated = prediction.covariance if prediction is not None else record.covariances.get(self.method or "")
         if stated is None or not is_positive_definite(stated):
             dt = (record.t_ns - base.t_ns) * 1e-9
-            stated = lost_covariance(dt, self._speed)
+            stated = lost_covariance(dt, self._speed) if dt > 0 else np.zeros((6, 6))
         chain = base.extended(record, MotionError.independent(stated, dt_s=record.dt_s, status=Status.LOST))
         self._remember(record, chain)
         if is_break:

@@ -158,8 +158,8 @@ def untangled(
 
     A bonnet, dirt on a lens or lettering stay in place with their disparity while the scene moves by pixels, and as all
     are within reach of a compromise, one through both would have small residuals. So the points that move have a motion
-    of their own; where it contradicts those that stay, that of the ones which cover more of the image is taken. Points
-    at infinity that stay do not count: they tell no translation, but may be dirt.
+    of their own; where it contradicts those that stay and covers more of the image, these are left out. Of points that
+    stay, those at infinity do not count: they tell no translation, but may be dirt.
     """
     still = np.linalg.norm(matches.uvd_cur - matches.uvd_prev, axis=1) < _STILL_PX
     if min(still.sum(), (~still).sum()) < _LEAST:
@@ -167,14 +167,14 @@ def untangled(
     moving = estimate(matches, ~still)
     if moving is None:
         return motion, False
-    held = still & (_off_px(moving.T_prev_cur, matches, camera) > 2 * _STILL_PX)
-    if held.sum() < _LEAST:
+    off_px = _off_px(moving.T_prev_cur, matches, camera)
+    if (off_px[still] > 4 * _STILL_PX).sum() < _LEAST:  # by less, far points of the scene stay beside a car
         return motion, False
+    held = still & (off_px > 2 * _STILL_PX)
     told = matches.uvd_prev[:, 2] > KNOWN_DEPTH_PX
     n_held, n_moving = (len(np.unique(cells(matches.uvd_cur[of & told], camera))) for of in (held, moving.inliers))
-    scene_moves = n_held <= n_moving
-    pure = estimate(matches, ~held if scene_moves else still)
-    return (motion, False) if pure is None else (pure, scene_moves)
+    freed = estimate(matches, ~held) if n_held <= n_moving else None
+    return (motion, False) if freed is None else (freed, True)
 
 
 def areas(first: Motion, second: Motion, matches: Matches, camera: StereoCamera, config: VoConfig) -> tuple[int, int]:
