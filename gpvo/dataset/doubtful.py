@@ -28,8 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpvo.dataset.errors import MotionErrors, interpolate_truth, motion_errors
 from gpvo.online.slip import flag_slips
 from gpvo.stats.series import moving_sums
-from gpvo.types import Array, Status, StereoCamera, TruthLog, VoLog, VoRecord
-from gpvo.vo.imu_moments import ImuMoments
+from gpvo.types import Array, ImuMoments, Status, StereoCamera, TruthLog, VoLog, VoRecord
 
 STILL_S = 1.0
 """So long a vehicle must stand at least for a wait."""

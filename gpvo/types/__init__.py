@@ -4,16 +4,15 @@ Frame of every motion, covariance, error and feature: the rectified left optical
 (x right, y down, z forward). Tangent order: translation xyz [m], rotation xyz [rad], right perturbation.
 """
 
+from gpvo.types.predictions import MotionError, Prediction, StoredPredictions
 from gpvo.types.records import (
     COUNT_FIELDS,
     FLOAT_FIELDS,
     IMPORTED,
     IMPORTED_POSE,
     IMU_FIELDS,
-    MotionError,
-    Prediction,
+    ImuMoments,
     Status,
-    StoredPredictions,
     StoredRecords,
     VoLog,
     VoRecord,
@@ -44,6 +43,7 @@ __all__ = [
     "VEHICLES",
     "Array",
     "ImuLog",
+    "ImuMoments",
     "ImuNoise",
     "MotionError",
     "Mounting",

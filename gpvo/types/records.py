@@ -1,20 +1,20 @@
-"""What odometry and models say about motions: records, logs of them, and the error that is stated for a motion."""
+"""What odometry says about motions: records, and logs of them."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
-from functools import cached_property
 from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.sensors import VEHICLES, Array, StereoCamera, Vehicle
+from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle
 
-_Error = TypeVar("_Error", bound="MotionError")
+_Item = TypeVar("_Item")
 
 IMPORTED = "imported"
 """Name of the covariances that somebody else's odometry states of its own motions."""
@@ -109,9 +109,32 @@ class VoRecord:
         return replace(self, status=status, reason="; ".join(filter(None, (self.reason, reason))))
 
 
+class Columns(Sequence[_Item], ABC):
+    """Rows that are kept as ``columns`` by the names of their fields, (N, ...): a fraction of what objects take.
+    Each is made when it is asked for."""
+
+    columns: Mapping[str, NDArray[Any]]
+
+    @abstractmethod
+    def made(self, k: int) -> _Item:
+        """Row k."""
+
+    def __len__(self) -> int:
+        return len(self.columns["t_ns"])
+
+    @overload
+    def __getitem__(self, k: int) -> _Item: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> list[_Item]: ...
+
+    def __getitem__(self, k: int | slice) -> _Item | list[_Item]:
+        return [self.made(i) for i in range(*k.indices(len(self)))] if isinstance(k, slice) else self.made(k)
+
+
 @dataclass(frozen=True, eq=False)
-class StoredRecords(Sequence[VoRecord]):
-    """N records as columns, a fifth of what they take as objects; each is made when it is asked for.
+class StoredRecords(Columns[VoRecord]):
+    """N records as columns, a fifth of what they take as objects.
 
     ``columns``: the fields of a record by name, (N,), (N, 4, 4) or (N, 3), an IMU's NaN throughout where there is none.
     ``covariances`` (N, 21) and ``v_t`` (N, 6), upper triangles, and ``stage_ms`` (N,): NaN where a record has none.
@@ -134,18 +157,8 @@ class StoredRecords(Sequence[VoRecord]):
 
         return cls(*(joined([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
-    def __len__(self) -> int:
-        return len(self.columns["t_ns"])
-
-    @overload
-    def __getitem__(self, k: int) -> VoRecord: ...
-
-    @overload
-    def __getitem__(self, k: slice) -> list[VoRecord]: ...
-
-    def __getitem__(self, k: int | slice) -> VoRecord | list[VoRecord]:
-        if isinstance(k, slice):
-            return [self[i] for i in range(*k.indices(len(self)))]
+    def made(self, k: int) -> VoRecord:
+        """Record k."""
         known: dict[str, Any] = {
             name: column.item(k) if column.ndim == 1 else _unless_nan(column[k])
             for name, column in self.columns.items()
@@ -287,132 +300,57 @@ class VoLog:
         return out
 
 
-@dataclass(frozen=True, kw_only=True)
-class MotionError:
-    """What is stated about the error of a motion, or of many along leading axes: ``T_true = T_est Exp(-xi)``.
+@dataclass(frozen=True)
+class ImuMoments:
+    """Mean and spread of the IMU over a motion; pieces of time are merged without keeping samples.
 
-    The error ``xi`` has the mean ``mean`` (..., 6) [m, rad], in ``cam``, per motion and not per second, and three parts
-    that differ in how they accumulate (see :mod:`gpvo.accumulation`):
-
-    * ``jitter`` (..., 6, 6): covariance of the pixel noise of the two frames, half of it each; a frame shares its own
-      with the motion before and the motion after, with opposite sign.
-    * ``white`` (..., 6, 6): covariance of what is independent from motion to motion.
-    * ``persistent_root`` L (..., 6, P): the error ``L u`` of one vector u that all motions share. Its elements are
-      first-order Gauss-Markov, of unit variance and time constants ``persistent_tau_s`` (P,). Models have P = 12: six
-      of the bias, then six of errors of calibration, whose L changes sign with the motion.
-
-    ``dt_s`` (...): duration. ``status``: of the motion, one for all of a batch; of a ``lost`` one nothing was measured.
-    ``nu``: degrees of freedom of the Student-t that the error of one motion has, ``covariance`` being its second
-    moment; infinite for a Gaussian. Filters use the covariance.
+    ``n`` samples, their mean and variance (6,): gyro [rad/s], then accelerometer [m/s^2], in IMU axes.
     """
 
+    n: int
     mean: Array
-    jitter: Array
-    white: Array
-    persistent_root: Array
-    persistent_tau_s: Array
-    dt_s: float | Array = 0.0
-    status: Status = Status.OK
-    nu: float = math.inf
+    variance: Array
 
     @classmethod
-    def independent(
-        cls, covariance: Array, mean: Array | None = None, *, dt_s: float | Array = 0.0, status: Status = Status.OK
-    ) -> MotionError:
-        """An error (..., 6, 6) that has nothing to do with that of any other motion; ``mean`` (..., 6) or zero."""
-        C = np.array(covariance, dtype=np.float64)  # a copy: whoever gives it may write the next one there
-        return MotionError(
-            mean=np.zeros(C.shape[:-1]) if mean is None else np.array(np.broadcast_to(mean, C.shape[:-1])),
-            jitter=np.zeros(C.shape),
-            white=C,
-            persistent_root=np.zeros((*C.shape[:-1], 0)),
-            persistent_tau_s=np.zeros(0),
-            dt_s=dt_s,
-            status=status,
-        )
-
-    @cached_property
-    def persistent(self) -> Array:
-        """(..., 6, 6) covariance of the part that persists."""
-        return np.asarray(self.persistent_root @ np.swapaxes(self.persistent_root, -1, -2))
-
-    @cached_property
-    def covariance(self) -> Array:
-        """(..., 6, 6) of all parts together."""
-        return np.asarray(self.jitter + self.white + self.persistent)
-
-    @property
-    def lost(self) -> bool:
-        """Whether nothing was measured: the motion is a guess, and its error shares nothing with its neighbours'."""
-        return self.status is Status.LOST
-
-    @property
-    def sigma(self) -> Array:
-        """(..., 6) standard deviation per axis [m, m, m, rad, rad, rad]."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
-
-    def extended(self, cls: type[_Error], **more: Any) -> _Error:
-        """The same statement as a class with ``more`` fields; what was worked out of it is kept."""
-        out = object.__new__(cls)
-        out.__dict__.update(vars(self), **more)
-        return out
-
-    def row(self: _Error, k: Any) -> _Error:
-        """Row k, or the rows that an index chooses, of a batch along its first axis; by ``None`` a batch of one."""
-        chosen = object.__new__(type(self))
-        for name, value in vars(self).items():
-            batched = isinstance(value, np.ndarray) and value.ndim and name != "persistent_tau_s"
-            chosen.__dict__[name] = value[k] if batched else value
-        return chosen
-
-
-@dataclass(frozen=True, kw_only=True)
-class Prediction(MotionError):
-    """A model's prediction of the error of a motion, or of many.
-
-    ``t_ns``: stamp of the frame where the motion ends (0 where rows have none). ``epistemic`` (..., 6) is the share of
-    each variance that comes from being away from the training data, already inside ``covariance``. ``confidence`` and
-    ``in_domain`` (...) are in [0, 1].
-    """
-
-    t_ns: int = 0
-    epistemic: Array
-    confidence: float | Array
-    in_domain: float | Array
-
-    def is_of(self, record: VoRecord) -> bool:
-        """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
-        return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class StoredPredictions(Sequence[Prediction]):
-    """N predictions as columns, a third of what they take as objects; each is made when it is asked for.
-
-    ``columns``: the fields of a prediction by name, (N, ...).
-    """
-
-    columns: Mapping[str, NDArray[Any]]
+    def of(cls, imu: ImuLog | None) -> ImuMoments:
+        """Of a piece of a log, which may be missing or empty."""
+        if imu is None or len(imu.t_ns) == 0:
+            return cls(0, np.zeros(6), np.zeros(6))
+        samples = np.hstack([imu.gyro_radps, imu.acc_mps2])
+        return cls(len(samples), samples.mean(0), samples.var(0))
 
     @classmethod
-    def join(cls, parts: Sequence[StoredPredictions]) -> StoredPredictions:
-        """One after the other."""
-        return cls({name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns})
+    def of_record(cls, record: VoRecord) -> ImuMoments:
+        """What a record says of the IMU over its motion, as one sample with that spread; NaN where it knows none."""
+        unknown = np.full(3, np.nan)
 
-    def __len__(self) -> int:
-        return len(self.columns["t_ns"])
+        def joined(*fields: Array | None) -> Array:
+            return np.concatenate([unknown if field is None else field for field in fields])
 
-    @overload
-    def __getitem__(self, k: int) -> Prediction: ...
+        mean = joined(record.imu_gyro_mean_radps, record.imu_acc_mean_mps2)
+        return cls(1, mean, joined(record.imu_gyro_std_radps, record.imu_acc_std_mps2) ** 2)
 
-    @overload
-    def __getitem__(self, k: slice) -> list[Prediction]: ...
+    def with_later(self, other: ImuMoments) -> ImuMoments:
+        """Of both pieces together (T. Chan, G. Golub, R. LeVeque, "Algorithms for computing the sample variance"
+        (1983)): however long a reference is kept, no sample need be."""
+        if self.n == 0 or other.n == 0:
+            return other if self.n == 0 else self
+        n, off = self.n + other.n, other.mean - self.mean
+        share = other.n / n
+        variance = (1.0 - share) * self.variance + share * other.variance + share * (1.0 - share) * off**2
+        return ImuMoments(n, self.mean + share * off, variance)
 
-    def __getitem__(self, k: int | slice) -> Prediction | list[Prediction]:
-        if isinstance(k, slice):
-            return [self[i] for i in range(*k.indices(len(self)))]
-        of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
-        return Prediction(**of_one)
+    def fields(self) -> dict[str, Any]:
+        """Fields of a record that describe the IMU over the motion; empty without samples."""
+        if self.n == 0:
+            return {}
+        deviation = np.sqrt(self.variance)
+        return {
+            "imu_gyro_mean_radps": self.mean[:3],
+            "imu_gyro_std_radps": deviation[:3],
+            "imu_acc_mean_mps2": self.mean[3:],
+            "imu_acc_std_mps2": deviation[3:],
+        }
 
 
 _FIELDS = frozenset(f.name for f in fields(VoRecord))

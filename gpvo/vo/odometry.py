@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from gpvo.errors import CalibrationError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import lost_covariance
-from gpvo.types import Array, ImuLog, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
+from gpvo.types import Array, ImuLog, ImuMoments, Status, StereoCamera, StereoFrame, TrackFrame, VoRecord
 from gpvo.vo import opencv
 from gpvo.vo.config import KNOWN_DEPTH_PX, TELLING_PX, VoConfig
 from gpvo.vo.covariance import covariances_by_method
 from gpvo.vo.frontend import EMPTY, DescriptorFrontend, Followed, Frontend, Matches, TrackFrontend
-from gpvo.vo.imu_moments import ImuMoments
 from gpvo.vo.klt import KltFrontend
 from gpvo.vo.motion import Motion, refine, whitened
 from gpvo.vo.points import triangulate

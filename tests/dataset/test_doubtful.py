@@ -27,9 +27,8 @@ from gpvo.learning.train import estimate_set
 from gpvo.runner import run, steps
 from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nll_per_dim
-from gpvo.types import Status, StereoCamera, TruthLog, VoLog, VoRecord
+from gpvo.types import ImuMoments, Status, StereoCamera, TruthLog, VoLog, VoRecord
 from gpvo.vo.config import make_config
-from gpvo.vo.imu_moments import ImuMoments
 from synthetic_runs import make_run
 
 # Simulated flights begin at rest.

@@ -1,0 +1,135 @@
+"""What is stated about the error of a motion: by odometry, or as a model's prediction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpvo.types.records import Columns, Status, VoRecord
+from gpvo.types.sensors import Array
+
+_Error = TypeVar("_Error", bound="MotionError")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionError:
+    """What is stated about the error of a motion, or of many along leading axes: ``T_true = T_est Exp(-xi)``.
+
+    The error ``xi`` has the mean ``mean`` (..., 6) [m, rad], in ``cam``, per motion and not per second, and three parts
+    that differ in how they accumulate (see :mod:`gpvo.accumulation`):
+
+    * ``jitter`` (..., 6, 6): covariance of the pixel noise of the two frames, half of it each; a frame shares its own
+      with the motion before and the motion after, with opposite sign.
+    * ``white`` (..., 6, 6): covariance of what is independent from motion to motion.
+    * ``persistent_root`` L (..., 6, P): the error ``L u`` of one vector u that all motions share. Its elements are
+      first-order Gauss-Markov, of unit variance and time constants ``persistent_tau_s`` (P,). Models have P = 12: six
+      of the bias, then six of errors of calibration, whose L changes sign with the motion.
+
+    ``dt_s`` (...): duration. ``status``: of the motion, one for all of a batch; of a ``lost`` one nothing was measured.
+    ``nu``: degrees of freedom of the Student-t that the error of one motion has, ``covariance`` being its second
+    moment; infinite for a Gaussian. Filters use the covariance.
+    """
+
+    mean: Array
+    jitter: Array
+    white: Array
+    persistent_root: Array
+    persistent_tau_s: Array
+    dt_s: float | Array = 0.0
+    status: Status = Status.OK
+    nu: float = math.inf
+
+    @classmethod
+    def independent(
+        cls, covariance: Array, mean: Array | None = None, *, dt_s: float | Array = 0.0, status: Status = Status.OK
+    ) -> MotionError:
+        """An error (..., 6, 6) that has nothing to do with that of any other motion; ``mean`` (..., 6) or zero."""
+        C = np.array(covariance, dtype=np.float64)  # a copy: whoever gives it may write the next one there
+        return MotionError(
+            mean=np.zeros(C.shape[:-1]) if mean is None else np.array(np.broadcast_to(mean, C.shape[:-1])),
+            jitter=np.zeros(C.shape),
+            white=C,
+            persistent_root=np.zeros((*C.shape[:-1], 0)),
+            persistent_tau_s=np.zeros(0),
+            dt_s=dt_s,
+            status=status,
+        )
+
+    @cached_property
+    def persistent(self) -> Array:
+        """(..., 6, 6) covariance of the part that persists."""
+        return np.asarray(self.persistent_root @ np.swapaxes(self.persistent_root, -1, -2))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(..., 6, 6) of all parts together."""
+        return np.asarray(self.jitter + self.white + self.persistent)
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing was measured: the motion is a guess, and its error shares nothing with its neighbours'."""
+        return self.status is Status.LOST
+
+    @property
+    def sigma(self) -> Array:
+        """(..., 6) standard deviation per axis [m, m, m, rad, rad, rad]."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
+
+    def extended(self, cls: type[_Error], **more: Any) -> _Error:
+        """The same statement as a class with ``more`` fields; what was worked out of it is kept."""
+        out = object.__new__(cls)
+        out.__dict__.update(vars(self), **more)
+        return out
+
+    def row(self: _Error, k: Any) -> _Error:
+        """Row k, or the rows that an index chooses, of a batch along its first axis; by ``None`` a batch of one."""
+        chosen = object.__new__(type(self))
+        for name, value in vars(self).items():
+            batched = isinstance(value, np.ndarray) and value.ndim and name != "persistent_tau_s"
+            chosen.__dict__[name] = value[k] if batched else value
+        return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction(MotionError):
+    """A model's prediction of the error of a motion, or of many.
+
+    ``t_ns``: stamp of the frame where the motion ends (0 where rows have none). ``epistemic`` (..., 6) is the share of
+    each variance that comes from being away from the training data, already inside ``covariance``. ``confidence`` and
+    ``in_domain`` (...) are in [0, 1].
+    """
+
+    t_ns: int = 0
+    epistemic: Array
+    confidence: float | Array
+    in_domain: float | Array
+
+    def is_of(self, record: VoRecord) -> bool:
+        """Whether it speaks of the record's own motion, not of a window of motions that ends there."""
+        return self.t_ns == record.t_ns and abs(float(self.dt_s) - record.dt_s) < 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPredictions(Columns[Prediction]):
+    """N predictions as columns, a third of what they take as objects.
+
+    ``columns``: the fields of a prediction by name, (N, ...).
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def join(cls, parts: Sequence[StoredPredictions]) -> StoredPredictions:
+        """One after the other."""
+        return cls({name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns})
+
+    def made(self, k: int) -> Prediction:
+        """Prediction k."""
+        of_one = {name: column.item(k) if column.ndim == 1 else column[k] for name, column in self.columns.items()}
+        return Prediction(**of_one)
