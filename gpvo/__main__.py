@@ -12,7 +12,9 @@ from gpvo.cameras.imagesize import MAX_PIXELS
 
 def _terminate(number: int, _frame: object) -> NoReturn:
     """End as by Ctrl-C: worker processes and temporary folders go too. A second signal ends the process at once."""
-    signal.signal(number, signal.SIG_DFL)
+    from gpvo.parallel import after_first
+
+    signal.signal(number, after_first(number))
     sys.exit(128 + number)  # the exit code that shells know it by
 
 

@@ -24,6 +24,12 @@ def ending_signals() -> list[int]:
     return [signal.SIGTERM, *(number for number in lost if signal.getsignal(number) is not signal.SIG_IGN)]
 
 
+def after_first(number: int) -> signal.Handlers:
+    """What a second signal of the kind does: it ends the process at once; but shell and kernel both say that a terminal
+    is lost."""
+    return signal.SIG_IGN if number == getattr(signal, "SIGHUP", None) else signal.SIG_DFL
+
+
 def map_jobs(
     function: Callable[..., Any],
     jobs_arguments: Sequence[tuple[Any, ...]],

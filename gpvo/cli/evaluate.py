@@ -163,7 +163,7 @@ def _pictures(runs: list[Path], frames: str, sequence: Path | None) -> list[Matc
         raise GpvoError("--frames needs one run and its --sequence", cure="give --sequence PATH and one run")
     wanted = [int(f) for f in numbers("--frames", frames, "give numbers, separated by commas")]
     run = read_run(runs[0])
-    opened: dict[str, Any] = run.meta.get("options", {})
+    opened: dict[str, Any] = run.meta.get("options") or {}
     options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in opened.items()}
     return match_pictures(open_source(sequence, **options), config_of(runs[0]), wanted, run.log)
 
@@ -187,12 +187,12 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
     options, found = judge.options(), []
     with progress("runs", len(runs)) as advance:
         loaded, predictor = _loaded(runs, judge)
-        for run in loaded:
-            if judge.model is not None and predictor is not None:
-                warn_of_misfits(judge.model, predictor, run)
-        for run in loaded:
+        misfits = [() if predictor is None else warn_of_misfits(judge.model, predictor, run) for run in loaded]
+        for run, known in zip(loaded, misfits):
             alone = unjudged and run.truth is None
-            found.append(unjudged_run(run, predictor) if alone else evaluate_run(run, predictor, options))
+            found.append(
+                unjudged_run(run, predictor, known) if alone else evaluate_run(run, predictor, options, misfits=known)
+            )
             advance()
     return found
 
@@ -218,9 +218,9 @@ def _with_twins(
     for run in runs:
         with TemporaryDirectory(prefix="gpvo-twins-") as folder:
             twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
-        if model is not None and predictor is not None:
-            warn_of_misfits(model, predictor, run if run.truth is not None else twins[0])
-        about, own = by_twins(run, twins, predictor, options)
+        judged = run if run.truth is not None else twins[0]
+        misfits = () if predictor is None else warn_of_misfits(model, predictor, judged)
+        about, own = by_twins(run, twins, predictor, options, misfits)
         documents.append(about)
         found += own
     return documents, found

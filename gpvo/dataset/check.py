@@ -68,10 +68,14 @@ def check(predictor: Predictor, run: Run) -> Check:
     return Check(len(run.log), len(X), inside, farthest, tuple(problems))
 
 
-def warn_of_misfits(model: Path, predictor: Predictor, run: Run) -> None:
-    """Warn of each problem that :func:`check` finds; ``model``: the file, to name it."""
-    for problem in check(predictor, run).problems:
-        warnings.warn(f"{model.name} does not fit {run.name}: {problem}", stacklevel=2)
+def warn_of_misfits(model: Path | None, predictor: Predictor, run: Run) -> tuple[str, ...]:
+    """Warn of each problem that :func:`check` finds, and return its misfits; ``model``: the file, to name it."""
+    found = check(predictor, run)
+    for problem in found.problems:
+        warnings.warn(
+            f"{'the model' if model is None else model.name} does not fit {run.name}: {problem}", stacklevel=2
+        )
+    return found.misfits
 
 
 def _learned_from(predictor: Predictor, X: Array) -> bool:

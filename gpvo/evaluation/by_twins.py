@@ -46,7 +46,11 @@ def ratios(run: Run, twins: Sequence[Run]) -> Array:
 
 
 def by_twins(
-    run: Run, twins: Sequence[Run], predictor: Predictor | None, options: EvaluateOptions
+    run: Run,
+    twins: Sequence[Run],
+    predictor: Predictor | None,
+    options: EvaluateOptions,
+    misfits: tuple[str, ...] | None = None,
 ) -> tuple[dict[str, Any], list[Evaluation]]:
     """Document (:func:`gpvo.evaluation.document.run_document`) and evaluation of a run with truth, with the covariance
     that its twins show as the method ``twin``. Of a run without: the mean over its twins, without a verdict, and the
@@ -56,9 +60,9 @@ def by_twins(
         return plain_statement(run.log, METHOD, twin_covariance(run.log, twins))
 
     if run.truth is not None:
-        own = evaluate_run(run, predictor, options, [statement(run, twins)])
+        own = evaluate_run(run, predictor, options, [statement(run, twins)], misfits)
         return run_document(own), [own]
-    found = [evaluate_run(t, predictor, options, [statement(t, others)]) for t, others in leave_one_out(twins)]
+    found = [evaluate_run(t, predictor, options, [statement(t, others)], ()) for t, others in leave_one_out(twins)]
     mean = average([run_document(e) for e in found])
     # A verdict is in words, which have no mean: the numbers speak.
     about = {"run": run.name, "source": run.meta.get("source"), "verdict": None}

@@ -126,16 +126,18 @@ def evaluate_run(
     predictor: Predictor | None = None,
     options: EvaluateOptions | None = None,
     further: Sequence[Statement] = (),
+    misfits: tuple[str, ...] | None = None,
 ) -> Evaluation:
     """Evaluate a run against its truth; with a predictor, predictions are made as in flight, else those of the run
     are used. A motion that either says is lost counts as lost for every method. ``further``: methods of elsewhere.
+    ``misfits``: those of :func:`gpvo.dataset.check.check`, where they are known.
 
     Raises SourceError if the run has no truth, or none at the times of its frames; ModelError if the model predicts
     something else than the error of a motion.
     """
     options = options or EvaluateOptions()
     truth, offset_s = _truth(run, options)
-    predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor)
+    predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor, misfits)
     run = replace(run, log=judged(run.log, predictions))
     log = run.log
     T_true, known = interpolate_truth(truth, log.t_ns)
@@ -209,12 +211,12 @@ def _refuse_too_little(run: Run, truth: TruthLog, known: int) -> None:
     raise SourceError(what, where=run.path, cure=cure)
 
 
-def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
+def unjudged_run(run: Run, predictor: Predictor | None = None, misfits: tuple[str, ...] | None = None) -> Evaluation:
     """An evaluation without errors: no frame is covered by truth, and no method has a score.
 
     Raises ModelError if the model predicts something else than the error of a motion.
     """
-    predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor)
+    predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor, misfits)
     run = replace(run, log=judged(run.log, predictions))
     T_est, noiseless = run.log.trajectory(), np.zeros(6)
     none = np.zeros((0, 4, 4))
@@ -236,8 +238,10 @@ def unjudged_run(run: Run, predictor: Predictor | None = None) -> Evaluation:
     )
 
 
-def _misfits(run: Run, predictor: Predictor | None) -> tuple[str, ...]:
-    return () if predictor is None else check(predictor, run).misfits
+def _misfits(run: Run, predictor: Predictor | None, known: tuple[str, ...] | None) -> tuple[str, ...]:
+    if known is not None or predictor is None:
+        return known or ()
+    return check(predictor, run).misfits
 
 
 def _in_domain(predictions: Mapping[int, Prediction]) -> float | None:

@@ -235,8 +235,8 @@ def fuse_side_by_side(
     """Filter one run under each policy (of one member) that speaks for at least half of its measured motions; results
     as if each had filtered alone.
 
-    Members see the same clock and the same records. A policy that has nothing to say about some records, or whose bias
-    has other time constants, is filtered by itself.
+    Members see the same clock and the same records; that it was set, the motions of all must say. A policy that has
+    nothing to say about some records, or whose bias has other time constants, is filtered by itself.
     """
     usable = int(VoLog(flight.records).usable.sum())
     found = {name: _noises(flight, policy) for name, policy in policies.items()}

@@ -116,14 +116,16 @@ class Timeline:
             self.counts[problem] += 1
             return
         i = bisect.bisect_left(self._imu_t, t_ns)
-        if i < len(self._imu_t) and t_ns <= self._heard_ns and not self._is_missing(i):
+        again = self._imu_t[i : i + 1] == [t_ns]
+        is_back = i < len(self._imu_t) and t_ns <= self._heard_ns and not self._is_missing(i)
+        if again and (not is_back or np.array_equal(self._imu[i], sample)):
+            self.counts["imu_repeated"] += 1
+            return
+        if is_back:
             # The clock was set back, and no record can be put among what came before.
             self._go_on_from(int(t_ns))
             del self._imu_t[:], self._imu[:]
             i = 0
-        if self._imu_t[i : i + 1] == [t_ns]:
-            self.counts["imu_repeated"] += 1
-            return
         self._imu_t.insert(i, int(t_ns))
         self._imu.insert(i, sample)
         self._heard_ns = int(t_ns)
@@ -189,7 +191,7 @@ class Timeline:
         target = t_ns if t_ns is not None else (self._imu_t[-1] if self._imu_t else self.t_ns)
         ahead = self.filter.copy()
         if target > self.t_ns:
-            self._propagate(ahead, self.t_ns, target, Counter())
+            self._propagate(ahead, self.t_ns, target, Counter(), may_be_set=False)
         return ahead
 
     # -- one record -------------------------------------------------------------------------------------------
@@ -200,7 +202,8 @@ class Timeline:
         self.t_ns = self._newest_ns = record.t_ns
         if noise is not None and len(noise.persistent_tau_s):
             # Since it last did, not since the last record: VO's bias goes on changing while frames are lost.
-            self.filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.persistent_tau_s)
+            for filter in (self.filter, *([] if unmoved is None else [unmoved])):
+                filter.decay_bias((record.t_ns - self._bias_ns) * 1e-9, noise.persistent_tau_s)
             self._bias_ns = record.t_ns
         outcome, judged = self._measure(record, noise, unmoved)
         if judged is None and unmoved is not None:
@@ -263,9 +266,10 @@ class Timeline:
     # -- time ---------------------------------------------------------------------------------------------------
 
     def _propagate(
-        self, filter: ErrorStateFilter, start_ns: int, end_ns: int, counts: Counter[str]
+        self, filter: ErrorStateFilter, start_ns: int, end_ns: int, counts: Counter[str], may_be_set: bool = True
     ) -> ErrorStateFilter | None:
-        """Move the filter; where nothing was heard for a while, returns what it is if that was a clock set ahead."""
+        """Move the filter; where nothing was heard for a while, returns what it is if that was a clock set ahead, which
+        ``may_be_set`` looks for."""
         if end_ns <= start_ns:
             return None
         if not self._with_imu:
@@ -292,7 +296,7 @@ class Timeline:
             dt, ends = (t1 - t) * 1e-9, np.array([sample, after])
             over = self._over_gap(i, t, t1, ends)
             ends = ends if over is None else over[0]
-            if over is not None and t >= resumed_ns and heard_ns - t > _CLOCK_NS:
+            if may_be_set and over is not None and t >= resumed_ns and heard_ns - t > _CLOCK_NS:
                 unmoved, resumed_ns = filter.copy(), heard_ns
             filter.propagate_imu(dt, ends[:1, :3], ends[:1, 3:], ends[1:, :3], ends[1:, 3:])
             if over is not None:
@@ -302,9 +306,9 @@ class Timeline:
         if unmoved is not None:
             # Between two samples some time has passed even so: about one usual step.
             before, step_ns = unmoved.x.copy(), round(1e9 * self._usual_step_s(i))
-            self._propagate(unmoved, resumed_ns - step_ns, resumed_ns, Counter())
+            self._propagate(unmoved, resumed_ns - step_ns, resumed_ns, Counter(), may_be_set=False)
             unmoved.doubt_passage(before)
-            self._propagate(unmoved, resumed_ns, end_ns, Counter())
+            self._propagate(unmoved, resumed_ns, end_ns, Counter(), may_be_set=False)
         return unmoved
 
     @staticmethod

@@ -30,7 +30,7 @@ from gpvo.live.outputs import FileOutput, MavlinkOutput, Px4Output, Wire, WireOu
 from gpvo.live.stages import TF_STATIC, TF_TOPICS, TF_TYPE, BaseFrameStage, PoseStage, Stage
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.online.predictor import Predictor
-from gpvo.parallel import ending_signals
+from gpvo.parallel import after_first, ending_signals
 from gpvo.publish.ros import check_topic
 
 WIRES = ("zenoh", "dds", "ros2", "ros1")
@@ -264,10 +264,10 @@ def open_wire(name: str, address: str | None = None, domain: int = 0) -> Wire:
 
 @contextmanager
 def ending_by_signal(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C, SIGTERM and SIGHUP set ``stop`` inside the block; a second one ends the process at once."""
+    """Ctrl-C, SIGTERM and SIGHUP set ``stop`` inside the block; a second one of the former ends the process at once."""
 
     def end(number: int, _frame: object) -> None:
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, after_first(number))
         stop.set()
 
     if threading.current_thread() is not threading.main_thread():

@@ -104,13 +104,13 @@ def follows(before_ns: int, t_ns: int) -> bool:
 class Window:
     """Joins the latest motions into one that spans ``size`` seconds or metres, frame by frame and causally.
 
-    ``kind`` is "window" (seconds) or "length" (metres of path). A window holds at most ``MOST_MOTIONS``: a vehicle
-    that stands would need ever more for a metre.
+    ``kind`` is "window" (seconds) or "length" (metres of path). A window of metres holds at most ``MOST_MOTIONS``: a
+    vehicle that stands would need ever more for one.
     """
 
     def __init__(self, kind: str, size: float) -> None:
         self.kind, self.size = kind, size
-        self._motions: deque[VoRecord] = deque(maxlen=MOST_MOTIONS)
+        self._motions: deque[VoRecord] = deque(maxlen=MOST_MOTIONS if kind == "length" else None)
 
     @classmethod
     def of(cls, target: str) -> Window | None:

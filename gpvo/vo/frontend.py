@@ -61,7 +61,7 @@ class Matches:
 
     ``row_error`` (N,): row in the right image less that in the left one, in the current frame [px]. ``n_tracked``:
     points found again in the left image, with or without a right one. ``spare`` (N,) marks weaker points where the
-    strong ones leave the image empty: they do not decide the motion, but may speak against it; None for none.
+    strong ones leave the image empty: they decide no motion while strong ones do, but speak against it; None for none.
     ``right``: how the search in the right image went. ``sought_uvd`` (M, 3): all points of the reference.
     """
 

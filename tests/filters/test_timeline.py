@@ -228,6 +228,33 @@ def test_motions_go_on_where_the_clock_of_the_imu_alone_is_set_back(flight: Flig
     assert error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3 < 3.0
 
 
+def test_a_gap_of_a_slow_imu_is_crossed(flight: Flight) -> None:
+    imu = flight.imu
+    assert imu is not None
+    t = imu.t_ns[::40]  # 5 Hz
+    kept = np.flatnonzero((t <= t[0] + 2 * 10**9) | (t >= t[0] + 4 * 10**9)) * 40
+    slow = replace(flight, imu=ImuLog(imu.t_ns[kept], imu.gyro_radps[kept], imu.acc_mps2[kept], imu.noise))
+    timeline = _timeline(slow)
+    _feed_imu(timeline, slow)
+    _feed(timeline, slow, [*range(41), *range(90, 110)])
+    assert timeline.t_ns == flight.records[109].t_ns
+    np.linalg.cholesky(timeline.filter.covariance)
+
+
+def test_a_batch_of_samples_that_is_sent_twice_is_no_clock_set_back(flight: Flight) -> None:
+    imu = flight.imu
+    assert imu is not None
+    usual, twice = _timeline(flight), _timeline(flight)
+    again = np.concatenate([np.arange(500), np.arange(460, 480), np.arange(500, len(imu.t_ns))])
+    _feed_imu(usual, flight)
+    columns = (values[again] for values in (imu.t_ns, imu.gyro_radps, imu.acc_mps2))
+    _feed_imu(twice, replace(flight, imu=ImuLog(*columns, imu.noise)))
+    for timeline in (usual, twice):
+        _feed(timeline, flight, list(range(110)))
+    assert twice.counts["clock_set_back"] == 0
+    _same(usual.filter, twice.filter)
+
+
 @pytest.mark.parametrize("ahead_s", [0.5, 2.0])
 def test_where_no_motion_tells_whether_time_has_passed_the_filter_doubts_it(ahead_s: float) -> None:
     nees = []

@@ -156,6 +156,9 @@ def test_a_lost_terminal_costs_nothing_that_was_recorded(wrapper: list[str], tmp
     while not (state.is_file() and read_json(state)["t_ns"] > 10**18) and time.monotonic() < deadline:
         time.sleep(0.05)  # until it is written for the second time
     os.close(ours)
+    if not wrapper:
+        time.sleep(0.02)
+        call.send_signal(signal.SIGHUP)  # the shell that started it says so, too
     if wrapper:
         with pytest.raises(subprocess.TimeoutExpired):
             call.wait(timeout=3)

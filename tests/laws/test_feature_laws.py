@@ -62,6 +62,13 @@ def test_image_lengths_scale_with_the_focal_length(zoom, seed):
     np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
+def test_a_window_of_seconds_holds_as_many_motions_as_a_fast_camera_makes():
+    window, n = Window.of("window:10s"), MOST_MOTIONS + 300
+    step_ns = round(10.0 / n * 1e9)
+    records = [VoRecord(k * step_ns, (k - 1) * step_ns, Status.OK, np.eye(4)) for k in range(1, n + 3)]
+    assert [window.step(r) is not None for r in records].count(True) > 0
+
+
 def test_a_vehicle_that_stands_does_not_make_a_window_grow():
     """Each motion of imported odometry starts from the frame before, at rest too: after an hour, a metre held 100,000
     motions, all joined anew with each frame."""
