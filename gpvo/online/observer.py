@@ -110,7 +110,7 @@ class Window:
 
     def __init__(self, kind: str, size: float) -> None:
         self.kind, self.size = kind, size
-        self._motions: deque[VoRecord] = deque(maxlen=MOST_MOTIONS if kind == "length" else None)
+        self._motions: deque[tuple[VoRecord, float]] = deque(maxlen=MOST_MOTIONS if kind == "length" else None)
 
     @classmethod
     def of(cls, target: str) -> Window | None:
@@ -128,18 +128,17 @@ class Window:
             self._motions.clear()
             return None
         # Where the reference is an older frame, the motions that came after it are dropped.
-        while self._motions and self._motions[-1].t_ns != record.t_prev_ns:
+        while self._motions and self._motions[-1][0].t_ns != record.t_prev_ns:
             self._motions.pop()
-        self._motions.append(deepcopy(record))  # its giver may write the next motion into the same arrays
-        while len(self._motions) > 1 and self._extent() - self._measure(self._motions[0]) >= self.size * (1 - 1e-9):
+        long = record.dt_s if self.kind == "window" else float(np.linalg.norm(record.T_prev_cur[:3, 3]))
+        self._motions.append((deepcopy(record), long))  # its giver may write the next motion into the same arrays
+        enough = self.size * (1 - 1e-9)
+        while len(self._motions) > 1 and self._extent() - self._motions[0][1] >= enough:
             self._motions.popleft()
-        return joined(list(self._motions)) if self._extent() >= self.size * (1 - 1e-9) else None
-
-    def _measure(self, record: VoRecord) -> float:
-        return record.dt_s if self.kind == "window" else float(np.linalg.norm(record.T_prev_cur[:3, 3]))
+        return joined([r for r, _ in self._motions]) if self._extent() >= enough else None
 
     def _extent(self) -> float:
-        return sum(self._measure(r) for r in self._motions)
+        return sum(long for _, long in self._motions)
 
 
 def joined(motions: list[VoRecord]) -> VoRecord:
