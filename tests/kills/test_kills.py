@@ -111,7 +111,8 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_sigterm_ends_the_workers_too(tmp_path: Path) -> None:
     """As of a service manager or a batch system: nothing goes on to write after the command has ended."""
-    call = start(*GPVO, "simulate", "tunnel-clean", "--points", "--duration", 5, "--seeds", "0..9999", "--jobs", 2, "-o", tmp_path)
+    short = ("--points", "--duration", 5, "--seeds", "0..9999")
+    call = start(*GPVO, "simulate", "tunnel-clean", *short, "--jobs", 2, "-o", tmp_path)
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("*.npz")) and time.monotonic() < deadline:
         time.sleep(0.05)
