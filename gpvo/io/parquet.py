@@ -220,9 +220,14 @@ def read_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
     import pyarrow as pa
 
     with _opened(path) as file:
-        blocks = file.iter_batches(_BLOCK_ROWS) if file.metadata.num_rows else [file.read()]
-        for block in blocks:
-            yield _columns(block if isinstance(block, pa.Table) else pa.Table.from_batches([block]))
+        left = file.metadata.num_rows
+        if not left:
+            yield _columns(file.read())
+        for block in file.iter_batches(_BLOCK_ROWS):
+            left -= block.num_rows
+            yield _columns(pa.Table.from_batches([block]))
+        if left:
+            raise ValueError("it does not hold as many rows as it states")
 
 
 def count_rows(path: Path) -> int:
