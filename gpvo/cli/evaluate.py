@@ -187,7 +187,7 @@ def _evaluate(runs: list[Path], judge: JudgeOptions, unjudged: bool = False) -> 
     options, found = judge.options(), []
     with progress("runs", len(runs)) as advance:
         loaded, predictor = _loaded(runs, judge)
-        misfits = [() if predictor is None else warn_of_misfits(judge.model, predictor, run) for run in loaded]
+        misfits = [warn_of_misfits(judge.model, predictor, run) for run in loaded]
         for run, known in zip(loaded, misfits):
             alone = unjudged and run.truth is None
             found.append(
@@ -219,8 +219,7 @@ def _with_twins(
         with TemporaryDirectory(prefix="gpvo-twins-") as folder:
             twins = [read_run(p) for p in make_all([run.path], Path(folder), settings)]
         judged = run if run.truth is not None else twins[0]
-        misfits = () if predictor is None else warn_of_misfits(model, predictor, judged)
-        about, own = by_twins(run, twins, predictor, options, misfits)
+        about, own = by_twins(run, twins, predictor, options, warn_of_misfits(model, predictor, judged))
         documents.append(about)
         found += own
     return documents, found

@@ -68,8 +68,11 @@ def check(predictor: Predictor, run: Run) -> Check:
     return Check(len(run.log), len(X), inside, farthest, tuple(problems))
 
 
-def warn_of_misfits(model: Path | None, predictor: Predictor, run: Run) -> tuple[str, ...]:
-    """Warn of each problem that :func:`check` finds, and return its misfits; ``model``: the file, to name it."""
+def warn_of_misfits(model: Path | None, predictor: Predictor | None, run: Run) -> tuple[str, ...]:
+    """Warn of each problem that :func:`check` finds, and return its misfits, none without a model; ``model``: the file,
+    to name it."""
+    if predictor is None:
+        return ()
     found = check(predictor, run)
     for problem in found.problems:
         warnings.warn(

@@ -88,6 +88,7 @@ def _guarded(path: Path) -> Iterator[None]:
     """What is wrong with a file, in one line."""
     try:
         yield
+    # pyarrow raises NotImplementedError for types that NumPy lacks.
     except (ArithmeticError, AttributeError, CalibrationError, LookupError, NotImplementedError, OSError,
             RecursionError, TypeError, ValueError, pa.ArrowException) as problem:  # fmt: skip
         cure = "give run folders, or the .rows.parquet beside a model"
@@ -98,10 +99,8 @@ def _require_sound(s: TrainingSet) -> None:
     """Raise ValueError for what no run gives: names that are none, numbers that nothing can be learned from."""
     if not all(isinstance(text, str) for text in (s.name, s.target, *s.columns)):
         raise ValueError("a name in it is no text")
-    if not all(isinstance(n, int) for n in (s.counts["lost"], *s.counts.values())) or s.counts.keys() & {
-        "name",
-        "rows",
-    }:
+    taken = s.counts.keys() & {"name", "rows"}
+    if taken or not all(isinstance(n, int) for n in (s.counts["lost"], *s.counts.values())):
         raise ValueError(f"the counts of '{s.name}' are none")
     if s.t_ns.dtype != np.int64 or (s.t_ns[1:] < s.t_ns[:-1]).any() or not (s.dt_s > 0).all():
         raise ValueError(f"the stamps of '{s.name}' do not increase")

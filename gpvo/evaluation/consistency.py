@@ -211,14 +211,15 @@ def horizon(
         noise[:, range(3), range(3)] = np.maximum(noise[:, range(3), range(3)], drift)
     z2 = (e**2 / variances(C + noise)).mean(axis=0)
     plain, noisy = (float(nees_by_block(e, S, axes)["joint"].mean()) for S in (C, C + noise))
-    worth = _independent(statement.errors, log, chains, C + noise, np.asarray(axes))
+    worth = _independent(statement.errors, log, chains, C, C + noise, np.asarray(axes))
     return Horizon(span, plain, noisy, tuple(z2.tolist()), tuple(np.sqrt(drift).tolist()), len(chains), worth)
 
 
 def _independent(
-    errors: Sequence[MotionError], log: VoLog, chains: list[list[int]], C: Array, axes: NDArray[np.intp]
+    errors: Sequence[MotionError], log: VoLog, chains: list[list[int]], C: Array, judged: Array, axes: NDArray[np.intp]
 ) -> float:
-    """How many windows with independent errors the mean NEES of these is worth, of stated covariances ``C`` (W, 6, 6).
+    """How many windows with independent errors the mean NEES of these is worth, of stated covariances ``C`` (W, 6, 6),
+    ``judged`` with the truth's noise.
 
     Of Gaussian errors whitened over d axes, with correlations R_ij between windows, the mean of NEES/dof has the
     variance ``2 / (W d)^2 sum_ij |R_ij|^2``. Windows overlap by half, which alone costs at most half of them; and
@@ -230,8 +231,8 @@ def _independent(
         return half
     used = {k: errors[k] for chain in chains for k in chain}
     passing = {k: replace(e, persistent_root=np.zeros_like(e.persistent_root)) for k, e in used.items()}
-    lasting = over_windows(log.T_prev_cur, used, chains) - over_windows(log.T_prev_cur, passing, chains)
-    share = np.linalg.solve(marginal(C, axes), marginal(lasting, axes))
+    lasting = C - over_windows(log.T_prev_cur, passing, chains)
+    share = np.linalg.solve(marginal(judged, axes), marginal(lasting, axes))
     t_s = 1e-9 * (log.t_ns[[c[-1] for c in chains]] - log.t_ns[0])
     both = np.einsum("iab,jba->ij", share, share) * np.exp(-2.0 * np.abs(t_s[:, None] - t_s) / tau_s)
     np.fill_diagonal(both, 0.0)

@@ -81,22 +81,22 @@ def join_tables(parts: Sequence[RowGroup], target: Path, metadata: Mapping[str, 
     with replacing(target) as temporary, temporary.open("wb") as file:
         file.write(_MAGIC)
         for k in range(0, len(parts), at_once or 1):
-            some, rows = [(part, part.path.read_bytes()) for part in parts[k : k + at_once]], []
+            some, rows = [(p, p.path.read_bytes(), dict(zip(p.names, p.place))) for p in parts[k : k + at_once]], []
             for name in names:
-                pages = [_stored_page(part, stored, name) for part, stored in some]
+                pages = [_stored_page(stored, place.get(name), part.rows, name) for part, stored, place in some]
                 size = file.write(b"".join(page for page, _ in pages))
                 rows.append((end, size, sum(plain for _, plain in pages)))
                 end += size
-            count = sum(part.rows for part, _ in some)
+            count = sum(part.rows for part, _, _ in some)
             joined.append(RowGroup(target, count, names, np.array(rows, dtype=np.int64)))
         file.write(_footer(joined, metadata))
 
 
-def _stored_page(part: RowGroup, stored: bytes, name: str) -> tuple[bytes, int]:
+def _stored_page(stored: bytes, place: NDArray[np.int64] | None, rows: int, name: str) -> tuple[bytes, int]:
     """A column's page in a stored table, of nulls where it has none, and its size before compression."""
-    if name not in part.names:
-        return _page([None] * part.rows, KIND_OF.get(name, "float64"))
-    offset, size, plain = part.place[part.names.index(name)].tolist()
+    if place is None:
+        return _page([None] * rows, KIND_OF.get(name, "float64"))
+    offset, size, plain = place.tolist()
     return stored[offset : offset + size], plain
 
 

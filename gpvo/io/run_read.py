@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -129,15 +129,15 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and value >= 0
 
 
-def _are_numbers(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(v, int | float) for v in value.values())
+def _are_numbers(values: Iterable[Any]) -> bool:
+    return all(isinstance(v, int | float) for v in values)
 
 
 def _is_gap(value: Any) -> bool:
     if not value:
         return value is None
     return isinstance(value, dict) and all(
-        isinstance(v := value.get(key), list) and _are_numbers(dict(enumerate(v))) for key in ("ratio", "spread")
+        isinstance(v := value.get(key), list) and _are_numbers(v) for key in ("ratio", "spread")
     )
 
 
@@ -148,7 +148,7 @@ _META: dict[str, Callable[[Any], bool]] = {
 _TWIN: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("of", "tolerance_name"), lambda v: isinstance(v, str)),
     **dict.fromkeys(("seed", "replicate"), _is_count),
-    "tolerance": _are_numbers,
+    "tolerance": lambda v: isinstance(v, dict) and _are_numbers(v.values()),
     "gap": _is_gap,
 }
 """What is read of ``run.json``, and of what it says of a twin."""

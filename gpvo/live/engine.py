@@ -118,9 +118,8 @@ class Engine:
         self._resume = load_state(self.settings.state)
         self._scale = np.ones(6) if self._resume is None else self._resume.scale
         # Of the body, as last measured; before that, one as fast as vehicles were in training.
-        self._twist = np.sqrt(predictor.model.velocities.usual_rate_var)
-        if self._resume is not None:
-            self._twist = self._resume.twist
+        usual = np.sqrt(predictor.model.velocities.usual_rate_var)
+        self._twist = usual if self._resume is None else self._resume.twist
         if self._resume is not None and self._resume.model not in ("", predictor.digest):
             tell("the state is another model's: its pose is used, the scale learned from late truth is not")
             self._scale = np.ones(6)

@@ -90,8 +90,7 @@ def publish_run(path: Path, settings: PublishSettings) -> Published:
     run = read_run(path)
     model = settings.model
     predictor = None if model is None else Predictor.load(model).require_motions(model)
-    if model is not None and predictor is not None:
-        warn_of_misfits(model, predictor, run)
+    warn_of_misfits(model, predictor, run)
     predictions = predictions_of(run, predictor)
     odometry = odometry_of(run, predictions, settings)
     consumer = settings.consumer or ("px4" if settings.to == "mavlink" else "robot_localization")

@@ -263,18 +263,19 @@ class VoLog:
 
     def covariance(self, method: str) -> Array:
         """(N, 6, 6) of one method; NaN where a record has none."""
-        missing = np.full((6, 6), np.nan)
-        if isinstance(self.records, StoredRecords):
-            elements = self.records.covariances.get(method, np.full((len(self), 21), np.nan))
-            return np.asarray(elements[:, _PLACE_6])
-        return np.array([r.covariances.get(method, missing) for r in self.records]).reshape(-1, 6, 6)
+        return self._matrices("covariances", method, _PLACE_6)
 
     def v_t(self, method: str) -> Array:
         """(N, 3, 3) ``V_T`` by one method [m^2], in axes of the reference camera; NaN where a record has none."""
-        missing = np.full((3, 3), np.nan)
+        return self._matrices("v_t", method, _PLACE_3)
+
+    def _matrices(self, of: str, method: str, place: NDArray[np.int64]) -> Array:
+        """(N, n, n) of one method; ``place`` (n, n) of their elements in an upper triangle."""
         if isinstance(self.records, StoredRecords):
-            return np.asarray(self.records.v_t.get(method, np.full((len(self), 6), np.nan))[:, _PLACE_3])
-        return np.array([r.v_t.get(method, missing) for r in self.records]).reshape(-1, 3, 3)
+            missing = np.full((len(self), place.max() + 1), np.nan)
+            return np.asarray(getattr(self.records, of).get(method, missing)[:, place])
+        missing = np.full(place.shape, np.nan)
+        return np.array([getattr(r, of).get(method, missing) for r in self.records]).reshape(-1, *place.shape)
 
     def judged_as(self, records: Iterable[VoRecord]) -> VoLog:
         """The log with the statuses and reasons of ``records``, which are otherwise its own, in their order."""

@@ -45,6 +45,19 @@ def _feed(timeline: Timeline, flight: Flight, order: list[int]) -> None:
         timeline.add_vo(record, flight.predictions.get(record.t_ns))
 
 
+def _with_samples(flight: Flight, rows: np.ndarray) -> Flight:
+    """The flight with these samples of its IMU, in this order."""
+    assert flight.imu is not None
+    columns = (values[rows] for values in (flight.imu.t_ns, flight.imu.gyro_radps, flight.imu.acc_mps2))
+    return replace(flight, imu=ImuLog(*columns, flight.imu.noise))
+
+
+def _position_nees(timeline: Timeline, flight: Flight, k: int) -> float:
+    """Of the filter against the truth of record k."""
+    error = timeline.filter.x.position[0] - flight.T_world_imu[k, :3, 3]
+    return float(error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3)
+
+
 def _same(a: ErrorStateFilter, b: ErrorStateFilter) -> None:
     np.testing.assert_allclose(a.x.position, b.x.position, atol=1e-12)
     np.testing.assert_allclose(a.P, b.P, atol=1e-14)
@@ -206,9 +219,7 @@ def test_the_filter_goes_on_when_the_clock_is_set_back_or_ahead(flight: Flight, 
     assert timeline.t_ns == told(flight.records[99].t_ns)
     assert timeline.counts["clock_set_back" if back_s > 0 else "clock_set_ahead" if back_s > -4.0 else "silences"] == 1
     assert timeline.counts["used"] >= 96 - late
-    error = timeline.filter.x.position[0] - flight.T_world_imu[99, :3, 3]
-    C = timeline.filter.covariance[0, P, P]
-    assert error @ np.linalg.solve(C, error) / 3 < 3.0
+    assert _position_nees(timeline, flight, 99) < 3.0
 
 
 @pytest.mark.parametrize("back_s", [0.3, 0.9])
@@ -224,8 +235,7 @@ def test_motions_go_on_where_the_clock_of_the_imu_alone_is_set_back(flight: Flig
     assert timeline.counts["clock_set_back"] == 1
     assert timeline.t_ns == flight.records[n - 1].t_ns
     assert timeline.counts["used"] >= 70
-    error = timeline.filter.x.position[0] - flight.T_world_imu[n - 1, :3, 3]
-    assert error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3 < 3.0
+    assert _position_nees(timeline, flight, n - 1) < 3.0
 
 
 def test_a_gap_of_a_slow_imu_is_crossed(flight: Flight) -> None:
@@ -233,7 +243,7 @@ def test_a_gap_of_a_slow_imu_is_crossed(flight: Flight) -> None:
     assert imu is not None
     t = imu.t_ns[::40]  # 5 Hz
     kept = np.flatnonzero((t <= t[0] + 2 * 10**9) | (t >= t[0] + 4 * 10**9)) * 40
-    slow = replace(flight, imu=ImuLog(imu.t_ns[kept], imu.gyro_radps[kept], imu.acc_mps2[kept], imu.noise))
+    slow = _with_samples(flight, kept)
     timeline = _timeline(slow)
     _feed_imu(timeline, slow)
     _feed(timeline, slow, [*range(41), *range(90, 110)])
@@ -247,8 +257,7 @@ def test_a_batch_of_samples_that_is_sent_twice_is_no_clock_set_back(flight: Flig
     usual, twice = _timeline(flight), _timeline(flight)
     again = np.concatenate([np.arange(500), np.arange(460, 480), np.arange(500, len(imu.t_ns))])
     _feed_imu(usual, flight)
-    columns = (values[again] for values in (imu.t_ns, imu.gyro_radps, imu.acc_mps2))
-    _feed_imu(twice, replace(flight, imu=ImuLog(*columns, imu.noise)))
+    _feed_imu(twice, _with_samples(flight, again))
     for timeline in (usual, twice):
         _feed(timeline, flight, list(range(110)))
     assert twice.counts["clock_set_back"] == 0
@@ -268,8 +277,7 @@ def test_where_no_motion_tells_whether_time_has_passed_the_filter_doubts_it(ahea
         _feed(timeline, flight, list(range(60)))
         r = flight.records[60]
         timeline.add_vo(replace(r, t_ns=r.t_ns + ahead_ns, status=Status.LOST))
-        error = timeline.filter.x.position[0] - flight.T_world_imu[60, :3, 3]
-        nees.append(error @ np.linalg.solve(timeline.filter.covariance[0, P, P], error) / 3)
+        nees.append(_position_nees(timeline, flight, 60))
     assert 0.1 < np.mean(nees) < 2.0
 
 
@@ -282,8 +290,7 @@ def test_samples_that_come_late_fill_their_gap(flight: Flight, n: int) -> None:
     order[500 : 500 + 2 * n] = np.roll(order[500 : 500 + 2 * n], n)
     usual, swapped = _timeline(flight), _timeline(flight)
     _feed_imu(usual, flight)
-    columns = (values[order] for values in (imu.t_ns, imu.gyro_radps, imu.acc_mps2))
-    _feed_imu(swapped, replace(flight, imu=ImuLog(*columns, imu.noise)))
+    _feed_imu(swapped, _with_samples(flight, order))
     for timeline in (usual, swapped):
         _feed(timeline, flight, list(range(120)))
     assert swapped.counts["imu_out_of_order"] == 1
