@@ -48,9 +48,7 @@ class Groups(TyperGroup):
                 formatter.write_dl([(name, (c.help or "").split("\n\n")[0].strip()) for name, c in commands])
 
 
-Config = Annotated[
-    Path | None, typer.Option(help="TOML file of options, one table per command. The command line takes precedence.")
-]
+Config = Annotated[Path | None, "TOML file of options, one table per command. The command line takes precedence."]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Also print settings, time and memory.")]
 _OPTIONS = {"config": (Config, None), "quiet": (Quiet, False), "verbose": (Verbose, False)}
@@ -84,6 +82,13 @@ def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    """``kind``: typer's own annotation, or a type annotated with its help alone. Then what has no default is an
+    argument, but for ``out``; and a flag has no opposite."""
+    told = getattr(kind, "__metadata__", (None,))[0]
+    if isinstance(told, str):
+        words = [*(["-o"] if name == "out" else []), f"--{name.rstrip('_').replace('_', '-')}"]
+        is_argument = default is inspect.Parameter.empty and name != "out"
+        kind = Annotated[kind.__origin__, typer.Argument(help=told) if is_argument else typer.Option(*words, help=told)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
@@ -130,24 +135,22 @@ def options_of_file(path: Path, name: str, commands: Mapping[str, Any]) -> list[
 
 
 Kind = Annotated[str | None, typer.Option("--source", help="Format of the sequence; guessed by default.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
+Overwrite = Annotated[bool, "Replace a finished run, once the new one is complete."]
 
 
 @dataclass(frozen=True)
 class ViewOptions:
     """How images are paired, read and rectified: options that go to :func:`gpvo.io.open_source`."""
 
-    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")] = None
-    size: Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")] = None
-    mask_left: Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")] = (
-        None
-    )
-    mask_right: Annotated[Path | None, typer.Option(help="The same for the right lens.")] = None
+    hfov_deg: Annotated[float | None, "Field of view of the virtual pinhole pair [deg]."] = None
+    size: Annotated[str | None, "Size of the rectified images, WIDTHxHEIGHT."] = None
+    mask_left: Annotated[Path | None, "Mask image for the left lens: which pixels may be used."] = None
+    mask_right: Annotated[Path | None, "The same for the right lens."] = None
     tolerance_s: Annotated[
         float | None,
         typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
     ] = None
-    bits: Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")] = None
+    bits: Annotated[int | None, "Bits in use per sample of 16-bit images, e.g. 12."] = None
 
     def given(self) -> dict[str, Any]:
         """Those that were given, parsed. Raises GpvoError if a size is not WIDTHxHEIGHT."""
@@ -163,30 +166,24 @@ class ViewOptions:
 class SequenceOptions(ViewOptions):
     """How a sequence is read."""
 
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")] = None
-    left_topic: Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")] = None
-    right_topic: Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")] = None
-    rate_hz: Annotated[
-        float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")
-    ] = None
-    imu_topic: Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")] = None
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none to ignore it.")] = (
-        None
-    )
-    truth_frame: Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")] = None
+    calibration: Annotated[Path | None, "Calibration file to use instead of the one found."] = None
+    left_topic: Annotated[str | None, "Topic of the left images in a bag."] = None
+    right_topic: Annotated[str | None, "Topic of the right images in a bag."] = None
+    rate_hz: Annotated[float | None, "Frame rate of an image folder whose file names are numbers."] = None
+    imu_topic: Annotated[str | None, "Topic of the IMU in a bag."] = None
+    truth_topic: Annotated[str | None, "Topic of the ground truth in a bag; none to ignore it."] = None
+    truth_frame: Annotated[str | None, "Frame of the poses in the truth topic: imu or cam."] = None
 
 
 @dataclass(frozen=True)
 class WireOptions:
     """How messages of a running system come in."""
 
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False
-    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False
-    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False
-    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False
-    address: Annotated[
-        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
-    ] = None
+    zenoh: Annotated[bool, "ROS 2 over Zenoh, without ROS (extra gpvo[ros])."] = False
+    dds: Annotated[bool, "ROS 2 over DDS, without ROS (extra gpvo[ros])."] = False
+    ros2: Annotated[bool, "ROS 2 through rclpy, where it is installed."] = False
+    ros1: Annotated[bool, "ROS 1 through rospy, where it is installed."] = False
+    address: Annotated[str | None, "Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one."] = None
     domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0
 
     def transport(self) -> str | None:
@@ -202,13 +199,9 @@ class WireOptions:
 class VehicleOptions:
     """What carries the camera."""
 
-    vehicle: Annotated[
-        str, typer.Option("--vehicle", help="What carries the camera: car, rover, multirotor, handheld or any.")
-    ] = "any"
-    max_acceleration: Annotated[
-        float | None, typer.Option(help="Largest acceleration [m/s^2], overriding --vehicle.")
-    ] = None
-    max_turn: Annotated[float | None, typer.Option(help="Largest angular acceleration [rad/s^2], likewise.")] = None
+    vehicle: Annotated[str, "What carries the camera: car, rover, multirotor, handheld or any."] = "any"
+    max_acceleration: Annotated[float | None, "Largest acceleration [m/s^2], overriding --vehicle."] = None
+    max_turn: Annotated[float | None, "Largest angular acceleration [rad/s^2], likewise."] = None
 
     def bounds(self) -> Vehicle:
         """Those of the kind of vehicle, or the ones given to override them.
@@ -226,16 +219,16 @@ class VehicleOptions:
 class OdometryOptions:
     """Settings of gpvo's own odometry. A model knows only the odometry that it was trained on."""
 
-    preset: Annotated[str, typer.Option(help="Settings of the odometry: fast or thesis.")] = "fast"
-    methods: Annotated[str, typer.Option(help="Covariances: triangulation, pointing_matching, spherical.")] = (
+    preset: Annotated[str, "Settings of the odometry: fast or thesis."] = "fast"
+    methods: Annotated[str, "Covariances: triangulation, pointing_matching, spherical."] = (
         "triangulation,pointing_matching"
     )
-    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1"
-    sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5"
-    sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0
-    min_inliers: Annotated[int, typer.Option(help="A motion with fewer inliers is lost; at least 4.")] = 8
-    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer inliers is degraded.")] = 20
-    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2 estimates each motion alone.")] = 2
+    sigma_p: Annotated[str, "Pointing noise [px], or auto (estimated from the residuals)."] = "0.1"
+    sigma_m: Annotated[str, "Matching noise [px], or auto."] = "0.5"
+    sigma: Annotated[float, "Pixel noise of the triangulation method [px]."] = 1.0
+    min_inliers: Annotated[int, "A motion with fewer inliers is lost; at least 4."] = 8
+    weak_inliers: Annotated[int, "A motion with fewer inliers is degraded."] = 20
+    window: Annotated[int, "Frames adjusted together (slower); 2 estimates each motion alone."] = 2
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
@@ -245,10 +238,7 @@ class OdometryOptions:
         typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
     ] = None
     calibration_state: Annotated[
-        Path | None,
-        typer.Option(
-            help="Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
-        ),
+        Path | None, "Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
     ] = None
 
     def config(self, vehicle: Vehicle) -> VoConfig:

@@ -27,30 +27,21 @@ if TYPE_CHECKING:
     from gpvo.evaluation.pictures import MatchPicture
     from gpvo.twin.replicate import TwinSettings
 
-Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
+Runs = Annotated[list[Path], "Run folders."]
 
 
 @dataclass(frozen=True)
 class JudgeOptions:
     """How runs are judged."""
 
-    model: Annotated[
-        Path | None, typer.Option(help="Error model: adds the rows constant, scaled, gp_thesis, base and learned.")
-    ] = None
-    truth: Annotated[
-        Path | None, typer.Option(help="Ground truth (TUM lines, left camera) to use instead of the run's own.")
-    ] = None
-    segments: Annotated[
-        str | None, typer.Option(help="Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800.")
-    ] = None
+    model: Annotated[Path | None, "Error model: adds the rows constant, scaled, gp_thesis, base and learned."] = None
+    truth: Annotated[Path | None, "Ground truth (TUM lines, left camera) to use instead of the run's own."] = None
+    segments: Annotated[str | None, "Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800."] = None
     truth_sigma: Annotated[
-        str | None,
-        typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),
+        str | None, "Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."
     ] = None
-    align: Annotated[
-        str, typer.Option(help="Fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
-    ] = "none"
-    time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")] = "0"
+    align: Annotated[str, "Fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = "none"
+    time_offset: Annotated[str, "Seconds to add to the log's clock, or auto."] = "0"
 
     def options(self) -> EvaluateOptions:
         """The flags, parsed."""
@@ -72,13 +63,9 @@ def evaluate(
     ctx: typer.Context,
     runs: Runs,
     judge: JudgeOptions = JudgeOptions(),
-    plots: Annotated[Path | None, typer.Option(help="Folder for plots, as PNG and PDF, one set per run.")] = None,
-    tables: Annotated[
-        Path | None, typer.Option(help="Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX).")
-    ] = None,
-    stated: Annotated[
-        Path | None, typer.Option(help="Folder for the stated covariances of each method, as files for gpvo score.")
-    ] = None,
+    plots: Annotated[Path | None, "Folder for plots, as PNG and PDF, one set per run."] = None,
+    tables: Annotated[Path | None, "Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX)."] = None,
+    stated: Annotated[Path | None, "Folder for the stated covariances of each method, as files for gpvo score."] = None,
     twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
@@ -132,10 +119,10 @@ def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path 
 
 def report(
     runs: Runs,
-    out: Annotated[Path, typer.Option("-o", "--out", help="HTML file to write.")] = Path("report.html"),
+    out: Annotated[Path, "HTML file to write."] = Path("report.html"),
     judge: JudgeOptions = JudgeOptions(),
-    frames: Annotated[str | None, typer.Option(help="Also show the matches of these frames, e.g. 5,80.")] = None,
-    sequence: Annotated[Path | None, typer.Option(help="The sequence of the run, for --frames.")] = None,
+    frames: Annotated[str | None, "Also show the matches of these frames, e.g. 5,80."] = None,
+    sequence: Annotated[Path | None, "The sequence of the run, for --frames."] = None,
 ) -> None:
     """Write a report: one HTML page that opens with a verdict.
 

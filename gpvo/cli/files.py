@@ -132,7 +132,7 @@ def _frame(log: ForeignLog) -> str:
 
 
 def info(
-    path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
+    path: Annotated[Path, "Sequence, run folder, trajectory, calibration, bag or model."],
     kind: options.Kind = None,
     reading: options.SequenceOptions = options.SequenceOptions(),
     json_: Json = False,
@@ -151,11 +151,11 @@ def info(
 
 
 def import_(
-    log: Annotated[Path, typer.Argument(help="Trajectory, CSV or bag of another odometry.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
-    truth: Annotated[Path | None, typer.Option(help="Ground truth: a trajectory, CSV or bag.")] = None,
-    format_: Annotated[str | None, typer.Option("--format", help="tum, kitti, csv or bag; guessed by default.")] = None,
-    truth_format: Annotated[str | None, typer.Option(help="The same for the ground truth.")] = None,
+    log: Annotated[Path, "Trajectory, CSV or bag of another odometry."],
+    out: Annotated[Path, "Run folder to write."],
+    truth: Annotated[Path | None, "Ground truth: a trajectory, CSV or bag."] = None,
+    format_: Annotated[str | None, "tum, kitti, csv or bag; guessed by default."] = None,
+    truth_format: Annotated[str | None, "The same for the ground truth."] = None,
     map_: Annotated[
         list[str] | None,
         typer.Option("--map", metavar="COLUMN=NAME", help="Columns of a CSV, e.g. var_x=cov_00."),
@@ -163,32 +163,24 @@ def import_(
     truth_map: Annotated[
         list[str] | None, typer.Option(metavar="COLUMN=NAME", help="The same for a CSV of the ground truth.")
     ] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic of the odometry in a bag.")] = None,
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
-    times: Annotated[
-        Path | None, typer.Option(help="File of stamps in seconds, one line per pose, for KITTI poses.")
-    ] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Frame rate, for KITTI poses without stamps.")] = None,
+    topic: Annotated[str | None, "Topic of the odometry in a bag."] = None,
+    truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
+    times: Annotated[Path | None, "File of stamps in seconds, one line per pose, for KITTI poses."] = None,
+    rate_hz: Annotated[float | None, "Frame rate, for KITTI poses without stamps."] = None,
     frame: Annotated[
         str,
-        typer.Option(
-            help="Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
-            "name contains optical; cam for a file."
-        ),
+        "Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
+        "name contains optical; cam for a file.",
     ] = "auto",
     align: Annotated[
         str,
-        typer.Option(
-            help="Fit a fixed transform between log and truth: rotation, transform (with lever arm, and the truth's "
-            "attitudes against its positions) or none."
-        ),
+        "Fit a fixed transform between log and truth: rotation, transform (with lever arm, and the truth's "
+        "attitudes against its positions) or none.",
     ] = "none",
-    time_offset: Annotated[str, typer.Option(help="Seconds to add to the stamps of the log, or auto.")] = "0",
-    truth_sigma: Annotated[str | None, typer.Option(help="White noise of the truth per pose, METRES,RADIANS.")] = None,
-    covariance_of: Annotated[
-        str, typer.Option(help="Whether the covariances in a CSV are of poses or motions.")
-    ] = "pose",
-    covariance_axes: Annotated[str, typer.Option(help="Axes of the covariances in a CSV: world or body.")] = "world",
+    time_offset: Annotated[str, "Seconds to add to the stamps of the log, or auto."] = "0",
+    truth_sigma: Annotated[str | None, "White noise of the truth per pose, METRES,RADIANS."] = None,
+    covariance_of: Annotated[str, "Whether the covariances in a CSV are of poses or motions."] = "pose",
+    covariance_axes: Annotated[str, "Axes of the covariances in a CSV: world or body."] = "world",
     vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,
     json_: Json = False,

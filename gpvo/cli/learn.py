@@ -24,50 +24,44 @@ if TYPE_CHECKING:
 
 _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 
-Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth, or one file of training rows.")]
+Runs = Annotated[list[Path], "Run folders with ground truth, or one file of training rows."]
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     """What is learned, from which rows; a model that is updated keeps its own."""
 
-    features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto"
-    target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame"
-    regressor: Annotated[
-        str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
-    ] = "auto"
-    align: Annotated[
-        str, typer.Option(help="First fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
-    ] = "none"
+    features: Annotated[str, "auto, thesis, full, or a list of groups and columns."] = "auto"
+    target: Annotated[str, "frame, window:1s, length:1m or position."] = "frame"
+    regressor: Annotated[str, "Regressor for --target position: auto, exact, sparse, svgp or sklearn."] = "auto"
+    align: Annotated[str, "First fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = (
+        "none"
+    )
     waits: Annotated[
         str,
         typer.Option("--stationary", "--waits", help="Motions where truth wanders at rest, or jumps: drop or keep."),
     ] = "drop"
-    odd: Annotated[
-        str, typer.Option(help="Stretches where odometry and truth differ far more than elsewhere: keep or drop.")
-    ] = "keep"
+    odd: Annotated[str, "Stretches where odometry and truth differ far more than elsewhere: keep or drop."] = "keep"
     max_rows: Annotated[int, typer.Option(min=1000, help="Rows held in memory; more are streamed in blocks.")] = 100_000
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0
+    seed: Annotated[int, "Random seed."] = 0
 
 
 def train(
     ctx: typer.Context,
     runs: Runs,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Model file to write.")],
+    out: Annotated[Path, "Model file to write."],
     options: TrainOptions = TrainOptions(),
     update: Annotated[
-        Path | None,
-        typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
+        Path | None, "Add the runs to the training rows of this model and train again, with its settings."
     ] = None,
     twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     statements: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the covariances that each method states for the runs left out, for gpvo score."),
+        Path | None, "Folder for the covariances that each method states for the runs left out, for gpvo score."
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
-    backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
-    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
+    jobs: Annotated[int, "Folds to fit in parallel; -1 for all cores."] = 1,
+    backend: Annotated[str, "local or dask."] = "local",
+    scheduler: Annotated[str | None, "Address of a Dask scheduler."] = None,
     json_: Json = False,
 ) -> None:
     """Train an error model; score it by leaving each run out.

@@ -23,50 +23,32 @@ if TYPE_CHECKING:
 def live(
     model: Annotated[Path, typer.Option(help="Error model of this camera, or of this odometry.")],
     stereo: Annotated[tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the images.")] = None,
-    imu: Annotated[
-        str | None, typer.Option(help="Topic of the IMU, with --stereo; .../gyro/... is joined by .../accel/....")
-    ] = None,
-    odometry: Annotated[
-        str | None, typer.Option(help="Topic of another odometry, to be republished with an honest covariance.")
-    ] = None,
+    imu: Annotated[str | None, "Topic of the IMU, with --stereo; .../gyro/... is joined by .../accel/...."] = None,
+    odometry: Annotated[str | None, "Topic of another odometry, to be republished with an honest covariance."] = None,
     odometry_type: Annotated[
-        str, typer.Option(help="Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped.")
+        str, "Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped."
     ] = "odometry",
-    truth: Annotated[
-        str | None, typer.Option(help="Topic of delayed ground truth (mocap, tags); the covariance adapts to it.")
-    ] = None,
-    truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
-    replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
-    fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
+    truth: Annotated[str | None, "Topic of delayed ground truth (mocap, tags); the covariance adapts to it."] = None,
+    truth_type: Annotated[str, "Type of that topic: pose, odometry or pose_stamped."] = "pose",
+    replay: Annotated[Path | None, "Replay a bag instead of listening to a transport."] = None,
+    fast: Annotated[bool, "Replay as fast as possible."] = False,
     wire: flags.WireOptions = flags.WireOptions(),
-    mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
-    px4: Annotated[
-        bool, typer.Option("--px4", help="Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Write a new bag, in parts until the end: .bag, .mcap or a ROS 2 folder."),
-    ] = None,
-    topic: Annotated[str, typer.Option(help="Topic on which the odometry is published.")] = "/gpvo/odometry",
-    pose_topic: Annotated[str | None, typer.Option(help="Also publish PoseWithCovarianceStamped here.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the images.")] = (
-        None
-    ),
+    mavlink: Annotated[str | None, "Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD."] = None,
+    px4: Annotated[bool, "Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS."] = False,
+    out: Annotated[Path | None, "Write a new bag, in parts until the end: .bag, .mcap or a ROS 2 folder."] = None,
+    topic: Annotated[str, "Topic on which the odometry is published."] = "/gpvo/odometry",
+    pose_topic: Annotated[str | None, "Also publish PoseWithCovarianceStamped here."] = None,
+    calibration: Annotated[Path | None, "Calibration; default: CameraInfo beside the images."] = None,
     base_frame: Annotated[
-        str | None,
-        typer.Option(help="Publish the odometry of this robot frame, located through /tf_static and /tf."),
+        str | None, "Publish the odometry of this robot frame, located through /tf_static and /tf."
     ] = None,
-    pose_covariance: Annotated[
-        str, typer.Option(help="accumulated (since the start) or increment (the last motion).")
-    ] = ("accumulated"),
-    state: Annotated[
-        Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
-    ] = None,
+    pose_covariance: Annotated[str, "accumulated (since the start) or increment (the last motion)."] = "accumulated",
+    state: Annotated[Path | None, "File that keeps the state, so that a restart continues from it."] = None,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     vo: flags.OdometryOptions = flags.OdometryOptions(),
     view: flags.ViewOptions = flags.ViewOptions(),
     depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
-    json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
+    json_: Annotated[bool, "Print the counts as JSON at the end."] = False,
 ) -> None:
     """Publish odometry with an honest covariance, live.
 
@@ -123,19 +105,14 @@ def _stereo_settings(
 
 def doctor(
     source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
-    topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: adds the NEES (bags only).")
-    ] = None,
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
-    align: Annotated[
-        str,
-        typer.Option(help="Fit a fixed transform between bag and truth, as gpvo import does."),
-    ] = "none",
+    topic: Annotated[str | None, "Topic in a bag; default: all that hold poses."] = None,
+    truth: Annotated[Path | None, "Ground truth of the same body, a file or a bag: adds the NEES (bags only)."] = None,
+    truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
+    align: Annotated[str, "Fit a fixed transform between bag and truth, as gpvo import does."] = "none",
     wire: flags.WireOptions = flags.WireOptions(),
-    odometry_type: Annotated[str, typer.Option(help="Type of a topic: odometry, pose, or pose_stamped.")] = "odometry",
+    odometry_type: Annotated[str, "Type of a topic: odometry, pose, or pose_stamped."] = "odometry",
     seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
-    json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    json_: Annotated[bool, "Print the findings as JSON."] = False,
 ) -> None:
     """Check anyone's covariance, and what each filter would do with it.
 

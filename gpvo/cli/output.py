@@ -12,15 +12,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from gpvo.errors import GpvoError
 from gpvo.files import plain
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Json = Annotated[bool, "Print the result as JSON."]
 _MOST = 1e10  # of any number on a command line: metres, seconds
 _loud = {"quiet": False, "verbose": False}
 

@@ -11,11 +11,8 @@ from gpvo.cli.output import Json, print_json, progress
 
 
 def reproduce(
-    out: Annotated[
-        Path,
-        typer.Option("-o", "--out", help="Folder for results. Finished stages are kept, so a second run continues."),
-    ],
-    quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
+    out: Annotated[Path, "Folder for results. Finished stages are kept, so a second run continues."],
+    quick: Annotated[bool, "One seed with images, flights of 20 s."] = False,
     seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
     points_seeds: Annotated[
         int | None, typer.Option(min=0, help="Further test seeds without images [20, quick: 6].")
@@ -23,12 +20,10 @@ def reproduce(
     data: Annotated[
         Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
     ] = None,
-    only: Annotated[
-        str | None, typer.Option(help="Tables or rows to make, such as 4.3,4.1-clean; all by default.")
-    ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes; -1: one per core.")] = -1,
-    backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
-    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
+    only: Annotated[str | None, "Tables or rows to make, such as 4.3,4.1-clean; all by default."] = None,
+    jobs: Annotated[int, "Processes; -1: one per core."] = -1,
+    backend: Annotated[str, "local, or dask."] = "local",
+    scheduler: Annotated[str | None, "Address of a dask scheduler."] = None,
     json_: Json = False,
 ) -> None:
     """Reproduce every experiment of the thesis.

@@ -14,17 +14,13 @@ from gpvo.errors import GpvoError
 
 
 def score(
-    stated: Annotated[
-        list[Path], typer.Argument(help="Files of stated motions (or CSV), one per sequence; or one folder of methods.")
-    ],
+    stated: Annotated[list[Path], "Files of stated motions (or CSV), one per sequence; or one folder of methods."],
     truth: Annotated[
         list[Path] | None,
         typer.Option("--truth", metavar="<path>", help="TUM poses of the same camera, in the same order."),
     ] = None,
-    truth_sigma: Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians].")] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="With a folder of methods: write METHOD.json and board.csv here.")
-    ] = None,
+    truth_sigma: Annotated[str | None, "Noise of the truth per pose: metres[,radians]."] = None,
+    out: Annotated[Path | None, "With a folder of methods: write METHOD.json and board.csv here."] = None,
     json_: Json = False,
 ) -> None:
     """Score anyone's stated covariances from files alone.

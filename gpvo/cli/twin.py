@@ -30,18 +30,11 @@ class TwinOptions:
     replicates: Annotated[int, typer.Option(min=2, max=1000, help="Twins per run.")] = 8
     tolerance: Annotated[
         str,
-        typer.Option(
-            "--tolerance",
-            help="Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
-            " with baseline and focal (fractions) and rotation_rad. Each twin draws its own error.",
-        ),
+        "Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
+        " with baseline and focal (fractions) and rotation_rad. Each twin draws its own error.",
     ] = "none"
     gap: Annotated[
-        str | None,
-        typer.Option(
-            "--gap",
-            help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
-        ),
+        str | None, "By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'."
     ] = None
 
     def settings(self, seed: int) -> TwinSettings:
@@ -66,11 +59,8 @@ class TwinOptions:
 
 Twins = Annotated[
     bool,
-    typer.Option(
-        "--twins",
-        help="For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run"
-        " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
-    ),
+    "For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run"
+    " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
 ]
 Seed = Annotated[
     int,
@@ -81,15 +71,12 @@ Seed = Annotated[
 
 
 def twin(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders made with --keep-tracks.")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for the twins.")] = None,
-    against: Annotated[
-        bool,
-        typer.Option("--against", help="Compare with the runs' ground truth: real errors over predicted ones."),
-    ] = False,
+    runs: Annotated[list[Path], "Run folders made with --keep-tracks."],
+    out: Annotated[Path | None, "Folder for the twins."] = None,
+    against: Annotated[bool, "Compare with the runs' ground truth: real errors over predicted ones."] = False,
     options: TwinOptions = TwinOptions(),
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    jobs: Annotated[int, typer.Option(help="Twins to make in parallel; -1 for one per core.")] = 1,
+    jobs: Annotated[int, "Twins to make in parallel; -1 for one per core."] = 1,
     json_: Json = False,
 ) -> None:
     """Simulate runs again, so that their errors are known.
