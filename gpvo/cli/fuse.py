@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +12,7 @@ import typer
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.output import Json, one_of, print_json, progress, say
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
+from gpvo.publish import PublishSettings
 
 
 def fuse(
@@ -92,40 +93,19 @@ def fuse(
             say("With fewer than three runs there is no interval.")
 
 
-@dataclass(frozen=True)
-class PublishOptions:
-    """What is published, and where to."""
-
-    to: Annotated[str | None, "bag (default), mcap or mavlink."] = None
-    out: Annotated[
-        Path | None, "File or folder to write; a suffix .bag (ROS 1), .mcap or .tlog stands in for --to."
-    ] = None
-    link: Annotated[str | None, "Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD."] = None
-    model: Annotated[Path | None, "Error model; default: predictions stored in the run."] = None
-    method: Annotated[str, "Geometric covariance to use where there is no prediction."] = "pointing_matching"
-    topic: Annotated[str, "Topic of the odometry."] = "/gpvo/odometry"
-    system: Annotated[int, "MAVLink system id of the vehicle."] = 1
-    consumer: Annotated[
-        str | None, "For --check: px4, ardupilot, robot_localization or fusioncore; default: px4 for MAVLink."
-    ] = None
-    check: Annotated[
-        bool, "Report what the consumer will do with the messages; writes a file only with --to or -o."
-    ] = False
-
-
 def publish(
     run: Annotated[Path, "Run folder."],
-    options: PublishOptions = PublishOptions(),
+    options: PublishSettings = PublishSettings(),
     json_: Json = False,
 ) -> None:
     """Write messages for robot_localization, PX4, ArduPilot and FusionCore.
 
     Example: gpvo publish runs/flight7 --to mavlink -o flight7.tlog --consumer px4 --check
     """
-    from gpvo.publish.job import PublishSettings, publish_run
+    from gpvo.publish.job import publish_run
 
     with progress("runs", 1):
-        result = publish_run(run, PublishSettings(**vars(options)))
+        result = publish_run(run, options)
     if json_:
         print_json(result.document())
     else:
