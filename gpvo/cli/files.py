@@ -12,7 +12,7 @@ import typer
 
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
-from gpvo.cli.output import Json, note, numbers, one_of, print_json, progress
+from gpvo.cli.output import Json, answer, note, numbers, one_of, progress
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
@@ -143,11 +143,9 @@ def info(
     """
     with progress("files", 1):
         document = plain(describe(path, kind, reading.given()))
-    if json_:
-        print_json({"schema": 1, "path": str(path), **document})
-    else:
-        document.pop("header", None)  # of a model: hundreds of lines, for --json
-        print("\n".join([str(path), *as_lines(document, "  ")]))
+    short = {k: v for k, v in document.items() if k != "header"}  # of a model: hundreds of lines, for --json
+    whole = {"schema": 1, "path": str(path), **document}
+    answer(json_, whole, lambda: print("\n".join([str(path), *as_lines(short, "  ")])))
 
 
 def import_(
@@ -216,10 +214,7 @@ def import_(
             vehicle=vehicle.bounds(),
             overwrite=overwrite,
         )
-    if json_:
-        print_json({"schema": 1, "run": str(out), **summary.__dict__})
-    else:
-        print(f"{out}: {summary}")
+    answer(json_, {"schema": 1, "run": str(out), **vars(summary)}, lambda: print(f"{out}: {summary}"))
 
 
 def _mapping(option: str, texts: list[str]) -> dict[str, str]:

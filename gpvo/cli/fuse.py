@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, one_of, print_json, progress, say
+from gpvo.cli.output import Json, answer, one_of, print_json, progress, say
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
 from gpvo.publish import PublishSettings
 
@@ -106,11 +106,7 @@ def publish(
 
     with progress("runs", 1):
         result = publish_run(run, options)
-    if json_:
-        print_json(result.document())
-    else:
-        for line in str(result).splitlines():
-            say(line)
+    answer(json_, result.document(), lambda: [say(line) for line in str(result).splitlines()])
 
 
 def _tell(what: str) -> None:

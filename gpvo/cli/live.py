@@ -10,7 +10,7 @@ import typer
 
 from gpvo.cli import common as flags
 from gpvo.cli.files import import_log
-from gpvo.cli.output import one_of, print_json, say
+from gpvo.cli.output import answer, one_of, print_json, say
 from gpvo.errors import GpvoError, printable
 from gpvo.io.foreign import ForeignLog, read_foreign
 from gpvo.io.run import read_run
@@ -86,10 +86,8 @@ def live(
             engine=EngineSettings(pose_covariance == "increment", state, carrier),
         )
     )
-    if json_:
-        print_json({"schema": 1, **result})
-    else:
-        print(", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received")
+    told = ", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received"
+    answer(json_, {"schema": 1, **result}, lambda: print(told))
 
 
 def _stereo_settings(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from gpvo.cli.output import Json, new_table, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, new_table, print_json, progress, say, show
 from gpvo.errors import GpvoError
 from gpvo.files import make_folder, replacing, write_csv
 from gpvo.io.parquet import write_table
@@ -159,10 +159,7 @@ def forecast(
 
         with replacing(plot) as temporary:
             plots.forecast(found, path.name).savefig(temporary, dpi=110, format="png")
-    if json_:
-        print_json(_forecast_document(found, model, path, frame))
-    else:
-        _print_forecast(found, path)
+    answer(json_, _forecast_document(found, model, path, frame), lambda: _print_forecast(found, path))
 
 
 def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:

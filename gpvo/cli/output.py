@@ -87,6 +87,11 @@ def print_json(document: dict[str, Any]) -> None:
     print(json.dumps(plain(document), indent=2))
 
 
+def answer(as_json: bool, document: dict[str, Any], told: Callable[[], object]) -> None:
+    """Print a result: the document for scripts, or as people are ``told`` it."""
+    print_json(document) if as_json else told()
+
+
 def one_of(option: str, value: str, choices: Iterable[str]) -> str:
     """The value of an option. Raises GpvoError if it is not one of the choices."""
     known = list(choices)

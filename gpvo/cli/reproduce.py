@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, print_json, progress
+from gpvo.cli.output import Json, answer, progress
 
 
 def reproduce(
@@ -40,10 +40,7 @@ def reproduce(
     chosen = {k: v for k, v in given.items() if v is not None}
     plan = Plan.quick(**chosen) if quick else Plan(**chosen)
     result = run(plan, out, Workers(jobs, backend, scheduler, progress))
-    if json_:
-        print_json(result)
-    else:
-        _print_tables(result, out)
+    answer(json_, result, lambda: _print_tables(result, out))
 
 
 def _print_tables(result: dict[str, Any], out: Path) -> None:

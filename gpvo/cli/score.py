@@ -9,7 +9,7 @@ import typer
 
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
-from gpvo.cli.output import Json, cell, new_table, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, cell, new_table, progress, say, show
 from gpvo.errors import GpvoError
 
 
@@ -31,8 +31,8 @@ def score(
 
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
-    from gpvo.evaluation.score import board, on_other_axes, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
+    from gpvo.evaluation.score import score_folder, write_board
 
     refuse_twice(stated)
     truth = truth or []
@@ -42,34 +42,30 @@ def score(
             methods = score_folder(stated[0], options)
         if out is not None:
             write_board(methods, out)
-        if json_:
-            print_json({"schema": 1, "methods": list(methods.values())})
-        else:
-            _print_board(board(methods))
-            for method, axes in on_other_axes(methods).items():
-                say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
+        answer(json_, {"schema": 1, "methods": list(methods.values())}, lambda: _print_board(methods))
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
     with progress("files", 1):
         found = score_files(list(zip(stated, truth)), options)
-    if json_:
-        print_json(found)
-    else:
-        _print(found)
+    answer(json_, found, lambda: _print(found))
 
 
 _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10 m and 100 m; 1 is right."
 
 
-def _print_board(columns: dict[str, list[Any]]) -> None:
+def _print_board(methods: dict[str, dict[str, Any]]) -> None:
+    from gpvo.evaluation.score import board, on_other_axes
+
     table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
-    for row in zip(*columns.values()):
+    for row in zip(*board(methods).values()):
         name, *numbers = row  # NEES and shares to two digits: the table fits 80 columns
         table.add_row(name, *map(cell, numbers[:3]), *(cell(v, 2) for v in numbers[3:]))
     show(table)
     say(_LEGEND)
     say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
+    for method, axes in on_other_axes(methods).items():
+        say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
 
 
 def _print(found: dict[str, Any]) -> None:
