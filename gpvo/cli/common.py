@@ -188,8 +188,7 @@ class WireOptions:
 
     def transport(self) -> str | None:
         """The one that was chosen, None if none was. Raises GpvoError if several were."""
-        flags = {"zenoh": self.zenoh, "dds": self.dds, "ros2": self.ros2, "ros1": self.ros1}
-        chosen = [name for name, is_on in flags.items() if is_on]
+        chosen = [name for name in ("zenoh", "dds", "ros2", "ros1") if getattr(self, name)]
         if len(chosen) > 1:
             raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
         return chosen[0] if chosen else None
@@ -245,19 +244,9 @@ class OdometryOptions:
         """The settings, parsed. Raises GpvoError for an unknown one, or a value out of its range."""
         from gpvo.vo.config import make_config, read_settings
 
-        shorthand = {
-            **asdict(vehicle),
-            "methods": self.methods,
-            "sigma_px": self.sigma,
-            "sigma_p_px": self.sigma_p,
-            "sigma_m_px": self.sigma_m,
-            "min_inliers": self.min_inliers,
-            "weak_inliers": self.weak_inliers,
-            "window": self.window,
-        }
-        if self.self_calibration is not None:
-            shorthand["self_calibration"] = self.self_calibration
-        texts = [*(f"{k}={v}" for k, v in shorthand.items()), *(self.settings or ())]
+        own = {k: v for k, v in vars(self).items() if k not in ("preset", "settings", "calibration_state")}
+        shorthand = {f"{k}_px" if k.startswith("sigma") else k: v for k, v in own.items() if v is not None}
+        texts = [*(f"{k}={v}" for k, v in (asdict(vehicle) | shorthand).items()), *(self.settings or ())]
         return make_config(self.preset, **read_settings(texts))
 
     def state(self, camera: StereoCamera) -> RigState | None:

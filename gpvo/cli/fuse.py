@@ -106,7 +106,7 @@ def publish(
 
     with progress("runs", 1):
         result = publish_run(run, options)
-    answer(json_, result.document(), lambda: [say(line) for line in str(result).splitlines()])
+    answer(json_, result.document(), lambda: list(map(say, str(result).splitlines())))
 
 
 def _tell(what: str) -> None:

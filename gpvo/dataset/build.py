@@ -4,7 +4,7 @@ split: by sequence, or by time block where there are too few sequences, never by
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -67,15 +67,15 @@ class TrainingSet:
 
     def rows(self, keep: NDArray) -> TrainingSet:
         """A part of the rows."""
-        return replace(
-            self,
-            X=self.X[keep],
-            Y=self.Y[keep],
-            t_ns=self.t_ns[keep],
-            dt_s=self.dt_s[keep],
-            covariances={m: C[keep] for m, C in self.covariances.items()},
-            v_t={m: C[keep] for m, C in self.v_t.items()},
-        )
+        return self.over([self], lambda arrays: arrays[0][keep])
+
+    @classmethod
+    def over(cls, sets: Sequence[TrainingSet], made: Callable[[list[NDArray[Any]]], NDArray[Any]]) -> TrainingSet:
+        """The first set with other rows: each array of a row per motion is ``made`` of those of all the sets, alike."""
+        changed: dict[str, Any] = {n: made([getattr(s, n) for s in sets]) for n in ("X", "Y", "t_ns", "dt_s")}
+        for name in ("covariances", "v_t"):
+            changed[name] = {m: made([getattr(s, name)[m] for s in sets]) for m in getattr(sets[0], name)}
+        return replace(sets[0], **changed)
 
     def supported(self) -> set[str]:
         """Columns that the log knows in at least 95 of 100 rows."""
