@@ -57,7 +57,8 @@ def replacing(path: Path) -> Iterator[Path]:
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        os.chmod(temporary, 0o666 & ~_umask())
+        os.umask(mask := os.umask(0))  # which cannot be asked for otherwise
+        os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, path)
     except BaseException as error:
         if temporary is not None:
@@ -66,12 +67,6 @@ def replacing(path: Path) -> Iterator[Path]:
             reason = error.strerror or (str(error).splitlines() or ["the disk refuses"])[-1]
             raise OutputError(f"cannot be written: {reason}", where=path) from None
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def make_folder(path: Path) -> Path:

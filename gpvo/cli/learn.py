@@ -198,14 +198,10 @@ def _train(
         return learning.train_position([config.rows_of(r) for r in runs], config)
     if update is not None:
         return store.update(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
-    if _frames(paths) > config.max_rows:
+    frames = (read_meta(p).get("frames") or 0 for p in paths if (p / "run.json").is_file())  # as the runs say
+    if sum(map(int, frames)) > config.max_rows:
         return _train_streaming(runs, config, on_fit)
     return learning.train(runs, config, on_fit=on_fit)
-
-
-def _frames(paths: list[Path]) -> int:
-    """How many frames the runs say they have."""
-    return sum(int(read_meta(p).get("frames") or 0) for p in paths if (p / "run.json").is_file())
 
 
 def _train_streaming(runs: Iterator[Run], config: TrainConfig, on_fit: OnFit) -> TrainedModel:

@@ -75,24 +75,13 @@ def examine_topic(
 
 def examine(stated: Stated) -> list[Finding]:
     """Everything that is wrong with a recording, worst first; empty for a good one."""
-    return list(_findings(stated))
-
-
-def _findings(stated: Stated) -> Iterator[Finding]:
     motions = _motions(stated)
-    yield from _stamps(stated)
-    yield from _frames(stated)
-    yield from _poses(stated)
-    if motions is not None:
-        _, steps, dt = motions
-        yield from _jumps(steps, dt)
+    found = [*_stamps(stated), *_frames(stated), *_poses(stated), *(_jumps(*motions[1:]) if motions else ())]
     if stated.pose is None and stated.twist is None:
-        yield Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR)
+        found.append(Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR))
     for name, C in (("pose", stated.pose), ("twist", stated.twist)):
-        if C is not None:
-            yield from _matrices(name, C)
-    if motions is not None:
-        yield from _pose_against_twist(stated, *motions)
+        found += () if C is None else _matrices(name, C)
+    return [*found, *(_pose_against_twist(stated, *motions) if motions else ())]
 
 
 def _matrices(name: str, C: Array) -> Iterator[Finding]:
@@ -102,7 +91,8 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
         text = "robot_localization does not check, so its state becomes NaN; ArduPilot checks only element 0 for NaN"
         yield Finding(f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text, share)
         return
-    D, symmetric = variances(C), _symmetric(C)
+    D, scale = variances(C), np.abs(C).max(axis=(1, 2))[:, None, None]
+    symmetric = (np.abs(C - np.swapaxes(C, 1, 2)) <= 1e-6 * scale).all(axis=(1, 2))
     zero = (C == 0).all(axis=(1, 2))
     if zero.all():
         text = f"{_RL_FLOOR}; {_PX4_FLOOR}; {_AP_FLOOR}; {_ZERO_FALLBACK}"
@@ -138,11 +128,6 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
     elif len(np.unique(D.round(12), axis=0)) <= 4 < len(D) // 4:
         text = "a few levels only (such as a tracker's confidence): most of what the source knows is lost"
         yield Finding(f"{name}-levels", f"the {name}'s covariance takes four values or fewer", text)
-
-
-def _symmetric(C: Array) -> NDArray[np.bool_]:
-    scale = np.abs(C).max(axis=(1, 2))[:, None, None]
-    return np.asarray((np.abs(C - np.swapaxes(C, 1, 2)) <= 1e-6 * scale).all(axis=(1, 2)))
 
 
 def _stamps(s: Stated) -> Iterator[Finding]:
