@@ -216,18 +216,11 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
     return n_lost, slips, np.array(jumps).reshape(-1, 6)
 
 
-def build_run(
-    run: Run,
-    *,
-    columns: Sequence[str] | None = None,
-    target: str = "frame",
-    align: str = "none",
-    waits: str = "drop",
-    odd: str = "keep",
-) -> TrainingSet:
-    """The training set of a run folder. ``align``: see :func:`aligned_truth`."""
+def build_run(run: Run, *, align: str = "none", **how: Any) -> TrainingSet:
+    """The training set of a run folder. ``align``: see :func:`aligned_truth`; ``how``: further arguments of
+    :func:`build`, as ``columns``, ``target``, ``waits`` and ``odd``."""
     truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
-    rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
+    rows = build(run.log, truth, name=run.name, where=run.path, **how)
     return replace(rows, odometry=that_matter(run.settings))
 
 

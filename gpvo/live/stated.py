@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,12 @@ class Finding:
     what: str
     consequence: str
     share: float = 1.0
+
+    @classmethod
+    def where(cls, bad: Any, code: str, what: str, consequence: str) -> Iterator[Finding]:
+        """Of the messages that are ``bad`` (N,); none where none is."""
+        if bad.any():
+            yield cls(code, what, consequence, float(bad.mean()))
 
     def __str__(self) -> str:
         part = "" if self.share >= 1.0 else f" ({100 * self.share:.0f} % of the messages)"

@@ -12,9 +12,10 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle
+from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle, field_names
 
 _Item = TypeVar("_Item")
+_Rows = TypeVar("_Rows", bound="Columns[Any]")
 
 IMPORTED = "imported"
 """Name of the covariances that somebody else's odometry states of its own motions."""
@@ -115,6 +116,18 @@ class Columns(Sequence[_Item], ABC):
 
     columns: Mapping[str, NDArray[Any]]
 
+    @classmethod
+    def join(cls: type[_Rows], parts: Sequence[_Rows]) -> _Rows:
+        """One after the other; of mappings by method or stage, with those of all, NaN where a part has none."""
+        lengths = [len(part) for part in parts]
+
+        def joined(maps: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+            shape = {name: column.shape[1:] for m in maps for name, column in m.items()}
+            absent = {name: [np.broadcast_to(np.nan, (n, *of)) for n in lengths] for name, of in shape.items()}
+            return {name: np.concatenate([m.get(name, a) for m, a in zip(maps, absent[name])]) for name in shape}
+
+        return cls(*(joined([getattr(part, name) for part in parts]) for name in field_names(cls)))
+
     @abstractmethod
     def made(self, k: int) -> _Item:
         """Row k."""
@@ -144,18 +157,6 @@ class StoredRecords(Columns[VoRecord]):
     covariances: Mapping[str, Array] = field(default_factory=dict)
     v_t: Mapping[str, Array] = field(default_factory=dict)
     stage_ms: Mapping[str, Array] = field(default_factory=dict)
-
-    @classmethod
-    def join(cls, parts: Sequence[StoredRecords]) -> StoredRecords:
-        """One after the other, with the methods and stages of all."""
-        lengths = [len(part) for part in parts]
-
-        def joined(maps: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-            shape = {name: column.shape[1:] for m in maps for name, column in m.items()}
-            absent = {name: [np.broadcast_to(np.nan, (n, *of)) for n in lengths] for name, of in shape.items()}
-            return {name: np.concatenate([m.get(name, a) for m, a in zip(maps, absent[name])]) for name in shape}
-
-        return cls(*(joined([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def made(self, k: int) -> VoRecord:
         """Record k."""
