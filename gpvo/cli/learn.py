@@ -179,6 +179,7 @@ def _train(
     paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit, noisy: list[str]
 ) -> TrainedModel:
     """``noisy`` gets the names of runs whose truth cannot judge single motions."""
+    from gpvo.dataset.table import write_sets
     from gpvo.learning import store
     from gpvo.learning import train as learning
     from gpvo.learning.config import TrainConfig
@@ -200,19 +201,11 @@ def _train(
         return store.update(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
     frames = (read_meta(p).get("frames") or 0 for p in paths if (p / "run.json").is_file())  # as the runs say
     if sum(map(int, frames)) > config.max_rows:
-        return _train_streaming(runs, config, on_fit)
+        # They do not fit into memory together: their rows pass through a file, one run at a time.
+        with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
+            write_sets(rows := Path(folder) / "rows.parquet", map(config.rows_of, runs))
+            return store.train_stored(rows, config, on_fit=on_fit)
     return learning.train(runs, config, on_fit=on_fit)
-
-
-def _train_streaming(runs: Iterator[Run], config: TrainConfig, on_fit: OnFit) -> TrainedModel:
-    """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
-    from gpvo.dataset.table import write_sets
-    from gpvo.learning.store import train_stored
-
-    with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
-        rows = Path(folder) / "rows.parquet"
-        write_sets(rows, map(config.rows_of, runs))
-        return train_stored(rows, config, on_fit=on_fit)
 
 
 def _print_table(document: dict[str, Any]) -> None:

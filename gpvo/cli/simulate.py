@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, print_json, progress
+from gpvo.cli.output import Json, answer, progress
 from gpvo.errors import GpvoError
 from gpvo.files import parse_toml
 
@@ -112,14 +112,12 @@ def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path 
         from gpvo.sim.sequence import contact_sheet
 
         contact_sheet(good[0].path, preview)
-    if json_:
-        print_json(
-            {"schema": 1, "scenario": scenario.name, "flights": [f.__dict__ | {"path": str(f.path)} for f in flights]}
-        )
-    else:
-        for f in flights:
-            what = f.error or f"{f.frames} frames, {f.distance_m:.1f} m" + ("" if f.redone else ", already there")
-            print(f"{f.path}: {what}")
+    lines = []
+    for f in flights:
+        what = f.error or f"{f.frames} frames, {f.distance_m:.1f} m" + ("" if f.redone else ", already there")
+        lines.append(f"{f.path}: {what}")
+    document = {"schema": 1, "scenario": scenario.name, "flights": [vars(f) for f in flights]}
+    answer(json_, document, lambda: print(*lines, sep="\n"))
     if len(good) < len(flights):
         raise GpvoError(f"{len(flights) - len(good)} of {len(flights)} flights failed", cure="see the lines above")
 
@@ -128,11 +126,8 @@ def _show_list(json_: bool) -> None:
     from gpvo.sim.scenario import load_scenario, names
 
     known = {name: load_scenario(name).about for name in names()}
-    if json_:
-        print_json({"schema": 1, "scenarios": known})
-        return
-    for name, about in known.items():
-        print(f"{name:16s}{about}")
+    lines = (f"{name:16s}{about}" for name, about in known.items())
+    answer(json_, {"schema": 1, "scenarios": known}, lambda: print(*lines, sep="\n"))
 
 
 def _assignment(text: str) -> tuple[str, Any]:

@@ -324,13 +324,8 @@ class ImuMoments:
     @classmethod
     def of_record(cls, record: VoRecord) -> ImuMoments:
         """What a record says of the IMU over its motion, as one sample with that spread; NaN where it knows none."""
-        unknown = np.full(3, np.nan)
-
-        def joined(*fields: Array | None) -> Array:
-            return np.concatenate([unknown if field is None else field for field in fields])
-
-        mean = joined(record.imu_gyro_mean_radps, record.imu_acc_mean_mps2)
-        return cls(1, mean, joined(record.imu_gyro_std_radps, record.imu_acc_std_mps2) ** 2)
+        known = [np.full(3, np.nan) if (v := getattr(record, name)) is None else v for name in IMU_FIELDS]
+        return cls(1, np.concatenate(known[::2]), np.concatenate(known[1::2]) ** 2)
 
     def with_later(self, other: ImuMoments) -> ImuMoments:
         """Of both pieces together (T. Chan, G. Golub, R. LeVeque, "Algorithms for computing the sample variance"
@@ -347,12 +342,7 @@ class ImuMoments:
         if self.n == 0:
             return {}
         deviation = np.sqrt(self.variance)
-        return {
-            "imu_gyro_mean_radps": self.mean[:3],
-            "imu_gyro_std_radps": deviation[:3],
-            "imu_acc_mean_mps2": self.mean[3:],
-            "imu_acc_std_mps2": deviation[3:],
-        }
+        return dict(zip(IMU_FIELDS, (self.mean[:3], deviation[:3], self.mean[3:], deviation[3:])))
 
 
 _FIELDS = frozenset(f.name for f in fields(VoRecord))
