@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, cell, new_table, numbers, print_json, progress, say, show
+from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show
 from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
 from gpvo.files import in_metres
@@ -248,7 +248,7 @@ def _print_methods(d: dict[str, Any]) -> None:
     sigma = d["truth_sigma"]
     noisy = bool(sigma["translation_m"] or sigma["rotation_rad"])
     given = ("+truth", "1 s", "coverage", "NLL", "stated")
-    table = new_table("method", "NEES", "interval", *given[0 if noisy else 1 :])
+    rows = []
     for method, m in d["methods"].items():
         block = "joint" if m["nees_dof"]["joint"] is not None else "translation"
         if m["nees_dof"][block] is None:
@@ -262,10 +262,10 @@ def _print_methods(d: dict[str, Any]) -> None:
             m["nll_stated_per_dim"],
         )
         cells = [cell(c) for c in rest[0 if noisy else 1 :]]
-        table.add_row(method, cell(m["nees_dof"][block]), f"{cell(low, 2)}-{cell(high, 2)}", *cells)
-    if not table.row_count:
+        rows.append([method, cell(m["nees_dof"][block]), f"{cell(low, 2)}-{cell(high, 2)}", *cells])
+    if not rows:
         return
-    show(table)
+    show(("method", "NEES", "interval", *given[0 if noisy else 1 :]), rows)
     say("NEES: per degree of freedom, for one motion; 1 is right. _vt: for the translation alone.")
     say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
     say("NLL: nats per axis, as a Gaussian; stated: under the stated density, where it has heavier tails.")
@@ -275,12 +275,12 @@ def _print_methods(d: dict[str, Any]) -> None:
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
-    table = new_table("method", "NLL", "interval", "NEES", "interval")
+    rows = []
     for method, scores in pooled.items():
-        cells = []
+        cells = [method]
         for s in (scores["nll_per_dim"], scores["nees_dof"]):
             cells += [cell(s["mean"]), "-" if s["low"] is None else f"{cell(s['low'])} to {cell(s['high'])}"]
-        table.add_row(method, *cells)
-    if table.row_count:
+        rows.append(cells)
+    if rows:
         say(f"mean of the {runs} runs" + ("" if runs > 2 else ": too few for an interval"))
-        show(table)
+        show(("method", "NLL", "interval", "NEES", "interval"), rows)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import is_given, refuse_twice
-from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
+from gpvo.cli.output import Json, cell, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
@@ -214,7 +214,7 @@ def _print_table(document: dict[str, Any]) -> None:
         return
     few = len(document["folds"]) <= _MOST_COLUMNS
     columns = [str(k + 1) for k in range(len(document["folds"]))] if few else ["least", "most"]
-    table = new_table("method", *columns, "mean", "median", "1 sig", "NLL", "stated")
+    rows = []
     for method, mean in document["mean"].items():
         per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
         rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"]]
@@ -222,13 +222,13 @@ def _print_table(document: dict[str, Any]) -> None:
         if not few and (known := [v for v in per_fold if v is not None]):
             per_fold = [min(known), max(known)]
         if any(v is not None for v in (*per_fold, *rest)):
-            table.add_row(method, *(cell(v) for v in (*per_fold, *rest)))
+            rows.append([method, *(cell(v) for v in (*per_fold, *rest))])
     what = (
         "run" if document.get("folds_are") != "time blocks" else "part of one run (this says nothing about other runs)"
     )
     say(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
     say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
-    show(table)
+    show(("method", *columns, "mean", "median", "1 sig", "NLL", "stated"), rows)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
     say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")
     at_rest, odd = (

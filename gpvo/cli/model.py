@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from gpvo.cli.output import Json, answer, new_table, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, print_json, progress, say, show
 from gpvo.errors import GpvoError
 from gpvo.files import make_folder, replacing, write_csv
 from gpvo.io.parquet import write_table
@@ -211,8 +211,9 @@ def _print_forecast(f: Forecast, path: Path) -> None:
             f"  {o.feature}: planned {a[0]:.3g} to {a[1]:.3g}, trained {b[0]:.3g} to {b[1]:.3g}"
             f" ({100 * o.share:.0f} % beyond)"
         )
-    table = new_table("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
-    for row in _rows(f):
-        table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
-    show(table)
+    numbers = (list(row.values()) for row in _rows(f))
+    show(
+        ("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]"),
+        ([f"{t_s:.1f}", f"{path_m:.1f}", *(f"{v:.3g}" for v in sigmas)] for t_s, path_m, *sigmas in numbers),
+    )
     say("1 sigma of the position relative to the first pose, in the axes of the plan's world")

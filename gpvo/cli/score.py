@@ -9,7 +9,7 @@ import typer
 
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
-from gpvo.cli.output import Json, answer, cell, new_table, progress, say, show
+from gpvo.cli.output import Json, answer, cell, progress, say, show
 from gpvo.errors import GpvoError
 
 
@@ -57,11 +57,9 @@ _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10
 def _print_board(methods: dict[str, dict[str, Any]]) -> None:
     from gpvo.evaluation.score import board, on_other_axes
 
-    table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
-    for row in zip(*board(methods).values()):
-        name, *numbers = row  # NEES and shares to two digits: the table fits 80 columns
-        table.add_row(name, *map(cell, numbers[:3]), *(cell(v, 2) for v in numbers[3:]))
-    show(table)
+    head = ("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
+    rows = zip(*board(methods).values())  # NEES and shares to two digits: the table fits 80 columns
+    show(head, ([row[0], *map(cell, row[1:4]), *(cell(v, 2) for v in row[4:])] for row in rows))
     say(_LEGEND)
     say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
     for method, axes in on_other_axes(methods).items():
@@ -69,13 +67,13 @@ def _print_board(methods: dict[str, dict[str, Any]]) -> None:
 
 
 def _print(found: dict[str, Any]) -> None:
-    table = new_table("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
+    rows = []
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
         over = (s["nees_dof_over"][name] for name in ("1s", "10m", "100m"))
         numbers = (*energy, s["nll_per_dim"], s["nees_dof"], *over)
-        table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers))
-    show(table)
+        rows.append([s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers)])
+    show(("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m"), rows)
     say(_LEGEND)
     pooled = found["pooled"]
     if pooled["nees_dof"]["low"] is None:

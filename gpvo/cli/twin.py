@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from gpvo.cli.common import is_given
-from gpvo.cli.output import Json, new_table, note, print_json, progress, say, show
+from gpvo.cli.output import Json, note, print_json, progress, say, show
 from gpvo.dataset.errors import require_attitude
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
@@ -118,13 +118,11 @@ def _print_ratios(runs: Sequence[Run], twins: Sequence[Sequence[Path]], json_: b
         each = [{"run": n, "ratio": dict(zip(SPANS, r))} for n, r in zip(names, found)]
         print_json({"schema": 1, "axes": AXES, "runs": each, "pooled": of_all})
         return
-    table = new_table("run", "over", *AXES)
-    for name, of_run in zip(names, found):
-        for span, row in zip(SPANS, of_run):
-            table.add_row(name, span, *(f"{v:.2f}" for v in row))
+    each_run = ((name, span, row) for name, of_run in zip(names, found) for span, row in zip(SPANS, of_run))
+    rows = [[name, span, *(f"{v:.2f}" for v in row)] for name, span, row in each_run]
     for span, m, d in zip(SPANS, mean, spread):
-        table.add_row("all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
-    show(table)
+        rows.append(["all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d))])
+    show(("run", "over", *AXES), rows)
     print("real over predicted error, root mean square; the truth's own noise is taken into account")
 
 
