@@ -49,8 +49,8 @@ class Groups(TyperGroup):
 
 
 Config = Annotated[Path | None, "TOML file of options, one table per command. The command line takes precedence."]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Also print settings, time and memory.")]
+Quiet = Annotated[bool, "-q", "--quiet", "No progress and no notes."]
+Verbose = Annotated[bool, "-v", "--verbose", "Also print settings, time and memory."]
 _OPTIONS = {"config": (Config, None), "quiet": (Quiet, False), "verbose": (Verbose, False)}
 
 
@@ -82,13 +82,15 @@ def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
-    """``kind``: typer's own annotation, or a type annotated with its help alone. Then what has no default is an
-    argument, but for ``out``; and a flag has no opposite."""
-    told = getattr(kind, "__metadata__", (None,))[0]
-    if isinstance(told, str):
-        words = [*(["-o"] if name == "out" else []), f"--{name.rstrip('_').replace('_', '-')}"]
-        is_argument = default is inspect.Parameter.empty and name != "out"
-        kind = Annotated[kind.__origin__, typer.Argument(help=told) if is_argument else typer.Option(*words, help=told)]
+    """``kind``: typer's own annotation, or a type annotated with its help: before it may stand its words, if they are
+    not its name, and after it what else typer is told. Without words, what has no default is an argument, but for
+    ``out``, and a flag has no opposite."""
+    told = getattr(kind, "__metadata__", ())
+    if texts := [text for text in told if isinstance(text, str)]:
+        words, more = texts[:-1], {"help": texts[-1], **next((m for m in told if isinstance(m, dict)), {})}
+        is_argument = not words and default is inspect.Parameter.empty and name != "out"
+        words = words or [*(["-o"] if name == "out" else []), f"--{name.rstrip('_').replace('_', '-')}"]
+        kind = Annotated[kind.__origin__, typer.Argument(**more) if is_argument else typer.Option(*words, **more)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
@@ -134,7 +136,7 @@ def options_of_file(path: Path, name: str, commands: Mapping[str, Any]) -> list[
     return words
 
 
-Kind = Annotated[str | None, typer.Option("--source", help="Format of the sequence; guessed by default.")]
+Kind = Annotated[str | None, "--source", "Format of the sequence; guessed by default."]
 Overwrite = Annotated[bool, "Replace a finished run, once the new one is complete."]
 
 
@@ -147,8 +149,7 @@ class ViewOptions:
     mask_left: Annotated[Path | None, "Mask image for the left lens: which pixels may be used."] = None
     mask_right: Annotated[Path | None, "The same for the right lens."] = None
     tolerance_s: Annotated[
-        float | None,
-        typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
+        float | None, "--pair-tolerance", "Largest difference between the stamps of a stereo pair [s]."
     ] = None
     bits: Annotated[int | None, "Bits in use per sample of 16-bit images, e.g. 12."] = None
 
@@ -184,7 +185,7 @@ class WireOptions:
     ros2: Annotated[bool, "ROS 2 through rclpy, where it is installed."] = False
     ros1: Annotated[bool, "ROS 1 through rospy, where it is installed."] = False
     address: Annotated[str | None, "Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one."] = None
-    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0
+    domain: Annotated[int, "ROS domain id, for --zenoh and --dds.", {"min": 0, "max": 232}] = 0
 
     def transport(self) -> str | None:
         """The one that was chosen, None if none was. Raises GpvoError if several were."""
@@ -229,12 +230,12 @@ class OdometryOptions:
     weak_inliers: Annotated[int, "A motion with fewer inliers is degraded."] = 20
     window: Annotated[int, "Frames adjusted together (slower); 2 estimates each motion alone."] = 2
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
+        list[str] | None, "--set", "Any setting of the odometry (gpvo.vo.config.VoConfig).", {"metavar": "NAME=VALUE"}
     ] = None
     self_calibration: Annotated[
         bool | None,
-        typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
+        "--self-calibration/--no-self-calibration",
+        "Estimate calibration errors in flight. On by default, except with --preset thesis.",
     ] = None
     calibration_state: Annotated[
         Path | None, "Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."

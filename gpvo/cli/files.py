@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
@@ -154,12 +153,9 @@ def import_(
     truth: Annotated[Path | None, "Ground truth: a trajectory, CSV or bag."] = None,
     format_: Annotated[str | None, "tum, kitti, csv or bag; guessed by default."] = None,
     truth_format: Annotated[str | None, "The same for the ground truth."] = None,
-    map_: Annotated[
-        list[str] | None,
-        typer.Option("--map", metavar="COLUMN=NAME", help="Columns of a CSV, e.g. var_x=cov_00."),
-    ] = None,
+    map_: Annotated[list[str] | None, "Columns of a CSV, e.g. var_x=cov_00.", {"metavar": "COLUMN=NAME"}] = None,
     truth_map: Annotated[
-        list[str] | None, typer.Option(metavar="COLUMN=NAME", help="The same for a CSV of the ground truth.")
+        list[str] | None, "The same for a CSV of the ground truth.", {"metavar": "COLUMN=NAME"}
     ] = None,
     topic: Annotated[str | None, "Topic of the odometry in a bag."] = None,
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,

@@ -20,8 +20,7 @@ def fuse(
     runs: Annotated[list[Path], "Run folders to filter."],
     model: Annotated[Path | None, "Error model; default: predictions stored in the runs."] = None,
     train: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="<path>", help="Training run for the constants; repeatable. Default: the model's."),
+        list[Path] | None, "Training run for the constants; repeatable. Default: the model's.", {"metavar": "<path>"}
     ] = None,
     policies: Annotated[str, "Policies to compare, comma-separated; all by default."] = "",
     init: Annotated[str, "Start from the truth, or at rest (static)."] = "truth",

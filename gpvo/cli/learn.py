@@ -37,12 +37,11 @@ class TrainOptions:
     align: Annotated[str, "First fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = (
         "none"
     )
-    waits: Annotated[
-        str,
-        typer.Option("--stationary", "--waits", help="Motions where truth wanders at rest, or jumps: drop or keep."),
-    ] = "drop"
+    waits: Annotated[str, "--stationary", "--waits", "Motions where truth wanders at rest, or jumps: drop or keep."] = (
+        "drop"
+    )
     odd: Annotated[str, "Stretches where odometry and truth differ far more than elsewhere: keep or drop."] = "keep"
-    max_rows: Annotated[int, typer.Option(min=1000, help="Rows held in memory; more are streamed in blocks.")] = 100_000
+    max_rows: Annotated[int, "Rows held in memory; more are streamed in blocks.", {"min": 1000}] = 100_000
     seed: Annotated[int, "Random seed."] = 0
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from gpvo.cli import common as flags
 from gpvo.cli.files import import_log
 from gpvo.cli.output import answer, one_of, print_json, say
@@ -21,8 +19,8 @@ if TYPE_CHECKING:
 
 
 def live(
-    model: Annotated[Path, typer.Option(help="Error model of this camera, or of this odometry.")],
-    stereo: Annotated[tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the images.")] = None,
+    model: Annotated[Path, "--model", "Error model of this camera, or of this odometry."],
+    stereo: Annotated[tuple[str, str] | None, "Topics of the images.", {"metavar": "LEFT RIGHT"}] = None,
     imu: Annotated[str | None, "Topic of the IMU, with --stereo; .../gyro/... is joined by .../accel/...."] = None,
     odometry: Annotated[str | None, "Topic of another odometry, to be republished with an honest covariance."] = None,
     odometry_type: Annotated[
@@ -47,7 +45,7 @@ def live(
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     vo: flags.OdometryOptions = flags.OdometryOptions(),
     view: flags.ViewOptions = flags.ViewOptions(),
-    depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
+    depth: Annotated[int, "Queue length per topic; older messages are dropped.", {"min": 2}] = 10,
     json_: Annotated[bool, "Print the counts as JSON at the end."] = False,
 ) -> None:
     """Publish odometry with an honest covariance, live.
@@ -102,14 +100,14 @@ def _stereo_settings(
 
 
 def doctor(
-    source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
+    source: Annotated[str, "A bag, or a topic of a running system.", {"metavar": "TOPIC|BAG"}],
     topic: Annotated[str | None, "Topic in a bag; default: all that hold poses."] = None,
     truth: Annotated[Path | None, "Ground truth of the same body, a file or a bag: adds the NEES (bags only)."] = None,
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
     align: Annotated[str, "Fit a fixed transform between bag and truth, as gpvo import does."] = "none",
     wire: flags.WireOptions = flags.WireOptions(),
     odometry_type: Annotated[str, "Type of a topic: odometry, pose, or pose_stamped."] = "odometry",
-    seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
+    seconds: Annotated[float, "How long to listen.", {"min": 1.0}] = 10.0,
     json_: Annotated[bool, "Print the findings as JSON."] = False,
 ) -> None:
     """Check anyone's covariance, and what each filter would do with it.

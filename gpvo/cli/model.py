@@ -130,13 +130,12 @@ def export(
 
 def forecast(
     model: Model,
-    path: Annotated[Path, typer.Option("--path", help="Planned poses, TUM lines at any spacing.")],
+    path: Annotated[Path, "--path", "Planned poses, TUM lines at any spacing."],
     frame: Annotated[str, "Frame of the poses: cam (left camera, z forward) or body (FLU, camera forward)."] = "cam",
     draws: Annotated[
-        int,
-        typer.Option(min=1, max=1000, help="Simulated flights along the plan, each in different conditions."),
+        int, "Simulated flights along the plan, each in different conditions.", {"min": 1, "max": 1000}
     ] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
+    seed: Annotated[int, "Random seed.", {"min": 0}] = 0,
     plot: Annotated[Path | None, "PNG to write: top view, and sigma over distance."] = None,
     out: Annotated[Path | None, "Every pose, as .parquet or .csv."] = None,
     json_: Json = False,

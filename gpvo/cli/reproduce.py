@@ -5,21 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from gpvo.cli.output import Json, answer, progress
 
 
 def reproduce(
     out: Annotated[Path, "Folder for results. Finished stages are kept, so a second run continues."],
     quick: Annotated[bool, "One seed with images, flights of 20 s."] = False,
-    seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
-    points_seeds: Annotated[
-        int | None, typer.Option(min=0, help="Further test seeds without images [20, quick: 6].")
-    ] = None,
-    data: Annotated[
-        Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
-    ] = None,
+    seeds: Annotated[int | None, "Test seeds with images [5, quick: 1].", {"min": 0}] = None,
+    points_seeds: Annotated[int | None, "Further test seeds without images [20, quick: 6].", {"min": 0}] = None,
+    data: Annotated[Path | None, "Folder of real data: flown_paths/, tracks, logs.", {"envvar": "GPVO_DATA"}] = None,
     only: Annotated[str | None, "Tables or rows to make, such as 4.3,4.1-clean; all by default."] = None,
     jobs: Annotated[int, "Processes; -1: one per core."] = -1,
     backend: Annotated[str, "local, or dask."] = "local",

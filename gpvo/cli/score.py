@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
 from gpvo.cli.output import Json, answer, cell, progress, say, show
@@ -16,8 +14,7 @@ from gpvo.errors import GpvoError
 def score(
     stated: Annotated[list[Path], "Files of stated motions (or CSV), one per sequence; or one folder of methods."],
     truth: Annotated[
-        list[Path] | None,
-        typer.Option("--truth", metavar="<path>", help="TUM poses of the same camera, in the same order."),
+        list[Path] | None, "TUM poses of the same camera, in the same order.", {"metavar": "<path>"}
     ] = None,
     truth_sigma: Annotated[str | None, "Noise of the truth per pose: metres[,radians]."] = None,
     out: Annotated[Path | None, "With a folder of methods: write METHOD.json and board.csv here."] = None,

@@ -22,9 +22,7 @@ _SEED_LIMIT = 100_000
 def simulate(
     scenario: Annotated[str | None, typer.Argument(help="Name of a scenario (see --list), or a TOML file.")] = None,
     out: Annotated[Path | None, "Folder to write; with --points, a .npz file."] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed; default 0, or the one in the TOML file.")
-    ] = None,
+    seed: Annotated[int | None, "Random seed; default 0, or the one in the TOML file.", {"min": 0}] = None,
     seeds: Annotated[str | None, "Several seeds, such as 0..9 or 1,4,7; each flight goes to OUT/seed_N."] = None,
     duration: Annotated[float | None, "Length of the flight [s]."] = None,
     rate: Annotated[float | None, "Frames per second."] = None,
@@ -38,14 +36,13 @@ def simulate(
     ] = None,
     points: Annotated[bool, "Landmark tracks instead of images: a thousand times faster."] = False,
     jobs: Annotated[int, "Flights to simulate in parallel with --seeds; -1 for one per core."] = 1,
-    threads: Annotated[int, typer.Option(min=1, help="Threads per flight; they do not change the result.")] = 2,
+    threads: Annotated[int, "Threads per flight; they do not change the result.", {"min": 1}] = 2,
     backend: Annotated[str, "local, or dask."] = "local",
     scheduler: Annotated[str | None, "Address of a dask scheduler."] = None,
     preview: Annotated[Path | None, "Write a contact sheet of the images (PNG)."] = None,
     list_: Annotated[bool, "List the scenarios."] = False,
     set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Setting of the scenario, with dots for tables; repeatable."),
+        list[str] | None, "Setting of the scenario, with dots for tables; repeatable.", {"metavar": "KEY=VALUE"}
     ] = None,
     json_: Json = False,
 ) -> None:

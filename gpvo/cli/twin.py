@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class TwinOptions:
     """How twins are made."""
 
-    replicates: Annotated[int, typer.Option(min=2, max=1000, help="Twins per run.")] = 8
+    replicates: Annotated[int, "Twins per run.", {"min": 2, "max": 1000}] = 8
     tolerance: Annotated[
         str,
         "Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
@@ -63,10 +63,7 @@ Twins = Annotated[
     " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
 ]
 Seed = Annotated[
-    int,
-    typer.Option(
-        min=0, help="Random seed of the twins; not that of 'gpvo train', so a model is judged on other twins."
-    ),
+    int, "Random seed of the twins; not that of 'gpvo train', so a model is judged on other twins.", {"min": 0}
 ]
 
 
@@ -75,7 +72,7 @@ def twin(
     out: Annotated[Path | None, "Folder for the twins."] = None,
     against: Annotated[bool, "Compare with the runs' ground truth: real errors over predicted ones."] = False,
     options: TwinOptions = TwinOptions(),
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
+    seed: Annotated[int, "Random seed.", {"min": 0}] = 0,
     jobs: Annotated[int, "Twins to make in parallel; -1 for one per core."] = 1,
     json_: Json = False,
 ) -> None:
