@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from itertools import groupby
@@ -63,22 +63,38 @@ def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         with output.loudness(quiet=quiet, verbose=verbose):
             output.detail(", ".join(f"{k.rstrip('_')}={v}" for k, v in given.items() if isinstance(v, _PLAIN)))
             for name, group in groups.items():
-                given[name] = group(**{f.name: given.pop(f.name) for f in fields(group)})
+                given[name] = _made(group, given)
             return function(**given)
 
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     own: list[inspect.Parameter] = []
     for name, p in inspect.signature(function).parameters.items():
-        if name in groups:
-            kinds = get_type_hints(groups[name], include_extras=True)
-            own += [_option(f.name, kinds[f.name], f.default) for f in fields(groups[name])]
-        else:
-            own.append(_option(name, hints[name], p.default))
+        own += _options(groups[name]) if name in groups else [_option(name, hints[name], p.default)]
     more = [_option(name, kind, default) for name, (kind, default) in _OPTIONS.items()]
     command.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in (*own, *more)}
     return command
+
+
+def _options(group: Any) -> Iterator[inspect.Parameter]:
+    """Of the fields of a dataclass that have a help, and of those of dataclasses in it."""
+    for name, kind, default in _asked(group):
+        yield from _options(kind) if is_dataclass(kind) else [_option(name, kind, default)]
+
+
+def _made(group: Any, given: dict[str, Any]) -> Any:
+    """The dataclass, of what was given."""
+    asked = _asked(group)
+    return group(**{name: _made(kind, given) if is_dataclass(kind) else given.pop(name) for name, kind, _ in asked})
+
+
+def _asked(group: Any) -> list[tuple[str, Any, Any]]:
+    hints = get_type_hints(group, include_extras=True)
+    found = [
+        (f.name, hints[f.name], inspect.Parameter.empty if f.default is MISSING else f.default) for f in fields(group)
+    ]
+    return [(name, kind, d) for name, kind, d in found if hasattr(kind, "__metadata__") or is_dataclass(kind)]
 
 
 def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
@@ -174,25 +190,6 @@ class SequenceOptions(ViewOptions):
     imu_topic: Annotated[str | None, "Topic of the IMU in a bag."] = None
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag; none to ignore it."] = None
     truth_frame: Annotated[str | None, "Frame of the poses in the truth topic: imu or cam."] = None
-
-
-@dataclass(frozen=True)
-class WireOptions:
-    """How messages of a running system come in."""
-
-    zenoh: Annotated[bool, "ROS 2 over Zenoh, without ROS (extra gpvo[ros])."] = False
-    dds: Annotated[bool, "ROS 2 over DDS, without ROS (extra gpvo[ros])."] = False
-    ros2: Annotated[bool, "ROS 2 through rclpy, where it is installed."] = False
-    ros1: Annotated[bool, "ROS 1 through rospy, where it is installed."] = False
-    address: Annotated[str | None, "Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one."] = None
-    domain: Annotated[int, "ROS domain id, for --zenoh and --dds.", {"min": 0, "max": 232}] = 0
-
-    def transport(self) -> str | None:
-        """The one that was chosen, None if none was. Raises GpvoError if several were."""
-        chosen = [name for name in ("zenoh", "dds", "ros2", "ros1") if getattr(self, name)]
-        if len(chosen) > 1:
-            raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
-        return chosen[0] if chosen else None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +13,7 @@ from gpvo.cli.output import answer, one_of, print_json, say
 from gpvo.errors import GpvoError, printable
 from gpvo.io.foreign import ForeignLog, read_foreign
 from gpvo.io.run import read_run
+from gpvo.live import POSE_TYPE_NAMES, LiveSettings, WireSettings
 from gpvo.types import IMPORTED, Vehicle
 
 if TYPE_CHECKING:
@@ -19,29 +21,7 @@ if TYPE_CHECKING:
 
 
 def live(
-    model: Annotated[Path, "--model", "Error model of this camera, or of this odometry."],
-    stereo: Annotated[tuple[str, str] | None, "Topics of the images.", {"metavar": "LEFT RIGHT"}] = None,
-    imu: Annotated[str | None, "Topic of the IMU, with --stereo; .../gyro/... is joined by .../accel/...."] = None,
-    odometry: Annotated[str | None, "Topic of another odometry, to be republished with an honest covariance."] = None,
-    odometry_type: Annotated[
-        str, "Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped."
-    ] = "odometry",
-    truth: Annotated[str | None, "Topic of delayed ground truth (mocap, tags); the covariance adapts to it."] = None,
-    truth_type: Annotated[str, "Type of that topic: pose, odometry or pose_stamped."] = "pose",
-    replay: Annotated[Path | None, "Replay a bag instead of listening to a transport."] = None,
-    fast: Annotated[bool, "Replay as fast as possible."] = False,
-    wire: flags.WireOptions = flags.WireOptions(),
-    mavlink: Annotated[str | None, "Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD."] = None,
-    px4: Annotated[bool, "Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS."] = False,
-    out: Annotated[Path | None, "Write a new bag, in parts until the end: .bag, .mcap or a ROS 2 folder."] = None,
-    topic: Annotated[str, "Topic on which the odometry is published."] = "/gpvo/odometry",
-    pose_topic: Annotated[str | None, "Also publish PoseWithCovarianceStamped here."] = None,
-    calibration: Annotated[Path | None, "Calibration; default: CameraInfo beside the images."] = None,
-    base_frame: Annotated[
-        str | None, "Publish the odometry of this robot frame, located through /tf_static and /tf."
-    ] = None,
-    pose_covariance: Annotated[str, "accumulated (since the start) or increment (the last motion)."] = "accumulated",
-    state: Annotated[Path | None, "File that keeps the state, so that a restart continues from it."] = None,
+    asked: LiveSettings,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     vo: flags.OdometryOptions = flags.OdometryOptions(),
     view: flags.ViewOptions = flags.ViewOptions(),
@@ -52,38 +32,14 @@ def live(
 
     Example: gpvo live --odometry /vins_estimator/odometry --model vins.gpvo --zenoh
     """
-    from gpvo.live.engine import EngineSettings
-    from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings, run_live
+    from gpvo.live.job import run_live
 
-    one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
+    one_of("--odometry-type", asked.odometry_type, POSE_TYPE_NAMES)
     carrier = vehicle.bounds()
-    one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
-    result = run_live(
-        LiveSettings(
-            model=model,
-            stereo=stereo,
-            vo=_stereo_settings(vo, carrier, stereo is not None, view.given()),
-            imu=imu,
-            odometry=odometry,
-            pose_type=POSE_TYPE_NAMES[odometry_type],
-            truth=truth,
-            truth_type=POSE_TYPE_NAMES[one_of("--truth-type", truth_type, POSE_TYPE_NAMES)],
-            calibration=calibration,
-            base_frame=base_frame,
-            replay=replay,
-            fast=fast,
-            wire=wire.transport(),
-            address=wire.address,
-            domain=wire.domain,
-            mavlink=mavlink,
-            px4=px4,
-            out=out,
-            topic=topic,
-            pose_topic=pose_topic,
-            depth=depth,
-            engine=EngineSettings(pose_covariance == "increment", state, carrier),
-        )
-    )
+    one_of("--pose-covariance", asked.pose_covariance, ("accumulated", "increment"))
+    stereo = _stereo_settings(vo, carrier, asked.stereo is not None, view.given())
+    one_of("--truth-type", asked.truth_type, POSE_TYPE_NAMES)
+    result = run_live(replace(asked, vo=stereo, vehicle=carrier, depth=depth))
     told = ", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received"
     answer(json_, {"schema": 1, **result}, lambda: print(told))
 
@@ -105,7 +61,7 @@ def doctor(
     truth: Annotated[Path | None, "Ground truth of the same body, a file or a bag: adds the NEES (bags only)."] = None,
     truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
     align: Annotated[str, "Fit a fixed transform between bag and truth, as gpvo import does."] = "none",
-    wire: flags.WireOptions = flags.WireOptions(),
+    wire: WireSettings = WireSettings(),
     odometry_type: Annotated[str, "Type of a topic: odometry, pose, or pose_stamped."] = "odometry",
     seconds: Annotated[float, "How long to listen.", {"min": 1.0}] = 10.0,
     json_: Annotated[bool, "Print the findings as JSON."] = False,
@@ -115,7 +71,6 @@ def doctor(
     Example: gpvo doctor flight.mcap --truth mocap.tum
     """
     from gpvo.live.doctor import examine_bag, examine_topic
-    from gpvo.live.job import POSE_TYPE_NAMES
 
     transport = wire.transport()
     one_of("--align", align, ("none", "rotation", "transform"))

@@ -22,8 +22,9 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_covariances, variances
 from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
+from gpvo.live import WIRES
 from gpvo.live.intake import Mailbox, arrivals
-from gpvo.live.job import WIRES, open_wire
+from gpvo.live.job import open_wire
 from gpvo.live.outputs import decode
 from gpvo.live.stated import ENOUGH, Finding, Stated
 from gpvo.types import Array
