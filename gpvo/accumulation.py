@@ -215,11 +215,7 @@ def persistent_sum(root: Array, phi: Array) -> Array:
     before = np.zeros_like(root)
     for k in range(1, root.shape[1]):
         before[:, k] = (before[:, k - 1] + root[:, k - 1]) * phi[:, k, None, :]
-    return symmetrise(_sum(root + 2.0 * before, root))
-
-
-def _sum(A: Array, B: Array) -> Array:
-    """(w, n, n) ``sum_k A_k B_k^T`` of (w, m, n, p) each, as one product a window."""
-    w, m, n, p = A.shape
-    flat_A, flat_B = (X.swapaxes(1, 2).reshape(w, n, m * p) for X in (A, B))
-    return np.asarray(flat_A @ flat_B.swapaxes(1, 2))
+    w, m, n, p = root.shape
+    # The sum over motions is one product a window.
+    A, B = (X.swapaxes(1, 2).reshape(w, n, m * p) for X in (root + 2.0 * before, root))
+    return symmetrise(A @ B.swapaxes(1, 2))

@@ -33,14 +33,18 @@ class TooLarge(Exception):
     """A file, or a part of one, is longer than anything that may stand in its place."""
 
 
-def read_bounded(path: Path, most: int) -> bytes:
-    """All of a file or pipe. Raises TooLarge where it holds more than ``most`` bytes, OSError where unreadable."""
+def read_bounded(path: Path, most: int, beyond: str, kind: type[GpvoError] = SourceError) -> bytes:
+    """All of a file or pipe. Raises an error of the ``kind`` where it cannot be read, or holds more than ``most``
+    bytes, which is said as ``beyond``."""
     data = bytearray()
-    with path.open("rb") as file:
-        while part := file.read(_STEP_BYTES):  # read(most) would allocate all of it at once
-            data += part
-            if len(data) > most:
-                raise TooLarge(f"holds more than {most} bytes")
+    try:
+        with path.open("rb") as file:
+            while part := file.read(_STEP_BYTES):  # read(most) would allocate all of it at once
+                data += part
+                if len(data) > most:
+                    raise kind(beyond, where=path)
+    except OSError as error:
+        raise kind(f"cannot be read: {error.strerror}", where=path) from None
     return bytes(data)
 
 
@@ -57,7 +61,8 @@ def replacing(path: Path) -> Iterator[Path]:
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        os.chmod(temporary, 0o666 & ~_umask())
+        os.umask(mask := os.umask(0))  # which cannot be asked for otherwise
+        os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, path)
     except BaseException as error:
         if temporary is not None:
@@ -66,12 +71,6 @@ def replacing(path: Path) -> Iterator[Path]:
             reason = error.strerror or (str(error).splitlines() or ["the disk refuses"])[-1]
             raise OutputError(f"cannot be written: {reason}", where=path) from None
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def make_folder(path: Path) -> Path:
@@ -173,11 +172,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a document, its texts without what a terminal would obey. Raises SourceError where the file is missing, too
     large, or not a JSON object."""
     try:
-        document = parse_json(read_bounded(path, _MAX_BYTES).decode("utf-8"))
-    except TooLarge:
-        raise SourceError("is larger than 50 MB", where=path) from None
-    except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+        document = parse_json(read_bounded(path, _MAX_BYTES, "is larger than 50 MB").decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise SourceError(f"is damaged: {str(error).splitlines()[0]}", where=path) from None
     if not isinstance(document, dict):
@@ -214,11 +209,10 @@ def _whole(text: str) -> int:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Settings of a file. Raises GpvoError where it cannot be read."""
+    data = read_bounded(path, _MAX_TOML_BYTES, "is larger than 200 kB, too large for settings", GpvoError)
     try:
-        return parse_toml(read_bounded(path, _MAX_TOML_BYTES).decode("utf-8-sig"))
-    except TooLarge:
-        raise GpvoError("is larger than 200 kB, too large for settings", where=path) from None
-    except (OSError, ValueError, RecursionError) as problem:
+        return parse_toml(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as problem:
         raise GpvoError(f"cannot be read as TOML: {problem}", where=path) from None
 
 

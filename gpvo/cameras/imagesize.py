@@ -37,15 +37,10 @@ def is_plausible(size: Size | None) -> bool:
     return size is not None and max(size) <= MAX_SIDE_PX and size[0] * size[1] <= MAX_PIXELS
 
 
-def is_decodable(raw: bytes | memoryview) -> bool:
-    """Whether encoded bytes are an image, of a size and of chunks that a decoder may be given."""
-    return is_plausible(image_size(raw)) and is_whole(raw)
-
-
 def decoded(raw: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
     """Encoded bytes as OpenCV decodes them with these ``flags``; None where they are no image, or claim to be larger
     than any."""
-    if not is_decodable(raw.data):
+    if not (is_plausible(image_size(raw.data)) and is_whole(raw.data)):
         return None
     import cv2
 

@@ -16,7 +16,7 @@ import yaml
 from gpvo.cameras.models import CameraModel, KannalaBrandt, PinholeRadtan
 from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import CalibrationError
-from gpvo.files import TooLarge, read_bounded
+from gpvo.files import read_bounded
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuNoise
 
@@ -53,12 +53,8 @@ for _tag in ("tag:yaml.org,2002:opencv-matrix", "!opencv-matrix"):
 
 def calibration_text(path: Path) -> str:
     """The text of a file. Raises CalibrationError where it cannot be read, or is too large for a calibration."""
-    try:
-        return read_bounded(path, _MAX_BYTES).decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
-    except TooLarge:
-        raise CalibrationError("too large for a calibration", where=path) from None
-    except OSError as error:
-        raise CalibrationError(f"cannot be read: {error.strerror}", where=path) from None
+    data = read_bounded(path, _MAX_BYTES, "too large for a calibration", CalibrationError)
+    return data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -110,14 +110,6 @@ class Rectifier:
         cx, cy = centre - shift
         return float(cx), float(cy)
 
-    def _sample_points(self, lens: CameraModel, R_rect: Array, rows: slice) -> tuple[Array, NDArray[np.bool_]]:
-        """Where each virtual pixel of some rows lies in the raw image: (n, W, 2) px, and whether the lens sees it."""
-        c = self.camera
-        u, v = np.meshgrid(np.arange(c.width), np.arange(c.height)[rows])
-        rays = np.stack([(u - c.cx_px) / c.fx_px, (v - c.cy_px) / c.fy_px, np.ones(u.shape)], axis=-1)
-        uv, valid = lens.project(rays.reshape(-1, 3) @ R_rect)
-        return uv.reshape(*u.shape, 2), valid.reshape(u.shape)
-
     def _make_maps(self) -> tuple[list[_Map], list[NDArray[np.bool_] | None]]:
         maps: list[_Map] = []
         seen: list[NDArray[np.bool_] | None] = []
@@ -136,8 +128,11 @@ class Rectifier:
         self, lens: CameraModel, R: Array, mask: NDArray[np.bool_] | None, rows: slice
     ) -> tuple[NDArray[np.int16], NDArray[np.uint16], NDArray[np.bool_]]:
         """The map of some rows, and which of their pixels show anything."""
-        uv, valid = self._sample_points(lens, R, rows)
-        uv = np.where(valid[..., None], uv, -10.0)
+        c = self.camera
+        u, v = np.meshgrid(np.arange(c.width), np.arange(c.height)[rows])
+        rays = np.stack([(u - c.cx_px) / c.fx_px, (v - c.cy_px) / c.fy_px, np.ones(u.shape)], axis=-1)
+        uv, valid = lens.project(rays.reshape(-1, 3) @ R)
+        uv = np.where(valid[:, None], uv, -10.0).reshape(*u.shape, 2)
         x, y = uv[..., 0], uv[..., 1]
         inside = (x >= _BORDER_PX) & (x <= lens.width - 1 - _BORDER_PX)
         inside &= (y >= _BORDER_PX) & (y <= lens.height - 1 - _BORDER_PX)

@@ -43,7 +43,20 @@ class StereoRig:
     where: str | None = None
 
     def __post_init__(self) -> None:
-        check_rig(self)
+        """Raise CalibrationError for a rig that cannot exist: baseline absent, too long, pointing the wrong way or not
+        sideways; cameras turned apart; lenses that do not belong together; intrinsics outside the image."""
+        for name, lens, mask in (("left", self.left, self.mask_left), ("right", self.right, self.mask_right)):
+            _check_lens(lens, name, self.where)
+            if mask is not None and mask.shape != (lens.height, lens.width):
+                text = f"the {name} mask is {mask.shape[1]}x{mask.shape[0]}, the camera {lens.width}x{lens.height}"
+                raise CalibrationError(text, where=self.where)
+        check_pose(self.T_right_left, "T_right_left", self.where)
+        _check_baseline(self)
+        a, b = self.left.fx_px, self.right.fx_px
+        if max(a, b) / min(a, b) > MAX_FOCAL_RATIO:
+            text = f"focal lengths of {a:.1f} px and {b:.1f} px do not make a stereo pair"
+            cure = "are these two cameras of one rig, calibrated at one resolution?"
+            raise CalibrationError(text, where=self.where, cure=cure)
 
     @property
     def baseline_m(self) -> float:
@@ -115,24 +128,6 @@ def mean_view(T_right_left: Array) -> tuple[Array, Array]:
     half = se3.so3_exp(0.5 * se3.so3_log(T_right_left[:3, :3]))
     right = half @ (-T_right_left[:3, :3].T @ T_right_left[:3, 3])
     return half, right / np.linalg.norm(right)
-
-
-def check_rig(rig: StereoRig) -> None:
-    """Raise CalibrationError for a rig that cannot exist: baseline absent, too long, pointing the wrong way or not
-    sideways; cameras turned apart; lenses that do not belong together; intrinsics outside the image."""
-    for name, lens in (("left", rig.left), ("right", rig.right)):
-        _check_lens(lens, name, rig.where)
-    check_pose(rig.T_right_left, "T_right_left", rig.where)
-    _check_baseline(rig)
-    ratio = max(rig.left.fx_px, rig.right.fx_px) / min(rig.left.fx_px, rig.right.fx_px)
-    if ratio > MAX_FOCAL_RATIO:
-        text = f"focal lengths of {rig.left.fx_px:.1f} px and {rig.right.fx_px:.1f} px do not make a stereo pair"
-        cure = "are these two cameras of one rig, calibrated at one resolution?"
-        raise CalibrationError(text, where=rig.where, cure=cure)
-    for name, mask, lens in (("left", rig.mask_left, rig.left), ("right", rig.mask_right, rig.right)):
-        if mask is not None and mask.shape != (lens.height, lens.width):
-            text = f"the {name} mask is {mask.shape[1]}x{mask.shape[0]}, the camera {lens.width}x{lens.height}"
-            raise CalibrationError(text, where=rig.where)
 
 
 def _check_lens(lens: CameraModel, name: str, where: str | None) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from itertools import groupby
@@ -48,11 +48,9 @@ class Groups(TyperGroup):
                 formatter.write_dl([(name, (c.help or "").split("\n\n")[0].strip()) for name, c in commands])
 
 
-Config = Annotated[
-    Path | None, typer.Option(help="TOML file of options, one table per command. The command line takes precedence.")
-]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Also print settings, time and memory.")]
+Config = Annotated[Path | None, "TOML file of options, one table per command. The command line takes precedence."]
+Quiet = Annotated[bool, "-q", "--quiet", "No progress and no notes."]
+Verbose = Annotated[bool, "-v", "--verbose", "Also print settings, time and memory."]
 _OPTIONS = {"config": (Config, None), "quiet": (Quiet, False), "verbose": (Verbose, False)}
 
 
@@ -65,25 +63,50 @@ def with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         with output.loudness(quiet=quiet, verbose=verbose):
             output.detail(", ".join(f"{k.rstrip('_')}={v}" for k, v in given.items() if isinstance(v, _PLAIN)))
             for name, group in groups.items():
-                given[name] = group(**{f.name: given.pop(f.name) for f in fields(group)})
+                given[name] = _made(group, given)
             return function(**given)
 
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     own: list[inspect.Parameter] = []
     for name, p in inspect.signature(function).parameters.items():
-        if name in groups:
-            kinds = get_type_hints(groups[name], include_extras=True)
-            own += [_option(f.name, kinds[f.name], f.default) for f in fields(groups[name])]
-        else:
-            own.append(_option(name, hints[name], p.default))
+        own += _options(groups[name]) if name in groups else [_option(name, hints[name], p.default)]
     more = [_option(name, kind, default) for name, (kind, default) in _OPTIONS.items()]
     command.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in (*own, *more)}
     return command
 
 
+def _options(group: Any) -> Iterator[inspect.Parameter]:
+    """Of the fields of a dataclass that have a help, and of those of dataclasses in it."""
+    for name, kind, default in _asked(group):
+        yield from _options(kind) if is_dataclass(kind) else [_option(name, kind, default)]
+
+
+def _made(group: Any, given: dict[str, Any]) -> Any:
+    """The dataclass, of what was given."""
+    asked = _asked(group)
+    return group(**{name: _made(kind, given) if is_dataclass(kind) else given.pop(name) for name, kind, _ in asked})
+
+
+def _asked(group: Any) -> list[tuple[str, Any, Any]]:
+    hints = get_type_hints(group, include_extras=True)
+    found = [
+        (f.name, hints[f.name], inspect.Parameter.empty if f.default is MISSING else f.default) for f in fields(group)
+    ]
+    return [(name, kind, d) for name, kind, d in found if hasattr(kind, "__metadata__") or is_dataclass(kind)]
+
+
 def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    """``kind``: typer's own annotation, or a type annotated with its help: before it may stand its words, if they are
+    not its name, and after it what else typer is told. Without words, what has no default is an argument, but for
+    ``out``, and a flag has no opposite."""
+    told = getattr(kind, "__metadata__", ())
+    if texts := [text for text in told if isinstance(text, str)]:
+        words, more = texts[:-1], {"help": texts[-1], **next((m for m in told if isinstance(m, dict)), {})}
+        is_argument = not words and default is inspect.Parameter.empty and name != "out"
+        words = words or [*(["-o"] if name == "out" else []), f"--{name.rstrip('_').replace('_', '-')}"]
+        kind = Annotated[kind.__origin__, typer.Argument(**more) if is_argument else typer.Option(*words, **more)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
@@ -129,25 +152,22 @@ def options_of_file(path: Path, name: str, commands: Mapping[str, Any]) -> list[
     return words
 
 
-Kind = Annotated[str | None, typer.Option("--source", help="Format of the sequence; guessed by default.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run, once the new one is complete.")]
+Kind = Annotated[str | None, "--source", "Format of the sequence; guessed by default."]
+Overwrite = Annotated[bool, "Replace a finished run, once the new one is complete."]
 
 
 @dataclass(frozen=True)
 class ViewOptions:
     """How images are paired, read and rectified: options that go to :func:`gpvo.io.open_source`."""
 
-    hfov_deg: Annotated[float | None, typer.Option(help="Field of view of the virtual pinhole pair [deg].")] = None
-    size: Annotated[str | None, typer.Option(help="Size of the rectified images, WIDTHxHEIGHT.")] = None
-    mask_left: Annotated[Path | None, typer.Option(help="Mask image for the left lens: which pixels may be used.")] = (
-        None
-    )
-    mask_right: Annotated[Path | None, typer.Option(help="The same for the right lens.")] = None
+    hfov_deg: Annotated[float | None, "Field of view of the virtual pinhole pair [deg]."] = None
+    size: Annotated[str | None, "Size of the rectified images, WIDTHxHEIGHT."] = None
+    mask_left: Annotated[Path | None, "Mask image for the left lens: which pixels may be used."] = None
+    mask_right: Annotated[Path | None, "The same for the right lens."] = None
     tolerance_s: Annotated[
-        float | None,
-        typer.Option("--pair-tolerance", help="Largest difference between the stamps of a stereo pair [s]."),
+        float | None, "--pair-tolerance", "Largest difference between the stamps of a stereo pair [s]."
     ] = None
-    bits: Annotated[int | None, typer.Option(help="Bits in use per sample of 16-bit images, e.g. 12.")] = None
+    bits: Annotated[int | None, "Bits in use per sample of 16-bit images, e.g. 12."] = None
 
     def given(self) -> dict[str, Any]:
         """Those that were given, parsed. Raises GpvoError if a size is not WIDTHxHEIGHT."""
@@ -163,52 +183,22 @@ class ViewOptions:
 class SequenceOptions(ViewOptions):
     """How a sequence is read."""
 
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file to use instead of the one found.")] = None
-    left_topic: Annotated[str | None, typer.Option(help="Topic of the left images in a bag.")] = None
-    right_topic: Annotated[str | None, typer.Option(help="Topic of the right images in a bag.")] = None
-    rate_hz: Annotated[
-        float | None, typer.Option(help="Frame rate of an image folder whose file names are numbers.")
-    ] = None
-    imu_topic: Annotated[str | None, typer.Option(help="Topic of the IMU in a bag.")] = None
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag; none to ignore it.")] = (
-        None
-    )
-    truth_frame: Annotated[str | None, typer.Option(help="Frame of the poses in the truth topic: imu or cam.")] = None
-
-
-@dataclass(frozen=True)
-class WireOptions:
-    """How messages of a running system come in."""
-
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="ROS 2 over Zenoh, without ROS (extra gpvo[ros]).")] = False
-    dds: Annotated[bool, typer.Option("--dds", help="ROS 2 over DDS, without ROS (extra gpvo[ros]).")] = False
-    ros2: Annotated[bool, typer.Option("--ros2", help="ROS 2 through rclpy, where it is installed.")] = False
-    ros1: Annotated[bool, typer.Option("--ros1", help="ROS 1 through rospy, where it is installed.")] = False
-    address: Annotated[
-        str | None, typer.Option(help="Zenoh router, e.g. tcp/127.0.0.1:7447; default: the local one.")
-    ] = None
-    domain: Annotated[int, typer.Option(help="ROS domain id, for --zenoh and --dds.", min=0, max=232)] = 0
-
-    def transport(self) -> str | None:
-        """The one that was chosen, None if none was. Raises GpvoError if several were."""
-        flags = {"zenoh": self.zenoh, "dds": self.dds, "ros2": self.ros2, "ros1": self.ros1}
-        chosen = [name for name, is_on in flags.items() if is_on]
-        if len(chosen) > 1:
-            raise GpvoError(f"--{' and --'.join(chosen)} are mutually exclusive", cure="choose one")
-        return chosen[0] if chosen else None
+    calibration: Annotated[Path | None, "Calibration file to use instead of the one found."] = None
+    left_topic: Annotated[str | None, "Topic of the left images in a bag."] = None
+    right_topic: Annotated[str | None, "Topic of the right images in a bag."] = None
+    rate_hz: Annotated[float | None, "Frame rate of an image folder whose file names are numbers."] = None
+    imu_topic: Annotated[str | None, "Topic of the IMU in a bag."] = None
+    truth_topic: Annotated[str | None, "Topic of the ground truth in a bag; none to ignore it."] = None
+    truth_frame: Annotated[str | None, "Frame of the poses in the truth topic: imu or cam."] = None
 
 
 @dataclass(frozen=True)
 class VehicleOptions:
     """What carries the camera."""
 
-    vehicle: Annotated[
-        str, typer.Option("--vehicle", help="What carries the camera: car, rover, multirotor, handheld or any.")
-    ] = "any"
-    max_acceleration: Annotated[
-        float | None, typer.Option(help="Largest acceleration [m/s^2], overriding --vehicle.")
-    ] = None
-    max_turn: Annotated[float | None, typer.Option(help="Largest angular acceleration [rad/s^2], likewise.")] = None
+    vehicle: Annotated[str, "What carries the camera: car, rover, multirotor, handheld or any."] = "any"
+    max_acceleration: Annotated[float | None, "Largest acceleration [m/s^2], overriding --vehicle."] = None
+    max_turn: Annotated[float | None, "Largest angular acceleration [rad/s^2], likewise."] = None
 
     def bounds(self) -> Vehicle:
         """Those of the kind of vehicle, or the ones given to override them.
@@ -226,48 +216,35 @@ class VehicleOptions:
 class OdometryOptions:
     """Settings of gpvo's own odometry. A model knows only the odometry that it was trained on."""
 
-    preset: Annotated[str, typer.Option(help="Settings of the odometry: fast or thesis.")] = "fast"
-    methods: Annotated[str, typer.Option(help="Covariances: triangulation, pointing_matching, spherical.")] = (
+    preset: Annotated[str, "Settings of the odometry: fast or thesis."] = "fast"
+    methods: Annotated[str, "Covariances: triangulation, pointing_matching, spherical."] = (
         "triangulation,pointing_matching"
     )
-    sigma_p: Annotated[str, typer.Option(help="Pointing noise [px], or auto (estimated from the residuals).")] = "0.1"
-    sigma_m: Annotated[str, typer.Option(help="Matching noise [px], or auto.")] = "0.5"
-    sigma: Annotated[float, typer.Option(help="Pixel noise of the triangulation method [px].")] = 1.0
-    min_inliers: Annotated[int, typer.Option(help="A motion with fewer inliers is lost; at least 4.")] = 8
-    weak_inliers: Annotated[int, typer.Option(help="A motion with fewer inliers is degraded.")] = 20
-    window: Annotated[int, typer.Option(help="Frames adjusted together (slower); 2 estimates each motion alone.")] = 2
+    sigma_p: Annotated[str, "Pointing noise [px], or auto (estimated from the residuals)."] = "0.1"
+    sigma_m: Annotated[str, "Matching noise [px], or auto."] = "0.5"
+    sigma: Annotated[float, "Pixel noise of the triangulation method [px]."] = 1.0
+    min_inliers: Annotated[int, "A motion with fewer inliers is lost; at least 4."] = 8
+    weak_inliers: Annotated[int, "A motion with fewer inliers is degraded."] = 20
+    window: Annotated[int, "Frames adjusted together (slower); 2 estimates each motion alone."] = 2
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the odometry (gpvo.vo.config.VoConfig)."),
+        list[str] | None, "--set", "Any setting of the odometry (gpvo.vo.config.VoConfig).", {"metavar": "NAME=VALUE"}
     ] = None
     self_calibration: Annotated[
         bool | None,
-        typer.Option(help="Estimate calibration errors in flight. On by default, except with --preset thesis."),
+        "--self-calibration/--no-self-calibration",
+        "Estimate calibration errors in flight. On by default, except with --preset thesis.",
     ] = None
     calibration_state: Annotated[
-        Path | None,
-        typer.Option(
-            help="Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
-        ),
+        Path | None, "Start from the calibration errors of an earlier run: its folder, or its calibration_state.json."
     ] = None
 
     def config(self, vehicle: Vehicle) -> VoConfig:
         """The settings, parsed. Raises GpvoError for an unknown one, or a value out of its range."""
         from gpvo.vo.config import make_config, read_settings
 
-        shorthand = {
-            **asdict(vehicle),
-            "methods": self.methods,
-            "sigma_px": self.sigma,
-            "sigma_p_px": self.sigma_p,
-            "sigma_m_px": self.sigma_m,
-            "min_inliers": self.min_inliers,
-            "weak_inliers": self.weak_inliers,
-            "window": self.window,
-        }
-        if self.self_calibration is not None:
-            shorthand["self_calibration"] = self.self_calibration
-        texts = [*(f"{k}={v}" for k, v in shorthand.items()), *(self.settings or ())]
+        own = {k: v for k, v in vars(self).items() if k not in ("preset", "settings", "calibration_state")}
+        shorthand = {f"{k}_px" if k.startswith("sigma") else k: v for k, v in own.items() if v is not None}
+        texts = [*(f"{k}={v}" for k, v in (asdict(vehicle) | shorthand).items()), *(self.settings or ())]
         return make_config(self.preset, **read_settings(texts))
 
     def state(self, camera: StereoCamera) -> RigState | None:

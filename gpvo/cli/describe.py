@@ -147,23 +147,17 @@ def _model(path: Path) -> dict[str, Any]:
 
     _, header = modelfile.load(path)
     try:
-        return _of_header(header)
+        learned = {name: m.get("learned") or {} for name, m in (header.get("scores") or {}).items()}
+        return {
+            "what": "model",
+            **{key: header.get(key) for key in ("target", "frame", "rate_hz", "base_method", "camera", "features")},
+            "trained_on": [s["name"] for s in header.get("sequences") or []],
+            "nees_dof_left_out": {name: m.get("nees_dof", {}).get("joint") for name, m in learned.items()},
+            "versions": header.get("versions"),
+            "header": header,
+        }
     except (AttributeError, KeyError, TypeError):
         raise ModelError("its header is damaged", where=path) from None
-
-
-def _of_header(header: dict[str, Any]) -> dict[str, Any]:
-    scores = header.get("scores") or {}
-    return {
-        "what": "model",
-        **{key: header.get(key) for key in ("target", "frame", "rate_hz", "base_method", "camera", "features")},
-        "trained_on": [s["name"] for s in header.get("sequences") or []],
-        "nees_dof_left_out": {
-            name: (m.get("learned") or {}).get("nees_dof", {}).get("joint") for name, m in scores.items()
-        },
-        "versions": header.get("versions"),
-        "header": header,
-    }
 
 
 def _is_safetensors(path: Path) -> bool:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, cell, new_table, numbers, print_json, progress, say, show
+from gpvo.cli.output import Json, cell, numbers, print_json, progress, say, show
 from gpvo.cli.twin import Seed, TwinOptions, Twins, make_all, say_simulated
 from gpvo.errors import GpvoError
 from gpvo.files import in_metres
@@ -27,30 +27,21 @@ if TYPE_CHECKING:
     from gpvo.evaluation.pictures import MatchPicture
     from gpvo.twin.replicate import TwinSettings
 
-Runs = Annotated[list[Path], typer.Argument(help="Run folders.")]
+Runs = Annotated[list[Path], "Run folders."]
 
 
 @dataclass(frozen=True)
 class JudgeOptions:
     """How runs are judged."""
 
-    model: Annotated[
-        Path | None, typer.Option(help="Error model: adds the rows constant, scaled, gp_thesis, base and learned.")
-    ] = None
-    truth: Annotated[
-        Path | None, typer.Option(help="Ground truth (TUM lines, left camera) to use instead of the run's own.")
-    ] = None
-    segments: Annotated[
-        str | None, typer.Option(help="Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800.")
-    ] = None
+    model: Annotated[Path | None, "Error model: adds the rows constant, scaled, gp_thesis, base and learned."] = None
+    truth: Annotated[Path | None, "Ground truth (TUM lines, left camera) to use instead of the run's own."] = None
+    segments: Annotated[str | None, "Segment lengths [m]; default: 10,20,50,100, over 800 m 100 to 800."] = None
     truth_sigma: Annotated[
-        str | None,
-        typer.Option(help="Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."),
+        str | None, "Noise of the truth per pose: metres[,radians]; 0 for none. Estimated by default."
     ] = None
-    align: Annotated[
-        str, typer.Option(help="Fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
-    ] = "none"
-    time_offset: Annotated[str, typer.Option(help="Seconds to add to the log's clock, or auto.")] = "0"
+    align: Annotated[str, "Fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = "none"
+    time_offset: Annotated[str, "Seconds to add to the log's clock, or auto."] = "0"
 
     def options(self) -> EvaluateOptions:
         """The flags, parsed."""
@@ -72,13 +63,9 @@ def evaluate(
     ctx: typer.Context,
     runs: Runs,
     judge: JudgeOptions = JudgeOptions(),
-    plots: Annotated[Path | None, typer.Option(help="Folder for plots, as PNG and PDF, one set per run.")] = None,
-    tables: Annotated[
-        Path | None, typer.Option(help="Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX).")
-    ] = None,
-    stated: Annotated[
-        Path | None, typer.Option(help="Folder for the stated covariances of each method, as files for gpvo score.")
-    ] = None,
+    plots: Annotated[Path | None, "Folder for plots, as PNG and PDF, one set per run."] = None,
+    tables: Annotated[Path | None, "Folder for trajectories (TUM, for evo) and tables (CSV, LaTeX)."] = None,
+    stated: Annotated[Path | None, "Folder for the stated covariances of each method, as files for gpvo score."] = None,
     twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
@@ -132,10 +119,10 @@ def _write_files(e: Evaluation, name: str, *, stated: Path | None, tables: Path 
 
 def report(
     runs: Runs,
-    out: Annotated[Path, typer.Option("-o", "--out", help="HTML file to write.")] = Path("report.html"),
+    out: Annotated[Path, "HTML file to write."] = Path("report.html"),
     judge: JudgeOptions = JudgeOptions(),
-    frames: Annotated[str | None, typer.Option(help="Also show the matches of these frames, e.g. 5,80.")] = None,
-    sequence: Annotated[Path | None, typer.Option(help="The sequence of the run, for --frames.")] = None,
+    frames: Annotated[str | None, "Also show the matches of these frames, e.g. 5,80."] = None,
+    sequence: Annotated[Path | None, "The sequence of the run, for --frames."] = None,
 ) -> None:
     """Write a report: one HTML page that opens with a verdict.
 
@@ -261,7 +248,7 @@ def _print_methods(d: dict[str, Any]) -> None:
     sigma = d["truth_sigma"]
     noisy = bool(sigma["translation_m"] or sigma["rotation_rad"])
     given = ("+truth", "1 s", "coverage", "NLL", "stated")
-    table = new_table("method", "NEES", "interval", *given[0 if noisy else 1 :])
+    rows = []
     for method, m in d["methods"].items():
         block = "joint" if m["nees_dof"]["joint"] is not None else "translation"
         if m["nees_dof"][block] is None:
@@ -275,10 +262,10 @@ def _print_methods(d: dict[str, Any]) -> None:
             m["nll_stated_per_dim"],
         )
         cells = [cell(c) for c in rest[0 if noisy else 1 :]]
-        table.add_row(method, cell(m["nees_dof"][block]), f"{cell(low, 2)}-{cell(high, 2)}", *cells)
-    if not table.row_count:
+        rows.append([method, cell(m["nees_dof"][block]), f"{cell(low, 2)}-{cell(high, 2)}", *cells])
+    if not rows:
         return
-    show(table)
+    show(("method", "NEES", "interval", *given[0 if noisy else 1 :]), rows)
     say("NEES: per degree of freedom, for one motion; 1 is right. _vt: for the translation alone.")
     say("1 s: over a second. coverage [%]: within 1, 2, 3 sigma.")
     say("NLL: nats per axis, as a Gaussian; stated: under the stated density, where it has heavier tails.")
@@ -288,12 +275,12 @@ def _print_methods(d: dict[str, Any]) -> None:
 
 
 def _print_pooled(pooled: dict[str, Any], runs: int) -> None:
-    table = new_table("method", "NLL", "interval", "NEES", "interval")
+    rows = []
     for method, scores in pooled.items():
-        cells = []
+        cells = [method]
         for s in (scores["nll_per_dim"], scores["nees_dof"]):
             cells += [cell(s["mean"]), "-" if s["low"] is None else f"{cell(s['low'])} to {cell(s['high'])}"]
-        table.add_row(method, *cells)
-    if table.row_count:
+        rows.append(cells)
+    if rows:
         say(f"mean of the {runs} runs" + ("" if runs > 2 else ": too few for an interval"))
-        show(table)
+        show(("method", "NLL", "interval", "NEES", "interval"), rows)

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 
 from gpvo.cli import common as options
 from gpvo.cli.describe import as_lines, describe
-from gpvo.cli.output import Json, note, numbers, one_of, print_json, progress
+from gpvo.cli.output import Json, answer, note, numbers, one_of, progress
 from gpvo.dataset.clock import estimate_time_offset
 from gpvo.dataset.errors import interpolate_truth
 from gpvo.dataset.hand_eye import FixedTransform, align_frames
@@ -132,7 +131,7 @@ def _frame(log: ForeignLog) -> str:
 
 
 def info(
-    path: Annotated[Path, typer.Argument(help="Sequence, run folder, trajectory, calibration, bag or model.")],
+    path: Annotated[Path, "Sequence, run folder, trajectory, calibration, bag or model."],
     kind: options.Kind = None,
     reading: options.SequenceOptions = options.SequenceOptions(),
     json_: Json = False,
@@ -143,52 +142,39 @@ def info(
     """
     with progress("files", 1):
         document = plain(describe(path, kind, reading.given()))
-    if json_:
-        print_json({"schema": 1, "path": str(path), **document})
-    else:
-        document.pop("header", None)  # of a model: hundreds of lines, for --json
-        print("\n".join([str(path), *as_lines(document, "  ")]))
+    short = {k: v for k, v in document.items() if k != "header"}  # of a model: hundreds of lines, for --json
+    whole = {"schema": 1, "path": str(path), **document}
+    answer(json_, whole, lambda: print("\n".join([str(path), *as_lines(short, "  ")])))
 
 
 def import_(
-    log: Annotated[Path, typer.Argument(help="Trajectory, CSV or bag of another odometry.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
-    truth: Annotated[Path | None, typer.Option(help="Ground truth: a trajectory, CSV or bag.")] = None,
-    format_: Annotated[str | None, typer.Option("--format", help="tum, kitti, csv or bag; guessed by default.")] = None,
-    truth_format: Annotated[str | None, typer.Option(help="The same for the ground truth.")] = None,
-    map_: Annotated[
-        list[str] | None,
-        typer.Option("--map", metavar="COLUMN=NAME", help="Columns of a CSV, e.g. var_x=cov_00."),
-    ] = None,
+    log: Annotated[Path, "Trajectory, CSV or bag of another odometry."],
+    out: Annotated[Path, "Run folder to write."],
+    truth: Annotated[Path | None, "Ground truth: a trajectory, CSV or bag."] = None,
+    format_: Annotated[str | None, "tum, kitti, csv or bag; guessed by default."] = None,
+    truth_format: Annotated[str | None, "The same for the ground truth."] = None,
+    map_: Annotated[list[str] | None, "Columns of a CSV, e.g. var_x=cov_00.", {"metavar": "COLUMN=NAME"}] = None,
     truth_map: Annotated[
-        list[str] | None, typer.Option(metavar="COLUMN=NAME", help="The same for a CSV of the ground truth.")
+        list[str] | None, "The same for a CSV of the ground truth.", {"metavar": "COLUMN=NAME"}
     ] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic of the odometry in a bag.")] = None,
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
-    times: Annotated[
-        Path | None, typer.Option(help="File of stamps in seconds, one line per pose, for KITTI poses.")
-    ] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Frame rate, for KITTI poses without stamps.")] = None,
+    topic: Annotated[str | None, "Topic of the odometry in a bag."] = None,
+    truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
+    times: Annotated[Path | None, "File of stamps in seconds, one line per pose, for KITTI poses."] = None,
+    rate_hz: Annotated[float | None, "Frame rate, for KITTI poses without stamps."] = None,
     frame: Annotated[
         str,
-        typer.Option(
-            help="Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
-            "name contains optical; cam for a file."
-        ),
+        "Frame of the poses: cam (left optical frame), body (FLU), or auto: body for a bag, unless its frame "
+        "name contains optical; cam for a file.",
     ] = "auto",
     align: Annotated[
         str,
-        typer.Option(
-            help="Fit a fixed transform between log and truth: rotation, transform (with lever arm, and the truth's "
-            "attitudes against its positions) or none."
-        ),
+        "Fit a fixed transform between log and truth: rotation, transform (with lever arm, and the truth's "
+        "attitudes against its positions) or none.",
     ] = "none",
-    time_offset: Annotated[str, typer.Option(help="Seconds to add to the stamps of the log, or auto.")] = "0",
-    truth_sigma: Annotated[str | None, typer.Option(help="White noise of the truth per pose, METRES,RADIANS.")] = None,
-    covariance_of: Annotated[
-        str, typer.Option(help="Whether the covariances in a CSV are of poses or motions.")
-    ] = "pose",
-    covariance_axes: Annotated[str, typer.Option(help="Axes of the covariances in a CSV: world or body.")] = "world",
+    time_offset: Annotated[str, "Seconds to add to the stamps of the log, or auto."] = "0",
+    truth_sigma: Annotated[str | None, "White noise of the truth per pose, METRES,RADIANS."] = None,
+    covariance_of: Annotated[str, "Whether the covariances in a CSV are of poses or motions."] = "pose",
+    covariance_axes: Annotated[str, "Axes of the covariances in a CSV: world or body."] = "world",
     vehicle: options.VehicleOptions = options.VehicleOptions(),
     overwrite: options.Overwrite = False,
     json_: Json = False,
@@ -224,10 +210,7 @@ def import_(
             vehicle=vehicle.bounds(),
             overwrite=overwrite,
         )
-    if json_:
-        print_json({"schema": 1, "run": str(out), **summary.__dict__})
-    else:
-        print(f"{out}: {summary}")
+    answer(json_, {"schema": 1, "run": str(out), **vars(summary)}, lambda: print(f"{out}: {summary}"))
 
 
 def _mapping(option: str, texts: list[str]) -> dict[str, str]:

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from gpvo.cli.common import refuse_twice
-from gpvo.cli.output import Json, one_of, print_json, progress, say
+from gpvo.cli.output import Json, answer, one_of, print_json, progress, say
 from gpvo.cli.twin import Seed, TwinOptions, Twins, in_place_of_runs_without_truth, say_simulated
+from gpvo.publish import PublishSettings
 
 
 def fuse(
     ctx: typer.Context,
-    runs: Annotated[list[Path], typer.Argument(help="Run folders to filter.")],
-    model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the runs.")] = None,
+    runs: Annotated[list[Path], "Run folders to filter."],
+    model: Annotated[Path | None, "Error model; default: predictions stored in the runs."] = None,
     train: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="<path>", help="Training run for the constants; repeatable. Default: the model's."),
+        list[Path] | None, "Training run for the constants; repeatable. Default: the model's.", {"metavar": "<path>"}
     ] = None,
-    policies: Annotated[str, typer.Option(help="Policies to compare, comma-separated; all by default.")] = "",
-    init: Annotated[str, typer.Option(help="Start from the truth, or at rest (static).")] = "truth",
-    gate: Annotated[
-        str, typer.Option(help="What to do with a measurement beyond 3 sigma: discard or inflate.")
-    ] = "discard",
-    no_imu: Annotated[bool, typer.Option("--no-imu", help="Use a constant-velocity model instead of the IMU.")] = False,
+    policies: Annotated[str, "Policies to compare, comma-separated; all by default."] = "",
+    init: Annotated[str, "Start from the truth, or at rest (static)."] = "truth",
+    gate: Annotated[str, "What to do with a measurement beyond 3 sigma: discard or inflate."] = "discard",
+    no_imu: Annotated[bool, "Use a constant-velocity model instead of the IMU."] = False,
     twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     seed: Seed = 1,
-    plot: Annotated[Path | None, typer.Option(help="Write a plot of all policies to this image.")] = None,
-    log: Annotated[Path | None, typer.Option(help="Folder for innovations, NIS and rejections, as CSV.")] = None,
+    plot: Annotated[Path | None, "Write a plot of all policies to this image."] = None,
+    log: Annotated[Path | None, "Folder for innovations, NIS and rejections, as CSV."] = None,
     json_: Json = False,
 ) -> None:
     """Fuse VO with an IMU, once with each covariance.
@@ -94,54 +92,20 @@ def fuse(
             say("With fewer than three runs there is no interval.")
 
 
-@dataclass(frozen=True)
-class PublishOptions:
-    """What is published, and where to."""
-
-    to: Annotated[str | None, typer.Option(help="bag (default), mcap or mavlink.")] = None
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", help="File or folder to write; a suffix .bag (ROS 1), .mcap or .tlog stands in for --to."
-        ),
-    ] = None
-    link: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None
-    model: Annotated[Path | None, typer.Option(help="Error model; default: predictions stored in the run.")] = None
-    method: Annotated[str, typer.Option(help="Geometric covariance to use where there is no prediction.")] = (
-        "pointing_matching"
-    )
-    topic: Annotated[str, typer.Option(help="Topic of the odometry.")] = "/gpvo/odometry"
-    system: Annotated[int, typer.Option(help="MAVLink system id of the vehicle.")] = 1
-    consumer: Annotated[
-        str | None,
-        typer.Option(help="For --check: px4, ardupilot, robot_localization or fusioncore; default: px4 for MAVLink."),
-    ] = None
-    check: Annotated[
-        bool,
-        typer.Option(
-            "--check", help="Report what the consumer will do with the messages; writes a file only with --to or -o."
-        ),
-    ] = False
-
-
 def publish(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
-    options: PublishOptions = PublishOptions(),
+    run: Annotated[Path, "Run folder."],
+    options: PublishSettings = PublishSettings(),
     json_: Json = False,
 ) -> None:
     """Write messages for robot_localization, PX4, ArduPilot and FusionCore.
 
     Example: gpvo publish runs/flight7 --to mavlink -o flight7.tlog --consumer px4 --check
     """
-    from gpvo.publish.job import PublishSettings, publish_run
+    from gpvo.publish.job import publish_run
 
     with progress("runs", 1):
-        result = publish_run(run, PublishSettings(**vars(options)))
-    if json_:
-        print_json(result.document())
-    else:
-        for line in str(result).splitlines():
-            say(line)
+        result = publish_run(run, options)
+    answer(json_, result.document(), lambda: list(map(say, str(result).splitlines())))
 
 
 def _tell(what: str) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpvo.cli.common import is_given, refuse_twice
-from gpvo.cli.output import Json, cell, new_table, note, print_json, progress, say, show
+from gpvo.cli.output import Json, cell, note, print_json, progress, say, show
 from gpvo.cli.twin import TwinOptions, Twins, in_place_of_runs_without_truth
 from gpvo.dataset.errors import made_from_odometry, motion_errors, outweighed_by_truth
 from gpvo.errors import GpvoError
@@ -24,50 +24,43 @@ if TYPE_CHECKING:
 
 _MOST_COLUMNS = 3  # of folds: more do not fit into 80 columns
 
-Runs = Annotated[list[Path], typer.Argument(help="Run folders with ground truth, or one file of training rows.")]
+Runs = Annotated[list[Path], "Run folders with ground truth, or one file of training rows."]
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     """What is learned, from which rows; a model that is updated keeps its own."""
 
-    features: Annotated[str, typer.Option(help="auto, thesis, full, or a list of groups and columns.")] = "auto"
-    target: Annotated[str, typer.Option(help="frame, window:1s, length:1m or position.")] = "frame"
-    regressor: Annotated[
-        str, typer.Option(help="Regressor for --target position: auto, exact, sparse, svgp or sklearn.")
-    ] = "auto"
-    align: Annotated[
-        str, typer.Option(help="First fit between log and truth: a fixed rotation, transform (with lever arm) or none.")
-    ] = "none"
-    waits: Annotated[
-        str,
-        typer.Option("--stationary", "--waits", help="Motions where truth wanders at rest, or jumps: drop or keep."),
-    ] = "drop"
-    odd: Annotated[
-        str, typer.Option(help="Stretches where odometry and truth differ far more than elsewhere: keep or drop.")
-    ] = "keep"
-    max_rows: Annotated[int, typer.Option(min=1000, help="Rows held in memory; more are streamed in blocks.")] = 100_000
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0
+    features: Annotated[str, "auto, thesis, full, or a list of groups and columns."] = "auto"
+    target: Annotated[str, "frame, window:1s, length:1m or position."] = "frame"
+    regressor: Annotated[str, "Regressor for --target position: auto, exact, sparse, svgp or sklearn."] = "auto"
+    align: Annotated[str, "First fit between log and truth: a fixed rotation, transform (with lever arm) or none."] = (
+        "none"
+    )
+    waits: Annotated[str, "--stationary", "--waits", "Motions where truth wanders at rest, or jumps: drop or keep."] = (
+        "drop"
+    )
+    odd: Annotated[str, "Stretches where odometry and truth differ far more than elsewhere: keep or drop."] = "keep"
+    max_rows: Annotated[int, "Rows held in memory; more are streamed in blocks.", {"min": 1000}] = 100_000
+    seed: Annotated[int, "Random seed."] = 0
 
 
 def train(
     ctx: typer.Context,
     runs: Runs,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Model file to write.")],
+    out: Annotated[Path, "Model file to write."],
     options: TrainOptions = TrainOptions(),
     update: Annotated[
-        Path | None,
-        typer.Option(help="Add the runs to the training rows of this model and train again, with its settings."),
+        Path | None, "Add the runs to the training rows of this model and train again, with its settings."
     ] = None,
     twins: Twins = False,
     twin_options: TwinOptions = TwinOptions(),
     statements: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the covariances that each method states for the runs left out, for gpvo score."),
+        Path | None, "Folder for the covariances that each method states for the runs left out, for gpvo score."
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Folds to fit in parallel; -1 for all cores.")] = 1,
-    backend: Annotated[str, typer.Option(help="local or dask.")] = "local",
-    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
+    jobs: Annotated[int, "Folds to fit in parallel; -1 for all cores."] = 1,
+    backend: Annotated[str, "local or dask."] = "local",
+    scheduler: Annotated[str | None, "Address of a Dask scheduler."] = None,
     json_: Json = False,
 ) -> None:
     """Train an error model; score it by leaving each run out.
@@ -185,6 +178,7 @@ def _train(
     paths: list[Path], settings: dict[str, Any], update: Path | None, on_fit: OnFit, noisy: list[str]
 ) -> TrainedModel:
     """``noisy`` gets the names of runs whose truth cannot judge single motions."""
+    from gpvo.dataset.table import write_sets
     from gpvo.learning import store
     from gpvo.learning import train as learning
     from gpvo.learning.config import TrainConfig
@@ -204,25 +198,13 @@ def _train(
         return learning.train_position([config.rows_of(r) for r in runs], config)
     if update is not None:
         return store.update(update, runs, config, tell=lambda what: note(f"gpvo: {what}"), on_fit=on_fit)
-    if _frames(paths) > config.max_rows:
-        return _train_streaming(runs, config, on_fit)
+    frames = (read_meta(p).get("frames") or 0 for p in paths if (p / "run.json").is_file())  # as the runs say
+    if sum(map(int, frames)) > config.max_rows:
+        # They do not fit into memory together: their rows pass through a file, one run at a time.
+        with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
+            write_sets(rows := Path(folder) / "rows.parquet", map(config.rows_of, runs))
+            return store.train_stored(rows, config, on_fit=on_fit)
     return learning.train(runs, config, on_fit=on_fit)
-
-
-def _frames(paths: list[Path]) -> int:
-    """How many frames the runs say they have."""
-    return sum(int(read_meta(p).get("frames") or 0) for p in paths if (p / "run.json").is_file())
-
-
-def _train_streaming(runs: Iterator[Run], config: TrainConfig, on_fit: OnFit) -> TrainedModel:
-    """Runs that do not fit into memory together: their rows pass through a file, one run at a time."""
-    from gpvo.dataset.table import write_sets
-    from gpvo.learning.store import train_stored
-
-    with tempfile.TemporaryDirectory(prefix="gpvo-") as folder:
-        rows = Path(folder) / "rows.parquet"
-        write_sets(rows, map(config.rows_of, runs))
-        return train_stored(rows, config, on_fit=on_fit)
 
 
 def _print_table(document: dict[str, Any]) -> None:
@@ -231,7 +213,7 @@ def _print_table(document: dict[str, Any]) -> None:
         return
     few = len(document["folds"]) <= _MOST_COLUMNS
     columns = [str(k + 1) for k in range(len(document["folds"]))] if few else ["least", "most"]
-    table = new_table("method", *columns, "mean", "median", "1 sig", "NLL", "stated")
+    rows = []
     for method, mean in document["mean"].items():
         per_fold = [_nees(f["methods"][method]["nees_dof"]) for f in document["folds"]]
         rest = [_nees(mean["nees_dof"]), _nees(mean["nees_dof_median"]), mean["coverage"]["1"]]
@@ -239,13 +221,13 @@ def _print_table(document: dict[str, Any]) -> None:
         if not few and (known := [v for v in per_fold if v is not None]):
             per_fold = [min(known), max(known)]
         if any(v is not None for v in (*per_fold, *rest)):
-            table.add_row(method, *(cell(v) for v in (*per_fold, *rest)))
+            rows.append([method, *(cell(v) for v in (*per_fold, *rest))])
     what = (
         "run" if document.get("folds_are") != "time blocks" else "part of one run (this says nothing about other runs)"
     )
     say(f"NEES per degree of freedom on each {what} left out (1 is right), then means")
     say(", ".join(f"{k + 1}: {f['held_out']} ({f['rows']} rows)" for k, f in enumerate(document["folds"])))
-    show(table)
+    show(("method", *columns, "mean", "median", "1 sig", "NLL", "stated"), rows)
     say("1 sig: share within 1 sigma (0.68 is right). NLL: nats per axis, as a Gaussian, lower is better;")
     say("stated: under the stated density, where it has heavier tails. _vt: for the translation alone.")
     at_rest, odd = (

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from gpvo.cli import common as flags
 from gpvo.cli.files import import_log
-from gpvo.cli.output import one_of, print_json, say
+from gpvo.cli.output import answer, one_of, print_json, say
 from gpvo.errors import GpvoError, printable
 from gpvo.io.foreign import ForeignLog, read_foreign
 from gpvo.io.run import read_run
+from gpvo.live import POSE_TYPE_NAMES, LiveSettings, WireSettings
 from gpvo.types import IMPORTED, Vehicle
 
 if TYPE_CHECKING:
@@ -21,93 +21,27 @@ if TYPE_CHECKING:
 
 
 def live(
-    model: Annotated[Path, typer.Option(help="Error model of this camera, or of this odometry.")],
-    stereo: Annotated[tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Topics of the images.")] = None,
-    imu: Annotated[
-        str | None, typer.Option(help="Topic of the IMU, with --stereo; .../gyro/... is joined by .../accel/....")
-    ] = None,
-    odometry: Annotated[
-        str | None, typer.Option(help="Topic of another odometry, to be republished with an honest covariance.")
-    ] = None,
-    odometry_type: Annotated[
-        str, typer.Option(help="Type of that topic: odometry, pose (PoseWithCovarianceStamped) or pose_stamped.")
-    ] = "odometry",
-    truth: Annotated[
-        str | None, typer.Option(help="Topic of delayed ground truth (mocap, tags); the covariance adapts to it.")
-    ] = None,
-    truth_type: Annotated[str, typer.Option(help="Type of that topic: pose, odometry or pose_stamped.")] = "pose",
-    replay: Annotated[Path | None, typer.Option(help="Replay a bag instead of listening to a transport.")] = None,
-    fast: Annotated[bool, typer.Option("--fast", help="Replay as fast as possible.")] = False,
-    wire: flags.WireOptions = flags.WireOptions(),
-    mavlink: Annotated[str | None, typer.Option(help="Send MAVLink to udp:HOST:PORT or serial:DEVICE:BAUD.")] = None,
-    px4: Annotated[
-        bool, typer.Option("--px4", help="Also send px4_msgs/VehicleOdometry, for PX4 over uXRCE-DDS.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Write a new bag, in parts until the end: .bag, .mcap or a ROS 2 folder."),
-    ] = None,
-    topic: Annotated[str, typer.Option(help="Topic on which the odometry is published.")] = "/gpvo/odometry",
-    pose_topic: Annotated[str | None, typer.Option(help="Also publish PoseWithCovarianceStamped here.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration; default: CameraInfo beside the images.")] = (
-        None
-    ),
-    base_frame: Annotated[
-        str | None,
-        typer.Option(help="Publish the odometry of this robot frame, located through /tf_static and /tf."),
-    ] = None,
-    pose_covariance: Annotated[
-        str, typer.Option(help="accumulated (since the start) or increment (the last motion).")
-    ] = ("accumulated"),
-    state: Annotated[
-        Path | None, typer.Option(help="File that keeps the state, so that a restart continues from it.")
-    ] = None,
+    asked: LiveSettings,
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     vo: flags.OdometryOptions = flags.OdometryOptions(),
     view: flags.ViewOptions = flags.ViewOptions(),
-    depth: Annotated[int, typer.Option(help="Queue length per topic; older messages are dropped.", min=2)] = 10,
-    json_: Annotated[bool, typer.Option("--json", help="Print the counts as JSON at the end.")] = False,
+    depth: Annotated[int, "Queue length per topic; older messages are dropped.", {"min": 2}] = 10,
+    json_: Annotated[bool, "Print the counts as JSON at the end."] = False,
 ) -> None:
     """Publish odometry with an honest covariance, live.
 
     Example: gpvo live --odometry /vins_estimator/odometry --model vins.gpvo --zenoh
     """
-    from gpvo.live.engine import EngineSettings
-    from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings, run_live
+    from gpvo.live.job import run_live
 
-    one_of("--odometry-type", odometry_type, POSE_TYPE_NAMES)
+    one_of("--odometry-type", asked.odometry_type, POSE_TYPE_NAMES)
     carrier = vehicle.bounds()
-    one_of("--pose-covariance", pose_covariance, ("accumulated", "increment"))
-    result = run_live(
-        LiveSettings(
-            model=model,
-            stereo=stereo,
-            vo=_stereo_settings(vo, carrier, stereo is not None, view.given()),
-            imu=imu,
-            odometry=odometry,
-            pose_type=POSE_TYPE_NAMES[odometry_type],
-            truth=truth,
-            truth_type=POSE_TYPE_NAMES[one_of("--truth-type", truth_type, POSE_TYPE_NAMES)],
-            calibration=calibration,
-            base_frame=base_frame,
-            replay=replay,
-            fast=fast,
-            wire=wire.transport(),
-            address=wire.address,
-            domain=wire.domain,
-            mavlink=mavlink,
-            px4=px4,
-            out=out,
-            topic=topic,
-            pose_topic=pose_topic,
-            depth=depth,
-            engine=EngineSettings(pose_covariance == "increment", state, carrier),
-        )
-    )
-    if json_:
-        print_json({"schema": 1, **result})
-    else:
-        print(", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received")
+    one_of("--pose-covariance", asked.pose_covariance, ("accumulated", "increment"))
+    stereo = _stereo_settings(vo, carrier, asked.stereo is not None, view.given())
+    one_of("--truth-type", asked.truth_type, POSE_TYPE_NAMES)
+    result = run_live(replace(asked, vo=stereo, vehicle=carrier, depth=depth))
+    told = ", ".join(f"{name} {n}" for name, n in result["counts"].items()) or "nothing received"
+    answer(json_, {"schema": 1, **result}, lambda: print(told))
 
 
 def _stereo_settings(
@@ -122,27 +56,21 @@ def _stereo_settings(
 
 
 def doctor(
-    source: Annotated[str, typer.Argument(metavar="TOPIC|BAG", help="A bag, or a topic of a running system.")],
-    topic: Annotated[str | None, typer.Option(help="Topic in a bag; default: all that hold poses.")] = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="Ground truth of the same body, a file or a bag: adds the NEES (bags only).")
-    ] = None,
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the ground truth in a bag.")] = None,
-    align: Annotated[
-        str,
-        typer.Option(help="Fit a fixed transform between bag and truth, as gpvo import does."),
-    ] = "none",
-    wire: flags.WireOptions = flags.WireOptions(),
-    odometry_type: Annotated[str, typer.Option(help="Type of a topic: odometry, pose, or pose_stamped.")] = "odometry",
-    seconds: Annotated[float, typer.Option(help="How long to listen.", min=1.0)] = 10.0,
-    json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    source: Annotated[str, "A bag, or a topic of a running system.", {"metavar": "TOPIC|BAG"}],
+    topic: Annotated[str | None, "Topic in a bag; default: all that hold poses."] = None,
+    truth: Annotated[Path | None, "Ground truth of the same body, a file or a bag: adds the NEES (bags only)."] = None,
+    truth_topic: Annotated[str | None, "Topic of the ground truth in a bag."] = None,
+    align: Annotated[str, "Fit a fixed transform between bag and truth, as gpvo import does."] = "none",
+    wire: WireSettings = WireSettings(),
+    odometry_type: Annotated[str, "Type of a topic: odometry, pose, or pose_stamped."] = "odometry",
+    seconds: Annotated[float, "How long to listen.", {"min": 1.0}] = 10.0,
+    json_: Annotated[bool, "Print the findings as JSON."] = False,
 ) -> None:
     """Check anyone's covariance, and what each filter would do with it.
 
     Example: gpvo doctor flight.mcap --truth mocap.tum
     """
     from gpvo.live.doctor import examine_bag, examine_topic
-    from gpvo.live.job import POSE_TYPE_NAMES
 
     transport = wire.transport()
     one_of("--align", align, ("none", "rotation", "transform"))

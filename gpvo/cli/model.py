@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from gpvo.cli.output import Json, new_table, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, print_json, progress, say, show
 from gpvo.errors import GpvoError
 from gpvo.files import make_folder, replacing, write_csv
 from gpvo.io.parquet import write_table
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 _LINES = 11  # of the table of a forecast
 _TOLD = ("t_s", "distance_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_m")
 
-Model = Annotated[Path, typer.Argument(help="Model file.")]
+Model = Annotated[Path, "Model file."]
 
 
 def predict(
     model: Model,
-    runs: Annotated[list[Path], typer.Argument(help="Run folders.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Parquet file to write; for several runs, a folder.")],
+    runs: Annotated[list[Path], "Run folders."],
+    out: Annotated[Path, "Parquet file to write; for several runs, a folder."],
     json_: Json = False,
 ) -> None:
     """Predict the error of every motion of a run.
@@ -81,7 +81,7 @@ def _summary(predictions: list[Prediction]) -> dict[str, Any]:
     }
 
 
-def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")], json_: Json = False) -> None:
+def check(model: Model, run: Annotated[Path, "Run folder."], json_: Json = False) -> None:
     """Check whether a model fits a camera and its conditions.
 
     Exits with 1 if it does not.
@@ -109,12 +109,10 @@ def check(model: Model, run: Annotated[Path, typer.Argument(help="Run folder.")]
 
 def export(
     model: Model,
-    to: Annotated[str | None, typer.Option(help="onnx or c; guessed from the suffix of --out.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write; by default beside the model.")] = None,
+    to: Annotated[str | None, "onnx or c; guessed from the suffix of --out."] = None,
+    out: Annotated[Path | None, "File to write; by default beside the model."] = None,
     for_filter: Annotated[bool, typer.Option("--for-filter", hidden=True)] = False,
-    prefix: Annotated[
-        str, typer.Option(help="Prefix of every C symbol, so that several models fit into one program.")
-    ] = "gpvo",
+    prefix: Annotated[str, "Prefix of every C symbol, so that several models fit into one program."] = "gpvo",
 ) -> None:
     """Export a model to ONNX or to one C header.
 
@@ -132,17 +130,14 @@ def export(
 
 def forecast(
     model: Model,
-    path: Annotated[Path, typer.Option("--path", help="Planned poses, TUM lines at any spacing.")],
-    frame: Annotated[
-        str, typer.Option(help="Frame of the poses: cam (left camera, z forward) or body (FLU, camera forward).")
-    ] = "cam",
+    path: Annotated[Path, "--path", "Planned poses, TUM lines at any spacing."],
+    frame: Annotated[str, "Frame of the poses: cam (left camera, z forward) or body (FLU, camera forward)."] = "cam",
     draws: Annotated[
-        int,
-        typer.Option(min=1, max=1000, help="Simulated flights along the plan, each in different conditions."),
+        int, "Simulated flights along the plan, each in different conditions.", {"min": 1, "max": 1000}
     ] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    plot: Annotated[Path | None, typer.Option(help="PNG to write: top view, and sigma over distance.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Every pose, as .parquet or .csv.")] = None,
+    seed: Annotated[int, "Random seed.", {"min": 0}] = 0,
+    plot: Annotated[Path | None, "PNG to write: top view, and sigma over distance."] = None,
+    out: Annotated[Path | None, "Every pose, as .parquet or .csv."] = None,
     json_: Json = False,
 ) -> None:
     """Predict the covariance along a planned path.
@@ -163,10 +158,7 @@ def forecast(
 
         with replacing(plot) as temporary:
             plots.forecast(found, path.name).savefig(temporary, dpi=110, format="png")
-    if json_:
-        print_json(_forecast_document(found, model, path, frame))
-    else:
-        _print_forecast(found, path)
+    answer(json_, _forecast_document(found, model, path, frame), lambda: _print_forecast(found, path))
 
 
 def _forecast_document(f: Forecast, model: Path, path: Path, frame: str) -> dict[str, Any]:
@@ -218,8 +210,9 @@ def _print_forecast(f: Forecast, path: Path) -> None:
             f"  {o.feature}: planned {a[0]:.3g} to {a[1]:.3g}, trained {b[0]:.3g} to {b[1]:.3g}"
             f" ({100 * o.share:.0f} % beyond)"
         )
-    table = new_table("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]")
-    for row in _rows(f):
-        table.add_row(f"{row['t_s']:.1f}", f"{row['distance_m']:.1f}", *(f"{v:.3g}" for v in list(row.values())[2:]))
-    show(table)
+    numbers = (list(row.values()) for row in _rows(f))
+    show(
+        ("time [s]", "path [m]", "sigma x [m]", "sigma y [m]", "sigma z [m]", "all three [m]"),
+        ([f"{t_s:.1f}", f"{path_m:.1f}", *(f"{v:.3g}" for v in sigmas)] for t_s, path_m, *sigmas in numbers),
+    )
     say("1 sigma of the position relative to the first pose, in the axes of the plan's world")

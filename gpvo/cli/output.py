@@ -10,17 +10,12 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import Annotated, Any
 
 from gpvo.errors import GpvoError
 from gpvo.files import plain
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Json = Annotated[bool, "Print the result as JSON."]
 _MOST = 1e10  # of any number on a command line: metres, seconds
 _loud = {"quiet": False, "verbose": False}
 
@@ -67,26 +62,28 @@ def say(text: str) -> None:
     print(text if len(text) <= width else textwrap.fill(text, int(width), subsequent_indent=indent))
 
 
-def show(table: Table) -> None:
-    """Print a table as wide as the terminal, 80 columns in a pipe; never narrower, where its numbers would break."""
+def show(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table without rules between its columns, numbers to the right; the first column holds names. It is as
+    wide as the terminal, 80 columns in a pipe; never narrower, where its numbers would break."""
     from rich.console import Console
-
-    Console(width=max(Console().width, 80), highlight=False, markup=False).print(table)
-
-
-def new_table(*columns: str) -> Table:
-    """A table without rules between its columns, numbers to the right; the first column holds names."""
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for k, column in enumerate(columns):
         table.add_column(column, justify="right" if k else "left", overflow="fold", no_wrap=not k)
-    return table
+    for row in rows:
+        table.add_row(*row)
+    Console(width=max(Console().width, 80), highlight=False, markup=False).print(table)
 
 
 def print_json(document: dict[str, Any]) -> None:
     """Print a document as JSON, for scripts."""
     print(json.dumps(plain(document), indent=2))
+
+
+def answer(as_json: bool, document: dict[str, Any], told: Callable[[], object]) -> None:
+    """Print a result: the document for scripts, or as people are ``told`` it."""
+    print_json(document) if as_json else told()
 
 
 def one_of(option: str, value: str, choices: Iterable[str]) -> str:

@@ -5,30 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
-from gpvo.cli.output import Json, print_json, progress
+from gpvo.cli.output import Json, answer, progress
 
 
 def reproduce(
-    out: Annotated[
-        Path,
-        typer.Option("-o", "--out", help="Folder for results. Finished stages are kept, so a second run continues."),
-    ],
-    quick: Annotated[bool, typer.Option("--quick", help="One seed with images, flights of 20 s.")] = False,
-    seeds: Annotated[int | None, typer.Option(min=0, help="Test seeds with images [5, quick: 1].")] = None,
-    points_seeds: Annotated[
-        int | None, typer.Option(min=0, help="Further test seeds without images [20, quick: 6].")
-    ] = None,
-    data: Annotated[
-        Path | None, typer.Option(envvar="GPVO_DATA", help="Folder of real data: flown_paths/, tracks, logs.")
-    ] = None,
-    only: Annotated[
-        str | None, typer.Option(help="Tables or rows to make, such as 4.3,4.1-clean; all by default.")
-    ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes; -1: one per core.")] = -1,
-    backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
-    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
+    out: Annotated[Path, "Folder for results. Finished stages are kept, so a second run continues."],
+    quick: Annotated[bool, "One seed with images, flights of 20 s."] = False,
+    seeds: Annotated[int | None, "Test seeds with images [5, quick: 1].", {"min": 0}] = None,
+    points_seeds: Annotated[int | None, "Further test seeds without images [20, quick: 6].", {"min": 0}] = None,
+    data: Annotated[Path | None, "Folder of real data: flown_paths/, tracks, logs.", {"envvar": "GPVO_DATA"}] = None,
+    only: Annotated[str | None, "Tables or rows to make, such as 4.3,4.1-clean; all by default."] = None,
+    jobs: Annotated[int, "Processes; -1: one per core."] = -1,
+    backend: Annotated[str, "local, or dask."] = "local",
+    scheduler: Annotated[str | None, "Address of a dask scheduler."] = None,
     json_: Json = False,
 ) -> None:
     """Reproduce every experiment of the thesis.
@@ -45,10 +34,7 @@ def reproduce(
     chosen = {k: v for k, v in given.items() if v is not None}
     plan = Plan.quick(**chosen) if quick else Plan(**chosen)
     result = run(plan, out, Workers(jobs, backend, scheduler, progress))
-    if json_:
-        print_json(result)
-    else:
-        _print_tables(result, out)
+    answer(json_, result, lambda: _print_tables(result, out))
 
 
 def _print_tables(result: dict[str, Any], out: Path) -> None:

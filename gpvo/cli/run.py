@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from gpvo.cli import common as flags
 from gpvo.cli.output import Json, note, print_json, progress
 from gpvo.errors import SourceError
@@ -27,18 +25,16 @@ _MUCH_LEFT = 1 / 3  # of a displacement: with 0.4 left, drive 0001 of KITTI drif
 
 
 def run(
-    source: Annotated[Path, typer.Argument(help="EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder to write.")],
-    model: Annotated[Path | None, typer.Option(help="Error model: store a prediction with each frame.")] = None,
+    source: Annotated[Path, "EuRoC, TUM-VI or KITTI folder, bag, image folder or tracks."],
+    out: Annotated[Path, "Run folder to write."],
+    model: Annotated[Path | None, "Error model: store a prediction with each frame."] = None,
     odometry: flags.OdometryOptions = flags.OdometryOptions(),
     vehicle: flags.VehicleOptions = flags.VehicleOptions(),
     kind: flags.Kind = None,
     reading: flags.SequenceOptions = flags.SequenceOptions(),
-    keep_tracks: Annotated[
-        bool, typer.Option("--keep-tracks", help="Keep the tracks of the points; 'gpvo twin' needs them.")
-    ] = False,
-    view: Annotated[bool, typer.Option("--view", help="Watch the run live in rerun (extra gpvo[viz]).")] = False,
-    record_view: Annotated[Path | None, typer.Option(help="Write what --view would show to this .rrd file.")] = None,
+    keep_tracks: Annotated[bool, "Keep the tracks of the points; 'gpvo twin' needs them."] = False,
+    view: Annotated[bool, "Watch the run live in rerun (extra gpvo[viz])."] = False,
+    record_view: Annotated[Path | None, "Write what --view would show to this .rrd file."] = None,
     overwrite: flags.Overwrite = False,
     json_: Json = False,
 ) -> None:
@@ -100,8 +96,8 @@ def _tell(out: Path, summary: RunSummary, notes: Sequence[str], json_: bool) -> 
 
 
 def calibration(
-    run: Annotated[Path, typer.Argument(help="Run folder of gpvo run.")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Corrected Kalibr camera chain to write.")] = None,
+    run: Annotated[Path, "Run folder of gpvo run."],
+    out: Annotated[Path | None, "Corrected Kalibr camera chain to write."] = None,
     json_: Json = False,
 ) -> None:
     """Print the calibration errors that a run found; write a corrected calibration.

@@ -5,26 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from gpvo.cli.common import refuse_twice
 from gpvo.cli.evaluate import JudgeOptions
-from gpvo.cli.output import Json, cell, new_table, print_json, progress, say, show
+from gpvo.cli.output import Json, answer, cell, progress, say, show
 from gpvo.errors import GpvoError
 
 
 def score(
-    stated: Annotated[
-        list[Path], typer.Argument(help="Files of stated motions (or CSV), one per sequence; or one folder of methods.")
-    ],
+    stated: Annotated[list[Path], "Files of stated motions (or CSV), one per sequence; or one folder of methods."],
     truth: Annotated[
-        list[Path] | None,
-        typer.Option("--truth", metavar="<path>", help="TUM poses of the same camera, in the same order."),
+        list[Path] | None, "TUM poses of the same camera, in the same order.", {"metavar": "<path>"}
     ] = None,
-    truth_sigma: Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians].")] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="With a folder of methods: write METHOD.json and board.csv here.")
-    ] = None,
+    truth_sigma: Annotated[str | None, "Noise of the truth per pose: metres[,radians]."] = None,
+    out: Annotated[Path | None, "With a folder of methods: write METHOD.json and board.csv here."] = None,
     json_: Json = False,
 ) -> None:
     """Score anyone's stated covariances from files alone.
@@ -35,8 +28,8 @@ def score(
 
     Example: gpvo score mine/00.txt mine/02.txt --truth gt/00.txt --truth gt/02.txt
     """
-    from gpvo.evaluation.score import board, on_other_axes, score_folder, write_board
     from gpvo.evaluation.score import score as score_files
+    from gpvo.evaluation.score import score_folder, write_board
 
     refuse_twice(stated)
     truth = truth or []
@@ -46,44 +39,38 @@ def score(
             methods = score_folder(stated[0], options)
         if out is not None:
             write_board(methods, out)
-        if json_:
-            print_json({"schema": 1, "methods": list(methods.values())})
-        else:
-            _print_board(board(methods))
-            for method, axes in on_other_axes(methods).items():
-                say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
+        answer(json_, {"schema": 1, "methods": list(methods.values())}, lambda: _print_board(methods))
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
     with progress("files", 1):
         found = score_files(list(zip(stated, truth)), options)
-    if json_:
-        print_json(found)
-    else:
-        _print(found)
+    answer(json_, found, lambda: _print(found))
 
 
 _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10 m and 100 m; 1 is right."
 
 
-def _print_board(columns: dict[str, list[Any]]) -> None:
-    table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
-    for row in zip(*columns.values()):
-        name, *numbers = row  # NEES and shares to two digits: the table fits 80 columns
-        table.add_row(name, *map(cell, numbers[:3]), *(cell(v, 2) for v in numbers[3:]))
-    show(table)
+def _print_board(methods: dict[str, dict[str, Any]]) -> None:
+    from gpvo.evaluation.score import board, on_other_axes
+
+    head = ("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
+    rows = zip(*board(methods).values())  # NEES and shares to two digits: the table fits 80 columns
+    show(head, ([row[0], *map(cell, row[1:4]), *(cell(v, 2) for v in row[4:])] for row in rows))
     say(_LEGEND)
     say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
+    for method, axes in on_other_axes(methods).items():
+        say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
 
 
 def _print(found: dict[str, Any]) -> None:
-    table = new_table("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
+    rows = []
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
         over = (s["nees_dof_over"][name] for name in ("1s", "10m", "100m"))
         numbers = (*energy, s["nll_per_dim"], s["nees_dof"], *over)
-        table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers))
-    show(table)
+        rows.append([s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers)])
+    show(("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m"), rows)
     say(_LEGEND)
     pooled = found["pooled"]
     if pooled["nees_dof"]["low"] is None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpvo.cli.output import Json, print_json, progress
+from gpvo.cli.output import Json, answer, progress
 from gpvo.errors import GpvoError
 from gpvo.files import parse_toml
 
@@ -21,43 +21,28 @@ _SEED_LIMIT = 100_000
 
 def simulate(
     scenario: Annotated[str | None, typer.Argument(help="Name of a scenario (see --list), or a TOML file.")] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder to write; with --points, a .npz file.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed; default 0, or the one in the TOML file.")
-    ] = None,
-    seeds: Annotated[
-        str | None, typer.Option(help="Several seeds, such as 0..9 or 1,4,7; each flight goes to OUT/seed_N.")
-    ] = None,
-    duration: Annotated[float | None, typer.Option(help="Length of the flight [s].")] = None,
-    rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
-    speed: Annotated[float | None, typer.Option(help="Speed [m/s].")] = None,
+    out: Annotated[Path | None, "Folder to write; with --points, a .npz file."] = None,
+    seed: Annotated[int | None, "Random seed; default 0, or the one in the TOML file.", {"min": 0}] = None,
+    seeds: Annotated[str | None, "Several seeds, such as 0..9 or 1,4,7; each flight goes to OUT/seed_N."] = None,
+    duration: Annotated[float | None, "Length of the flight [s]."] = None,
+    rate: Annotated[float | None, "Frames per second."] = None,
+    speed: Annotated[float | None, "Speed [m/s]."] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Path to fly, scaled to fit the world: TUM lines or EuRoC CSV, z up, or a run.")
+        Path | None, "Path to fly, scaled to fit the world: TUM lines or EuRoC CSV, z up, or a run."
     ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(help="pinhole, euroc, t265, a Kalibr, OpenCV, ROS or KITTI file, or a run."),
-    ] = None,
+    camera: Annotated[str | None, "pinhole, euroc, t265, a Kalibr, OpenCV, ROS or KITTI file, or a run."] = None,
     like: Annotated[
-        Path | None,
-        typer.Option(
-            help="Run folder with tracks: fly its path, with its camera, rate, depths, track count and noise."
-        ),
+        Path | None, "Run folder with tracks: fly its path, with its camera, rate, depths, track count and noise."
     ] = None,
-    points: Annotated[
-        bool, typer.Option("--points", help="Landmark tracks instead of images: a thousand times faster.")
-    ] = False,
-    jobs: Annotated[int, typer.Option(help="Flights to simulate in parallel with --seeds; -1 for one per core.")] = 1,
-    threads: Annotated[int, typer.Option(min=1, help="Threads per flight; they do not change the result.")] = 2,
-    backend: Annotated[str, typer.Option(help="local, or dask.")] = "local",
-    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler.")] = None,
-    preview: Annotated[Path | None, typer.Option(help="Write a contact sheet of the images (PNG).")] = None,
-    list_: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
+    points: Annotated[bool, "Landmark tracks instead of images: a thousand times faster."] = False,
+    jobs: Annotated[int, "Flights to simulate in parallel with --seeds; -1 for one per core."] = 1,
+    threads: Annotated[int, "Threads per flight; they do not change the result.", {"min": 1}] = 2,
+    backend: Annotated[str, "local, or dask."] = "local",
+    scheduler: Annotated[str | None, "Address of a dask scheduler."] = None,
+    preview: Annotated[Path | None, "Write a contact sheet of the images (PNG)."] = None,
+    list_: Annotated[bool, "List the scenarios."] = False,
     set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Setting of the scenario, with dots for tables; repeatable."),
+        list[str] | None, "Setting of the scenario, with dots for tables; repeatable.", {"metavar": "KEY=VALUE"}
     ] = None,
     json_: Json = False,
 ) -> None:
@@ -124,14 +109,12 @@ def _tell(scenario: Scenario, flights: list[Flight], json_: bool, preview: Path 
         from gpvo.sim.sequence import contact_sheet
 
         contact_sheet(good[0].path, preview)
-    if json_:
-        print_json(
-            {"schema": 1, "scenario": scenario.name, "flights": [f.__dict__ | {"path": str(f.path)} for f in flights]}
-        )
-    else:
-        for f in flights:
-            what = f.error or f"{f.frames} frames, {f.distance_m:.1f} m" + ("" if f.redone else ", already there")
-            print(f"{f.path}: {what}")
+    lines = []
+    for f in flights:
+        what = f.error or f"{f.frames} frames, {f.distance_m:.1f} m" + ("" if f.redone else ", already there")
+        lines.append(f"{f.path}: {what}")
+    document = {"schema": 1, "scenario": scenario.name, "flights": [vars(f) for f in flights]}
+    answer(json_, document, lambda: print(*lines, sep="\n"))
     if len(good) < len(flights):
         raise GpvoError(f"{len(flights) - len(good)} of {len(flights)} flights failed", cure="see the lines above")
 
@@ -140,11 +123,8 @@ def _show_list(json_: bool) -> None:
     from gpvo.sim.scenario import load_scenario, names
 
     known = {name: load_scenario(name).about for name in names()}
-    if json_:
-        print_json({"schema": 1, "scenarios": known})
-        return
-    for name, about in known.items():
-        print(f"{name:16s}{about}")
+    lines = (f"{name:16s}{about}" for name, about in known.items())
+    answer(json_, {"schema": 1, "scenarios": known}, lambda: print(*lines, sep="\n"))
 
 
 def _assignment(text: str) -> tuple[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from gpvo.cli.common import is_given
-from gpvo.cli.output import Json, new_table, note, print_json, progress, say, show
+from gpvo.cli.output import Json, note, print_json, progress, say, show
 from gpvo.dataset.errors import require_attitude
 from gpvo.errors import GpvoError
 from gpvo.io.run import Run, read_run
@@ -27,21 +27,14 @@ if TYPE_CHECKING:
 class TwinOptions:
     """How twins are made."""
 
-    replicates: Annotated[int, typer.Option(min=2, max=1000, help="Twins per run.")] = 8
+    replicates: Annotated[int, "Twins per run.", {"min": 2, "max": 1000}] = 8
     tolerance: Annotated[
         str,
-        typer.Option(
-            "--tolerance",
-            help="Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
-            " with baseline and focal (fractions) and rotation_rad. Each twin draws its own error.",
-        ),
+        "Tolerance of the calibration: none, t265, d455, zed2, oak-d, kitti, euroc, or a TOML file"
+        " with baseline and focal (fractions) and rotation_rad. Each twin draws its own error.",
     ] = "none"
     gap: Annotated[
-        str | None,
-        typer.Option(
-            "--gap",
-            help="By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'.",
-        ),
+        str | None, "By how much real errors exceed those of twins: drives, or the JSON of 'gpvo twin --against'."
     ] = None
 
     def settings(self, seed: int) -> TwinSettings:
@@ -66,30 +59,21 @@ class TwinOptions:
 
 Twins = Annotated[
     bool,
-    typer.Option(
-        "--twins",
-        help="For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run"
-        " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
-    ),
+    "For runs without ground truth, use twins: the runs simulated again from their tracks (gpvo run"
+    " --keep-tracks). 'gpvo evaluate' gives a run that has truth a row 'twin'.",
 ]
 Seed = Annotated[
-    int,
-    typer.Option(
-        min=0, help="Random seed of the twins; not that of 'gpvo train', so a model is judged on other twins."
-    ),
+    int, "Random seed of the twins; not that of 'gpvo train', so a model is judged on other twins.", {"min": 0}
 ]
 
 
 def twin(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders made with --keep-tracks.")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for the twins.")] = None,
-    against: Annotated[
-        bool,
-        typer.Option("--against", help="Compare with the runs' ground truth: real errors over predicted ones."),
-    ] = False,
+    runs: Annotated[list[Path], "Run folders made with --keep-tracks."],
+    out: Annotated[Path | None, "Folder for the twins."] = None,
+    against: Annotated[bool, "Compare with the runs' ground truth: real errors over predicted ones."] = False,
     options: TwinOptions = TwinOptions(),
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    jobs: Annotated[int, typer.Option(help="Twins to make in parallel; -1 for one per core.")] = 1,
+    seed: Annotated[int, "Random seed.", {"min": 0}] = 0,
+    jobs: Annotated[int, "Twins to make in parallel; -1 for one per core."] = 1,
     json_: Json = False,
 ) -> None:
     """Simulate runs again, so that their errors are known.
@@ -131,13 +115,11 @@ def _print_ratios(runs: Sequence[Run], twins: Sequence[Sequence[Path]], json_: b
         each = [{"run": n, "ratio": dict(zip(SPANS, r))} for n, r in zip(names, found)]
         print_json({"schema": 1, "axes": AXES, "runs": each, "pooled": of_all})
         return
-    table = new_table("run", "over", *AXES)
-    for name, of_run in zip(names, found):
-        for span, row in zip(SPANS, of_run):
-            table.add_row(name, span, *(f"{v:.2f}" for v in row))
+    each_run = ((name, span, row) for name, of_run in zip(names, found) for span, row in zip(SPANS, of_run))
+    rows = [[name, span, *(f"{v:.2f}" for v in row)] for name, span, row in each_run]
     for span, m, d in zip(SPANS, mean, spread):
-        table.add_row("all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d)))
-    show(table)
+        rows.append(["all (spread)", span, *(f"{v:.2f} ({w:.2f})" for v, w in zip(m, d))])
+    show(("run", "over", *AXES), rows)
     print("real over predicted error, root mean square; the truth's own noise is taken into account")
 
 

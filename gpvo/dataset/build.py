@@ -4,7 +4,7 @@ split: by sequence, or by time block where there are too few sequences, never by
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -67,15 +67,15 @@ class TrainingSet:
 
     def rows(self, keep: NDArray) -> TrainingSet:
         """A part of the rows."""
-        return replace(
-            self,
-            X=self.X[keep],
-            Y=self.Y[keep],
-            t_ns=self.t_ns[keep],
-            dt_s=self.dt_s[keep],
-            covariances={m: C[keep] for m, C in self.covariances.items()},
-            v_t={m: C[keep] for m, C in self.v_t.items()},
-        )
+        return self.over([self], lambda arrays: arrays[0][keep])
+
+    @classmethod
+    def over(cls, sets: Sequence[TrainingSet], made: Callable[[list[NDArray[Any]]], NDArray[Any]]) -> TrainingSet:
+        """The first set with other rows: each array of a row per motion is ``made`` of those of all the sets, alike."""
+        changed: dict[str, Any] = {n: made([getattr(s, n) for s in sets]) for n in ("X", "Y", "t_ns", "dt_s")}
+        for name in ("covariances", "v_t"):
+            changed[name] = {m: made([getattr(s, name)[m] for s in sets]) for m in getattr(sets[0], name)}
+        return replace(sets[0], **changed)
 
     def supported(self) -> set[str]:
         """Columns that the log knows in at least 95 of 100 rows."""
@@ -216,18 +216,11 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
     return n_lost, slips, np.array(jumps).reshape(-1, 6)
 
 
-def build_run(
-    run: Run,
-    *,
-    columns: Sequence[str] | None = None,
-    target: str = "frame",
-    align: str = "none",
-    waits: str = "drop",
-    odd: str = "keep",
-) -> TrainingSet:
-    """The training set of a run folder. ``align``: see :func:`aligned_truth`."""
+def build_run(run: Run, *, align: str = "none", **how: Any) -> TrainingSet:
+    """The training set of a run folder. ``align``: see :func:`aligned_truth`; ``how``: further arguments of
+    :func:`build`, as ``columns``, ``target``, ``waits`` and ``odd``."""
     truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
-    rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
+    rows = build(run.log, truth, name=run.name, where=run.path, **how)
     return replace(rows, odometry=that_matter(run.settings))
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.errors import MAX_GAP_S, interpolate_truth
+from gpvo.dataset.errors import MAX_GAP_S, interpolate_truth, sizes
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
 from gpvo.types import Array, TruthLog, VoLog
@@ -55,8 +55,7 @@ def on_clock_of_log(truth: TruthLog, offset_s: float) -> TruthLog:
 
 def _amounts(T: Array, ok: NDArray[np.bool_], window: int) -> Array:
     """(2, N - window) angle [rad] and distance [m] over each window; NaN where an end is unknown."""
-    motion = se3.inverse(T[:-window]) @ T[window:]
-    both = np.stack([np.linalg.norm(se3.so3_log(motion[:, :3, :3]), axis=1), np.linalg.norm(motion[:, :3, 3], axis=1)])
+    both = sizes(se3.inverse(T[:-window]) @ T[window:])[::-1]
     return np.where(ok[:-window] & ok[window:], both, np.nan)
 
 

@@ -39,6 +39,11 @@ _NO_TURN_DEG, _TURN_DEG, _STRAIGHT = 1e-3, 5.0, 0.05  # the last: of a path's ex
 _LEAPS, _MOVING = 1.5, 0.25
 
 
+def sizes(motions: Array) -> Array:
+    """(2, M) lengths [m] and angles [rad] of motions (M, 4, 4)."""
+    return np.stack([np.linalg.norm(v, axis=1) for v in (motions[:, :3, 3], se3.so3_log(motions[:, :3, :3]))])
+
+
 def without_held(truth: TruthLog) -> TruthLog:
     """The truth without poses that repeat the one before, to the last digit, while the vehicle moves: motion capture
     that stalls, and slow poses logged at a higher rate, hold the last one.
@@ -54,8 +59,7 @@ def without_held(truth: TruthLog) -> TruthLog:
         return truth
     moved = se3.inverse(T[new[:-1]]) @ T[new[1:]]
     held, judged = np.zeros((2, len(new)), dtype=bool)
-    for step in (moved[:, :3, 3], se3.so3_log(moved[:, :3, :3])):
-        size = np.linalg.norm(step, axis=1)
+    for size in sizes(moved):
         pace, leap = size / np.diff(t_s[new]), size / (t_s[new[1:]] - t_s[new[1:] - 1])
         around = np.maximum(np.append(0.0, pace[:-1]), np.append(pace[1:], 0.0))
         moving = pace > _MOVING * np.quantile(pace, 0.75)

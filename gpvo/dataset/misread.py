@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
-from gpvo.dataset.errors import turn_without_truth_deg
+from gpvo.dataset.errors import sizes, turn_without_truth_deg
 from gpvo.dataset.hand_eye import MIN_MOTIONS, between, fit_fixed_transform, residuals, windowed_motions, windows
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
@@ -133,13 +133,13 @@ def resemblance(log: VoLog, truth: TruthLog) -> Resemblance | None:
         return None
     A, B = between(T, start, end), between(T_world, start, end)
     moves, true_moves = _moves(T, start, end), _moves(T_world, start, end)
-    size = _sizes(B)
+    size = sizes(B)
     if not (moves[0] and true_moves[0]):
-        ratio = float(np.sqrt((_sizes(A)[0] ** 2).sum() / max((size[0] ** 2).sum(), _WRITTEN_M**2)))
+        ratio = float(np.sqrt((sizes(A)[0] ** 2).sum() / max((size[0] ** 2).sum(), _WRITTEN_M**2)))
         one_rests = (moves[0] and ratio > _TIMES_REST) or (true_moves[0] and ratio < 1 / _TIMES_REST)
         return Resemblance(ratio, 1.0, 0.0, 1.0) if one_rests else None
     moving = size > 0.5 * np.sqrt((size**2).mean(axis=1, keepdims=True))
-    scale = float(np.median(_sizes(A)[0, moving[0]] / size[0, moving[0]]))
+    scale = float(np.median(sizes(A)[0, moving[0]] / size[0, moving[0]]))
     A[:, :3, 3] /= max(scale, 1e-12)
     try:
         X = fit_fixed_transform(A, B).T_log_truth
@@ -156,15 +156,10 @@ def resemblance(log: VoLog, truth: TruthLog) -> Resemblance | None:
     return Resemblance(scale, min(motion), min(turn) if (moves & true_moves)[1] else 0.0, max(path))
 
 
-def _sizes(motions: Array) -> Array:
-    """(2, M) lengths [m] and angles [rad] of motions (M, 4, 4)."""
-    return np.stack([np.linalg.norm(v, axis=1) for v in (motions[:, :3, 3], se3.so3_log(motions[:, :3, :3]))])
-
-
 def _moves(T: Array, start: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.bool_]:
     """(2,) whether poses (N, 4, 4) travel, and turn, over windows of more than one frame by more than their noise."""
     half = (start + end) // 2
-    whole, part = (np.sqrt((_sizes(between(T, start, e)) ** 2).mean(axis=1)) for e in (end, half))
+    whole, part = (np.sqrt((sizes(between(T, start, e)) ** 2).mean(axis=1)) for e in (end, half))
     return np.asarray((half > start).all() & (whole > np.maximum(_MOVES * part, _LEAST_MOVES)))
 
 

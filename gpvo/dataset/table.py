@@ -7,7 +7,6 @@ import json
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from gpvo.io.parquet import numbers_of
 from gpvo.types import Array, StereoCamera
 
 SCHEMA = 1
+_STATED = ("name", "target", "counts", "camera", "odometry", "columns", "lost_xi", "lost_jump")  # beside the rows
 
 
 def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
@@ -35,19 +35,11 @@ def write_sets(path: str | Path, sets: Iterable[TrainingSet]) -> None:
             table = _table(i, s)
             pq.write_table(table, Path(folder) / str(i), row_group_size=max(len(s), 1))
             schemas.append(table.schema)
-            about.append(
-                {
-                    "name": s.name,
-                    "target": s.target,
-                    "counts": dict(s.counts),
-                    "camera": None if s.camera is None else asdict(s.camera),
-                    "odometry": dict(s.odometry),
-                    "columns": list(s.columns),
-                    "lost_xi": s.lost_xi.tolist(),
-                    "lost_jump": s.lost_jump.tolist(),
-                }
-            )
-        metadata = {"gpvo": json.dumps({"schema": SCHEMA, "sequences": about}, sort_keys=True)}
+            about.append({name: getattr(s, name) for name in _STATED})
+        document = {"schema": SCHEMA, "sequences": about}
+        metadata = {
+            "gpvo": json.dumps(document, sort_keys=True, default=lambda v: getattr(v, "tolist", lambda: vars(v))())
+        }
         schema = pa.unify_schemas(schemas).with_metadata(metadata)
         with pq.ParquetWriter(whole, schema, compression="zstd") as writer:
             for i in range(len(about)):
@@ -197,7 +189,7 @@ class StoredSets:
             for chunk in self.chunks(i, chunk_rows):
                 parts.append(chunk.rows(kept[start : start + len(chunk)]))
                 start += len(chunk)
-            out.append(_join(parts))
+            out.append(TrainingSet.over(parts, np.concatenate))
         return out
 
 
@@ -218,17 +210,3 @@ def kept_rows(lengths: Sequence[int], max_rows: int) -> list[Any]:
             keep[start : start + size] = True
         out.append(keep)
     return out
-
-
-def _join(parts: Sequence[TrainingSet]) -> TrainingSet:
-    """Pieces of one sequence below one another."""
-    first = parts[0]
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in parts]) for name in ("X", "Y", "t_ns", "dt_s")
-    }
-    return replace(
-        first,
-        **columns,
-        covariances={m: np.concatenate([p.covariances[m] for p in parts]) for m in first.covariances},
-        v_t={m: np.concatenate([p.v_t[m] for p in parts]) for m in first.v_t},
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -166,6 +166,13 @@ def pose_of(message: Any) -> Array:
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         p, q = pose.position, pose.orientation
     return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], dtype=np.float64)
+
+
+def covariances_of(messages: Sequence[Any], name: str) -> Array | None:
+    """(N, 6, 6) covariances of the ``pose`` or ``twist`` of messages, None where their type has none."""
+    if not hasattr(getattr(messages[0], name, None), "covariance"):
+        return None
+    return np.array([getattr(m, name).covariance for m in messages], dtype=np.float64).reshape(-1, 6, 6)
 
 
 def read_poses(

@@ -86,7 +86,10 @@ class BagSource(ImageSource):
     ) -> None:
         if truth_frame not in (None, "imu", "cam"):
             raise SourceError(f"truth frame '{truth_frame}' is neither 'imu' nor 'cam'")
-        chain = Path(calibration) if calibration is not None else _calibration_beside(path)
+        beside = (path, path.parent) if path.is_dir() else (path.parent,)
+        chain = (
+            Path(calibration) if calibration is not None else next(filter(None, map(find_calibration, beside)), None)
+        )
         with open_bag(path) as reader:
             asked = (left_topic, right_topic, imu_topic, truth_topic)
             self._topics = _choose_topics(reader, path, chain, asked, any_truth=truth_frame is not None)
@@ -144,11 +147,6 @@ class BagSource(ImageSource):
         truth = carry(Trajectory(t, T), place, MOTION_CAPTURE if _is_capture(topic) else UNKNOWN)
         check_overlap(truth, self.span_ns, self.path)
         return truth
-
-
-def _calibration_beside(path: Path) -> Path | None:
-    folders = (path, path.parent) if path.is_dir() else (path.parent,)
-    return next((found for folder in folders if (found := find_calibration(folder))), None)
 
 
 def _choose_topics(

@@ -30,7 +30,7 @@ from gpvo.io.trajectory import (
     read_kitti_poses,
     read_times,
 )
-from gpvo.types import Array, ImuLog, ImuNoise, TruthLog
+from gpvo.types import Array, ImuNoise, TruthLog
 
 # Folders with poses, the best first. A laser tracker (leica0) gives positions alone and is no truth of motions.
 _EUROC_TRUTH = (
@@ -60,9 +60,14 @@ class EurocSource(FileSource):
     ) -> None:
         mav = _mav_folder(path)
         rig = _euroc_rig(path, mav, None if calibration is None else Path(calibration))
-        known = SourceReport()
-        super().__init__(path, path.resolve().name, rig, _euroc_pairs(mav, tolerance_s, known), known, **options)
-        self.imu = self._read_imu(mav)
+        known, cameras = SourceReport(), (mav / "cam0", mav / "cam1")
+        left, right = (_read_image_list(camera / "data.csv", known) for camera in cameras)
+        matched = match_nearest(left, right, tolerance_ns(tolerance_s), known, mav)
+        pairs = [PairFiles(t, *(c / "data" / name for c, name in zip(cameras, names))) for t, *names in matched]
+        super().__init__(path, path.resolve().name, rig, pairs, known, **options)
+        if (samples := mav / "imu0" / "data.csv").is_file():
+            noise = _imu_noise(path, mav)
+            self.imu = read_imu_csv(samples, shift_s=rig.timeshift_cam_imu_s, noise=noise, remark=self.remark)
         self.truth = self._read_truth(mav)
         if self.truth is None and (mav / "leica0").is_dir():
             self.remark("leica0 gives positions only: not used as truth of motions")
@@ -71,13 +76,6 @@ class EurocSource(FileSource):
     def recognises(cls, path: Path) -> bool:
         """A folder with ``mav0/cam0/data.csv``, or that folder."""
         return path.is_dir() and any((p / "cam0" / "data.csv").is_file() for p in (path / "mav0", path))
-
-    def _read_imu(self, mav: Path) -> ImuLog | None:
-        file = mav / "imu0" / "data.csv"
-        if not file.is_file():
-            return None
-        noise = _imu_noise(self.path, mav)
-        return read_imu_csv(file, shift_s=self.rig.timeshift_cam_imu_s, noise=noise, remark=self.remark)
 
     def _read_truth(self, mav: Path) -> TruthLog | None:
         for folder, usual in _EUROC_TRUTH:
@@ -115,13 +113,6 @@ def _euroc_rig(path: Path, mav: Path, given: Path | None) -> StereoRig:
         cure = "put Kalibr's camchain.yaml into the folder or name one with --calibration"
         raise CalibrationError(text, where=mav, cure=cure)
     return read_stereo_yaml(chain)
-
-
-def _euroc_pairs(mav: Path, tolerance_s: float, known: SourceReport) -> list[PairFiles]:
-    left, right = (_read_image_list(mav / camera / "data.csv", known) for camera in ("cam0", "cam1"))
-    folders = [mav / camera / "data" for camera in ("cam0", "cam1")]
-    pairs = match_nearest(left, right, tolerance_ns(tolerance_s), known, mav)
-    return [PairFiles(t, folders[0] / a, folders[1] / b) for t, a, b in pairs]
 
 
 def _read_image_list(path: Path, known: SourceReport) -> list[tuple[int, str]]:

@@ -16,6 +16,7 @@ from gpvo.io.trajectory import UNKNOWN, carry, check_overlap, read_imu_csv, read
 
 _FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_left", "image_right"), ("left/data", "right/data"))
 _SIDE = re.compile(r"(?P<stem>.*?)[_-]?(?P<side>left|right|cam0|cam1|l|r)$", re.IGNORECASE)
+_END = re.compile(r"[_-](left|right|cam0|cam1)$", re.IGNORECASE)
 _DIGITS = re.compile(r"\d+(?:\.\d+)?")
 _DATE = re.compile(r"(?:19|20)\d\d\D?[01]\d\D?[0-3]\d\D?[0-2]\d\D?[0-5]\d")
 # Whole numbers of at least this many digits are nanoseconds since an epoch, not indices.
@@ -96,7 +97,8 @@ def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     for a, b in _FOLDERS:
         if (path / a).is_dir() and (path / b).is_dir():
             sides = [path / s / "data" if (path / s / "data").is_dir() else path / s for s in (a, b)]
-            left, right = ({_key(f): f for f in sorted(s.iterdir()) if _is_image(f)} for s in sides)
+            # Without a side at their ends: 000012_left and 000012 alike.
+            left, right = ({_END.sub("", f.stem): f for f in sorted(s.iterdir()) if _is_image(f)} for s in sides)
             return left, right
     named: tuple[dict[str, Path], dict[str, Path]] = ({}, {})
     for file in sorted(path.iterdir()):
@@ -104,11 +106,6 @@ def _find_images(path: Path) -> tuple[dict[str, Path], dict[str, Path]]:
         if match is not None:
             named[match["side"].lower() in ("right", "cam1", "r")][match["stem"]] = file
     return named
-
-
-def _key(file: Path) -> str:
-    """The name without a side at its end: ``000012_left`` and ``000012`` alike."""
-    return re.sub(r"[_-](left|right|cam0|cam1)$", "", file.stem, flags=re.IGNORECASE)
 
 
 def _stamps(path: Path, keys: list[str], rate_hz: float | None, known: SourceReport) -> dict[str, int]:

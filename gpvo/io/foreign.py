@@ -16,7 +16,7 @@ from gpvo.geometry import covariance as transport
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
 from gpvo.geometry.se3 import R_FLU_OPTICAL
-from gpvo.io.bag_messages import read_poses
+from gpvo.io.bag_messages import covariances_of, read_poses
 from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPES, is_bag, open_bag, topics_of
 from gpvo.io.foreign_csv import POSITIONS_ALONE, Table, is_number, names_other_columns, read_table
 from gpvo.io.stamps import check_interval, text_lines
@@ -297,7 +297,8 @@ def _read_bag_topic(path: Path, topic: str, complete: bool) -> ForeignLog:
     notes: list[str] = []
     t, T, read = read_poses(path, topic, notes.append, complete=complete)
     log = ForeignLog(path, Trajectory(t, T), notes=tuple(notes), topic=topic, frame_id=moving_frame(read[0]))
-    twist, pose = (_bag_covariance(read, name) for name in ("twist", "pose"))
+    stated = (covariances_of(read, name) for name in ("twist", "pose"))
+    twist, pose = (None if C is None else np.where(np.isfinite(C), C, np.nan) for C in stated)
     still = still_axes(T)
     pose = None if pose is None else definite_in_plane(_into_body(log.trajectory, pose), still)
     twist = None if twist is None else definite_in_plane(twist, still)
@@ -312,14 +313,6 @@ def _read_bag_topic(path: Path, topic: str, complete: bool) -> ForeignLog:
     if _looks_stated(pose):
         return replace(log, covariance=pose, covariance_of="pose")
     return replace(log, notes=(*notes, NONE_STATED))
-
-
-def _bag_covariance(read: list[Any], name: str) -> Array | None:
-    """(N, 6, 6) covariances of a field of the messages, None where their type has none."""
-    if not hasattr(getattr(read[0], name, None), "covariance"):
-        return None
-    C = np.array([getattr(m, name).covariance for m in read], dtype=np.float64).reshape(-1, 6, 6)
-    return np.where(np.isfinite(C), C, np.nan)
 
 
 def _looks_stated(covariance: Array) -> bool:

@@ -46,6 +46,8 @@ __all__ = [
     "write_run",
 ]
 
+_POSES = 20_000  # that came or served last, as possible starts of later motions
+
 
 class RunWriter:
     """Writes a run folder as the records come; use as a context manager.
@@ -141,7 +143,9 @@ class RunWriter:
             # At rest and in the dark one reference serves for as long as that lasts.
             now.poses.move_to_end(record.t_prev_ns)
         pose = record.T_prev_cur if T_prev is None else T_prev @ record.T_prev_cur
-        now.remember(record.t_ns, pose)
+        now.poses[record.t_ns] = pose
+        if len(now.poses) > _POSES:
+            now.poses.popitem(last=False)
         now.lines.append(tum_line(record.t_ns, pose))
         now.count(record)
         if self.kept is not None and now.records_total <= len(self.kept.records):
@@ -202,13 +206,9 @@ class RunWriter:
             shutil.rmtree(self._chunks, ignore_errors=True)
         self._write_meta(complete=complete)
 
-    def _digests(self) -> dict[str, str]:
-        """SHA-256 of each table of the folder."""
-        files = ((name, self.path / name) for name in run_folder.FILES)
-        return {name: digest_of_file(file) for name, file in files if file.is_file()}
-
     def _write_meta(self, *, complete: bool) -> None:
         state = self._state
+        tables = [p for name in run_folder.FILES if complete and (p := self.path / name).is_file()]
         write_json(
             self.path / "run.json",
             {
@@ -221,7 +221,7 @@ class RunWriter:
                 "started": state.started,
                 "finished": datetime.now(timezone.utc).isoformat(timespec="seconds") if complete else None,
                 "wall_s": round(time.monotonic() - state.clock, 3),
-                "digests": self._digests() if complete else {},
+                "digests": {p.name: digest_of_file(p) for p in tables},
                 "stage_ms_mean": {k: v / max(state.records_total, 1) for k, v in state.stage_ms.items()},
                 "versions": {"gpvo": __version__, "python": platform.python_version(), "numpy": np.__version__},
             },
@@ -254,12 +254,6 @@ class _State:
     last_t_ns: int = 0
     started: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
     clock: float = field(default_factory=time.monotonic)
-
-    def remember(self, t_ns: int, pose: Array) -> None:
-        """Keep the pose as a possible start of later motions, for the 20,000 frames that came or served last."""
-        self.poses[t_ns] = pose
-        if len(self.poses) > 20_000:
-            self.poses.popitem(last=False)
 
     def count(self, record: VoRecord) -> None:
         """Add to the sums of ``run.json``."""

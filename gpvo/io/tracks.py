@@ -138,26 +138,20 @@ class TracksSource:
         return check_pose(se3.from_rt(R_cam_body.T, p), "R_cam_body", self.path)
 
     def _make_imu(self) -> ImuLog | None:
-        n = len(self._t_ns)
+        """At its own rate, else once per frame."""
+        names, noise, t_ns = ("gyro_body_radps", "acc_body_mps2"), None, self._t_ns
         if "imu_t_ns" in self._data:
-            return self._full_imu()
-        if "gyro_body_radps" not in self._data:
+            names, t_ns = ("imu_gyro_radps", "imu_acc_mps2"), self._data["imu_t_ns"]
+            if t_ns.ndim != 1 or t_ns.dtype.kind not in "iu" or (t_ns > _MAX_STAMP_S * 1e9).any():
+                what = f"'imu_t_ns' is {t_ns.dtype} {t_ns.shape}, expected nanoseconds (N,)"
+                raise SourceError(what, where=self.path)
+            if absent := [a for a in names if a not in self._data]:
+                raise SourceError(f"has 'imu_t_ns' but not {', '.join(absent)}", where=self.path)
+            noise = ImuNoise(*self._array("imu_noise", 4)) if "imu_noise" in self._data else None
+        elif names[0] not in self._data:
             return None
-        gyro = self._array("gyro_body_radps", n, 3)
-        acc = self._array("acc_body_mps2", n, 3, absent=np.full((n, 3), np.nan))
-        keep = growing(self._t_ns)
-        return ImuLog(self._t_ns[keep], gyro[keep], acc[keep])
-
-    def _full_imu(self) -> ImuLog:
-        t_ns = self._data["imu_t_ns"]
-        if t_ns.ndim != 1 or t_ns.dtype.kind not in "iu" or (t_ns > _MAX_STAMP_S * 1e9).any():
-            raise SourceError(f"'imu_t_ns' is {t_ns.dtype} {t_ns.shape}, expected nanoseconds (N,)", where=self.path)
-        k = len(t_ns)
-        absent = [a for a in ("imu_gyro_radps", "imu_acc_mps2") if a not in self._data]
-        if absent:
-            raise SourceError(f"has 'imu_t_ns' but not {', '.join(absent)}", where=self.path)
-        gyro, acc = (self._array(a, k, 3) for a in ("imu_gyro_radps", "imu_acc_mps2"))
-        noise = ImuNoise(*self._array("imu_noise", 4)) if "imu_noise" in self._data else None
+        gyro = self._array(names[0], len(t_ns), 3)
+        acc = self._array(names[1], len(t_ns), 3, absent=np.full(gyro.shape, np.nan))
         keep = growing(t_ns)
         return ImuLog(t_ns[keep].astype(np.int64), gyro[keep], acc[keep], noise)
 

@@ -22,8 +22,9 @@ from gpvo.errors import GpvoError, SourceError
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import are_covariances, variances
 from gpvo.io.bag_reader import POSE_TYPES, is_bag, messages, open_bag, topics_of
+from gpvo.live import WIRES
 from gpvo.live.intake import Mailbox, arrivals
-from gpvo.live.job import WIRES, open_wire
+from gpvo.live.job import open_wire
 from gpvo.live.outputs import decode
 from gpvo.live.stated import ENOUGH, Finding, Stated
 from gpvo.types import Array
@@ -75,44 +76,31 @@ def examine_topic(
 
 def examine(stated: Stated) -> list[Finding]:
     """Everything that is wrong with a recording, worst first; empty for a good one."""
-    return list(_findings(stated))
-
-
-def _findings(stated: Stated) -> Iterator[Finding]:
     motions = _motions(stated)
-    yield from _stamps(stated)
-    yield from _frames(stated)
-    yield from _poses(stated)
-    if motions is not None:
-        _, steps, dt = motions
-        yield from _jumps(steps, dt)
+    found = [*_stamps(stated), *_frames(stated), *_poses(stated), *(_jumps(*motions[1:]) if motions else ())]
     if stated.pose is None and stated.twist is None:
-        yield Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR)
+        found.append(Finding("no-covariance", "the message type has no covariance", _PX4_FLOOR))
     for name, C in (("pose", stated.pose), ("twist", stated.twist)):
-        if C is not None:
-            yield from _matrices(name, C)
-    if motions is not None:
-        yield from _pose_against_twist(stated, *motions)
+        found += () if C is None else _matrices(name, C)
+    return [*found, *(_pose_against_twist(stated, *motions) if motions else ())]
 
 
 def _matrices(name: str, C: Array) -> Iterator[Finding]:
     """Findings about each matrix on its own."""
-    if not np.isfinite(C).all():
-        share = float(1 - np.isfinite(C).all(axis=(1, 2)).mean())
+    if (bad := ~np.isfinite(C).all(axis=(1, 2))).any():
         text = "robot_localization does not check, so its state becomes NaN; ArduPilot checks only element 0 for NaN"
-        yield Finding(f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text, share)
+        yield from Finding.where(bad, f"{name}-not-finite", f"the {name}'s covariance holds NaN or infinity", text)
         return
-    D, symmetric = variances(C), _symmetric(C)
+    D, scale = variances(C), np.abs(C).max(axis=(1, 2))[:, None, None]
+    symmetric = (np.abs(C - np.swapaxes(C, 1, 2)) <= 1e-6 * scale).all(axis=(1, 2))
     zero = (C == 0).all(axis=(1, 2))
     if zero.all():
         text = f"{_RL_FLOOR}; {_PX4_FLOOR}; {_AP_FLOOR}; {_ZERO_FALLBACK}"
         yield Finding(f"{name}-zero", f"the {name}'s covariance is zero throughout: 'unknown' stated as certain", text)
         return
-    if (D == 0).any():
-        share = float((D == 0).any(axis=1).mean())
-        what = f"variances of the {name} are exactly zero"
-        yield Finding(f"{name}-some-zero", what, f"{_RL_FLOOR}; {_ZERO_FALLBACK}", share)
+    sound = (D > 0).all() and symmetric.all()
     checks: list[tuple[str, str, Any, str]] = [
+        ("some-zero", "variances of the {} are exactly zero", (D == 0).any(axis=1), f"{_RL_FLOOR}; {_ZERO_FALLBACK}"),
         ("negative", "variances of the {} are negative", (D < 0).any(axis=1),
          "robot_localization takes the absolute value; PX4 and ArduPilot take their floors; Cholesky fails elsewhere"),
         ("tiny", "variances of the {} are below 1e-9: a placeholder, not a measurement",
@@ -122,16 +110,11 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
          "ArduPilot clamps it at 100 m and 1.5 rad and goes on fusing"),
         ("asymmetric", "the {}'s covariance is not symmetric", ~symmetric,
          "filters read different halves: PX4 and ArduPilot the diagonal, robot_localization all of it"),
+        ("not-positive", "the {}'s covariance is not positive definite", ~are_covariances(C) & sound,
+         "its correlations are impossible: robot_localization's gain goes wrong, Cholesky factorisation fails"),
     ]  # fmt: skip
     for code, what, bad, text in checks:
-        if bad.any():
-            yield Finding(f"{name}-{code}", what.format(name), text, float(bad.mean()))
-    if (D > 0).all() and symmetric.all():
-        bad = ~are_covariances(C)
-        if bad.any():
-            text = "its correlations are impossible: robot_localization's gain goes wrong, Cholesky factorisation fails"
-            what = f"the {name}'s covariance is not positive definite"
-            yield Finding(f"{name}-not-positive", what, text, float(bad.mean()))
+        yield from Finding.where(bad, f"{name}-{code}", what.format(name), text)
     if np.ptp(C, axis=0).max() == 0.0:
         text = "every frame has the same weight, in bad light and in good: a gate passes bad frames and drops good ones"
         yield Finding(f"{name}-constant", f"the {name}'s covariance never changes", text)
@@ -140,22 +123,16 @@ def _matrices(name: str, C: Array) -> Iterator[Finding]:
         yield Finding(f"{name}-levels", f"the {name}'s covariance takes four values or fewer", text)
 
 
-def _symmetric(C: Array) -> NDArray[np.bool_]:
-    scale = np.abs(C).max(axis=(1, 2))[:, None, None]
-    return np.asarray((np.abs(C - np.swapaxes(C, 1, 2)) <= 1e-6 * scale).all(axis=(1, 2)))
-
-
 def _stamps(s: Stated) -> Iterator[Finding]:
     steps = np.diff(s.t_ns)
-    if (s.t_ns == 0).any():
+    if (unset := s.t_ns == 0).any():
         text = "every consumer dates the measurement to the epoch and drops it"
-        yield Finding("stamp-zero", "stamps are zero", text, float((s.t_ns == 0).mean()))
-    elif (steps < 0).any():
+        yield from Finding.where(unset, "stamp-zero", "stamps are zero", text)
+    else:
         text = "robot_localization drops or replays them; PX4 and ArduPilot use them as they are"
-        yield Finding("stamp-backward", "stamps go backward", text, float((steps < 0).mean()))
-    if (steps == 0).any() and not (s.t_ns == 0).any():
+        yield from Finding.where(steps < 0, "stamp-backward", "stamps go backward", text)
         text = "the same measurement is fused twice: the filter becomes overconfident"
-        yield Finding("stamp-repeated", "stamps repeat", text, float((steps == 0).mean()))
+        yield from Finding.where(steps == 0, "stamp-repeated", "stamps repeat", text)
     good = steps[steps > 0]
     if len(good) and good.max() > 10 * np.median(good):
         what = f"a gap of {good.max() * 1e-9:.2f} s, at {1e9 / np.median(good):.0f} Hz"
@@ -180,9 +157,8 @@ def _frames(s: Stated) -> Iterator[Finding]:
 
 def _poses(s: Stated) -> Iterator[Finding]:
     bad = ~np.isfinite(s.T).all(axis=(1, 2))
-    if bad.any():
-        what = "poses hold NaN, or absurdly large numbers"
-        yield Finding("pose-not-finite", what, "robot_localization drops them", float(bad.mean()))
+    what = "poses hold NaN, or absurdly large numbers"
+    yield from Finding.where(bad, "pose-not-finite", what, "robot_localization drops them")
     off = np.abs(s.quaternion_norm - 1.0) > 1e-2
     if (off & ~bad).any():
         text = "robot_localization normalises with a warning, PX4 rejects the attitude"

@@ -249,7 +249,10 @@ class Engine:
         due = now_s - self._reported[0] >= _HEALTH_S
         if due:
             self._misfit = self._misfits()
-        silence = self._silence()
+        silence = []
+        if self._now_s - self._used_s > _STALE_S:
+            never = f": nothing received on {', '.join(self._unheard)}" if self._unheard else ""
+            silence = [f"no usable message for more than {_STALE_S:.0f} s{never}"]
         problems = [*silence, *self._misfit]
         for text in problems:
             self._warn(text)
@@ -262,12 +265,6 @@ class Engine:
         if self.settings.state is not None and now_s - self._saved_s >= _SAVE_S:
             self._saved_s = now_s
             self._save()
-
-    def _silence(self) -> list[str]:
-        if not self._now_s - self._used_s > _STALE_S:
-            return []
-        never = f": nothing received on {', '.join(self._unheard)}" if self._unheard else ""
-        return [f"no usable message for more than {_STALE_S:.0f} s{never}"]
 
     def _misfits(self) -> list[str]:
         """What does not fit between source and model, looked at once a second."""

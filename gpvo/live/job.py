@@ -7,8 +7,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from gpvo.cameras.readers import read_stereo_yaml
@@ -18,11 +16,10 @@ from gpvo.io.bag_reader import (
     IMAGE_TYPES,
     IMU_TYPE,
     INFO_TYPE,
-    ODOMETRY_TYPE,
-    POSE_TYPE,
     open_bag,
 )
 from gpvo.io.bags import has_word, info_topic
+from gpvo.live import POSE_TYPE_NAMES, WIRES, LiveSettings
 from gpvo.live.engine import Engine, EngineSettings, Output
 from gpvo.live.intake import Arrival, Mailbox, arrivals, odometry_topic, replay
 from gpvo.live.late_truth import LateTruth
@@ -33,40 +30,8 @@ from gpvo.online.predictor import Predictor
 from gpvo.parallel import after_first, ending_signals
 from gpvo.publish.ros import check_topic
 
-WIRES = ("zenoh", "dds", "ros2", "ros1")
 _DEPTHS = {IMU_TYPE: 400, TF_TYPE: 100}
 _LASTING = (INFO_TYPE, TF_TYPE)  # what was said holds until it is said anew; a recording may lack it
-
-
-@dataclass(frozen=True)
-class LiveSettings:
-    """What ``gpvo live`` was asked. ``wire``: one of :data:`WIRES`; ``address``: where its router or peer is.
-
-    ``base_frame``: whose odometry is published, of a frame that ROS's transforms join to the source's.
-    """
-
-    model: Path
-    stereo: tuple[str, str] | None = None
-    vo: StereoSettings = field(default_factory=StereoSettings)
-    imu: str | None = None
-    odometry: str | None = None
-    pose_type: str = ODOMETRY_TYPE
-    truth: str | None = None
-    truth_type: str = POSE_TYPE
-    calibration: Path | None = None
-    base_frame: str | None = None
-    replay: Path | None = None
-    fast: bool = False
-    wire: str | None = None
-    address: str | None = None
-    domain: int = 0
-    mavlink: str | None = None
-    px4: bool = False
-    out: Path | None = None
-    topic: str = "/gpvo/odometry"
-    pose_topic: str | None = None
-    depth: int = 10
-    engine: EngineSettings = field(default_factory=EngineSettings)
 
 
 def run_live(settings: LiveSettings) -> dict[str, Any]:
@@ -74,18 +39,19 @@ def run_live(settings: LiveSettings) -> dict[str, Any]:
 
     Raises GpvoError where an option, the model, the recording or the transport cannot be used; never for a bad message.
     """
-    if settings.wire is None and settings.replay is None:
+    transport = settings.wire.transport()
+    if transport is None and settings.replay is None:
         raise GpvoError("there is no source", cure=f"give --replay BAG, or one of --{', --'.join(WIRES)}")
     for is_used, names, cure in (
         (settings.replay, ("fast",), "add --replay BAG"),
-        (settings.wire == "zenoh", ("address",), "add --zenoh"),
-        (settings.wire in ("zenoh", "dds"), ("domain",), "add --zenoh or --dds"),
-        (settings.wire, ("pose_topic",), f"add one of --{', --'.join(WIRES)}"),
+        (transport == "zenoh", ("address",), "add --zenoh"),
+        (transport in ("zenoh", "dds"), ("domain",), "add --zenoh or --dds"),
+        (transport, ("pose_topic",), f"add one of --{', --'.join(WIRES)}"),
         (settings.replay is None, ("depth",), "a recording has no queue"),
     ):
         if not is_used:
             _refuse_idle(settings, names, cure)
-    wire = open_wire(settings.wire, settings.address, settings.domain) if settings.wire else None
+    wire = open_wire(transport, settings.wire.address, settings.wire.domain) if transport else None
     stop = threading.Event()
     try:
         with ending_by_signal(stop):
@@ -102,8 +68,8 @@ def run_live(settings: LiveSettings) -> dict[str, Any]:
 
 def _refuse_idle(settings: LiveSettings, names: tuple[str, ...], cure: str) -> None:
     """GpvoError where one of the settings was given, though nothing will read it."""
-    fresh = LiveSettings(settings.model)
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(settings, name) != getattr(fresh, name)]
+    asked, fresh = ({**vars(s), **vars(s.wire)} for s in (settings, LiveSettings(settings.model)))
+    given = [f"--{name.replace('_', '-')}" for name in names if asked[name] != fresh[name]]
     if given:
         raise GpvoError(f"{', '.join(given)} would be ignored", cure=cure)
 
@@ -122,7 +88,8 @@ class Live:
         predictor, outputs = Predictor.load(settings.model), _outputs(settings, wire)
         self._settings, self._wire, self._tell = settings, wire, tell
         self._topics = topics_in(stage, settings)
-        self.engine = Engine(stage, predictor, outputs, settings.engine, tell, truth, self._topics)
+        how = EngineSettings(settings.pose_covariance == "increment", settings.state, settings.vehicle)
+        self.engine = Engine(stage, predictor, outputs, how, tell, truth, self._topics)
         self._mailbox = Mailbox(settings.depth)
         self._ending, self._has_run = threading.Event(), False
         self._thread: threading.Thread | None = None
@@ -190,7 +157,7 @@ class Live:
 def _outputs(settings: LiveSettings, wire: Wire | None) -> list[Output]:
     for topic in (settings.topic, *([settings.pose_topic] if settings.pose_topic else [])):
         check_topic(topic)
-    if settings.engine.increment and (settings.px4 or settings.mavlink):
+    if settings.pose_covariance == "increment" and (settings.px4 or settings.mavlink):
         what = "a flight controller takes the covariance of a pose for that of the whole way, not of an increment"
         raise GpvoError(what, cure="leave out --pose-covariance increment")
     outputs: list[Output] = [WireOutput(wire, settings.topic, settings.pose_topic)] if wire else []
@@ -208,7 +175,7 @@ def make_stage(settings: LiveSettings) -> Stage:
     stage = _source_stage(settings)
     if settings.base_frame is None:
         return stage
-    if isinstance(stage, PoseStage) and settings.pose_type != ODOMETRY_TYPE:
+    if isinstance(stage, PoseStage) and settings.odometry_type != "odometry":
         raise GpvoError(
             "--base-frame needs to know which frame the poses are of, and these messages do not name one",
             cure="use a topic of nav_msgs/Odometry",
@@ -226,7 +193,7 @@ def _source_stage(settings: LiveSettings) -> PoseStage | StereoStage:
         is_kitti = path is not None and path.suffix.lower() == ".txt"  # which does not state the size of the images
         rig = path if path is None or is_kitti else read_stereo_yaml(path)
         return StereoStage(*settings.stereo, settings.imu, rig, settings.vo)
-    if settings.vo != StereoSettings():
+    if settings.vo not in (None, StereoSettings()):
         raise GpvoError("the odometry was given settings, but no images to run on", cure="add --stereo LEFT RIGHT")
     _refuse_idle(settings, ("imu", "calibration"), "add --stereo LEFT RIGHT")
     if settings.odometry is not None:
@@ -240,9 +207,9 @@ def topics_in(stage: Stage, settings: LiveSettings) -> dict[str, str]:
     """Topics to subscribe to, with their types."""
     if isinstance(stage, BaseFrameStage):
         return topics_in(stage.inner, settings) | dict.fromkeys(TF_TOPICS, TF_TYPE)
-    truth = {settings.truth: settings.truth_type} if settings.truth else {}
+    truth = {settings.truth: POSE_TYPE_NAMES[settings.truth_type]} if settings.truth else {}
     if isinstance(stage, PoseStage):
-        return {stage.topic: settings.pose_type, **truth}
+        return {stage.topic: POSE_TYPE_NAMES[settings.odometry_type], **truth}
     assert isinstance(stage, StereoStage)
     images = {t: IMAGE_TYPES[has_word("compressed", t)] for t in (stage.left, stage.right)}
     infos = {info_topic(t): INFO_TYPE for t in images} if stage.wants_info else {}
@@ -284,6 +251,3 @@ def ending_by_signal(stop: threading.Event) -> Iterator[None]:
 def _tell(text: str) -> None:
     with suppress(OSError):  # the terminal may be gone, and what is recorded is still to be written
         print(f"gpvo live: {text}", file=sys.stderr, flush=True)
-
-
-POSE_TYPE_NAMES = {"odometry": ODOMETRY_TYPE, "pose": POSE_TYPE, "pose_stamped": "geometry_msgs/msg/PoseStamped"}

@@ -31,15 +31,13 @@ class LateTruth:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
-        self._waiting: deque[tuple[VoRecord, Prediction]] = deque(maxlen=_MOTIONS)
-        self._watch = StampWatch()
-        self._poses: deque[tuple[int, Array, float, float]] = deque(maxlen=_POSES)  # with variances [m^2, rad^2]
+        self.forget()
 
     def forget(self) -> None:
         """The odometry's clock or origin is another one from here on."""
-        self._waiting.clear()
-        self._poses.clear()
+        self._waiting: deque[tuple[VoRecord, Prediction]] = deque(maxlen=_MOTIONS)
         self._watch = StampWatch()
+        self._poses: deque[tuple[int, Array, float, float]] = deque(maxlen=_POSES)  # with variances [m^2, rad^2]
 
     def predicted(self, record: VoRecord, prediction: Prediction | None) -> None:
         """A motion whose error is not known yet."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from gpvo.errors import GpvoError, printable
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import LARGEST
-from gpvo.io.bag_messages import pose_of
+from gpvo.io.bag_messages import covariances_of, pose_of
 from gpvo.io.bag_reader import stamp_ns
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.types import Array
@@ -28,6 +28,12 @@ class Finding:
     what: str
     consequence: str
     share: float = 1.0
+
+    @classmethod
+    def where(cls, bad: Any, code: str, what: str, consequence: str) -> Iterator[Finding]:
+        """Of the messages that are ``bad`` (N,); none where none is."""
+        if bad.any():
+            yield cls(code, what, consequence, float(bad.mean()))
 
     def __str__(self) -> str:
         part = "" if self.share >= 1.0 else f" ({100 * self.share:.0f} % of the messages)"
@@ -63,7 +69,9 @@ class Stated:
         pairs = ((m.header.frame_id, getattr(m, "child_frame_id", "-")) for m in kept)
         frames = dict.fromkeys((printable(parent), printable(child)) for parent, child in pairs)
         v = [_twist(m) for m in kept] if hasattr(kept[0], "twist") else None
-        pose, twist = (_covariances(kept, name) for name in ("pose", "twist"))
+        # What is beyond all measure is as good as infinite, and squares of the rest stay finite.
+        stated = (covariances_of(kept, name) for name in ("pose", "twist"))
+        pose, twist = (None if C is None else np.where(np.abs(C) >= LARGEST, np.inf, C) for C in stated)
         t_ns = np.array([stamp_ns(m) for m in kept], dtype=np.int64)
         return cls(t_ns, T, norm, tuple(frames), pose, twist, None if v is None else np.array(v))
 
@@ -71,12 +79,3 @@ class Stated:
 def _twist(message: Any) -> list[float]:
     a, b = message.twist.twist.linear, message.twist.twist.angular
     return [a.x, a.y, a.z, b.x, b.y, b.z]
-
-
-def _covariances(messages: Sequence[Any], name: str) -> Array | None:
-    if not hasattr(getattr(messages[0], name, None), "covariance"):
-        return None
-    C = np.array([getattr(m, name).covariance for m in messages], dtype=np.float64).reshape(-1, 6, 6)
-    # What is beyond all measure is as good as infinite, and squares of the rest stay finite.
-    C[np.abs(C) >= LARGEST] = np.inf
-    return C

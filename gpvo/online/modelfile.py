@@ -39,7 +39,7 @@ from safetensors.numpy import load as _load_tensors
 from safetensors.numpy import save as _save_tensors
 
 from gpvo.errors import ModelError
-from gpvo.files import TooLarge, parse_json, plain, printable_document, read_bounded, replacing
+from gpvo.files import parse_json, plain, printable_document, read_bounded, replacing
 
 SCHEMA = 1
 KIND = "gpvo-error-model"
@@ -68,12 +68,8 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[st
     path = Path(path)
     if path.is_dir():
         raise ModelError("is a folder, not a model file", where=path, cure="give one of gpvo train, before the run")
-    try:
-        blob = read_bounded(path, MAX_FILE_BYTES)
-    except TooLarge:
-        raise ModelError(f"is larger than {MAX_FILE_BYTES} bytes: not a model file", where=path) from None
-    except OSError as problem:
-        raise ModelError(f"cannot be opened: {problem.strerror}", where=path) from None
+    beyond = f"is larger than {MAX_FILE_BYTES} bytes: not a model file"
+    blob = read_bounded(path, MAX_FILE_BYTES, beyond, ModelError)
     try:
         # Whatever the header declares is held against the bytes there are.
         arrays = _load_tensors(blob)

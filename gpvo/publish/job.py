@@ -17,27 +17,12 @@ from gpvo.files import write_text
 from gpvo.io.run import Run, read_run
 from gpvo.io.stamps import END_OF_ROS_NS
 from gpvo.online.predictor import Predictor
-from gpvo.publish import consumers, mavlink, ros
+from gpvo.publish import PublishSettings, consumers, mavlink, ros
 from gpvo.publish.odometry import Odometry, OdometryBuilder, messages
 from gpvo.types import Prediction
 
 TARGETS = ("bag", "mcap", "mavlink")
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".tlog": "mavlink"}
-
-
-@dataclass(frozen=True)
-class PublishSettings:
-    """What ``gpvo publish`` was asked for; without ``to`` the name ``out`` may tell it."""
-
-    to: str | None = None
-    out: Path | None = None
-    link: str | None = None
-    model: Path | None = None
-    method: str = "pointing_matching"
-    topic: str = ros.TOPIC
-    system: int = 1
-    consumer: str | None = None
-    check: bool = False
 
 
 @dataclass(frozen=True)

@@ -222,23 +222,13 @@ def vehicle_odometry(odometry: Odometry, types: dict[str, Any]) -> Any:
     # FLU and FRD differ in signs, which variances have not.
     known = np.diagonal(odometry.pose_covariance) if odometry.tracked else nan
     velocity = nan if odometry.twist_covariance is None else np.diagonal(odometry.twist_covariance)
-    t_us = odometry.t_ns // 1000
+    vectors = {"position": pose[:3], "q": pose[3:], "velocity": twist[:3], "angular_velocity": twist[3:]}
+    vectors |= {"position_variance": known[:3], "orientation_variance": known[3:], "velocity_variance": velocity[:3]}
     return types[PX4_TYPE](
-        timestamp=t_us,
-        timestamp_sample=t_us,
+        **dict.fromkeys(("timestamp", "timestamp_sample"), odometry.t_ns // 1000),
         pose_frame=_POSE_FRAME_FRD,
-        position=_float32(pose[:3]),
-        q=_float32(pose[3:]),
         velocity_frame=_VELOCITY_FRAME_BODY_FRD,
-        velocity=_float32(twist[:3]),
-        angular_velocity=_float32(twist[3:]),
-        position_variance=_float32(known[:3]),
-        orientation_variance=_float32(known[3:]),
-        velocity_variance=_float32(velocity[:3]),
         reset_counter=odometry.reset_counter,
         quality=quality(odometry),
+        **{name: v.astype(np.float32) for name, v in vectors.items()},
     )
-
-
-def _float32(values: Any) -> np.ndarray:
-    return np.asarray(values, dtype=np.float32)

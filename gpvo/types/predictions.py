@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -123,11 +123,6 @@ class StoredPredictions(Columns[Prediction]):
     """
 
     columns: Mapping[str, NDArray[Any]]
-
-    @classmethod
-    def join(cls, parts: Sequence[StoredPredictions]) -> StoredPredictions:
-        """One after the other."""
-        return cls({name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns})
 
     def made(self, k: int) -> Prediction:
         """Prediction k."""

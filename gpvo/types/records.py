@@ -12,9 +12,10 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle
+from gpvo.types.sensors import VEHICLES, Array, ImuLog, StereoCamera, Vehicle, field_names
 
 _Item = TypeVar("_Item")
+_Rows = TypeVar("_Rows", bound="Columns[Any]")
 
 IMPORTED = "imported"
 """Name of the covariances that somebody else's odometry states of its own motions."""
@@ -115,6 +116,18 @@ class Columns(Sequence[_Item], ABC):
 
     columns: Mapping[str, NDArray[Any]]
 
+    @classmethod
+    def join(cls: type[_Rows], parts: Sequence[_Rows]) -> _Rows:
+        """One after the other; of mappings by method or stage, with those of all, NaN where a part has none."""
+        lengths = [len(part) for part in parts]
+
+        def joined(maps: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+            shape = {name: column.shape[1:] for m in maps for name, column in m.items()}
+            absent = {name: [np.broadcast_to(np.nan, (n, *of)) for n in lengths] for name, of in shape.items()}
+            return {name: np.concatenate([m.get(name, a) for m, a in zip(maps, absent[name])]) for name in shape}
+
+        return cls(*(joined([getattr(part, name) for part in parts]) for name in field_names(cls)))
+
     @abstractmethod
     def made(self, k: int) -> _Item:
         """Row k."""
@@ -144,18 +157,6 @@ class StoredRecords(Columns[VoRecord]):
     covariances: Mapping[str, Array] = field(default_factory=dict)
     v_t: Mapping[str, Array] = field(default_factory=dict)
     stage_ms: Mapping[str, Array] = field(default_factory=dict)
-
-    @classmethod
-    def join(cls, parts: Sequence[StoredRecords]) -> StoredRecords:
-        """One after the other, with the methods and stages of all."""
-        lengths = [len(part) for part in parts]
-
-        def joined(maps: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-            shape = {name: column.shape[1:] for m in maps for name, column in m.items()}
-            absent = {name: [np.broadcast_to(np.nan, (n, *of)) for n in lengths] for name, of in shape.items()}
-            return {name: np.concatenate([m.get(name, a) for m, a in zip(maps, absent[name])]) for name in shape}
-
-        return cls(*(joined([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def made(self, k: int) -> VoRecord:
         """Record k."""
@@ -323,13 +324,8 @@ class ImuMoments:
     @classmethod
     def of_record(cls, record: VoRecord) -> ImuMoments:
         """What a record says of the IMU over its motion, as one sample with that spread; NaN where it knows none."""
-        unknown = np.full(3, np.nan)
-
-        def joined(*fields: Array | None) -> Array:
-            return np.concatenate([unknown if field is None else field for field in fields])
-
-        mean = joined(record.imu_gyro_mean_radps, record.imu_acc_mean_mps2)
-        return cls(1, mean, joined(record.imu_gyro_std_radps, record.imu_acc_std_mps2) ** 2)
+        known = [np.full(3, np.nan) if (v := getattr(record, name)) is None else v for name in IMU_FIELDS]
+        return cls(1, np.concatenate(known[::2]), np.concatenate(known[1::2]) ** 2)
 
     def with_later(self, other: ImuMoments) -> ImuMoments:
         """Of both pieces together (T. Chan, G. Golub, R. LeVeque, "Algorithms for computing the sample variance"
@@ -346,12 +342,7 @@ class ImuMoments:
         if self.n == 0:
             return {}
         deviation = np.sqrt(self.variance)
-        return {
-            "imu_gyro_mean_radps": self.mean[:3],
-            "imu_gyro_std_radps": deviation[:3],
-            "imu_acc_mean_mps2": self.mean[3:],
-            "imu_acc_std_mps2": deviation[3:],
-        }
+        return dict(zip(IMU_FIELDS, (self.mean[:3], deviation[:3], self.mean[3:], deviation[3:])))
 
 
 _FIELDS = frozenset(f.name for f in fields(VoRecord))

@@ -139,8 +139,7 @@ def test_a_shell_completes_the_commands():
 
 
 def test_a_narrow_terminal_breaks_no_number_and_a_closed_one_no_command():
-    show = "from gpvo.cli.output import new_table, show; table = new_table('method', *'abcdef')\n"
-    show += "table.add_row('triangulation', *6 * ['0.0719']); show(table)"
+    show = "from gpvo.cli.output import show; show(('method', *'abcdef'), [['triangulation', *6 * ['0.0719']]])"
     env = {**os.environ, "COLUMNS": "40"}
     done = subprocess.run([sys.executable, "-c", show], capture_output=True, text=True, timeout=120, env=env)
     assert done.stdout.count(" 0.0719") == 6

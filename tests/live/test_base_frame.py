@@ -12,11 +12,12 @@ import pytest
 from bag_maker import BagMaker, stereo_bag
 from gpvo.errors import GpvoError
 from gpvo.geometry import se3
-from gpvo.io.bag_reader import POSE_TYPE, open_bag
+from gpvo.io.bag_reader import open_bag
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
+from gpvo.live import LiveSettings
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival
-from gpvo.live.job import Live, LiveSettings, make_stage, run_live
+from gpvo.live.job import Live, make_stage, run_live
 from gpvo.live.stages import BaseFrameStage, FrameTree, PoseStage
 from gpvo.live.stereo_stage import StereoStage
 from shim_bags import TOPIC, Kept, engine, flight, flown, messages, save_model, shim_predictor
@@ -177,7 +178,7 @@ def test_a_bag_with_transforms_is_replayed(tmp_path: Path) -> None:
 
 def test_poses_that_do_not_name_their_frame_are_refused() -> None:
     with pytest.raises(GpvoError, match="--base-frame"):
-        make_stage(LiveSettings(Path("m"), odometry="/pose", pose_type=POSE_TYPE, base_frame="base_link"))
+        make_stage(LiveSettings(Path("m"), odometry="/pose", odometry_type="pose", base_frame="base_link"))
 
 
 def test_recorded_poses_that_do_not_name_their_frame_are_told_and_not_taken_for_the_odometrys_origin() -> None:

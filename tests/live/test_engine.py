@@ -25,10 +25,10 @@ from gpvo.io.bag_reader import ODOMETRY_TYPE, open_bag, stamp_ns
 from gpvo.io.bag_reader import messages as read
 from gpvo.io.foreign import T_FLU_OPTICAL, read_foreign
 from gpvo.io.stated import to_records
-from gpvo.live import job, outputs
+from gpvo.live import LiveSettings, job, outputs
 from gpvo.live.engine import Engine, EngineSettings
 from gpvo.live.intake import Arrival, replay
-from gpvo.live.job import LiveSettings, run_live
+from gpvo.live.job import run_live
 from gpvo.live.late_truth import LateTruth
 from gpvo.live.stages import PoseStage
 from gpvo.live.stereo_stage import StereoStage
@@ -88,7 +88,7 @@ def test_a_pose_message_names_what_its_twist_is_the_motion_of(frame: str) -> Non
 def test_a_flight_controller_is_not_told_that_a_pose_does_not_drift(given: dict[str, Any]) -> None:
     """EKF2 and EKF3 fuse a pose as it stands; neither knows differences of poses."""
     with pytest.raises(GpvoError, match="not of an increment"):
-        job._outputs(LiveSettings(Path("m"), engine=EngineSettings(increment=True), **given), None)
+        job._outputs(LiveSettings(Path("m"), pose_covariance="increment", **given), None)
 
 
 def _of_a_planar_robot(

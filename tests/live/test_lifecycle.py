@@ -6,9 +6,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gpvo.live.engine import EngineSettings, load_state
+from gpvo.live import LiveSettings
+from gpvo.live.engine import load_state
 from gpvo.live.intake import Mailbox
-from gpvo.live.job import Live, LiveSettings, open_wire
+from gpvo.live.job import Live, open_wire
 from shim_bags import TOPIC, flight, flown, save_model
 from test_base_frame import TRANSFORMS, tf_message
 from test_wires import needs_dds
@@ -33,7 +34,7 @@ def test_a_pause_is_an_unknown_motion_and_what_came_in_it_is_not_used(tmp_path: 
         odometry=TOPIC,
         base_frame="chassis",
         depth=200,
-        engine=EngineSettings(state=state),
+        state=state,
     )
     try:
         live = Live(settings, here, told.append)

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 import yaml
 from gpvo.errors import GpvoError
-from gpvo.io.bag_reader import ODOMETRY_TYPE, POSE_TYPE
 from gpvo.live.job import Live
 from gpvo.live.ros_wire import Ros2Wire
 from gpvo.types import VEHICLES, Vehicle
@@ -49,11 +48,12 @@ def test_the_nodes_parameters_are_the_commands_options(parameters: ModuleType) -
     assert all(type(stated[name]) is type(p.default) for name, p in parameters.PARAMETERS.items())
     given = {"model": "m.gpvo", "odometry": "/vio", "odometry_type": "pose", "vehicle": "car", "max_turn": 5.0}
     settings = parameters.settings_of({**stated, **given})
-    assert (settings.odometry, settings.pose_type, settings.stereo, settings.wire) == ("/vio", POSE_TYPE, None, "ros2")
-    assert settings.engine.vehicle == Vehicle(VEHICLES["car"].max_acceleration_mps2, 5.0)
+    assert (settings.odometry, settings.odometry_type, settings.stereo) == ("/vio", "pose", None)
+    assert settings.wire.transport() == "ros2"
+    assert settings.vehicle == Vehicle(VEHICLES["car"].max_acceleration_mps2, 5.0)
     given = {"model": "m.gpvo", "left": "/l", "right": "/r", "pose_covariance": "increment", "base_frame": "base_link"}
     stereo = parameters.settings_of(given)
-    assert (stereo.stereo, stereo.pose_type, stereo.engine.increment) == (("/l", "/r"), ODOMETRY_TYPE, True)
+    assert (stereo.stereo, stereo.odometry_type, stereo.pose_covariance) == (("/l", "/r"), "odometry", "increment")
     assert stereo.base_frame == "base_link"
     assert stereo.calibration is None
     seen = {"preset": "thesis", "settings": "window=5 sigma_m_px=auto", "size": "320x240", "vehicle": "car"}

@@ -21,9 +21,10 @@ from gpvo.geometry import se3
 from gpvo.io import open_source
 from gpvo.io.bag_reader import messages, open_bag
 from gpvo.io.images import read_grey8
+from gpvo.live import LiveSettings, WireSettings
 from gpvo.live.engine import Engine
 from gpvo.live.intake import Arrival, replay
-from gpvo.live.job import LiveSettings, make_stage, run_live, topics_in
+from gpvo.live.job import make_stage, run_live, topics_in
 from gpvo.live.stereo_stage import StereoSettings, StereoStage
 from gpvo.types import StereoFrame, VoRecord
 from gpvo.vo.config import make_config
@@ -248,9 +249,10 @@ def test_a_folder_of_images_is_no_bag(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("given", "said"), [
     ({"stereo": ("/l", "/l")}, "same topic '/l'"), ({"odometry": "/o", "imu": "/imu"}, "--imu would be ignored"),
     ({"odometry": "/o", "calibration": Path("c.yaml")}, "--calibration would be ignored .*--stereo"),
-    ({"odometry": "/o", "address": "tcp/h:1", "domain": 3}, "--address would be ignored .*--zenoh"),
-    ({"odometry": "/o", "domain": 3}, "--domain would be ignored"), ({"pose_topic": "/p"}, "--pose-topic would"),
-    ({"replay": None, "wire": "dds", "fast": True}, "--fast would be ignored"),
+    ({"odometry": "/o", "wire": WireSettings(address="tcp/h:1", domain=3)}, "--address would be ignored .*--zenoh"),
+    ({"odometry": "/o", "wire": WireSettings(domain=3)}, "--domain would be ignored"),
+    ({"pose_topic": "/p"}, "--pose-topic would"),
+    ({"replay": None, "wire": WireSettings(dds=True), "fast": True}, "--fast would be ignored"),
     ({"odometry": "/o", "depth": 50}, "--depth would be ignored .*recording"),
 ])  # fmt: skip
 def test_options_that_nothing_would_read_are_refused(given: dict[str, Any], said: str, tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ from gpvo.errors import GpvoError, ModelError
 from gpvo.io.run import read_run, write_run
 from gpvo.online import modelfile
 from gpvo.online.predictor import Predictor
+from gpvo.publish import PublishSettings
 from gpvo.publish.export import export_model
-from gpvo.publish.job import PublishSettings, odometry_of, publish_run
+from gpvo.publish.job import odometry_of, publish_run
 from gpvo.types import Prediction, Status, VoLog
 from small_model import small_model
 from synthetic_runs import make_run

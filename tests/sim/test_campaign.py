@@ -5,6 +5,7 @@ import os
 
 import pytest
 from gpvo.cli import simulate as command
+from gpvo.cli.common import with_common_options
 from gpvo.errors import GpvoError
 from gpvo.parallel import map_jobs
 from gpvo.sim import scenario as sc
@@ -75,7 +76,7 @@ def test_command(tmp_path):
 
     app = typer.Typer()
     app.callback()(lambda: None)
-    app.command()(command.simulate)
+    app.command()(with_common_options(command.simulate))
     run = CliRunner().invoke
     listed = run(app, ["simulate", "--list"])
     assert "lunar-straight" in listed.output

@@ -9,8 +9,7 @@ from typing import Any
 
 from gpvo.cameras.rectify import read_size
 from gpvo.errors import GpvoError
-from gpvo.live.engine import EngineSettings
-from gpvo.live.job import POSE_TYPE_NAMES, LiveSettings
+from gpvo.live import POSE_TYPE_NAMES, LiveSettings, WireSettings
 from gpvo.live.stereo_stage import StereoSettings
 from gpvo.types import VEHICLES, Vehicle
 from gpvo.vo.config import PRESETS, make_config, read_settings
@@ -66,6 +65,12 @@ PARAMETERS = {
 }
 
 
+_AS_THEY_ARE = (
+    "imu", "odometry", "odometry_type", "truth", "truth_type", "base_frame", "mavlink", "px4", "topic", "pose_topic",
+    "pose_covariance", "depth",
+)  # fmt: skip
+
+
 def settings_of(given: Mapping[str, Any]) -> LiveSettings:
     """What ``gpvo live`` would have been asked, from parameters; empty texts are not given.
 
@@ -88,25 +93,12 @@ def settings_of(given: Mapping[str, Any]) -> LiveSettings:
     return LiveSettings(
         model=Path(p["model"]),
         stereo=None if p["left"] is None else (p["left"], p["right"]),
-        vo=StereoSettings() if p["left"] is None else _stereo_settings(p, vehicle),
-        imu=p["imu"],
-        odometry=p["odometry"],
-        pose_type=POSE_TYPE_NAMES[p["odometry_type"]],
-        truth=p["truth"],
-        truth_type=POSE_TYPE_NAMES[p["truth_type"]],
+        vo=None if p["left"] is None else _stereo_settings(p, vehicle),
         calibration=None if p["calibration"] is None else Path(p["calibration"]),
-        base_frame=p["base_frame"],
-        wire="ros2",
-        mavlink=p["mavlink"],
-        px4=p["px4"],
-        topic=p["topic"],
-        pose_topic=p["pose_topic"],
-        depth=p["depth"],
-        engine=EngineSettings(
-            increment=p["pose_covariance"] == "increment",
-            state=None if p["state"] is None else Path(p["state"]),
-            vehicle=vehicle,
-        ),
+        wire=WireSettings(ros2=True),
+        state=None if p["state"] is None else Path(p["state"]),
+        vehicle=vehicle,
+        **{name: p[name] for name in _AS_THEY_ARE},
     )
 
 
