@@ -21,7 +21,9 @@ def score(
         list[Path] | None,
         typer.Option("--truth", metavar="<path>", help="TUM poses of the same camera, in the same order."),
     ] = None,
-    truth_sigma: Annotated[str | None, typer.Option(help="Noise of the truth per pose: metres[,radians].")] = None,
+    truth_sigma: Annotated[
+        str | None, typer.Option(help="Noise of the truth per pose: metres[,radians]; none by default.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="With a folder of methods: write METHOD.json and board.csv here.")
     ] = None,
@@ -49,7 +51,7 @@ def score(
         if json_:
             print_json({"schema": 1, "methods": list(methods.values())})
         else:
-            _print_board(board(methods))
+            _print_board(board(methods), truth_sigma is None)
             for method, axes in on_other_axes(methods).items():
                 say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
         return
@@ -60,13 +62,14 @@ def score(
     if json_:
         print_json(found)
     else:
-        _print(found)
+        _print(found, truth_sigma is None)
 
 
+_EXACT = "The truth is taken as exact: an honest covariance seems overconfident if it is not. Give --truth-sigma."
 _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10 m and 100 m; 1 is right."
 
 
-def _print_board(columns: dict[str, list[Any]]) -> None:
+def _print_board(columns: dict[str, list[Any]], exact: bool) -> None:
     table = new_table("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
     for row in zip(*columns.values()):
         name, *numbers = row  # NEES and shares to two digits: the table fits 80 columns
@@ -74,9 +77,11 @@ def _print_board(columns: dict[str, list[Any]]) -> None:
     show(table)
     say(_LEGEND)
     say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
+    if exact:
+        say(_EXACT)
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print(found: dict[str, Any], exact: bool) -> None:
     table = new_table("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m")
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
@@ -85,6 +90,8 @@ def _print(found: dict[str, Any]) -> None:
         table.add_row(s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers))
     show(table)
     say(_LEGEND)
+    if exact:
+        say(_EXACT)
     pooled = found["pooled"]
     if pooled["nees_dof"]["low"] is None:
         say("With fewer than three sequences there is no mean with an interval.")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
 from gpvo.dataset.hand_eye import align_frames, windowed_motions
 from gpvo.errors import GpvoError
-from gpvo.io.run_read import Run
+from gpvo.io.run_read import Run, read_run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer, Window
@@ -217,7 +218,7 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
 
 
 def build_run(
-    run: Run,
+    run: Run | str | Path,
     *,
     columns: Sequence[str] | None = None,
     target: str = "frame",
@@ -225,7 +226,8 @@ def build_run(
     waits: str = "drop",
     odd: str = "keep",
 ) -> TrainingSet:
-    """The training set of a run folder. ``align``: see :func:`aligned_truth`."""
+    """The training set of a run or its folder. ``align``: see :func:`aligned_truth`."""
+    run = read_run(run)
     truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
     rows = build(run.log, truth, name=run.name, columns=columns, target=target, waits=waits, odd=odd, where=run.path)
     return replace(rows, odometry=that_matter(run.settings))

@@ -324,4 +324,4 @@ def _bag_covariance(read: list[Any], name: str) -> Array | None:
 
 def _looks_stated(covariance: Array) -> bool:
     """Whether most are: a dead reckoning begins without any uncertainty, and some odometries begin with zeros."""
-    return bool(transport.are_positive_definite(covariance).mean() > 0.5)
+    return bool(transport.are_covariances(transport.symmetrise(covariance)).mean() > 0.5)
