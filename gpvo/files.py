@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import math
 import os
 import re
+import stat
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ except ImportError:  # Windows: two writers there are not told of one another.
 _MAX_BYTES = 50_000_000
 _MAX_TOML_BYTES = 200_000
 _STEP_BYTES = 1 << 20
+_AT_ONCE: int = getattr(os, "O_NONBLOCK", 0)  # Windows has no pipes among its files
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -33,12 +36,24 @@ class TooLarge(Exception):
     """A file, or a part of one, is longer than anything that may stand in its place."""
 
 
+def at_once(path: str, flags: int) -> int:
+    """An ``opener`` of ``open``, for reading: a pipe that nobody writes to is empty instead of waited for. Raises
+    OSError for a device, which may have no end, or wait for someone to type."""
+    handle = os.open(path, flags | _AT_ONCE)
+    if stat.S_ISCHR(mode := os.fstat(handle).st_mode) or stat.S_ISBLK(mode):
+        os.close(handle)
+        raise OSError(errno.EINVAL, "it is a device, not a file")
+    if _AT_ONCE:
+        os.set_blocking(handle, True)  # one that somebody writes to may be slow
+    return handle
+
+
 def read_bounded(path: Path, most: int, beyond: str, kind: type[GpvoError] = SourceError) -> bytes:
     """All of a file or pipe. Raises an error of the ``kind`` where it cannot be read, or holds more than ``most``
     bytes, which is said as ``beyond``."""
     data = bytearray()
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=at_once) as file:
             while part := file.read(_STEP_BYTES):  # read(most) would allocate all of it at once
                 data += part
                 if len(data) > most:
@@ -57,6 +72,8 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     temporary: Path | None = None
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise OSError(errno.EINVAL, "it is a device or a pipe, not a file")
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         os.close(handle)
         temporary = Path(name)
@@ -168,16 +185,16 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(plain(document), indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a document, its texts without what a terminal would obey. Raises SourceError where the file is missing, too
-    large, or not a JSON object."""
+def read_json(path: Path, *, as_is: Collection[str] = ()) -> dict[str, Any]:
+    """Read a document, its texts without what a terminal would obey, but for what stands under the keys ``as_is``, such
+    as paths. Raises SourceError where the file is missing, too large, or not a JSON object."""
     try:
         document = parse_json(read_bounded(path, _MAX_BYTES, "is larger than 50 MB").decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise SourceError(f"is damaged: {str(error).splitlines()[0]}", where=path) from None
     if not isinstance(document, dict):
         raise SourceError("is damaged: no JSON object", where=path)
-    return {printable(k): printable_document(v) for k, v in document.items()}
+    return {printable(k): v if k in as_is else printable_document(v) for k, v in document.items()}
 
 
 def printable_document(value: Any) -> Any:

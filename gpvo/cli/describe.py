@@ -14,7 +14,7 @@ from gpvo.io.foreign import guess_format, read_foreign
 from gpvo.io.parquet import count_rows
 from gpvo.io.run import read_run
 from gpvo.io.run_read import is_run
-from gpvo.io.source import guess, open_source
+from gpvo.io.source import existing, guess, open_source
 from gpvo.io.trajectory import read_kitti_poses
 
 _HEAD = 100_000
@@ -26,8 +26,7 @@ def describe(path: Path, kind: str | None = None, options: dict[str, Any] | None
     ``kind`` treats the path as a sequence of that format, ``options`` go to its source. Raises GpvoError if the path is
     nothing that gpvo knows, or is damaged.
     """
-    if not path.exists():
-        raise SourceError("no such file or folder", where=path)
+    path = existing(path)
     if kind is None and path.suffix.lower() in (".safetensors", ".gpvo"):
         return _model(path)
     if kind is None:

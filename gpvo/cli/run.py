@@ -69,7 +69,7 @@ def run(
 
         summary = runner.run(
             sequence, out, config, predictor, on_frame, keep_tracks=keep_tracks, overwrite=overwrite,
-            calibration_state=state, options=options,
+            calibration_state=state, options=options, meta=None if model is None else {"model": str(model.resolve())},
         )  # fmt: skip
     if model is not None and inside and sum(inside) < ENOUGH_INSIDE * len(inside):
         share = 100 * sum(inside) / len(inside)

@@ -16,7 +16,7 @@ def score(
     truth: Annotated[
         list[Path] | None, "TUM poses of the same camera, in the same order.", {"metavar": "<path>"}
     ] = None,
-    truth_sigma: Annotated[str | None, "Noise of the truth per pose: metres[,radians]."] = None,
+    truth_sigma: Annotated[str | None, "Noise of the truth per pose: metres[,radians]; none by default."] = None,
     out: Annotated[Path | None, "With a folder of methods: write METHOD.json and board.csv here."] = None,
     json_: Json = False,
 ) -> None:
@@ -39,19 +39,20 @@ def score(
             methods = score_folder(stated[0], options)
         if out is not None:
             write_board(methods, out)
-        answer(json_, {"schema": 1, "methods": list(methods.values())}, lambda: _print_board(methods))
+        answer(json_, {"schema": 1, "methods": list(methods.values())}, lambda: _print_board(methods, truth_sigma is None))
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
     with progress("files", 1):
         found = score_files(list(zip(stated, truth)), options)
-    answer(json_, found, lambda: _print(found))
+    answer(json_, found, lambda: _print(found, truth_sigma is None))
 
 
+_EXACT = "The truth is taken as exact: an honest covariance seems overconfident if it is not. Give --truth-sigma."
 _LEGEND = "E: energy score, lower is better. NEES: per motion, then over 1 s, 10 m and 100 m; 1 is right."
 
 
-def _print_board(methods: dict[str, dict[str, Any]]) -> None:
+def _print_board(methods: dict[str, dict[str, Any]], exact: bool) -> None:
     from gpvo.evaluation.score import board, on_other_axes
 
     head = ("method", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m", "easy", "hard")
@@ -59,11 +60,13 @@ def _print_board(methods: dict[str, dict[str, Any]]) -> None:
     show(head, ([row[0], *map(cell, row[1:4]), *(cell(v, 2) for v in row[4:])] for row in rows))
     say(_LEGEND)
     say("easy, hard: share within 1 sigma (0.68 is right) of the motions that the method calls easiest and hardest.")
+    if exact:
+        say(_EXACT)
     for method, axes in on_other_axes(methods).items():
         say(f"{method}: NLL and NEES are of {', '.join(axes)} alone: not comparable with those of others.")
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print(found: dict[str, Any], exact: bool) -> None:
     rows = []
     for s in found["sequences"]:
         energy = (1e3 * s["energy_translation_m"], 1e3 * s["energy_rotation_rad"])
@@ -72,6 +75,8 @@ def _print(found: dict[str, Any]) -> None:
         rows.append([s["sequence"], str(s["motions"]), str(s["lost"]), *map(cell, numbers)])
     show(("sequence", "motions", "lost", "E [mm]", "[mrad]", "NLL", "NEES", "1 s", "10 m", "100 m"), rows)
     say(_LEGEND)
+    if exact:
+        say(_EXACT)
     pooled = found["pooled"]
     if pooled["nees_dof"]["low"] is None:
         say("With fewer than three sequences there is no mean with an interval.")

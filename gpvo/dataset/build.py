@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from gpvo.dataset.doubtful import false_motions, in_waits, odd_stretches
 from gpvo.dataset.errors import motion_targets, position_targets, require_attitude
 from gpvo.dataset.hand_eye import align_frames, windowed_motions
 from gpvo.errors import GpvoError
-from gpvo.io.run_read import Run
+from gpvo.io.run_read import Run, read_run
 from gpvo.online.base import RESIDUAL_COLUMN, positions
 from gpvo.online.features import resolve
 from gpvo.online.observer import Observer, Window
@@ -216,9 +217,10 @@ def lost_of(log: VoLog) -> tuple[int, list[VoRecord], Array]:
     return n_lost, slips, np.array(jumps).reshape(-1, 6)
 
 
-def build_run(run: Run, *, align: str = "none", **how: Any) -> TrainingSet:
-    """The training set of a run folder. ``align``: see :func:`aligned_truth`; ``how``: further arguments of
+def build_run(run: Run | str | Path, *, align: str = "none", **how: Any) -> TrainingSet:
+    """The training set of a run or its folder. ``align``: see :func:`aligned_truth`; ``how``: further arguments of
     :func:`build`, as ``columns``, ``target``, ``waits`` and ``odd``."""
+    run = read_run(run)
     truth = None if run.truth is None else aligned_truth(run.log, run.truth, align)
     rows = build(run.log, truth, name=run.name, where=run.path, **how)
     return replace(rows, odometry=that_matter(run.settings))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.dataset.build import observe, that_matter
+from gpvo.errors import GpvoError
 from gpvo.io.run_read import Run
 from gpvo.online.guard import camera_problems
 from gpvo.online.predictor import Predictor
@@ -69,8 +70,9 @@ def check(predictor: Predictor, run: Run) -> Check:
 
 
 def warn_of_misfits(model: Path | None, predictor: Predictor | None, run: Run) -> tuple[str, ...]:
-    """Warn of each problem that :func:`check` finds, and return its misfits, none without a model; ``model``: the file,
-    to name it."""
+    """Warn of each problem that :func:`check` finds, and return its misfits. ``model``: the file, to name it; without
+    one, the model of the predictions that are stored with the run, see :func:`predictor_of`."""
+    predictor = predictor or predictor_of(run)
     if predictor is None:
         return ()
     found = check(predictor, run)
@@ -79,6 +81,18 @@ def warn_of_misfits(model: Path | None, predictor: Predictor | None, run: Run) -
             f"{'the model' if model is None else model.name} does not fit {run.name}: {problem}", stacklevel=2
         )
     return found.misfits
+
+
+def predictor_of(run: Run) -> Predictor | None:
+    """The model of the predictions that are stored with a run; None where its file is gone, or is another now."""
+    path = run.meta.get("model")
+    if not run.predictions or not isinstance(path, str):
+        return None
+    try:
+        found = Predictor.load(path)
+    except GpvoError:
+        return None
+    return found if found.digest == run.meta.get("model_digest") else None
 
 
 def _learned_from(predictor: Predictor, X: Array) -> bool:

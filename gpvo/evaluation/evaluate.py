@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import along
 from gpvo.dataset.build import aligned_truth, predictions_of
-from gpvo.dataset.check import check
+from gpvo.dataset.check import check, predictor_of
 from gpvo.dataset.clock import estimate_time_offset, on_clock_of_log
 from gpvo.dataset.doubtful import Stretch, jumps, odd_stretches, without_wandering_truth
 from gpvo.dataset.errors import (
@@ -36,7 +37,7 @@ from gpvo.evaluation.trajectory import (
     trajectory_errors,
 )
 from gpvo.geometry import se3
-from gpvo.io.run import Run
+from gpvo.io.run import Run, read_run
 from gpvo.online.predictor import Predictor
 from gpvo.types import Array, Prediction, Status, TruthLog, VoLog
 
@@ -122,20 +123,20 @@ class Evaluation:
 
 
 def evaluate_run(
-    run: Run,
+    run: Run | str | Path,
     predictor: Predictor | None = None,
     options: EvaluateOptions | None = None,
     further: Sequence[Statement] = (),
     misfits: tuple[str, ...] | None = None,
 ) -> Evaluation:
-    """Evaluate a run against its truth; with a predictor, predictions are made as in flight, else those of the run
-    are used. A motion that either says is lost counts as lost for every method. ``further``: methods of elsewhere.
-    ``misfits``: those of :func:`gpvo.dataset.check.check`, where they are known.
+    """Evaluate a run, or its folder, against its truth; with a predictor, predictions are made as in flight, else those
+    of the run are used. A motion that either says is lost counts as lost for every method. ``further``: methods of
+    elsewhere. ``misfits``: those of :func:`gpvo.dataset.check.check`, where they are known.
 
     Raises SourceError if the run has no truth, or none at the times of its frames; ModelError if the model predicts
     something else than the error of a motion.
     """
-    options = options or EvaluateOptions()
+    run, options = read_run(run), options or EvaluateOptions()
     truth, offset_s = _truth(run, options)
     predictions, misfits = predictions_of(run, predictor), _misfits(run, predictor, misfits)
     run = replace(run, log=judged(run.log, predictions))
@@ -239,9 +240,8 @@ def unjudged_run(run: Run, predictor: Predictor | None = None, misfits: tuple[st
 
 
 def _misfits(run: Run, predictor: Predictor | None, known: tuple[str, ...] | None) -> tuple[str, ...]:
-    if known is not None or predictor is None:
-        return known or ()
-    return check(predictor, run).misfits
+    predictor = predictor or predictor_of(run) if known is None else None
+    return known or () if predictor is None else check(predictor, run).misfits
 
 
 def _in_domain(predictions: Mapping[int, Prediction]) -> float | None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpvo.dataset.check import check
+from gpvo.dataset.check import check, predictor_of
 from gpvo.errors import GpvoError
 from gpvo.evaluation.evaluate import distinct
 from gpvo.evaluation.flights import constants_in, constants_of, flight_of, start_sigmas
@@ -90,8 +90,8 @@ def fuse_runs(
     for run, name in zip(runs, distinct([r.name for r in runs]), strict=True):
         flights.append(replace(flight_of(run, predictor, use_imu=settings.use_imu), name=name))
         warnings += _findings(run, flights[-1], options)
-        if predictor is not None:
-            warnings += [f"{name}: the model does not fit: {problem}" for problem in check(predictor, run).problems]
+        if (stating := predictor or predictor_of(run)) is not None:
+            warnings += [f"{name}: the model does not fit: {problem}" for problem in check(stating, run).problems]
     constants = _constants(settings, predictor, flights, options, tell)
     learned = any(f.predictions for f in flights)
     policies = make_policies(constants, names=settings.policies, learned=learned)

@@ -23,7 +23,7 @@ from gpvo.geometry import se3
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run_read import Run
 from gpvo.io.stated import read_stated, to_records, write_stated
-from gpvo.io.trajectory import read_tum, write_tum
+from gpvo.io.trajectory import check_overlap, read_tum, write_tum
 from gpvo.online.features import AXES
 from gpvo.online.predictor import Predictor
 from gpvo.stats.series import sequence_bootstrap
@@ -76,10 +76,12 @@ def score(files: Sequence[tuple[Path, Path]], options: EvaluateOptions | None = 
 def score_sequence(stated: Path, truth: Path, options: EvaluateOptions | None = None) -> SequenceScore:
     """Scores of one file of stated motions against TUM poses of the same camera."""
     log, poses = _read(stated), read_tum(truth)
+    of_poses = TruthLog(poses.t_ns, poses.T_world_body)
+    check_overlap(of_poses, log.t_ns, truth)
     options = options or EvaluateOptions()
     # The judge declares the truth's noise. An estimate would depend on the method that is judged.
     options = replace(options, truth_sigma=options.truth_sigma or (0.0, 0.0))
-    run = Run(stated, stated.stem, log, TruthLog(poses.t_ns, poses.T_world_body), None, Mounting(), [])
+    run = Run(stated, stated.stem, log, of_poses, None, Mounting(), [])
     evaluation = evaluate_run(run, options=options)
     c, usable = evaluation.consistency.get(IMPORTED), int(log.usable.sum())
     if c is None or c.nll_per_dim is None or c.one_second is None:

@@ -64,14 +64,13 @@ def _have_roots(C: Array) -> NDArray[np.bool_]:
     return np.ones(len(C), bool)
 
 
-def are_positive_definite(C: Array, *, semi: bool = False) -> NDArray[np.bool_]:
-    """(N,) which of (N, n, n) symmetric matrices are finite and positive definite, or semidefinite, up to rounding:
-    whatever the axes' units, as it is their correlations that are judged."""
+def are_semidefinite(C: Array) -> NDArray[np.bool_]:
+    """(N,) which of (N, n, n) symmetric matrices are finite and positive semidefinite up to rounding: whatever the
+    axes' units, as it is their correlations that are judged."""
     C = np.asarray(C, dtype=np.float64)
     variance = variances(C)
     with np.errstate(all="ignore"):
-        positive = (variance >= 0) if semi else (variance > 1 / LARGEST)
-        good: NDArray[np.bool_] = np.asarray((np.abs(C) < LARGEST).all(axis=(1, 2)) & positive.all(axis=1))
+        good: NDArray[np.bool_] = np.asarray((np.abs(C) < LARGEST).all(axis=(1, 2)) & (variance >= 0).all(axis=1))
         sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
         R = C / sigma[:, :, None] / sigma[:, None, :]
     good &= np.isfinite(R).all(axis=(1, 2))

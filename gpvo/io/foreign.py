@@ -317,4 +317,4 @@ def _read_bag_topic(path: Path, topic: str, complete: bool) -> ForeignLog:
 
 def _looks_stated(covariance: Array) -> bool:
     """Whether most are: a dead reckoning begins without any uncertainty, and some odometries begin with zeros."""
-    return bool(transport.are_positive_definite(covariance).mean() > 0.5)
+    return bool(transport.are_covariances(transport.symmetrise(covariance)).mean() > 0.5)

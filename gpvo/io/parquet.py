@@ -38,7 +38,6 @@ _TYPE = {"bool": 0, "int32": 1, "int64": 2, "float32": 4, "float64": 5, "string"
 _MAGIC, _GZIP, _PLAIN, _RLE, _OPTIONAL, _UTF8 = b"PAR1", 2, 0, 3, 1, 0
 _I32, _I64, _TEXT, _LIST, _STRUCT = 5, 6, 8, 9, 12
 _LEVEL = 1  # of gzip: covariances hardly shrink further
-MAX_ROWS = 50_000_000
 MAX_COLUMNS = 4096
 MAX_BYTES = 8_000_000_000
 _BLOCK_ROWS = 50_000
@@ -245,17 +244,17 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             shape = file.metadata
-            if shape.num_rows > MAX_ROWS or shape.num_columns > MAX_COLUMNS:
-                raise SourceError(
-                    f"has {shape.num_rows} rows and {shape.num_columns} columns: too large for a run", where=path
-                )
-            if sum(shape.row_group(i).total_byte_size for i in range(shape.num_row_groups)) > MAX_BYTES:
-                raise SourceError("unpacks to more than 8 GB", where=path)
+            if shape.num_columns > MAX_COLUMNS:
+                raise SourceError(f"has {shape.num_columns} columns: too many for a run", where=path)
+            cells, stated = shape.num_rows * shape.num_columns, range(shape.num_row_groups)
+            if max(8 * cells, sum(shape.row_group(i).total_byte_size for i in stated)) > MAX_BYTES:
+                cure = f"it has {shape.num_rows} rows: run the sequence in parts"
+                raise SourceError("unpacks to more than 8 GB", where=path, cure=cure)
             names = file.schema_arrow.names
             if len(set(names)) < len(names):
                 raise ValueError("two columns have the same name")
             # What a page's run lengths stand for is in no size that the file states.
-            cells, packed = shape.num_rows * shape.num_columns, path.stat().st_size
+            packed = path.stat().st_size
             if 8 * cells > _PLAIN_BYTES + _MAX_RATIO * packed:
                 raise SourceError(f"unpacks {packed} bytes to {cells} numbers: too large for a run", where=path)
             yield file

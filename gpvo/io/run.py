@@ -25,7 +25,7 @@ import numpy as np
 from gpvo import __version__
 from gpvo.errors import SourceError
 from gpvo.files import write_json, write_toml
-from gpvo.geometry.covariance import are_positive_definite, from_upper, upper
+from gpvo.geometry.covariance import are_covariances, from_upper, upper
 from gpvo.io import run_folder, run_table
 from gpvo.io.parquet import RowGroup, join_tables, write_table
 from gpvo.io.run_folder import SCHEMA, is_finished
@@ -281,6 +281,6 @@ def as_stored(record: VoRecord) -> VoRecord:
     """The record as it will be read: covariances by their upper triangles, without those that are none: not finite, or
     not positive definite."""
     C = from_upper(upper(np.array(list(record.covariances.values())).reshape(-1, 6, 6)), 6)
-    good = are_positive_definite(C) if record.usable else np.ones(len(C), bool)
+    good = are_covariances(C) if record.usable else np.ones(len(C), bool)
     kept = {name: c for name, c, is_good in zip(record.covariances, C, good) if is_good}
     return replace(record, covariances=kept)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import shutil
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -75,7 +77,10 @@ def claim(path: Path) -> FolderLock:
 
 
 def put_in_place(new: Path, target: Path) -> None:
-    """Exchange a folder for a newer one; at no moment is there neither."""
+    """Exchange a folder for a newer one, in one step where the system can: else ``target`` is missing for a moment."""
+    if _exchanged(new, target):
+        shutil.rmtree(new, ignore_errors=True)
+        return
     old = target.with_name(f".{target.name}.old")
     try:
         shutil.rmtree(old, ignore_errors=True)
@@ -84,6 +89,13 @@ def put_in_place(new: Path, target: Path) -> None:
     except OSError as error:
         raise OutputError(f"cannot be replaced: {error.strerror}; run the command again", where=target) from None
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Whether two folders have changed places, which Linux does in one step on most file systems."""
+    swap = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    at, flag = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return swap is not None and swap(at, os.fsencode(one), at, os.fsencode(other), flag) == 0
 
 
 def prepare(path: Path, *, keep_chunks: bool) -> None:

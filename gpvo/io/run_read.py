@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpvo.errors import CalibrationError, SourceError, printable
 from gpvo.files import read_json, read_toml
-from gpvo.geometry.covariance import are_positive_definite, variances
+from gpvo.geometry.covariance import LARGEST, are_semidefinite, variances
 from gpvo.io import run_table
 from gpvo.io.parquet import read_blocks, read_columns
 from gpvo.types import (
@@ -77,11 +77,13 @@ def is_run(path: str | Path) -> bool:
     return (p / "run.json").is_file() and ((p / "vo_log.parquet").is_file() or (p / "chunks").is_dir())
 
 
-def read_run(path: str | Path) -> Run:
-    """Read a run folder; for a killed run, what its complete chunks hold.
+def read_run(path: str | Path | Run) -> Run:
+    """Read a run folder; for a killed run, what its complete chunks hold. A run that is read already is returned.
 
     Raises SourceError if it is not a run folder, is newer than this version, or a file in it is damaged.
     """
+    if isinstance(path, Run):
+        return path
     p = Path(path)
     if not p.is_dir():
         what = "is a file, not a run folder" if p.exists() else "no such run folder"
@@ -108,7 +110,7 @@ def read_run(path: str | Path) -> Run:
 def read_meta(path: Path) -> dict[str, Any]:
     """``run.json`` of a run folder. Raises SourceError where it is newer than this version, or damaged."""
     file = path / "run.json"
-    meta = read_json(file)
+    meta = read_json(file, as_is=_PATHS)
     schema = meta.get("schema")
     if not isinstance(schema, int) or schema > _MAX_SCHEMA:
         raise SourceError(f"has schema {schema!r}, this gpvo reads {_MAX_SCHEMA}", where=file, cure="upgrade")
@@ -141,6 +143,8 @@ def _is_gap(value: Any) -> bool:
     )
 
 
+_PATHS = ("options", "model")
+"""Keys of ``run.json`` under which paths stand: another spelling of these would lead elsewhere, or nowhere."""
 _META: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("twin", "options", "vehicle"), lambda v: v is None or isinstance(v, dict)),
     "frames": lambda v: v is None or _is_count(v),
@@ -255,7 +259,8 @@ def check_log(log: VoLog, path: Path) -> None:
 
 
 def _check_covariances(C: Array, what: str, path: Path, *, semi: bool = False) -> None:
-    good = are_positive_definite(C, semi=semi)
+    good = are_semidefinite(C)  # up to rounding: a sum of stored parts is rounded otherwise than its writer's
+    good &= semi | (variances(C) > 1 / LARGEST).all(axis=1)
     if not good.all():
         word = "positive semidefinite" if semi else "positive definite"
         raise SourceError(f"its {what} number {int(np.flatnonzero(~good)[0]) + 1} is not {word}", where=path)

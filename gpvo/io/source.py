@@ -146,9 +146,7 @@ def guess(path: str | Path) -> str:
 
     Raises SourceError where the path does not exist, is empty, or nothing recognises it.
     """
-    p = Path(path)
-    if not p.exists():
-        raise SourceError("no such file or folder", where=p)
+    p = existing(Path(path))
     if p.is_dir() and not any(p.iterdir()):
         raise SourceError("the folder is empty", where=p, cure="give the folder that holds the sequence")
     if p.is_file() and p.stat().st_size == 0:
@@ -172,6 +170,13 @@ def guess(path: str | Path) -> str:
     )
 
 
+def existing(path: Path) -> Path:
+    """The same path. Raises SourceError where it is no file or folder: a pipe or a device cannot be gone back in."""
+    if not (path.is_file() or path.is_dir()):
+        raise SourceError("is a pipe or a device" if path.exists() else "no such file or folder", where=path)
+    return path
+
+
 def open_source(path: str | Path, kind: str | None = None, **options: Any) -> Source:
     """Open a sequence; ``kind`` overrides the guess, ``options`` go to the source.
 
@@ -184,10 +189,8 @@ def open_source(path: str | Path, kind: str | None = None, **options: Any) -> So
     if kind is not None and kind not in kinds:
         raise SourceError(f"unknown source '{kind}'", cure=f"choose one of {', '.join(kinds)}")
     name = guess(path) if kind is None else kind
-    if not Path(path).exists():
-        raise SourceError("no such file or folder", where=path)
     try:
-        return kinds[name]()(Path(path), **options)
+        return kinds[name]()(existing(Path(path)), **options)
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
             raise

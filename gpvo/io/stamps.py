@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.errors import SourceError
+from gpvo.files import at_once
 from gpvo.io.source import SourceReport
 
 Stamps = NDArray[np.int64]
@@ -46,16 +47,25 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError("is larger than 2 GB: too large for a log", where=path)
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
+        with open(path, encoding="utf-8-sig", errors="replace", opener=at_once) as file:
             for number, line in enumerate(iter(partial(file.readline, _MAX_CHARACTERS + 1), ""), 1):
+                if "\0" in line:
+                    raise _not_text(number, path)
                 if len(line) > _MAX_CHARACTERS:
                     raise SourceError(f"line {number} is longer than a million characters", where=path)
-                if "\0" in line:
-                    raise SourceError("is no text file, or one in UTF-16", where=path, cure="give it as UTF-8 text")
                 if text := line.strip().removeprefix("\ufeff"):
                     yield number, text
     except OSError as error:
         raise SourceError(f"cannot be read: {error.strerror}", where=path) from None
+
+
+def _not_text(number: int, path: Path) -> SourceError:
+    """What to raise where a line holds NUL. Of text in UTF-16 the first line does; file systems fill up with NUL what
+    was not on the disk yet when power was lost."""
+    if number == 1:
+        return SourceError("is no text file, or one in UTF-16", where=path, cure="give it as UTF-8 text")
+    what = f"line {number} holds NUL bytes, as where power was lost while it was written"
+    return SourceError(what, where=path, cure=f"keep the lines before it: head -n {number - 1} {path.name} > NEW")
 
 
 def seconds_text_to_ns(text: str) -> int:

@@ -22,7 +22,6 @@ from gpvo.files import write_text
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import (
     are_covariances,
-    are_positive_definite,
     from_upper,
     is_positive_definite,
     symmetrise,
@@ -126,7 +125,7 @@ def to_records(log: ForeignLog) -> tuple[list[VoRecord], list[str]]:
         notes.append(f"motions that count as lost, over gaps of more than {GAP_STEPS} usual steps: {len(gaps)}")
     if unknown:
         notes.append(f"motions that count as lost, as their covariance says that they are unknown: {len(unknown)}")
-    if cov is not None and (bad := int((np.isfinite(cov).all(axis=(1, 2)) & ~are_positive_definite(cov))[1:].sum())):
+    if cov is not None and (bad := int((np.isfinite(cov).all(axis=(1, 2)) & ~are_covariances(cov))[1:].sum())):
         notes.append(f"{bad} of {len(motions)} covariances are not positive definite and were left out")
     if len(steps) and not log.is_counted and (usual_s := float(np.median(steps)) * 1e-9) > _UNUSUAL_S:
         notes.append(
@@ -160,7 +159,7 @@ def _motion_covariances(log: ForeignLog, motions: Array) -> tuple[str, Array | N
     if log.covariance is None:
         return "", None, []
     C = symmetrise(log.covariance)
-    if np.isfinite(C).all(axis=(1, 2)).any() and not are_positive_definite(C).any():
+    if np.isfinite(C).all(axis=(1, 2)).any() and not are_covariances(C).any():
         return "", None, [NONE_STATED]
     if log.covariance_of == "motion":
         return IMPORTED, C, _if_of_poses(C[1:], motions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from gpvo.dataset.build import TrainingSet, build_run
@@ -61,8 +62,8 @@ class TrainConfig:
         """Those that determine the model, not where its folds are fitted and kept."""
         return {k: v for k, v in asdict(self).items() if k not in ("jobs", "backend", "scheduler", "keep")}
 
-    def rows_of(self, run: Run) -> TrainingSet:
-        """The training set of a run under these settings."""
+    def rows_of(self, run: Run | str | Path) -> TrainingSet:
+        """The training set of a run, or of its folder, under these settings."""
         return build_run(run, target=self.target, align=self.align, waits=self.waits, odd=self.odd)
 
 

@@ -61,16 +61,17 @@ class TrainedModel:
 
 
 def train(
-    runs: Iterable[Run], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
+    runs: Iterable[Run | str | Path], config: TrainConfig | None = None, *, on_fit: OnFit = lambda done, total: None
 ) -> TrainedModel:
-    """Learn from runs with ground truth, and judge by leaving each run out; :func:`gpvo.learning.store.save_model`
-    writes the result.
+    """Learn from runs with ground truth, or their folders, and judge by leaving each run out;
+    :func:`gpvo.learning.store.save_model` writes the result.
 
     ``on_fit`` is called with how many fits are done, of how many, for progress bars. Raises GpvoError if a run has no
     truth, or the runs do not belong together.
     """
     config = config or TrainConfig()
-    return train_sets([config.rows_of(r) for r in runs], config, on_fit=on_fit)
+    several = [runs] if isinstance(runs, str | Path | Run) else runs
+    return train_sets([config.rows_of(r) for r in several], config, on_fit=on_fit)
 
 
 # On one thread: sums split otherwise round otherwise, and the same rows must give the same bytes on any machine.

@@ -21,7 +21,7 @@ from gpvo.dataset.check import odometry_problems, rate_problems
 from gpvo.errors import GpvoError
 from gpvo.files import read_json, write_json
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import are_positive_definite, lost_covariance, symmetrise
+from gpvo.geometry.covariance import are_semidefinite, lost_covariance, symmetrise
 from gpvo.geometry.se3 import is_rigid, rotate_covariance
 from gpvo.io.trajectory import FARTHEST_M
 from gpvo.live.intake import Arrival
@@ -362,7 +362,7 @@ def load_state(path: Path | None) -> KeptState | None:
         twist = np.array(document.get("twist", np.zeros(6)), dtype=np.float64)
         if T.shape != (4, 4) or not is_rigid(T, FARTHEST_M):
             raise ValueError("it holds no pose")
-        if C.shape != (6, 6) or not are_positive_definite(C[None], semi=True).all():
+        if C.shape != (6, 6) or not are_semidefinite(C[None]).all():
             raise ValueError("its covariance is not positive semidefinite")
         if scale.shape != (6,) or not ((scale > 1e-3) & (scale < 1e3)).all():
             raise ValueError("it holds an impossible scale")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gpvo.errors import printable
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import (
-    are_positive_definite,
+    are_semidefinite,
     change_body,
     is_positive_definite,
     is_symmetric,
@@ -237,7 +237,7 @@ def stated_covariance(holder: Any) -> Array | None:
     if flat is None or np.size(flat) != 36:
         return None
     C = np.asarray(flat, dtype=np.float64).reshape(6, 6)
-    return C if are_positive_definite(C[None], semi=True)[0] and is_symmetric(C) else None
+    return C if are_semidefinite(C[None])[0] and is_symmetric(C) else None
 
 
 def lost(record: VoRecord, duration_s: float, covariance: Array, method: str) -> VoRecord:

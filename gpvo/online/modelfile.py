@@ -66,8 +66,9 @@ def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], heade
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Arrays and header of a model file; ModelError (one line) if it is missing, damaged, truncated or too new."""
     path = Path(path)
-    if path.is_dir():
-        raise ModelError("is a folder, not a model file", where=path, cure="give one of gpvo train, before the run")
+    if path.exists() and not path.is_file():  # a pipe cannot be read again, for its digest
+        kind = "folder" if path.is_dir() else "pipe or a device"
+        raise ModelError(f"is a {kind}, not a model file", where=path, cure="give one of gpvo train, before the run")
     beyond = f"is larger than {MAX_FILE_BYTES} bytes: not a model file"
     blob = read_bounded(path, MAX_FILE_BYTES, beyond, ModelError)
     try:

@@ -23,6 +23,7 @@ from gpvo.publish.onnx import to_onnx
 
 SUFFIXES = {"onnx": ".onnx", "c": ".h"}
 FORMATS = tuple(SUFFIXES)
+_WRITTEN = {"onnx": b"\x12\x04gpvo", "c": b"written by gpvo"}  # stands in the first line, or as the producer
 PREFIX = "gpvo"
 """Of every symbol, unless another is asked for."""
 _PER_LINE = 8
@@ -56,9 +57,13 @@ def export_model(model: Path, path: Path, to: str, *, prefix: str = PREFIX) -> N
     """Write the model file ``model`` as ``to`` ("onnx" or "c").
 
     ``prefix``: of every symbol in C, so that one program can hold several models. GpvoError for other formats or names,
-    a prefix that is no C identifier, or a bad file.
+    a prefix that is no C identifier, a bad file, or where ``path`` holds anything but an earlier export.
     """
     to = format_of(to, path)
+    if path.is_file():
+        with path.open("rb") as file:
+            if _WRITTEN[to] not in file.read(100):
+                raise GpvoError("is another file, not an earlier export", where=path, cure="choose another -o")
     if prefix != PREFIX and to != "c":
         raise GpvoError(f"{to} has no symbols to prefix with '{prefix}'", cure="give it only with c")
     predictor = Predictor.load(model)

@@ -21,7 +21,7 @@ from gpvo.geometry import se3
 from gpvo.io.run import write_run
 from gpvo.io.run_read import Run, read_run
 from gpvo.io.stated import HEADER, read_stated, write_stated
-from gpvo.io.trajectory import tum_line, write_tum
+from gpvo.io.trajectory import read_tum, tum_line, write_tum
 from gpvo.types import Mounting, Status, StereoTracks, VoLog, VoRecord
 from synthetic_runs import make_run as synthetic_run
 
@@ -313,3 +313,21 @@ def test_the_scoreboard_of_the_documentation_comes_from_its_files(tmp_path: Path
         shown = json.loads((ROOT / "docs" / "scoreboard" / f"{method}.json").read_text())
         for name in ("nll_per_dim", "nees_dof", "energy_translation_m"):
             assert scores["pooled"][name]["mean"] == pytest.approx(shown["pooled"][name]["mean"], rel=1e-3), method
+
+
+def test_that_the_truth_is_taken_as_exact_is_said(written, capsys) -> None:
+    folder = written[0]
+    of_one = [str(folder / "triangulation" / "hall.txt"), "--truth", str(folder / "truth" / "hall.txt")]
+    for words in ([str(folder)], of_one):
+        for given, said in (([], True), (["--truth-sigma", "0"], False)):
+            cli.app(["score", *words, *given], standalone_mode=False)
+            assert ("The truth is taken as exact" in capsys.readouterr().out) == said
+
+
+def test_a_truth_of_another_clock_is_refused_without_an_option_that_is_not_there(written, tmp_path: Path) -> None:
+    stated, truth = (written[0] / of / "hall.txt" for of in ("triangulation", "truth"))
+    poses = read_tum(truth)
+    write_tum(tmp_path / "later.txt", poses.t_ns + 10**13, poses.T_world_body)
+    with pytest.raises(SourceError, match=r"later\.txt: the ground truth .* does not overlap") as refused:
+        score_sequence(stated, tmp_path / "later.txt")
+    assert "--time-offset" not in str(refused.value)

@@ -44,13 +44,13 @@ def read_model(path: Path) -> None:
 
 
 def read_run_folder(path: Path) -> None:
-    from gpvo.geometry.covariance import are_positive_definite
+    from gpvo.geometry.covariance import are_covariances
     from gpvo.io.run import read_run
 
     run = read_run(path)
     assert np.isfinite(run.log.trajectory()).all(), "a trajectory that is none"
     told = list(flying_model().replay(run.log).values())
-    assert are_positive_definite(np.array([p.covariance for p in told])).all(), "a covariance that is none"
+    assert are_covariances(np.array([p.covariance for p in told])).all(), "a covariance that is none"
     assert np.isfinite([p.mean for p in told]).all(), "a mean that is none"
 
 

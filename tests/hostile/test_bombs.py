@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
+import signal
 import struct
+import subprocess
+import threading
 import time
 import tracemalloc
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -24,16 +30,18 @@ from gpvo.cameras.readers import read_stereo_yaml
 from gpvo.cameras.rectify import Rectifier, read_mask
 from gpvo.cameras.rig import StereoRig
 from gpvo.cli.describe import describe
-from gpvo.errors import CalibrationError, GpvoError, SourceError
-from gpvo.files import read_json, read_toml
+from gpvo.errors import CalibrationError, GpvoError, OutputError, SourceError
+from gpvo.files import read_json, read_toml, write_text
 from gpvo.geometry.se3 import from_rt
 from gpvo.io import open_source
 from gpvo.io.folder import FolderSource
 from gpvo.io.foreign import read_foreign
 from gpvo.io.images import read_grey8
-from gpvo.io.parquet import read_blocks, read_columns
+from gpvo.io.parquet import count_rows, join_tables, read_blocks, read_columns, write_table
 from gpvo.io.run_read import _read_imu
 from gpvo.io.tracks import TracksSource
+from gpvo.io.trajectory import read_tum
+from gpvo.online.predictor import Predictor
 
 ENCODINGS = (".png", ".jpg", ".bmp", ".tif", ".pgm", ".ppm", ".webp")
 
@@ -303,14 +311,105 @@ def test_lengths_that_are_none_in_an_mcap_are_refused(tmp_path: Path) -> None:
     assert _peak_mb() - before < 500
 
 
-def test_a_file_without_an_end_is_left_at_its_bound() -> None:
+@contextmanager
+def _within_seconds(seconds: float) -> Iterator[None]:
+    """What waits for longer fails."""
+
+    def late(*_: object) -> None:
+        raise AssertionError("it waits")  # no OSError, which readers catch
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_a_pipe_without_an_end_is_left_at_its_bound(tmp_path: Path) -> None:
     """Its size is 0 to whoever asks before reading."""
+    os.mkfifo(tmp_path / "pipe")
+    end = os.open(tmp_path / "pipe", os.O_RDWR)  # both ends, so that neither waits for the other
+
+    def write() -> None:
+        with suppress(OSError):
+            while True:
+                os.write(end, bytes(1 << 16))
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
     with pytest.raises(SourceError, match="larger than 50 MB"):
-        read_json(Path("/dev/zero"))
+        read_json(tmp_path / "pipe")
     with pytest.raises(GpvoError, match="too large for settings"):
-        read_toml(Path("/dev/zero"))
+        read_toml(tmp_path / "pipe")
     with pytest.raises(CalibrationError, match="too large for a calibration"):
-        calibration_text(Path("/dev/zero"))
+        calibration_text(tmp_path / "pipe")
+    os.set_blocking(end, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.read(end, 1 << 16)
+    writer.join(10.0)
+    os.close(end)
+
+
+READERS = {
+    "json": read_json,
+    "toml": read_toml,
+    "calibration": calibration_text,
+    "log": read_foreign,
+    "poses": read_tum,
+    "model": Predictor.load,
+    "tracks": lambda path: open_source(path, "tracks"),
+    "sequence": open_source,
+    "info": describe,
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_what_is_no_file_is_refused_at_once(reader: str, kind: str, tmp_path: Path) -> None:
+    """A pipe that nobody writes to would be waited for, and a device may have no end."""
+    path = tmp_path / "it.txt"
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    before = _peak_mb()
+    with _within_seconds(20.0):
+        if kind == "pipe" and reader in ("toml", "calibration"):
+            assert not READERS[reader](path), "as of an empty file"
+        else:
+            with pytest.raises(GpvoError, match=r"it\.txt: ") as refused:
+                READERS[reader](path)
+            assert kind == "pipe" or "device" in str(refused.value)
+    assert _peak_mb() - before < 20
+
+
+def test_a_pipe_that_somebody_writes_to_is_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    writer = subprocess.Popen(
+        ["sh", "-c", f"(sleep 0.3; echo '[run]'; sleep 0.3; echo 'window = 3') > {tmp_path}/pipe"]
+    )
+    end = os.open(tmp_path / "pipe", os.O_RDONLY)  # waits for the writer
+    assert read_toml(tmp_path / "pipe") == {"run": {"window": 3}}
+    os.close(end)
+    writer.wait(10.0)
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="pipe: cannot be written: .*not a file"):
+        write_text(tmp_path / "pipe", "text")
+    assert [p.is_fifo() for p in tmp_path.iterdir()] == [True]
+
+
+def test_a_table_is_bounded_by_its_size_and_not_by_its_rows(tmp_path: Path) -> None:
+    """Ten hours of tracks have a hundred million rows."""
+    track = np.random.default_rng(0).integers(0, 2, 100_000)
+    part = write_table(tmp_path / "part.parquet", {"track": track})
+    join_tables([part] * 600, tmp_path / "tracks.parquet")
+    assert count_rows(tmp_path / "tracks.parquet") == 60_000_000
 
 
 def test_a_disk_that_fails_while_a_file_is_read_is_told_with_its_name(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 from gpvo.filters.policies import LearnedPolicy
 from gpvo.filters.run import FuseOptions, begin, make_filter
 from gpvo.filters.timeline import Timeline
-from gpvo.geometry.covariance import are_positive_definite
+from gpvo.geometry.covariance import are_covariances
 from gpvo.online.predictor import Predictor
 from gpvo.types import VoRecord
 from synthetic_flights import synthetic_flight
@@ -33,7 +33,7 @@ def flat(steps: int, step: Callable[[int], np.ndarray]) -> None:
     for k in range(steps):
         stated.append(step(k))
         if len(stated) == 1000 or k == steps - 1:
-            assert are_positive_definite(np.array(stated)).all(), k
+            assert are_covariances(np.array(stated)).all(), k
             stated = []
         if (k + 1) % (steps // READINGS) == 0:
             resident_mb.append(psutil.Process().memory_info().rss / 1e6)

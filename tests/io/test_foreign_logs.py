@@ -79,6 +79,31 @@ def test_what_is_no_text_is_said_to_be_none(tmp_path, encoding):
         read_foreign(tmp_path / "log.csv")
 
 
+def test_a_log_that_ends_in_nul_says_what_happened_and_how_to_keep_the_rest(tmp_path):
+    """As file systems leave it where power was lost: as long as it was to be, the last block never written."""
+    path = _csv(tmp_path / "log.csv", "t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-30] + bytes(3_000_000))
+    with pytest.raises(SourceError, match=r"log\.csv: line 26 holds NUL bytes, as where power was lost") as refused:
+        read_foreign(path)
+    (kept,) = re.findall(r"head -n (\d+) log\.csv > NEW", str(refused.value))
+    path.write_bytes(b"".join(whole.splitlines(True)[: int(kept)]))
+    np.testing.assert_array_equal(read_foreign(path).t_ns, T_NS[:-1])
+
+
+def test_as_many_covariances_are_left_out_as_is_said(tmp_path):
+    """One that says that two axes err as one cannot be inverted: no filter takes it."""
+    singular = np.eye(6)
+    singular[0, 1] = singular[1, 0] = 1.0
+    stated = [1e-4 * (singular if k in (5, 9) else np.eye(6)) for k in range(N)]
+    names = [f"cov_{i}{j}" for i in range(6) for j in range(6)]
+    columns = np.reshape(stated, (N, 36)).T.tolist()
+    path = _csv(tmp_path / "log.csv", ",".join(["t_ns,p_x,p_y,p_z,q_x,q_y,q_z,q_w", *names]), columns)
+    records, notes = to_records(read_foreign(path, covariance_of="motion", covariance_axes="body"))
+    assert [k for k, r in enumerate(records) if not r.covariances][1:] == [5, 9]
+    assert any(note.startswith(f"2 of {N - 1} covariances are not positive definite") for note in notes)
+
+
 @pytest.mark.parametrize(
     ("step", "doubt"), [("20", "20 s apart .*milliseconds"), ("1", "numbers of frames"), ("0.5", "")]
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 import tracemalloc
 from dataclasses import fields, replace
 
@@ -256,6 +257,51 @@ def test_a_finished_run_is_replaced_by_whatever_path_it_is_named(tmp_path, monke
         assert len(read_run(run).log) == 10
         write_run(run, log)
         assert sorted(p.name for p in tmp_path.iterdir()) == ["latest", "run"]
+
+
+def test_a_finished_run_is_replaced_in_one_step(tmp_path, monkeypatch):
+    """At whatever moment the writer is killed, there is the old run or the new one."""
+    log = VoLog(make_records(20), CAMERA)
+    write_run(tmp_path / "run", log)
+
+    def watched(call):
+        def then(*words, **named):
+            out = call(*words, **named)
+            assert len(read_run(tmp_path / "run").log) in (20, 10)
+            return out
+
+        return then
+
+    for name in ("os.replace", "os.rename", "shutil.rmtree"):
+        module, _, attribute = name.partition(".")
+        monkeypatch.setattr(name, watched(getattr(sys.modules[module], attribute)))
+    if sys.platform != "linux":
+        pytest.skip("no such step on this system")
+    write_run(tmp_path / "run", VoLog(log.records[:10], CAMERA))
+    monkeypatch.undo()
+    assert len(read_run(tmp_path / "run").log) == 10
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_where_no_step_exchanges_folders_two_do(tmp_path, monkeypatch):
+    log = VoLog(make_records(20), CAMERA)
+    write_run(tmp_path / "run", log)
+    monkeypatch.setattr("gpvo.io.run_folder._exchanged", lambda *_: False)
+    write_run(tmp_path / "run", VoLog(log.records[:10], CAMERA))
+    assert len(read_run(tmp_path / "run").log) == 10
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_stored_paths_lead_where_they_led(tmp_path):
+    """Persian names hold joiners, those of screenshots narrow spaces: neither is printable to Python."""
+    names = {
+        "options": {"calibration": "/data/\u06a9\u062a\u0627\u0628\u200c\u0647\u0627 9\u202fAM.yaml"},
+        "model": "/m\u200d.gpvo",
+    }
+    write_run(tmp_path / "run", VoLog(make_records(5)), meta={**names, "source": "a\u202eb"})
+    meta = read_run(tmp_path / "run").meta
+    assert {key: meta[key] for key in names} == names
+    assert meta["source"] == "a?b"
 
 
 def test_foreign_folder_is_not_overwritten(tmp_path):

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
+import gpvo
 import numpy as np
 import pytest
 from gpvo.cli import app
@@ -17,10 +18,11 @@ from gpvo.dataset.check import check, odometry_problems
 from gpvo.dataset.table import read_sets, write_sets
 from gpvo.errors import GpvoError, ModelError
 from gpvo.evaluation.evaluate import evaluate_run
+from gpvo.evaluation.verdict import verdict
 from gpvo.geometry import se3
-from gpvo.geometry.covariance import are_positive_definite
+from gpvo.geometry.covariance import are_semidefinite
 from gpvo.io import open_source
-from gpvo.io.run import read_run, write_run
+from gpvo.io.run import Run, read_run, write_run
 from gpvo.learning import train as training
 from gpvo.learning.basefit import rate_changes
 from gpvo.learning.card import model_card
@@ -38,7 +40,7 @@ from gpvo.online.predictor import Predictor
 from gpvo.runner import run
 from gpvo.sim.points import simulate_points
 from gpvo.stats.consistency import nees
-from gpvo.types import VoLog
+from gpvo.types import Mounting, VoLog
 from gpvo.vo.config import make_config
 from small_model import small_model, training_sets
 from synthetic_runs import make_run
@@ -279,6 +281,20 @@ def test_the_row_base_is_the_model_with_its_gp_at_the_mean_function(tmp_path):
     assert base.base().arrays.keys() == base.arrays.keys()
 
 
+def test_runs_are_taken_as_folders_too(tmp_path):
+    runs = [_as_run(*make_run(k, n=120), f"flight{k}") for k in range(2)]
+    for r in runs:
+        write_run(tmp_path / r.name, r.log, truth=r.truth)
+    paths = [tmp_path / r.name for r in runs]
+    of_runs, of_paths = (
+        gpvo.train(given, QUICK) for given in ([read_run(p) for p in paths], [str(paths[0]), paths[1]])
+    )
+    assert of_paths.header["training_digest"] == of_runs.header["training_digest"]
+    assert of_paths.table == of_runs.table
+    assert len(gpvo.train(paths[0], QUICK).sets) == len(gpvo.train(str(paths[0]), QUICK).sets) == 1
+    assert str(gpvo.evaluate(paths[0])) == str(gpvo.evaluate(read_run(paths[0])))
+
+
 def test_update_adds_flights(tmp_path):
     path = tmp_path / "m.gpvo"
     save_model(_of_three(), path)
@@ -369,9 +385,7 @@ def test_a_model_of_positions_is_not_updated(tmp_path):
 
 
 def _as_run(log, truth, name):
-    from types import SimpleNamespace
-
-    return SimpleNamespace(log=log, truth=truth, name=name, path=Path("runs", name), settings={})
+    return Run(Path("runs", name), name, log, truth, None, Mounting(), [])
 
 
 def test_few_sequences_are_calibrated_by_blocks_and_marked():
@@ -612,6 +626,13 @@ def test_a_model_knows_the_odometry_that_it_was_trained_on(tmp_path: Path) -> No
     assert [s.odometry for s in read_sets(rows_path(path))] == [s.odometry for s in sets[:2]]
     mixed = train_sets(sets, QUICK, judge=False).predictor()
     assert not any("settings" in problem for problem in check(mixed, runs[2]).problems)
+    # Predictions that are stored with a run are of a model, too, as long as its file is there to be asked.
+    for given, told in ((predictor, True), (Predictor(predictor.arrays, predictor.header, "another's"), False)):
+        stored = runs[0].path.with_name(f"stored-{told}")
+        source = open_source(tmp_path / "a.npz")
+        run(source, stored, make_config("fast"), given, meta={"model": str(path)})
+        assert any("learned from this very run" in p for p in evaluate_run(stored).misfits) == told
+        assert verdict(evaluate_run(stored)).colour != "green" or not told
     # Another's odometry has no settings of ours, and a model of its poses no camera.
     assert not odometry_problems(predictor, {"import": {"frame": "body"}})
     poses_alone = Predictor(predictor.arrays, {**predictor.header, "camera": None, "odometry": {}})
@@ -700,7 +721,7 @@ def test_covariances_that_call_some_error_impossible_are_not_held_against_errors
         C = s.covariances["pointing_matching"]
         sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
         C[:60] = sigma[:60, :, None] * sigma[:60, None, :]
-    assert are_positive_definite(sets[0].covariances["pointing_matching"]).all()
+    assert are_semidefinite(sets[0].covariances["pointing_matching"]).all()
     mean = train_sets(sets, QUICK).table["mean"]
     assert 0.5 < mean["pointing_matching_scaled"]["nees_dof"]["joint"] < 2.0
 

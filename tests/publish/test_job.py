@@ -181,3 +181,23 @@ def test_stamps_that_no_message_holds_are_refused(
             assert not (tmp_path / out).exists()
         else:
             publish_run(tmp_path / "run", settings)
+
+
+@pytest.mark.parametrize(("to", "name"), [("c", "main.c"), ("c", "errors.gpvo"), ("c", "main.h"), ("onnx", "net.onnx")])
+def test_an_export_replaces_an_earlier_one_and_nothing_else(tmp_path: Path, to: str, name: str) -> None:
+    if to == "onnx":
+        pytest.importorskip("onnx")
+    model = tmp_path / "errors.gpvo"
+    trained = small_model()
+    modelfile.save(model, trained.arrays, trained.header)
+    if not (tmp_path / name).exists():
+        (tmp_path / name).write_text("int main(void) { return 0; }")
+    before = (tmp_path / name).read_bytes()
+    with pytest.raises(GpvoError, match=rf"{name}: is another file, not an earlier export \(choose another -o"):
+        export_model(model, tmp_path / name, to)
+    assert (tmp_path / name).read_bytes() == before
+    out = tmp_path / {"c": "new.h", "onnx": "new.onnx"}[to]
+    export_model(model, out, to)
+    written = out.read_bytes()
+    export_model(model, out, to)
+    assert out.read_bytes() == written
