@@ -39,7 +39,8 @@ def score(
             methods = score_folder(stated[0], options)
         if out is not None:
             write_board(methods, out)
-        answer(json_, {"schema": 1, "methods": list(methods.values())}, lambda: _print_board(methods, truth_sigma is None))
+        document = {"schema": 1, "methods": list(methods.values())}
+        answer(json_, document, lambda: _print_board(methods, truth_sigma is None))
         return
     if len(stated) != len(truth):
         raise GpvoError(f"{len(stated)} files of stated motions and {len(truth)} truths", cure="one --truth per file")
