@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import first_jitter, from_end, independent_part, persistence
-from gpvo.filters import kernels
 from gpvo.filters import measurement as me
 from gpvo.filters.measurement import (
     BIAS,
@@ -47,6 +46,7 @@ from gpvo.filters.propagation import (
     imu_densities,
     imu_step,
     process_noise,
+    transpose,
 )
 from gpvo.geometry import se3
 from gpvo.geometry.covariance import variances
@@ -137,27 +137,27 @@ class ErrorStateFilter:
         if self._Q[0] != dt:
             self._Q = (dt, process_noise(self._densities, dt))
         FP = np.matmul(self._F, self.P[:, :CORE, :], out=self._FP)
-        core = FP[:, :, :CORE] @ kernels.transpose(self._F)
-        core += kernels.transpose(core)
+        core = FP[:, :, :CORE] @ transpose(self._F)
+        core += transpose(core)
         core *= 0.5
         core += self._Q[1]
         self.P[:, :CORE, :CORE] = core
         rest = FP[:, :, CORE:KEPT]
         self.P[:, :CORE, CORE:KEPT] = rest
-        self.P[:, CORE:KEPT, :CORE] = kernels.transpose(rest)
+        self.P[:, CORE:KEPT, :CORE] = transpose(rest)
 
     def doubt_readings(self, sigma: Array) -> None:
         """Widen by constant errors of the readings, gyroscope first, of standard deviations ``sigma`` (6,) [rad/s,
         m/s^2] over the interval just passed, as where its samples are missing: they act as biases do."""
         G = self._F[:, : BA.start, BA.start :] * np.roll(sigma, 3)
-        self.P[:, : BA.start, : BA.start] += G @ kernels.transpose(G)
+        self.P[:, : BA.start, : BA.start] += G @ transpose(G)
 
     def doubt_passage(self, before: Nominal) -> None:
         """Widen by all that has changed since ``before``: maybe a clock was set, and no time has passed."""
         moved = np.zeros((self.batch, CORE, 1))
         moved[:, P, 0], moved[:, V, 0] = self.x.position - before.position, self.x.velocity - before.velocity
-        moved[:, TH, 0] = kernels.log(kernels.transpose(before.R_world_imu) @ self.x.R_world_imu)
-        self.P[:, :CORE, :CORE] += moved @ kernels.transpose(moved)
+        moved[:, TH, 0] = se3.so3_log(transpose(before.R_world_imu) @ self.x.R_world_imu)
+        self.P[:, :CORE, :CORE] += moved @ transpose(moved)
 
     def lose_track(self, dt: float) -> None:
         """Widen by what may have happened in ``dt`` seconds of which nothing is known, if they have passed at all and
@@ -195,13 +195,12 @@ class ErrorStateFilter:
             self.P[:, JITTER_REF, JITTER_REF] = first_jitter(T_est, noise.jitter)
             self.jitter_known = True
         self.P[:, JITTER_CUR, JITTER_CUR] = from_end(noise)
-        R_ref, p_ref = self.camera.pose(self.clone_p, self.clone_R)
-        R_cur, p_cur = self.camera.pose(self.x.position, self.x.R_world_imu)
-        R_rel, t_rel = me.relative_motion(R_ref, p_ref, R_cur, p_cur)
+        T_ref = self.camera.pose(self.clone_p, self.clone_R)
+        T_cur = self.camera.pose(self.x.position, self.x.R_world_imu)
         H = self._H
-        me.jacobian(H, self.camera, R_ref, R_cur, R_rel, t_rel, noise)
+        me.jacobian(H, self.camera, T_ref, T_cur, noise)
         alone = independent_part(noise)
-        r = me.residual(R_rel, t_rel, T_est, noise.mean)
+        r = me.residual(T_ref, T_cur, T_est, noise.mean)
         r = r - (H[:, :, JITTER_REF] @ self.jitter_mean[:, :, None])[:, :, 0]
         # How the size of VO's bias follows the conditions is known only roughly. A filter that believes it to the
         # letter reads the bias off that, and is too sure: so it is considered, not estimated.
@@ -230,10 +229,10 @@ class ErrorStateFilter:
         state-space methods to navigation problems" (1966)).
         """
         r = residual - (H @ self.dx[:, :, None])[:, :, 0]
-        PHt = self.P @ kernels.transpose(H)
+        PHt = self.P @ transpose(H)
         S = H @ PHt + R
         L = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
-        whitened: Array = np.linalg.solve(L, np.concatenate([kernels.transpose(PHt), r[:, :, None]], axis=2))
+        whitened: Array = np.linalg.solve(L, np.concatenate([transpose(PHt), r[:, :, None]], axis=2))
         z = whitened[:, :, -1]
         nis = (z * z).sum(1)
         limit = gate.threshold(H.shape[1]) if gate else np.inf
@@ -249,7 +248,7 @@ class ErrorStateFilter:
             used = used & ~leave
         if used.any():
             whitened_H = np.asarray(whitened[:, :, :-1], dtype=np.float64)
-            K = np.asarray(np.linalg.solve(kernels.transpose(L), whitened_H), dtype=np.float64).transpose(0, 2, 1)
+            K = np.asarray(np.linalg.solve(transpose(L), whitened_H), dtype=np.float64).transpose(0, 2, 1)
             K[:, consider] = 0.0
             # A wider R turns S into alpha S, and the gain into a 1/alpha of itself.
             R = R + (alpha - 1.0)[:, None, None] * S
@@ -261,8 +260,8 @@ class ErrorStateFilter:
     def _own_part(self, H: Array, S: Array, r: Array) -> Array:
         """How much of the NIS (B,) state and clone have to answer for (see the gate's ``Wait``)."""
         y = np.asarray(np.linalg.solve(S, r[:, :, None]), dtype=np.float64)
-        v = kernels.transpose(H[:, :, :_STATE]) @ y
-        return np.asarray(kernels.transpose(v) @ self.P[:, :_STATE, :_STATE] @ v)[:, 0, 0]
+        v = transpose(H[:, :, :_STATE]) @ y
+        return np.asarray(transpose(v) @ self.P[:, :_STATE, :_STATE] @ v)[:, 0, 0]
 
     def _doubt(self, factor: Array) -> None:
         """Multiply the variances of all but the positions and VO's own parts by ``factor`` (B,), within reason."""
@@ -275,9 +274,9 @@ class ErrorStateFilter:
 
     def _joseph(self, K: Array, H: Array, PHt: Array, R: Array) -> None:
         """``A P A^T + K R K^T`` with ``A = I - K H``, which is never formed: its rank is that of the measurement."""
-        AP = self.P - K @ kernels.transpose(PHt)
-        new = AP + (K @ R - AP @ kernels.transpose(H)) @ kernels.transpose(K)
-        self.P = 0.5 * (new + kernels.transpose(new))
+        AP = self.P - K @ transpose(PHt)
+        new = AP + (K @ R - AP @ transpose(H)) @ transpose(K)
+        self.P = 0.5 * (new + transpose(new))
 
     def inject(self, passed: NDArray[np.bool_] | None = None) -> None:
         """Move the error's mean into the estimate and carry the covariance there.
@@ -290,7 +289,7 @@ class ErrorStateFilter:
         not explain would widen it without end.
         """
         dx, x = self.dx, self.x
-        (E, J), (E_clone, J_clone) = (kernels.exp_and_right_jacobian(dx[:, block]) for block in (TH, me.CLONE_TH))
+        (E, J), (E_clone, J_clone) = (se3.so3_exp_and_right_jacobian(dx[:, block]) for block in (TH, me.CLONE_TH))
         sound = np.ones(self.batch, bool) if passed is None else passed
         G = np.broadcast_to(np.eye(JOINT), self.P.shape).copy()
         of_state, of_clone = (
@@ -298,20 +297,20 @@ class ErrorStateFilter:
             (me.CLONE_TH, self.clone_R, E_clone, J_clone, (CLONE_P,)),
         )
         for turned, R, turn, jacobian, moved in (of_state, of_clone):
-            G[:, turned, turned] = np.where(sound[:, None, None], kernels.transpose(turn), jacobian)
+            G[:, turned, turned] = np.where(sound[:, None, None], transpose(turn), jacobian)
             for block in moved:
                 G[sound, block, turned] = -(se3.skew(dx[:, block]) @ R)[sound]
         x.position = x.position + dx[:, P]
         x.velocity = x.velocity + dx[:, V]
-        x.R_world_imu = kernels.orthonormalise(x.R_world_imu @ E)
+        x.R_world_imu = _orthonormalised(x.R_world_imu @ E)
         x.acc_bias = x.acc_bias + dx[:, BA]
         x.gyro_bias = x.gyro_bias + dx[:, BG]
         self.clone_p = self.clone_p + dx[:, CLONE_P]
-        self.clone_R = kernels.orthonormalise(self.clone_R @ E_clone)
+        self.clone_R = _orthonormalised(self.clone_R @ E_clone)
         self.jitter_mean = self.jitter_mean + dx[:, JITTER_REF]
         self.jitter_cur_mean = dx[:, JITTER_CUR].copy()
-        self.P = G @ self.P @ kernels.transpose(G)
-        self.P = 0.5 * (self.P + kernels.transpose(self.P))
+        self.P = G @ self.P @ transpose(G)
+        self.P = 0.5 * (self.P + transpose(self.P))
         dx[:] = 0.0
 
     def clone(self, *, measured: bool = False) -> None:
@@ -339,3 +338,8 @@ class ErrorStateFilter:
         self.P[:, JITTER_CUR, :] = 0.0
         self.P[:, :, JITTER_CUR] = 0.0
         self.jitter_cur_mean = np.zeros((self.batch, 6))
+
+
+def _orthonormalised(R: Array) -> Array:
+    """One Newton step towards the nearest rotations: ``R (3 I - R^T R) / 2``, enough for rounding drift."""
+    return R @ (1.5 * np.eye(3) - 0.5 * (transpose(R) @ R))

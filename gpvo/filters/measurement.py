@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpvo.accumulation import carry, from_start
-from gpvo.filters import kernels
-from gpvo.filters.propagation import TH, P, each
+from gpvo.filters.propagation import TH, P, each, transpose
 from gpvo.geometry import se3
 from gpvo.types import Array, MotionError
 
@@ -37,43 +36,35 @@ THREE_SIGMA = math.erf(3.0 / math.sqrt(2.0))
 
 @dataclass(frozen=True)
 class CameraOnImu:
-    """Extrinsics ``T_imu_cam`` taken apart once for all updates: ``R_imu_cam``, ``t_imu_cam`` and products."""
+    """Extrinsics ``T_imu_cam`` (4, 4), with what all updates need of them."""
 
-    R_imu_cam: Array
-    t_imu_cam: Array
+    T_imu_cam: Array
     R_cam_imu: Array
     lever: Array  # -R_cam_imu [t_imu_cam]x: what an IMU rotation moves the camera by
 
     @staticmethod
     def of(T_imu_cam: Array | None) -> CameraOnImu:
         """From a 4x4 pose; None means that the state is the camera's own."""
-        T = np.eye(4) if T_imu_cam is None else np.asarray(T_imu_cam, dtype=np.float64)
-        R, t = T[:3, :3].copy(), T[:3, 3].copy()
-        return CameraOnImu(R, t, R.T.copy(), -R.T @ se3.skew(t))
+        T = np.eye(4) if T_imu_cam is None else np.array(T_imu_cam, dtype=np.float64)
+        R_cam_imu = T[:3, :3].T.copy()
+        return CameraOnImu(T, R_cam_imu, -R_cam_imu @ se3.skew(T[:3, 3]))
 
-    def pose(self, position: Array, R_world_imu: Array) -> tuple[Array, Array]:
-        """Camera rotations (B, 3, 3) and positions (B, 3) in the world."""
-        return R_world_imu @ self.R_imu_cam, position + R_world_imu @ self.t_imu_cam
-
-
-def relative_motion(R_ref: Array, p_ref: Array, R_cur: Array, p_cur: Array) -> tuple[Array, Array]:
-    """``T_ref_cur`` as rotations (B, 3, 3) and translations (B, 3), from camera poses in the world."""
-    Rt = kernels.transpose(R_ref)
-    return Rt @ R_cur, (Rt @ (p_cur - p_ref)[:, :, None])[:, :, 0]
+    def pose(self, position: Array, R_world_imu: Array) -> Array:
+        """Camera poses (B, 4, 4) in the world."""
+        return se3.from_rt(R_world_imu, position) @ self.T_imu_cam
 
 
-def jacobian(
-    H: Array, camera: CameraOnImu, R_ref: Array, R_cur: Array, R_rel: Array, t_rel: Array, error: MotionError
-) -> None:
-    """Write d(measured motion)/d(joint error state) into ``H`` (B, 6, 45), in the right tangent of the prediction."""
-    moved = carry(se3.from_rt(R_rel, t_rel))
+def jacobian(H: Array, camera: CameraOnImu, T_ref: Array, T_cur: Array, error: MotionError) -> None:
+    """Write d(measured motion)/d(joint error state) into ``H`` (B, 6, 45), in the right tangent of the prediction, from
+    camera poses (B, 4, 4) in the world."""
+    moved = carry(se3.inverse(T_ref) @ T_cur)
 
     eta_ref = np.zeros((len(H), 6, 6))
-    eta_ref[:, :3, :3] = kernels.transpose(R_ref)
+    eta_ref[:, :3, :3] = transpose(T_ref[:, :3, :3])
     eta_ref[:, :3, 3:] = camera.lever
     eta_ref[:, 3:, 3:] = camera.R_cam_imu
 
-    H[:, :3, P] = kernels.transpose(R_cur)
+    H[:, :3, P] = transpose(T_cur[:, :3, :3])
     H[:, :3, TH] = camera.lever
     H[:, 3:, TH] = camera.R_cam_imu
     np.negative(moved @ eta_ref, out=H[:, :, CLONE])
@@ -83,14 +74,10 @@ def jacobian(
     H[:, :, BIAS.start + length : BIAS.stop] = 0.0
 
 
-def residual(R_rel: Array, t_rel: Array, T_est: Array, mean: Array) -> Array:
-    """``Log(T_pred^-1 T_est Exp(-mean))`` (B, 6), of predictions (B, ...) and measured motions (4, 4) or (B, 4, 4)."""
-    R_m, t_m = kernels.motion_exp(-mean)
-    R_est, t_est = T_est[..., :3, :3], T_est[..., :3, 3:]
-    Rt = kernels.transpose(R_rel)
-    R = Rt @ (R_est @ R_m)
-    t = Rt @ (R_est @ t_m[:, :, None] + t_est - t_rel[:, :, None])
-    return kernels.motion_log(R, t[:, :, 0])
+def residual(T_ref: Array, T_cur: Array, T_est: Array, mean: Array) -> Array:
+    """``Log(T_pred^-1 T_est Exp(-mean))`` (B, 6), of predictions from camera poses (B, 4, 4) in the world and measured
+    motions (4, 4) or (B, 4, 4)."""
+    return se3.log(se3.inverse(T_cur) @ T_ref @ (T_est @ se3.exp(-mean)))
 
 
 @dataclass(frozen=True)

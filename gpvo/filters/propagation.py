@@ -21,7 +21,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from gpvo.filters import kernels
 from gpvo.geometry import se3
 from gpvo.types import Array, ImuNoise, VoRecord, field_names
 
@@ -39,6 +38,11 @@ DEFAULT_IMU_NOISE = ImuNoise(
 
 
 _Arrays = TypeVar("_Arrays")
+
+
+def transpose(M: Array) -> Array:
+    """(B, n, m) to (B, m, n), a view."""
+    return M.transpose(0, 2, 1)
 
 
 def each(arrays: _Arrays, change: Callable[[Array], Array]) -> _Arrays:
@@ -85,18 +89,18 @@ def imu_step(x: Nominal, F: Array, dt: float, gyro0: Array, acc0: Array, gyro1: 
     ``gyro0, acc0, gyro1, acc1`` (B, 3) or (1, 3): raw samples at both ends; ``g`` (3,): gravity in the world [m/s^2].
     """
     R0 = x.R_world_imu
-    E, J = kernels.exp_and_right_jacobian((0.5 * (gyro0 + gyro1) - x.gyro_bias) * dt)
+    E, J = se3.so3_exp_and_right_jacobian((0.5 * (gyro0 + gyro1) - x.gyro_bias) * dt)
     R1 = R0 @ E
     f0, f1 = acc0 - x.acc_bias, acc1 - x.acc_bias
     half0 = 0.5 * (R0 @ se3.skew(f0))
     half1 = 0.5 * (R1 @ se3.skew(f1))
     a = 0.5 * ((R0 @ f0[:, :, None])[:, :, 0] + (R1 @ f1[:, :, None])[:, :, 0]) + g
-    a_th = -(half0 + half1 @ kernels.transpose(E))
+    a_th = -(half0 + half1 @ transpose(E))
     a_ba = -0.5 * (R0 + R1)
     J *= dt
     a_bg = half1 @ J
 
-    F[:, TH, TH] = kernels.transpose(E)
+    F[:, TH, TH] = transpose(E)
     np.negative(J, out=F[:, TH, BG])
     for block, column in ((a_th, TH), (a_ba, BA), (a_bg, BG)):
         dv = F[:, V, column]
@@ -112,22 +116,22 @@ def imu_step(x: Nominal, F: Array, dt: float, gyro0: Array, acc0: Array, gyro1: 
 def constant_velocity_step(x: Nominal, F: Array, dt: float) -> None:
     """Move ``x`` with constant body velocity and turn rate, in place; the transition goes into ``F`` (B, 15, 15)."""
     R0, rate = x.R_world_imu, x.gyro_bias
-    E, J = kernels.exp_and_right_jacobian(rate * dt)
+    E, J = se3.so3_exp_and_right_jacobian(rate * dt)
     R1 = R0 @ E
-    u = kernels.transpose(R0) @ x.velocity[:, :, None]
+    u = transpose(R0) @ x.velocity[:, :, None]
     v1 = R1 @ u
     turned = se3.skew((E @ u)[:, :, 0])
     straight = se3.skew(u[:, :, 0])
     J *= dt
 
-    A = R1 @ kernels.transpose(R0)
+    A = R1 @ transpose(R0)
     B = R0 @ (E @ straight - turned)
     C = -(R1 @ straight) @ J
     F[:, V, V], F[:, V, TH], F[:, V, BG] = A, B, C
     # The position moves with the mean of the two velocities.
     F[:, P, V] = 0.5 * dt * (A + np.eye(3))
     F[:, P, TH], F[:, P, BG] = 0.5 * dt * B, 0.5 * dt * C
-    F[:, TH, TH], F[:, TH, BG] = kernels.transpose(E), J
+    F[:, TH, TH], F[:, TH, BG] = transpose(E), J
 
     x.position = x.position + 0.5 * dt * (x.velocity + v1[:, :, 0])
     x.velocity = v1[:, :, 0]

@@ -33,8 +33,9 @@ def skew(v: Array) -> Array:
 
 def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:
     """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 from t^2, by series near zero."""
-    if np.ndim(theta2) == 0:
-        return _coefficients_of_one(theta2)
+    if np.size(theta2) == 1:
+        a, b, c = (np.reshape(v, np.shape(theta2)) for v in _coefficients_of_one(np.reshape(theta2, ())[()]))
+        return a, b, c
     theta = np.sqrt(theta2)
     small = theta < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, theta)
@@ -70,6 +71,12 @@ def so3_exp(phi: Array) -> Array:
     """Rotation vector [rad] to rotation matrix (Rodrigues). (..., 3) -> (..., 3, 3)."""
     a, b, _, W, WW = _powers(phi)
     return np.eye(3) + a * W + b * WW
+
+
+def so3_exp_and_right_jacobian(phi: Array) -> tuple[Array, Array]:
+    """:func:`so3_exp` and the right Jacobian, which is the left one of ``-phi``, for the price of one."""
+    a, b, c, W, WW = _powers(phi)
+    return np.eye(3) + a * W + b * WW, np.eye(3) - b * W + c * WW
 
 
 def so3_log(R: Array) -> Array:
@@ -136,8 +143,8 @@ def exp(xi: Array) -> Array:
 def log(T: Array) -> Array:
     """Pose (..., 4, 4) to tangent (..., 6)."""
     T = np.asarray(T, dtype=np.float64)
-    if T.ndim == 2:
-        return _log_one(T)
+    if T.size == 16:
+        return _log_one(T.reshape(4, 4)).reshape(*T.shape[:-2], 6)
     phi = so3_log(T[..., :3, :3])
     rho = (so3_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)

@@ -83,9 +83,9 @@ def test_covariance_after_5000_steps() -> None:
         acc = np.array([[np.sin(k / 30), 0.3, 9.80665]])
         filter.propagate_imu(0.005, gyro, acc, gyro, acc)
         if k % 10 == 9:
-            R_ref, p_ref = filter.camera.pose(filter.clone_p, filter.clone_R)
-            R, t = me.relative_motion(R_ref, p_ref, *filter.camera.pose(filter.x.position, filter.x.R_world_imu))
-            T = se3.from_rt(R[0], t[0]) @ se3.exp(1e-3 * rng.standard_normal(6))
+            T_ref = filter.camera.pose(filter.clone_p, filter.clone_R)
+            T_cur = filter.camera.pose(filter.x.position, filter.x.R_world_imu)
+            T = (se3.inverse(T_ref) @ T_cur)[0] @ se3.exp(1e-3 * rng.standard_normal(6))
             filter.decay_bias(0.05, np.full(12, 5.0))
             filter.update_motion(T, _noise(rng), ACCEPT)
             filter.clone(measured=True)
@@ -117,8 +117,9 @@ def test_no_measured_motion_tells_the_heading_or_the_place_of_the_whole(seed: in
         return N @ np.linalg.solve(filter.P[0, :21, :21], N.T)
 
     before = information()
-    R, t = me.relative_motion(filter.clone_R, filter.clone_p, filter.x.R_world_imu, filter.x.position)
-    T = se3.inverse(FORWARD_CAMERA) @ se3.from_rt(R[0], t[0]) @ FORWARD_CAMERA @ se3.exp(0.1 * rng.standard_normal(6))
+    ends = ((filter.clone_R, filter.clone_p), (filter.x.R_world_imu, filter.x.position))
+    T_ref, T_cur = (se3.from_rt(R, p)[0] @ FORWARD_CAMERA for R, p in ends)
+    T = se3.inverse(T_ref) @ T_cur @ se3.exp(0.1 * rng.standard_normal(6))
     assert filter.update_motion(T, MotionError.independent(np.eye(6)[None] * 1e-4), ACCEPT).passed.all()
     np.testing.assert_allclose(information(), before, rtol=1e-4, atol=1e-4 * np.abs(before).max())
 

@@ -98,8 +98,23 @@ def test_jacobians_are_the_numerical_derivatives(xi):
         right[:, j] = se3.so3_log(behind.T @ ahead) / (2 * h)
     np.testing.assert_allclose(se3.so3_left_jacobian(phi), left, atol=2e-9)
     np.testing.assert_allclose(se3.so3_left_jacobian(-phi), right, atol=2e-9)
+    R, J = se3.so3_exp_and_right_jacobian(np.stack([phi, -phi]))
+    np.testing.assert_array_equal(R, se3.so3_exp(np.stack([phi, -phi])))
+    np.testing.assert_allclose(J[0], right, atol=2e-9)
     product = se3.so3_left_jacobian_inverse(phi) @ se3.so3_left_jacobian(phi)
     np.testing.assert_allclose(product, np.eye(3), atol=1e-13)
+
+
+@EXAMPLES
+@given(tangents())
+def test_one_is_taken_as_many_are(xi):
+    """A single vector or pose goes another way than a batch, and a batch of one the way of a single one."""
+    one, many = xi[None], np.stack([xi, xi])
+    np.testing.assert_array_equal(se3.exp(one)[0], se3.exp(xi))
+    np.testing.assert_array_equal(se3.log(se3.exp(one))[0], se3.log(se3.exp(xi)))
+    np.testing.assert_array_equal(se3.exp(many)[0], se3.exp(xi))
+    scale = 1 + np.abs(xi).max()
+    np.testing.assert_allclose(se3.log(se3.exp(many))[0], se3.log(se3.exp(xi)), rtol=0, atol=1e-9 * scale)
 
 
 @EXAMPLES
