@@ -29,7 +29,8 @@ AXES = ("x", "y", "z", "rot x", "rot y", "rot z")
 _COLOURS = {
     "constant": "#888888", "triangulation": "#1f77b4", "pointing_matching": "#ff7f0e", "spherical": "#8c564b",
     "triangulation_scaled": "#17becf", "pointing_matching_scaled": "#bcbd22", "learned": "#2ca02c", "base": "#e377c2",
-    "imported": "#d62728", "imported_scaled": "#c49c94", "twin": "#3f51b5",
+    "imported": "#d62728", "imported_scaled": "#c49c94", "twin": "#3f51b5", "constant_best": "#393b79",
+    "constant_hindsight": "#e7969c",
 }  # fmt: skip
 
 
@@ -40,7 +41,7 @@ def colour(method: str) -> str:
 
 MAX_POINTS = 500
 _BLACK, _RED, _GREEN = "#1b1b1b", "#d62728", "#2ca02c"
-_SIX = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
+SIX = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
 _LEVELS: Array = np.linspace(0.02, 0.98, 49)
 _HALF_WIDTHS: Array = np.array([NormalDist().inv_cdf(0.5 + p / 2) for p in _LEVELS])
 _NEES_WINDOW_S = 0.5
@@ -67,15 +68,15 @@ def views(e: Evaluation) -> list[Panel]:
         lines = []
         for k in np.unique(np.linspace(0, max(len(bounds) - 1, 0), 12).astype(int))[1:]:
             R = to_plane @ e.T_est[k, :3, :3]
-            ring = _ring((R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]) + p[k, [i, j]]
+            outline = ring((R @ bounds[k, :3, :3] @ R.T)[np.ix_([i, j], [i, j])]) + p[k, [i, j]]
             # Whole ellipses lie inside the plot, unless they are far larger than the path.
-            far = bool(np.ptp(ring, axis=0).max() > 2 * np.ptp(p, axis=0).max())
-            lines.append({**_line(ring[:, 0], ring[:, 1], "", _GREEN, 0.8), "aside": far})
+            far = bool(np.ptp(outline, axis=0).max() > 2 * np.ptp(p, axis=0).max())
+            lines.append({**line(outline[:, 0], outline[:, 1], "", _GREEN, 0.8), "aside": far})
         if len(q):
-            lines.append(_line(*_thin(q[:, i], q[:, j]), "truth", _BLACK, 1.6))
-        lines.append(_line(*_thin(p[:, i], p[:, j]), "visual odometry", _RED))
+            lines.append(line(*_thin(q[:, i], q[:, j]), "truth", _BLACK, 1.6))
+        lines.append(line(*_thin(p[:, i], p[:, j]), "visual odometry", _RED))
         along = {"x": _rounded(p[keep, i]), "y": _rounded(p[keep, j]), "told": told}
-        panels.append(_panel("", f"{names[i]} [m]", f"{names[j]} [m]", lines, equal=True, along=along))
+        panels.append(panel("", f"{names[i]} [m]", f"{names[j]} [m]", lines, equal=True, along=along))
     return panels
 
 
@@ -108,9 +109,9 @@ def errors(e: Evaluation) -> list[Panel]:
             edge = edge[np.isfinite(edge)]
             if len(edge):
                 reach = max(reach, 1.15 * float(np.quantile(edge, 0.9)), min(1.05 * float(edge.max()), 4.0 * reach))
-        lines = [_line(*_thin(t, error), "", _BLACK, 1.0)]
+        lines = [line(*_thin(t, error), "", _BLACK, 1.0)]
         unit = "mm" if k < 3 else "mrad"
-        panels.append(_panel(axis, "time [s]", f"{axis} [{unit}]", lines, bands=bands, limit=[-reach, reach]))
+        panels.append(panel(axis, "time [s]", f"{axis} [{unit}]", lines, bands=bands, limit=[-reach, reach]))
     return panels
 
 
@@ -123,7 +124,7 @@ def stated(e: Evaluation) -> list[Panel]:
             sigma = np.sqrt(variances(s.covariance)[:, block].mean(axis=1))
             lines.append(_of_method(e, s, e.t_s[keep], 1e3 * sigma[keep]))
         if lines:
-            panels.append(_panel("", "time [s]", name, lines, log="y"))
+            panels.append(panel("", "time [s]", name, lines, log="y"))
     return panels
 
 
@@ -135,8 +136,8 @@ def reliability(e: Evaluation) -> list[Panel]:
     for s, error, C, _ in _stated_errors(e):
         z = np.abs(error) / np.sqrt(variances(C))
         lines.append(_of_method(e, s, _LEVELS, np.array([(z <= width).mean() for width in _HALF_WIDTHS])))
-    lines.append({**_line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
-    return [_panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])]
+    lines.append({**line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "", _BLACK, 1.0), "dash": True})
+    return [panel("Reliability", "stated probability", "share of errors inside", lines, limit=[0.0, 1.0])]
 
 
 def nees(e: Evaluation) -> list[Panel]:
@@ -150,7 +151,7 @@ def nees(e: Evaluation) -> list[Panel]:
         # Divide by what lies under the window, or both ends would seem more honest than they are.
         smooth = np.convolve(values, ones, mode="same") / np.convolve(np.ones(len(values)), ones, mode="same")
         lines.append(_of_method(e, s, *_thin(t, np.maximum(smooth, 1e-3))))
-    return [_panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)]
+    return [panel("NEES over time", "time [s]", "NEES / dof", lines, log="y", level=1.0)]
 
 
 def _stated_errors(e: Evaluation) -> Iterator[tuple[Statement, Array, Array, Array]]:
@@ -171,11 +172,11 @@ def memory(e: Evaluation) -> list[Panel]:
     dt, rho, allan = float(np.median(e.errors.dt_s)), [], []
     for k, axis in enumerate(AXES):
         values = autocorrelation(e.errors.xi[:, k], min(60, len(e.errors.xi) // 2))
-        rho.append(_line(np.array([dt * lag for lag in range(len(values))]), values, axis, _SIX[k], 1.0))
-        allan.append(_line(*allan_deviation(e.errors.xi[:, k] / dt, dt), axis, _SIX[k], 1.0))
+        rho.append(line(np.array([dt * lag for lag in range(len(values))]), values, axis, SIX[k], 1.0))
+        allan.append(line(*allan_deviation(e.errors.xi[:, k] / dt, dt), axis, SIX[k], 1.0))
     return [
-        _panel("Autocorrelation", "lag [s]", "autocorrelation", rho, level=0.0),
-        _panel("Allan deviation", "averaging time [s]", "deviation [m/s, rad/s]", allan, log="xy"),
+        panel("Autocorrelation", "lag [s]", "autocorrelation", rho, level=0.0),
+        panel("Allan deviation", "averaging time [s]", "deviation [m/s, rad/s]", allan, log="xy"),
     ]
 
 
@@ -192,9 +193,9 @@ def inputs(e: Evaluation) -> list[Panel]:
     for label, names in wanted.items():
         columns = {names[n]: np.where(c < 0, np.nan, c) for n in names for c in [log.column(n).astype(np.float64)]}
         known = [(n, c) for n, c in columns.items() if np.isfinite(c).any()]
-        lines = [_line(*_thin(t, c), n, _SIX[k]) for k, (n, c) in enumerate(known)]
+        lines = [line(*_thin(t, c), n, SIX[k]) for k, (n, c) in enumerate(known)]
         if lines:
-            panels.append(_panel("", "time [s]", label, lines, shades=shades))
+            panels.append(panel("", "time [s]", label, lines, shades=shades))
     return panels
 
 
@@ -219,20 +220,23 @@ def _shades(e: Evaluation) -> list[dict[str, Any]]:
     return out
 
 
-def _panel(title: str, x: str, y: str, lines: list[dict[str, Any]], **more: Any) -> Panel:
+def panel(title: str, x: str, y: str, lines: list[dict[str, Any]], **more: Any) -> Panel:
+    """A panel, see the module's text."""
     return {"title": title, "x": x, "y": y, "lines": lines, **more}
 
 
-def _line(x: Array, y: Array, name: str, tint: str, width: float = 1.3) -> dict[str, Any]:
+def line(x: Array, y: Array, name: str, tint: str, width: float = 1.3) -> dict[str, Any]:
+    """A line of a panel, in the legend where it has a name. It may be given more: ``dash``, ``dots`` in place of a line
+    (in figures alone), and ``aside``, whether it does not stretch the axes."""
     return {"x": _rounded(x), "y": _rounded(y), "name": name, "colour": tint, "width": width}
 
 
 def _of_method(e: Evaluation, s: Statement, x: Array, y: Array) -> dict[str, Any]:
     """A method's line; the method that the page is about stands out."""
-    return _line(x, y, s.method, colour(s.method), 2.4 if s.method == e.shown_method else 1.2)
+    return line(x, y, s.method, colour(s.method), 2.4 if s.method == e.shown_method else 1.2)
 
 
-def _ring(C: Array) -> Array:
+def ring(C: Array) -> Array:
     """(49, 2) points of the 3-sigma ellipse of a (2, 2) covariance."""
     angle = np.linspace(0, 2 * np.pi, 49)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1) @ half_axes(C)
