@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from gpvo.cameras.kalibr import make_lens
 from gpvo.cameras.models import CameraModel
 from gpvo.cameras.rectify import rectifying_rotations
 from gpvo.cameras.rig import StereoRig, check_pose
 from gpvo.errors import CalibrationError, SourceError
-from gpvo.files import read_json
+from gpvo.files import plain, read_json
 from gpvo.geometry import se3
 from gpvo.types import Array, StereoCamera
 from gpvo.vo.rig_error import N_TERMS, ORDER, POWERS, RigState, terms
@@ -235,27 +236,18 @@ def rig_of(calibration: dict[str, Any] | None, camera: StereoCamera) -> StereoRi
 
 def camchain(rig: StereoRig) -> str:
     """The rig as Kalibr's ``camchain.yaml``, with the place and the clock of the IMU where they are known."""
-    T_left_imu = None if rig.T_imu_left is None else se3.inverse(rig.T_imu_left)
-    lines = []
+    chain: dict[str, dict[str, Any]] = {}
     for name, lens, T_cam_left in (("cam0", rig.left, np.eye(4)), ("cam1", rig.right, rig.T_right_left)):
-        fisheye = len(lens.distortion) == 4
-        numbers = [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px]
-        lines += [f"{name}:", "  camera_model: pinhole", f"  intrinsics: {_list(numbers)}"]
-        lines += [f"  distortion_model: {'equidistant' if fisheye else 'radtan'}"]
-        lines += [
-            f"  distortion_coeffs: {_list(lens.distortion if any(lens.distortion[4:]) else lens.distortion[:4])}",
-            f"  resolution: [{lens.width}, {lens.height}]",
-        ]
-        if T_left_imu is not None:
-            lines += _matrix("T_cam_imu", T_cam_left @ T_left_imu)
+        chain[name] = {
+            "camera_model": "pinhole",
+            "intrinsics": lens.intrinsics_px,
+            "distortion_model": "equidistant" if len(lens.distortion) == 4 else "radtan",
+            "distortion_coeffs": lens.distortion if any(lens.distortion[4:]) else lens.distortion[:4],
+            "resolution": [lens.width, lens.height],
+        }
+        if rig.T_imu_left is not None:
+            chain[name]["T_cam_imu"] = T_cam_left @ se3.inverse(rig.T_imu_left)
         if rig.timeshift_cam_imu_s:
-            lines.append(f"  timeshift_cam_imu: {rig.timeshift_cam_imu_s!r}")
-    return "\n".join([*lines, *_matrix("T_cn_cnm1", rig.T_right_left)]) + "\n"
-
-
-def _matrix(name: str, T: Array) -> list[str]:
-    return [f"  {name}:", *(f"  - {_list(row)}" for row in T)]
-
-
-def _list(values: Any) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
+            chain[name]["timeshift_cam_imu"] = rig.timeshift_cam_imu_s
+    chain["cam1"]["T_cn_cnm1"] = rig.T_right_left
+    return str(yaml.safe_dump(plain(chain), sort_keys=False, default_flow_style=None, width=math.inf))

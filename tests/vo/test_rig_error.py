@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from gpvo.cameras.kalibr import read_camchain, read_yaml
 from gpvo.cameras.rectify import Rectifier
 from gpvo.cameras.rig import StereoRig
@@ -204,6 +205,17 @@ def test_corrected_camera_chain(axis: int, tmp_path: Path) -> None:
     w = se3.so3_log(read.T_right_left[:3, :3])
     assert w[axis] == pytest.approx(3e-3, rel=0.1)
     assert np.abs(np.delete(w, axis)).max() < 3e-4
+
+
+def test_every_number_of_a_camera_chain_is_a_number_to_other_readers() -> None:
+    """YAML 1.1, which Kalibr reads, takes 1e-05 for a text: it wants 1.0e-05."""
+    lens = replace(rig_of(None, CAMERA).left, distortion=(1e-5, -3e-17, 0.0, 2.0, 0.0))
+    T = se3.exp(np.array([-0.12, 1e-9, -2e-7, 1e-8, 3e-6, 0.0]))
+    rig = StereoRig(lens, lens, T, T_imu_left=se3.inverse(T), timeshift_cam_imu_s=1e-6)
+    for block in yaml.safe_load(camchain(rig)).values():
+        for key in ("intrinsics", "distortion_coeffs", "resolution", "T_cam_imu", "timeshift_cam_imu"):
+            assert np.asarray(block[key]).dtype.kind in "fi", key
+    assert np.array_equal(yaml.safe_load(camchain(rig))["cam1"]["T_cn_cnm1"], T)
 
 
 def test_how_much_a_corrected_calibration_explains() -> None:
