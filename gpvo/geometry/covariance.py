@@ -30,19 +30,11 @@ def is_symmetric(C: Array) -> bool:
 
 def is_positive_definite(C: Array) -> bool:
     """Whether one (n, n) matrix is finite, symmetric to rounding and positive definite."""
-    C = np.asarray(C, dtype=np.float64)
-    # Comparisons with NaN are false.
-    if not (np.abs(C).max() < LARGEST and np.diagonal(C).min() > 1 / LARGEST and is_symmetric(C)):
-        return False
-    try:
-        np.linalg.cholesky(C)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    return bool(are_covariances(np.asarray(C)[None])[0])
 
 
 def are_covariances(C: Array) -> NDArray[np.bool_]:
-    """(N,) which of (N, n, n) matrices :func:`is_positive_definite` is true of."""
+    """(N,) which of (N, n, n) matrices are finite, symmetric to rounding and positive definite."""
     C = np.asarray(C, dtype=np.float64)
     size = np.abs(C)
     largest = size.max(axis=(1, 2), initial=0.0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -19,8 +18,8 @@ from gpvo.geometry import se3
 from gpvo.sim import sequence_plan
 from gpvo.sim.imu import Motion
 from gpvo.sim.scenario import Scenario
-from gpvo.sim.worlds import World, check_ranges
-from gpvo.types import Array
+from gpvo.sim.worlds import World
+from gpvo.types import Array, out_of_limits, within
 
 Image = NDArray[np.float32]
 Grey = NDArray[np.uint8]
@@ -106,10 +105,6 @@ def optical_flow(
 _SHOT_STREAM, _ADDED_STREAM, _FIXED_STREAM = 0, 1, 2
 
 
-def _within(low: float, high: float, default: float) -> Any:
-    return field(default=default, metadata={"limits": (low, high)})
-
-
 @dataclass(frozen=True)
 class SensorParams:
     """A small global-shutter camera.
@@ -121,25 +116,20 @@ class SensorParams:
     times gain per unit of radiance. ``gamma``: exponent of the tone curve.
     """
 
-    psf_sigma_px: float = _within(0, 5, default=0.55)
-    vignetting: float = _within(0, 0.95, default=0.3)
-    prnu: float = _within(0, 0.2, default=0.006)
-    full_well_e: float = _within(0, 1e7, default=6000.0)
-    read_noise_e: float = _within(0, 1e5, default=6.0)
-    auto_exposure: float = _within(0, 1, default=0.08)
+    psf_sigma_px: float = within(0.55, 0, 5)
+    vignetting: float = within(0.3, 0, 0.95)
+    prnu: float = within(0.006, 0, 0.2)
+    full_well_e: float = within(6000.0, 0, 1e7)
+    read_noise_e: float = within(6.0, 0, 1e5)
+    auto_exposure: float = within(0.08, 0, 1)
     gain: float | None = None
-    target: float = _within(0.01, 0.99, default=0.30)
-    max_gain: float = _within(1e-3, 1e6, default=60.0)
-    gamma: float = _within(0.2, 1, default=0.5)
+    target: float = within(0.30, 0.01, 0.99)
+    max_gain: float = within(60.0, 1e-3, 1e6)
+    gamma: float = within(0.5, 0.2, 1)
 
     def __post_init__(self) -> None:
-        check_ranges(
-            **{
-                f"the sensor's {f.name}": (getattr(self, f.name), *f.metadata["limits"])
-                for f in fields(self)
-                if f.metadata
-            }
-        )
+        for name, value, low, high in out_of_limits(self):
+            raise GpvoError(f"the sensor's {name} = {value} is not between {low} and {high}")
 
 
 class SensorModel:

@@ -31,6 +31,8 @@ from gpvo.types.sensors import (
     TruthLog,
     Vehicle,
     field_names,
+    out_of_limits,
+    within,
 )
 
 __all__ = [
@@ -60,4 +62,6 @@ __all__ = [
     "VoLog",
     "VoRecord",
     "field_names",
+    "out_of_limits",
+    "within",
 ]

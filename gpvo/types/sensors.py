@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,19 @@ STANDARD_GRAVITY_MPS2 = 9.80665
 def field_names(cls: type) -> tuple[str, ...]:
     """Names of a dataclass' fields, in order."""
     return tuple(f.name for f in fields(cls))
+
+
+def within(default: Any, least: float, most: float) -> Any:
+    """A field of settings that lies between two limits, or is None; the limits are among what it may be."""
+    return field(default=default, metadata={"limits": (least, most)})
+
+
+def out_of_limits(settings: Any) -> Iterator[tuple[str, Any, float, float]]:
+    """Name, value and limits of each such field that lies beyond them, or is no number."""
+    for name, (low, high) in ((f.name, f.metadata["limits"]) for f in fields(settings) if f.metadata):
+        value = getattr(settings, name)
+        if value is not None and not low <= value <= high:
+            yield name, value, low, high
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, get_type_hints
 
 from gpvo.errors import GpvoError
-from gpvo.types import Vehicle
+from gpvo.types import Vehicle, out_of_limits, within
 
 METHODS = ("triangulation", "pointing_matching", "spherical")
 
@@ -18,33 +18,36 @@ TELLING_PX = 2 * KNOWN_DEPTH_PX  # disparity above which a point alone tells som
 
 @dataclass(frozen=True)
 class VoConfig:
-    """Everything that changes what the odometry does. Pixels are those of the rectified image."""
+    """Everything that changes what the odometry does. Pixels are those of the rectified image.
+
+    Limits include both ends; values of OpenCV stop the process where they are out of range.
+    """
 
     preset: str = "fast"
-    max_features: int = 300  # corners kept per frame
-    min_distance_px: float = 9.0  # between corners
-    corner_quality: float = 0.004  # relative to the best corner of the image
-    klt_window_px: int = 15
-    klt_levels: int = 4
-    max_row_error_px: float = 1.5  # of a left-right match; an ideal rectification gives 0
-    min_disparity_px: float = -2.0  # noise puts far points below zero: to leave them out is to choose by noise
-    max_disparity_share: float = 0.25  # of the image width
-    ransac_threshold_px: float = 2.0
-    ransac_iterations: int = 1000  # at most: few where most points agree
-    min_inliers: int = 8  # fewer: lost; P3P needs four
-    weak_inliers: int = 20  # fewer: degraded
-    max_acceleration_mps2: float = 40.0  # of the vehicle: beyond, a motion is something else's
-    max_turn_radps2: float = 200.0  # its angular acceleration: beyond, a motion is a slip
-    keyframe_parallax_px: float = 1.0  # keep the reference while the median image motion is below this; 0: never
+    max_features: int = within(300, 8, 20_000)  # corners kept per frame
+    min_distance_px: float = within(9.0, 1, 1000)  # between corners
+    corner_quality: float = within(0.004, 1e-6, 1)  # relative to the best corner of the image
+    klt_window_px: int = within(15, 3, 101)
+    klt_levels: int = within(4, 1, 10)
+    max_row_error_px: float = within(1.5, 0.01, 1000)  # of a left-right match; 0 in an ideal rectification
+    min_disparity_px: float = within(-2.0, -1000, 1000)  # noise puts far points below 0: it must not choose
+    max_disparity_share: float = within(0.25, 0.01, 1)  # of the image width
+    ransac_threshold_px: float = within(2.0, 0.01, 1000)
+    ransac_iterations: int = within(1000, 1, 100_000)  # at most: few where most points agree
+    min_inliers: int = within(8, 4, 10_000)  # fewer: lost; P3P needs four
+    weak_inliers: int = within(20, 0, 10_000)  # fewer: degraded
+    max_acceleration_mps2: float = within(40.0, 1e-6, 1e6)  # of the vehicle: beyond, a motion is another's
+    max_turn_radps2: float = within(200.0, 1e-6, 1e6)  # its angular acceleration: beyond, a motion is a slip
+    keyframe_parallax_px: float = within(1.0, 0, 1000)  # of the median point: below, the reference is kept; 0: never
     methods: tuple[str, ...] = ("triangulation", "pointing_matching")
-    sigma_px: float = 1.0  # triangulation: of each image coordinate
-    sigma_p_px: float | None = 0.1  # pointing; None: estimated from the residuals so far
-    sigma_m_px: float | None = 0.5  # matching; None: likewise
+    sigma_px: float = within(1.0, 1e-6, 100)  # triangulation: of each image coordinate
+    sigma_p_px: float | None = within(0.1, 1e-6, 100)  # pointing; None: estimated from the residuals so far
+    sigma_m_px: float | None = within(0.5, 1e-6, 100)  # matching; None: likewise
     sigma_pairs_px: tuple[tuple[float, float], ...] = ()  # further pairs, each stated as a method of its own
     self_calibration: bool = True  # estimate what the calibration has wrong between the cameras
     persistent_noise: bool = True  # estimate the error of disparity that a point keeps while it is followed
-    window: int = 2  # frames adjusted together; 2: each motion for itself
-    seed: int = 0
+    window: int = within(2, 2, 20)  # frames adjusted together; 2: each motion for itself
+    seed: int = within(0, 0, 2**31 - 1)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -77,29 +80,6 @@ PRESETS: dict[str, VoConfig] = {
 }
 
 
-# What values may be, both ends included; those of OpenCV stop the process where they are out of range.
-_LIMITS: dict[str, tuple[float, float]] = {
-    "max_features": (8, 20_000),
-    "min_distance_px": (1, 1000),
-    "corner_quality": (1e-6, 1),
-    "klt_window_px": (3, 101),
-    "klt_levels": (1, 10),
-    "max_row_error_px": (0.01, 1000),
-    "min_disparity_px": (-1000, 1000),
-    "max_disparity_share": (0.01, 1),
-    "ransac_threshold_px": (0.01, 1000),
-    "ransac_iterations": (1, 100_000),
-    "min_inliers": (4, 10_000),
-    "weak_inliers": (0, 10_000),
-    "max_acceleration_mps2": (1e-6, 1e6),
-    "max_turn_radps2": (1e-6, 1e6),
-    "keyframe_parallax_px": (0, 1000),
-    "sigma_px": (1e-6, 100),
-    "sigma_p_px": (1e-6, 100),
-    "sigma_m_px": (1e-6, 100),
-    "window": (2, 20),
-    "seed": (0, 2**31 - 1),
-}
 _SWITCH = {"on": True, "true": True, "off": False, "false": False}
 
 
@@ -117,10 +97,8 @@ def make_config(preset: str = "fast", **overrides: object) -> VoConfig:
     for method in config.methods:
         if method not in METHODS:
             raise GpvoError(f"unknown covariance method '{method}'", cure=f"choose from {', '.join(METHODS)}")
-    for name, (low, high) in _LIMITS.items():
-        value = getattr(config, name)
-        if value is not None and not low <= value <= high:
-            raise GpvoError(f"{name} is {value}", cure=f"give a value from {low:g} to {high:g}")
+    for name, value, low, high in out_of_limits(config):
+        raise GpvoError(f"{name} is {value}", cure=f"give a value from {low:g} to {high:g}")
     return config
 
 
