@@ -240,45 +240,20 @@ def _independent(
 
 
 def _windows(log: VoLog, known: NDArray[np.bool_], progress: Array, span: float) -> Iterator[list[int]]:
-    """The motions of each window."""
+    """The motions of each window: it ends where odometry measures first beyond its length."""
     stride, t_next = max(0.5 * span, float(progress[-1] - progress[0]) / _MAX_WINDOWS), float(progress[0])
     parent, usable = log.parent, log.usable
     leads_on = np.append(parent[1:] == np.arange(len(parent) - 1), False)  # whether the next motion starts there
-    # A run would cost the square of its frames without these cuts: a window ends where odometry measures first beyond
-    # its length or further on, and what stops one start stops all between.
-    measured = np.flatnonzero(usable)
-    end = np.searchsorted(measured, np.searchsorted(progress, progress + span * _HAIR))
-    beyond = np.append(measured, 0)[end]
-    may_begin = leads_on & known & (end < len(measured)) & known[beyond]
-    may_begin &= progress[beyond] - progress < TOO_FAR * span
-    starts, stops = np.flatnonzero(may_begin), 0
-    for start in starts.tolist():
-        if start < stops or progress[start] < t_next:
+    measured = np.flatnonzero(usable & (parent >= 0))
+    place = np.searchsorted(measured, np.searchsorted(progress, progress + span * _HAIR))
+    end = np.append(measured, 0)[place]
+    broken = np.cumsum(leads_on & ~usable)
+    may_begin = leads_on & known & (place < len(measured)) & known[end] & (broken[end] == broken)
+    may_begin &= progress[end] - progress < TOO_FAR * span
+    for start in np.flatnonzero(may_begin).tolist():
+        if progress[start] < t_next:
             continue
-        chain, last = _window(start, parent, usable, leads_on, progress, span)
-        stops = start if chain else last
-        if chain and known[chain[-1]] and progress[chain[-1]] - progress[start] < TOO_FAR * span:
+        chain = _ancestors(int(end[start]), start, parent)
+        if chain and parent[chain[0]] == start:
             t_next = float(progress[start]) + stride
             yield chain
-
-
-def _window(
-    start: int, parent: NDArray[np.int64], usable: NDArray[np.bool_], leads_on: NDArray[np.bool_], progress: Array,
-    span: float,
-) -> tuple[list[int], int]:  # fmt: skip
-    """The chain of motions from frame ``start`` over at least ``span``, empty where it is broken or too short; and the
-    frame that ends it."""
-    chain: list[int] = []
-    here = start
-    for k in range(start + 1, len(parent)):
-        if parent[k] != here:
-            continue
-        done = usable[k] and progress[k] - progress[start] >= span * _HAIR
-        if done or leads_on[k]:
-            if not usable[k]:
-                return [], k
-            chain.append(k)
-            here = k
-        if done:
-            return chain, k
-    return [], len(parent)

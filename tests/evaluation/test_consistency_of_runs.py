@@ -175,8 +175,8 @@ def test_windows_that_cannot_be_are_not_looked_through_from_every_frame(monkeypa
         usable[400::400] = False
     elif what == "gaps of the truth":
         known = np.arange(n) // 700 % 2 == 0
-    log, looked = SimpleNamespace(parent=np.arange(n) - 1, usable=usable), module._window
-    monkeypatch.setattr(module, "_window", lambda start, *known: starts.append(start) or looked(start, *known))
+    log, looked = SimpleNamespace(parent=np.arange(n) - 1, usable=usable), module._ancestors
+    monkeypatch.setattr(module, "_ancestors", lambda *ends: starts.append(ends) or looked(*ends))
     progress = np.repeat([0.0, 150.0], n // 2) if "rest" in what else np.arange(n) / 20
     windows = list(module._windows(log, known, progress, 50.0))
     assert bool(windows) == (what == "gaps of the truth")
