@@ -285,6 +285,11 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     write_text(path, stream.getvalue())
 
 
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Columns, as :func:`write_csv` takes them, of rows with the same names."""
+    return {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
+
+
 def in_metres(length_m: float) -> str:
     """A length for people: to a decimetre, of less than a metre, as of an endoscope's path, three digits."""
     return f"{length_m:{'.1f' if length_m >= 1 else '.3g'}} m"

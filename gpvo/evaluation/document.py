@@ -14,7 +14,7 @@ from gpvo.evaluation.consistency import HORIZONS_M, UNITS, Consistency, Horizon
 from gpvo.evaluation.evaluate import Evaluation
 from gpvo.evaluation.trajectory import nees_document
 from gpvo.evaluation.verdict import verdict
-from gpvo.files import write_csv, write_text
+from gpvo.files import columns_of, write_csv, write_text
 from gpvo.geometry.covariance import variances
 from gpvo.io.trajectory import write_tum
 from gpvo.learning.methods import METHODS
@@ -98,6 +98,7 @@ def run_document(e: Evaluation) -> dict[str, Any]:
     """One of the ``runs`` of :func:`document`."""
     t = e.trajectory
     counts = {s.value: e.run.log.statuses.count(s) for s in Status}
+    suspected: dict[str, Any] = {"fixed_rotation": e.turned, "inverse_poses": e.inverse, "unlike": e.unlike}
     return {
         "run": e.run.name,
         "source": e.run.meta.get("source"),
@@ -107,19 +108,14 @@ def run_document(e: Evaluation) -> dict[str, Any]:
         "truth_moves_at_rest": e.unscored,
         "odd_stretches": [str(s) for s in e.odd],
         "in_domain": e.in_domain,
-        "path_length_m": t.path_length_m,
-        "ate_rmse_m": t.ate_rmse_m,
-        "rmse_origin_m": t.rmse_origin_m,
-        "final_error_m": t.final_error_m,
+        **{name: getattr(t, name) for name in ("path_length_m", "ate_rmse_m", "rmse_origin_m", "final_error_m")},
         "time_offset_s": e.time_offset_s,
         "clocks_differ_by_s": e.late_s,
         "truth_sigma": _by_kind(e.truth_sigma),
         "truth_sigma_axes": e.truth_sigma.tolist(),
         "truth_sigma_stated": _by_kind(e.truth_sigma_stated),
         "truth_tells_from_m": e.tells_from_m,
-        "fixed_rotation": None if e.turned is None else asdict(e.turned),
-        "inverse_poses": None if e.inverse is None else asdict(e.inverse),
-        "unlike": None if e.unlike is None else asdict(e.unlike),
+        **{n: None if found is None else asdict(found) for n, found in suspected.items()},
         "rpe": {"frame": asdict(t.rpe_frame), "1s": asdict(t.rpe_second), "10m": asdict(t.rpe_10m)},
         "segments": [asdict(s) for s in t.segments],
         "poses": nees_document(e.poses),
@@ -178,7 +174,7 @@ def write_tables(e: Evaluation, folder: Path, name: str) -> list[Path]:
 
 def _scores(methods: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Columns of the methods that were scored."""
-    out: dict[str, list[Any]] = {}
+    rows = []
     for method, m in methods.items():
         if m["nll_per_dim"] is None:
             continue
@@ -187,9 +183,8 @@ def _scores(methods: Mapping[str, Any]) -> dict[str, list[Any]]:
         row |= {"nees_1s": m["one_second"]["nees_dof_truth_noise"], **over, "nll": m["nll_per_dim"]}
         row |= {f"within_{k}_sigma": share for k, share in m["coverage"].items()}
         row |= {f"energy_{unit}": m["energy"][unit] for unit in UNITS}
-        for key, value in row.items():
-            out.setdefault(key, []).append(value)
-    return out
+        rows.append(row)
+    return columns_of(rows)
 
 
 def latex(columns: Mapping[str, Sequence[Any]]) -> str:

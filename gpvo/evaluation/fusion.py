@@ -27,6 +27,7 @@ from gpvo.online.predictor import Predictor
 from gpvo.twin.gap import simulated_truth
 from gpvo.types import IMPORTED, Array
 
+_AVERAGED = ("ate_rmse_m", "final_error_m", "drift_percent", "nis_dof", "rejected")
 _AXES = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
 
 
@@ -227,23 +228,15 @@ def document(report: FusionReport) -> dict[str, Any]:
 def _score(scores: Scores | None) -> dict[str, Any] | None:
     if scores is None:
         return None
-    return {
-        "ate_rmse_m": scores.ate_rmse_m,
-        "final_error_m": scores.final_error_m,
-        "drift_percent": scores.drift_percent,
-        "nees_dof": scores.nees_dof,
-        "nis_dof": scores.nis_dof,
-        "nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high],
-        "rejected": scores.rejected,
-        "diverged": scores.diverged,
-    }
+    before, after = (*_AVERAGED[:3], "nees_dof", "nis_dof"), ("rejected", "diverged")
+    interval = {"nis_dof_interval": [scores.nis_interval.low, scores.nis_interval.high]}
+    return {k: getattr(scores, k) for k in before} | interval | {k: getattr(scores, k) for k in after}
 
 
 def _mean(result: Study, name: str, traces: Sequence[Trace]) -> dict[str, Any] | None:
     if all(s is None for s in result.scores[name]):
         return None
-    keys = ("ate_rmse_m", "final_error_m", "drift_percent", "nis_dof", "rejected")
-    out: dict[str, Any] = {key: result.mean(name, key) for key in keys}
+    out: dict[str, Any] = {key: result.mean(name, key) for key in _AVERAGED}
     nees = {part: result.mean(name, f"nees_{part}") for part in ("position", "attitude")}
     out["nis_in_band_percent"] = nis_in_band_percent([t for t in traces if t.policy == name])
     return {**out, "nees_dof": nees, "diverged": result.diverged(name)}

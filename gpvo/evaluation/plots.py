@@ -49,7 +49,9 @@ def _draw(ax: Axes, panel: Panel) -> None:
         ax.fill_between(x, low, high, color=band["colour"], alpha=0.2, lw=0)
     for told in panel["lines"]:
         x, y = (np.array(told[key], dtype=np.float64) for key in "xy")
-        style = {"ls": "", "marker": "."} if told.get("dots") else {"ls": "--" if told.get("dash") else "-"}
+        style: dict[str, Any] = (
+            {"ls": "", "marker": "."} if told.get("dots") else {"ls": "--" if told.get("dash") else "-"}
+        )
         drawn = Line2D(x, y, color=told["colour"], lw=told["width"], label=told["name"], **style)
         # As an artist a vast ellipse does not stretch the axes and hide the path.
         ax.add_artist(drawn) if told.get("aside") else ax.add_line(drawn)
@@ -95,8 +97,8 @@ def forecast(f: Forecast, title: str) -> Figure:
         lines.append({**line(p[far, 0], p[far, 1], "outside the training domain", "#d62728"), "dots": True})
     name = "3-sigma bound of the position"
     for k in np.unique(np.linspace(1, len(p) - 1, 12).astype(int)):
-        bound = (panels.ring(C[k, :2, :2]) + p[k, :2]).T
-        lines.append({**line(*bound, name, colour("learned"), 0.8), "aside": True})  # a vast one must not hide the path
+        x, y = (panels.ring(C[k, :2, :2]) + p[k, :2]).T
+        lines.append({**line(x, y, name, colour("learned"), 0.8), "aside": True})  # a vast one must not hide the path
         name = ""
     along = [line(f.plan.distance_m, f.position_sigma_m[:, j], "xyz"[j], panels.SIX[j], 1.0) for j in range(3)]
     along.append(line(f.plan.distance_m, f.sigma_m, "all three", "black", 1.4))

@@ -18,7 +18,7 @@ from gpvo.dataset.doubtful import false_motions, in_waits
 from gpvo.errors import SourceError
 from gpvo.evaluation.evaluate import EvaluateOptions, Evaluation, distinct, evaluate_run
 from gpvo.evaluation.statements import corrected
-from gpvo.files import write_csv, write_json
+from gpvo.files import columns_of, write_csv, write_json
 from gpvo.geometry import se3
 from gpvo.io.foreign import read_foreign
 from gpvo.io.run_read import Run
@@ -165,7 +165,7 @@ def write_board(found: Mapping[str, Mapping[str, Any]], folder: Path) -> None:
 
 def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Columns of the table of methods, to three digits: means over the sequences."""
-    out: dict[str, list[Any]] = {}
+    rows = []
     for method, scores in found.items():
         pooled, sequences = scores["pooled"], scores["sequences"]
         row: dict[str, Any] = {
@@ -179,10 +179,9 @@ def board(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Any]]:
             row[f"NEES {span}"] = float(np.mean(known)) if known else None
         covered = np.mean([s["coverage_by_difficulty"] for s in sequences], axis=0)
         row |= {"easy": covered[0], "hard": covered[-1]}
-        out.setdefault("method", []).append(method)
-        for name, value in row.items():
-            out.setdefault(name, []).append(None if value is None else float(f"{value:.3g}"))
-    return out
+        digits = {name: None if value is None else float(f"{value:.3g}") for name, value in row.items()}
+        rows.append({"method": method, **digits})
+    return columns_of(rows)
 
 
 def on_other_axes(found: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:

@@ -42,7 +42,6 @@ from gpvo.filters.propagation import (
     V,
     constant_velocity_densities,
     constant_velocity_step,
-    identity_transition,
     imu_densities,
     imu_step,
     process_noise,
@@ -87,6 +86,7 @@ class ErrorStateFilter:
         self.gravity = (
             np.array([0.0, 0.0, -STANDARD_GRAVITY_MPS2]) if gravity_world is None else np.asarray(gravity_world)
         )
+        self._with_imu = imu_noise is not None
         self._densities = (
             constant_velocity_densities(motion_noise or ConstantVelocityNoise())
             if imu_noise is None
@@ -101,7 +101,7 @@ class ErrorStateFilter:
         self.jitter_cur_mean = np.zeros((self.batch, 6))
         self.jitter_mean = np.zeros((self.batch, 6))
         self.jitter_known = False
-        self._F = identity_transition(self.batch)
+        self._F = np.tile(np.eye(CORE), (self.batch, 1, 1))
         self._H = np.zeros((self.batch, 6, JOINT))
         self._H[:, :, JITTER_CUR] = np.eye(6)
         self._FP = np.empty((self.batch, CORE, JOINT))
@@ -135,7 +135,7 @@ class ErrorStateFilter:
 
     def _propagate_covariance(self, dt: float) -> None:
         if self._Q[0] != dt:
-            self._Q = (dt, process_noise(self._densities, dt))
+            self._Q = (dt, process_noise(self._densities, dt, self._with_imu))
         FP = np.matmul(self._F, self.P[:, :CORE, :], out=self._FP)
         core = FP[:, :, :CORE] @ transpose(self._F)
         core += transpose(core)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,16 +21,16 @@ class Scores:
     """Scores of one run under one policy; NaN, of ``diverged`` None, where truth is missing. ``nis_interval`` by block
     bootstrap; ``frames`` that have truth."""
 
-    ate_rmse_m: float
-    final_error_m: float
-    drift_percent: float
-    nees_position: float
-    nees_attitude: float
     nis_dof: float
     nis_interval: Interval
     rejected: int
-    diverged: bool | None
-    frames: int
+    ate_rmse_m: float = math.nan
+    final_error_m: float = math.nan
+    drift_percent: float = math.nan
+    nees_position: float = math.nan
+    nees_attitude: float = math.nan
+    diverged: bool | None = None
+    frames: int = 0
 
     @property
     def nees_dof(self) -> dict[str, float]:
@@ -77,16 +78,6 @@ def diverged(errors_m: Array, path_m: float) -> bool:
 
 def without_truth(nis: Array, rejected: int) -> Scores:
     """What a run can say by itself: NIS (n,) of its updates, NaN where there was none, and rejections."""
-    measured, unknown = nis[np.isfinite(nis)] / 6.0, float("nan")
-    return Scores(
-        ate_rmse_m=unknown,
-        final_error_m=unknown,
-        drift_percent=unknown,
-        nees_position=unknown,
-        nees_attitude=unknown,
-        nis_dof=float(measured.mean()) if len(measured) else unknown,
-        nis_interval=block_bootstrap(measured),
-        rejected=rejected,
-        diverged=None,
-        frames=0,
-    )
+    measured = nis[np.isfinite(nis)] / 6.0
+    interval = block_bootstrap(measured)
+    return Scores(nis_dof=interval.mean, nis_interval=interval, rejected=rejected)

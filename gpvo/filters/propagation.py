@@ -78,13 +78,9 @@ class ConstantVelocityNoise:
     angular_acceleration: float = 0.5
 
 
-def identity_transition(batch: int) -> Array:
-    """(B, 15, 15) identities to be filled by the functions below, which touch only what varies."""
-    return np.broadcast_to(np.eye(CORE), (batch, CORE, CORE)).copy()
-
-
 def imu_step(x: Nominal, F: Array, dt: float, gyro0: Array, acc0: Array, gyro1: Array, acc1: Array, g: Array) -> None:
-    """Move ``x`` over one IMU interval in place and write the error transition into ``F`` (B, 15, 15).
+    """Move ``x`` over one IMU interval in place and write the error transition into ``F`` (B, 15, 15), an identity but
+    for what varies.
 
     ``gyro0, acc0, gyro1, acc1`` (B, 3) or (1, 3): raw samples at both ends; ``g`` (3,): gravity in the world [m/s^2].
     """
@@ -138,42 +134,26 @@ def constant_velocity_step(x: Nominal, F: Array, dt: float) -> None:
     x.R_world_imu = R1
 
 
-@dataclass(frozen=True)
-class Densities:
-    """White noise that drives the error state: ``diagonal`` (15,) spectral densities, of which the position is driven
-    through the velocity by ``acceleration``, and (constant velocity only) the attitude through the rate by
-    ``angular_acceleration``."""
-
-    diagonal: Array
-    acceleration: float
-    angular_acceleration: float = 0.0
+def imu_densities(noise: ImuNoise) -> Array:
+    """(15,) spectral densities of the white noise that drives an IMU's state."""
+    driven = noise.acc_density_mps2_sqrthz, noise.gyro_density_radps_sqrthz
+    walks = noise.acc_walk_mps3_sqrthz, noise.gyro_walk_radps2_sqrthz
+    return np.repeat(np.square([0.0, *driven, *walks]), 3)
 
 
-def imu_densities(noise: ImuNoise) -> Densities:
-    """Spectral densities of an IMU-driven state."""
-    q = np.zeros(CORE)
-    q[V] = noise.acc_density_mps2_sqrthz**2
-    q[TH] = noise.gyro_density_radps_sqrthz**2
-    q[BA] = noise.acc_walk_mps3_sqrthz**2
-    q[BG] = noise.gyro_walk_radps2_sqrthz**2
-    return Densities(q, float(q[3]))
-
-
-def constant_velocity_densities(noise: ConstantVelocityNoise) -> Densities:
+def constant_velocity_densities(noise: ConstantVelocityNoise) -> Array:
     """The same for the constant-velocity model: the turn rate walks and the attitude integrates it."""
-    q = np.zeros(CORE)
-    q[V] = noise.acceleration**2
-    q[BG] = noise.angular_acceleration**2
-    return Densities(q, noise.acceleration**2, noise.angular_acceleration**2)
+    return np.repeat(np.square([0.0, noise.acceleration, 0.0, 0.0, noise.angular_acceleration]), 3)
 
 
-def process_noise(densities: Densities, dt: float) -> Array:
-    """(15, 15) covariance added over ``dt``: white noise, integrated once more into position (and attitude)."""
-    Q = np.diag(densities.diagonal * dt)
-    for slow, fast, q in ((P, V, densities.acceleration), (TH, BG, densities.angular_acceleration)):
-        if q > 0:
-            Q[slow, slow] += np.eye(3) * (q * dt**3 / 3.0)
-            Q[slow, fast] = Q[fast, slow] = np.eye(3) * (q * dt * dt / 2.0)
+def process_noise(densities: Array, dt: float, with_imu: bool) -> Array:
+    """(15, 15) covariance added over ``dt``: white noise, integrated once more into the position, and without an IMU
+    that of the turn rate into the attitude."""
+    Q = np.diag(densities * dt)
+    for slow, fast in ((P, V),) if with_imu else ((P, V), (TH, BG)):
+        q = float(densities[fast.start])
+        Q[slow, slow] += np.eye(3) * (q * dt**3 / 3.0)
+        Q[slow, fast] = Q[fast, slow] = np.eye(3) * (q * dt * dt / 2.0)
     return Q
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from itertools import accumulate, permutations, product
 
 import numpy as np
 
@@ -275,12 +275,8 @@ def _accelerometer_axes(imu: ImuLog) -> Iterator[Finding]:
         rows = np.flatnonzero((t >= begin) & (t < begin + _AXES_WINDOW_S))[::stride]
         if len(rows) < 20:
             continue
-        R = np.eye(3)
-        turned = np.empty((len(rows), 3, 3))
         steps = se3.so3_exp(imu.gyro_radps[rows] * np.gradient(t[rows])[:, None])
-        for k in range(len(rows)):
-            turned[k] = R
-            R = R @ steps[k]
+        turned = np.array(list(accumulate(steps[:-1], np.matmul, initial=np.eye(3))))
         force = imu.acc_mps2[rows]
         constancy += [np.linalg.norm((turned @ (M @ force.T).T[:, :, None]).mean(axis=0)) for M in _RELABELLINGS]
         total += float(np.linalg.norm(force, axis=1).mean())

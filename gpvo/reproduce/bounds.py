@@ -75,14 +75,11 @@ def bounds_of(run: Run, mean_m: Array, covariance_m2: Array) -> Bounds:
 
 def summed_v_t(log: VoLog, method: str) -> Array:
     """(N, 3, 3) the thesis' bound: V_T of every motion, turned into the axes of the first camera and summed."""
-    T, parent = log.trajectory(), log.parent
+    T, parent, v_t = log.trajectory(), log.parent, log.v_t(method)
     out = np.zeros((len(log), 3, 3))
     last = 1e-12 * np.eye(3)
-    for k, record in enumerate(log):
-        if parent[k] < 0:
-            continue
-        stated = record.v_t.get(method)
-        last = last if stated is None or not np.isfinite(stated).all() else stated
+    for k in np.flatnonzero(parent >= 0):
+        last = v_t[k] if np.isfinite(v_t[k]).all() else last
         R = T[parent[k], :3, :3]
         out[k] = out[parent[k]] + R @ last @ R.T
     return out
@@ -166,7 +163,7 @@ class BoundsJob:
         if kind == "v_t":
             return lambda run: (np.zeros((len(run.log), 3)), summed_v_t(run.log, name))
         if kind == "joint":
-            return lambda run: (np.zeros((len(run.log), 3)), _joint(run.log, name))
+            return lambda run: (np.zeros((len(run.log), 3)), _joint(run.log, where_stated(run.log.covariance(name))))
         if kind == "motion":
             gps = fit_thesis(sets_of(self.training))
             return lambda run: _motion(run, gps)
@@ -193,24 +190,21 @@ def job_of(
     return BoundsJob(name, method, runs, training if method.kind == "motion" else (), model)
 
 
-def _joint(log: VoLog, method: str) -> Array:
-    errors = plain_statement(log, method, where_stated(log.covariance(method))).errors
+def _joint(log: VoLog, covariance: Array) -> Array:
+    """(N, 3, 3) of positions from the covariances (N, 6, 6) of motions, NaN where nothing is said: as of the one before
+    it."""
+    errors = plain_statement(log, "", covariance).errors
     assert errors is not None
     return compounded(log, errors)
 
 
 def _motion(run: Run, model: ThesisModel) -> tuple[Array, Array]:
-    """A GP speaks of measured motions; a lost one is taken to be like the one before."""
+    """A GP speaks of measured motions alone."""
     s = build_run(run, columns=THESIS)
-    stated = model.predict(s.select(model.columns))
-    at = {int(t): k for k, t in enumerate(s.t_ns)}
-    mean, errors, last = np.zeros((len(run.log), 6)), [], 1e-12 * np.eye(6)
-    for k, record in enumerate(run.log):
-        row = at.get(record.t_ns)
-        if row is not None:
-            mean[k], last = stated[0][row], stated[1][row]
-        errors.append(MotionError.independent(last))
-    return mean_shift(run.log, mean), compounded(run.log, errors)
+    mean, covariance = np.zeros((len(run.log), 6)), np.full((len(run.log), 6, 6), np.nan)
+    rows = np.searchsorted(run.log.t_ns, s.t_ns)
+    mean[rows], covariance[rows] = model.predict(s.select(model.columns))
+    return mean_shift(run.log, mean), _joint(run.log, covariance)
 
 
 def _learned(run: Run, predictor: Predictor) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gpvo import __version__
-from gpvo.files import plain, write_json, write_text
+from gpvo.files import plain, write_csv, write_json, write_text
 from gpvo.reproduce import models, rows, tables
 from gpvo.reproduce.claims import claims
 from gpvo.reproduce.experiments import ERRATA, OUT_OF_SCOPE, WAYS, Plan
@@ -27,7 +27,7 @@ def reproduce(plan: Plan, out: Path, workers: Workers | None = None) -> dict[str
         write_json(out / "results.json", document)
         write_text(out / "tables.md", tables.as_markdown(document))
         every_row = [*document["rows"], *document["sensitivity"], *document["real"]]
-        write_text(out / "tables.csv", tables.as_csv(every_row))
+        write_csv(out / "tables.csv", tables.as_columns(every_row))
         write_text(out / "report.html", tables.as_page(document, out))
     return result
 

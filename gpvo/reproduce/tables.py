@@ -4,8 +4,6 @@ position and 3-sigma bound, axis by axis), and one self-contained page with both
 from __future__ import annotations
 
 import base64
-import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gpvo.evaluation.plots import save
-from gpvo.files import make_folder, markdown_table
+from gpvo.files import columns_of, make_folder, markdown_table
 from gpvo.reproduce.bounds import Bounds
 from gpvo.reproduce.models import Studies
 from gpvo.reproduce.rows import Cell
@@ -42,18 +40,17 @@ def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
     return number(value) if interval is None else f"{number(value)} [{number(interval[0])}, {number(interval[1])}]"
 
 
-def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """One line per row and way, every digit."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*_COLUMNS, *(f"thesis_{n}" for n in _THESIS)])
+def as_columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """A line per row and way, every digit, as columns."""
+    lines = []
     for row in rows:
         thesis = row.get("thesis") or {}
         for way, found in row["ways"].items():
             low, high = found["ratio_interval"] or (None, None)
             known = {**row, **found, "way": way, "ratio_interval_low": low, "ratio_interval_high": high}
-            writer.writerow([*(known[name] for name in _COLUMNS), *(thesis.get(name) for name in _THESIS)])
-    return stream.getvalue()
+            printed = {f"thesis_{name}": thesis.get(name) for name in _THESIS}
+            lines.append({name: known[name] for name in _COLUMNS} | printed)
+    return columns_of(lines)
 
 
 TABLES = {"rows": "Tables 4.1 to 4.6", "sensitivity": "Sensitivity to sigma_p and sigma_m", "real": "Real data"}

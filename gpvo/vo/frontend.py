@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -134,6 +134,7 @@ class _AfreshFrontend(ABC):
 
     _reference: _Measured | None = None
     _current: _Measured | None = None
+    _says_what_was_sought = False
 
     @abstractmethod
     def _pairs(self, before: NDArray[Any], now: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -144,7 +145,10 @@ class _AfreshFrontend(ABC):
         if self._reference is None or self._current is None:
             return EMPTY
         i, j = self._pairs(self._reference.mark, self._current.mark)
-        return Matches(self._reference.uvd[i], self._current.uvd[j], self._current.row_error[j], len(i))
+        sought = self._reference.uvd if self._says_what_was_sought else None
+        return Matches(
+            self._reference.uvd[i], self._current.uvd[j], self._current.row_error[j], len(i), sought_uvd=sought
+        )
 
     def promote(self, inliers: NDArray[np.bool_] | None, at_least: int = 0) -> tuple[int, int]:
         """See :class:`Frontend`."""
@@ -155,7 +159,9 @@ class _AfreshFrontend(ABC):
 
 
 class TrackFrontend(_AfreshFrontend):
-    """For stereo tracks: points are matched by their identity."""
+    """For stereo tracks: points are matched by their identity, and all of the reference's are sought."""
+
+    _says_what_was_sought = True
 
     def __init__(self, rig_error: RigError, config: VoConfig) -> None:
         self._rig_error, self._config = rig_error, config
@@ -173,11 +179,6 @@ class TrackFrontend(_AfreshFrontend):
 
     def _pairs(self, before: NDArray[Any], now: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         return np.intersect1d(before, now, assume_unique=True, return_indices=True)[1:]
-
-    def match(self, T_prev_cur_guess: Array, *, from_scratch: bool = False) -> Matches:
-        """Pair the points of equal identity; all of the reference's were sought."""
-        found = super().match(T_prev_cur_guess)
-        return found if self._reference is None else replace(found, sought_uvd=self._reference.uvd)
 
 
 class DescriptorFrontend(_AfreshFrontend):

@@ -59,7 +59,7 @@ def test_flights_are_made_once_and_accidents_are_lost_frames(tmp_path: Path) -> 
 
 
 def _scores(ate: float) -> Scores:
-    return Scores(ate, ate, 0.1, 1.1, 0.9, 1.0, Interval(1.0, 0.9, 1.1), 3, False, 100)
+    return Scores(1.0, Interval(1.0, 0.9, 1.1), 3, ate, ate, 0.1, 1.1, 0.9, False, 100)
 
 
 def test_tables_hold_every_run_and_every_comparison(tmp_path: Path) -> None:
