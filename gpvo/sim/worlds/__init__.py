@@ -11,10 +11,11 @@ import json
 import os
 import zipfile
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,11 +81,11 @@ class Lighting:
 class LightMap:
     """Fine shadows on one material: ``image`` (H, W) uint8, 255 in full light, over a rectangle of its texture plane.
 
-    Texel centres lie at ``uv = origin + (column + 0.5, row + 0.5) * texel``; outside, full light.
+    Texel centres lie at ``uv = origin (2,) + (column + 0.5, row + 0.5) * texel``; outside, full light.
     """
 
     image: NDArray[np.uint8]
-    origin: tuple[float, float]
+    origin: Array
     texel: float
     material: int
 
@@ -252,23 +253,16 @@ def cache_folder() -> Path:
     return Path(os.devnull if base.startswith("~") else base) / "gpvo" / "worlds"
 
 
+_PARTS: dict[str, type] = {"mesh": Mesh, "lighting": Lighting, "ground": HeightGrid, "light_map": LightMap}
+
+
 def _save_world(world: World, path: Path) -> None:
     """Write a world atomically. Raises OSError or SourceError where the folder cannot be written."""
-    ground, shadows = world.ground, world.light_map
-    header = {
-        "lighting": asdict(world.lighting),
-        "textures": len(world.textures),
-        "ground": None if ground is None else (ground.x0, ground.y0, ground.cell),
-        "light_map": None if shadows is None else (shadows.origin, shadows.texel, shadows.material),
-    }
-    arrays = {
-        **{f"mesh_{f.name}": getattr(world.mesh, f.name) for f in fields(Mesh)},
-        **{f"texture_{k}": texture for k, texture in enumerate(world.textures)},
-        **{name: getattr(world, name) for name in _ARRAYS},
-        **({} if ground is None else {"ground": ground.z}),
-        **({} if shadows is None else {"light_map": shadows.image}),
-        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
-    }
+    arrays = {f"texture_{k}": texture for k, texture in enumerate(world.textures)}
+    arrays |= {name: getattr(world, name) for name in _ARRAYS}
+    for part in _PARTS:
+        if (whole := getattr(world, part)) is not None:
+            arrays |= {f"{part}.{name}": value for name, value in vars(whole).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)
@@ -281,16 +275,9 @@ def load_world(path: Path) -> World:
         if sum(info.file_size for info in archive.infolist()) > _LARGEST_BYTES:
             raise ValueError(f"{path} is too large for a world")
     with np.load(path, allow_pickle=False) as data:
-        header = json.loads(data["header"].tobytes())
-        light_map = None
-        if header["light_map"] is not None:
-            (u, v), texel, material = header["light_map"]
-            light_map = LightMap(data["light_map"], (u, v), texel, material)
-        return World(
-            mesh=Mesh(**{f.name: data[f"mesh_{f.name}"] for f in fields(Mesh)}),
-            textures=tuple(data[f"texture_{k}"] for k in range(header["textures"])),
-            lighting=Lighting(**header["lighting"]),
-            **{name: data[name] for name in _ARRAYS},
-            ground=HeightGrid(data["ground"], *header["ground"]) if header["ground"] is not None else None,
-            light_map=light_map,
-        )
+        read = {name: value if value.ndim else value.item() for name, value in data.items()}
+    values: dict[str, Any] = {name: read[name] for name in _ARRAYS}
+    for part, kind in _PARTS.items():
+        own = {name.partition(".")[2]: value for name, value in read.items() if name.startswith(f"{part}.")}
+        values[part] = kind(**own) if own else None
+    return World(textures=tuple(v for name, v in read.items() if name.startswith("texture_")), **values)

@@ -173,6 +173,6 @@ def _shadows(
     floor = _AMBIENT / (_AMBIENT + _SUN * max(float(sun[2]), 0.1))
     image = np.clip(floor + (1 - floor) * cv2.GaussianBlur(image, (0, 0), 0.6), 0, 1)
     texel = _SHADOW_TEXEL_M / _TILE_M
-    origin = (low / _TILE_M, -_SHADOW_WIDTH_M / _TILE_M)
+    origin = np.array([low, -_SHADOW_WIDTH_M]) / _TILE_M
     light_map = LightMap((image * 255 + 0.5).astype(np.uint8), origin, texel, _GROUND)
     return light_map, lambda at: (at > low) & (at < high)
